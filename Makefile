@@ -9,16 +9,17 @@ PARALLEL := -n auto --dist loadgroup --durations=25
 # Tests start thousands of programs; without bytecode each of them compiles all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help install demo test test-all test-quick fuzz lint format reference bench lock clean
+.PHONY: help install demo test test-all test-quick fuzz lint format docs reference bench lock clean
 
 help:
 	@echo "make demo    engine, containers and a simulated fleet, with its web page"
-	@echo "make test    everything: linters, types, unit, integration and end-to-end tests"
+	@echo "make test    everything: linters, types, docs, unit, integration and end-to-end tests"
 	@echo "make test-all  make test without linters and types        make test-quick  the unit tests"
 	@echo "make fuzz    send the servers what no client would; EXAMPLES=5000 of each kind"
 	@echo "make lint    ruff and mypy        make format   rewrite the layout"
 	@echo "make bench   measure              make lock     pin the dependencies anew"
-	@echo "make reference  the pages of settings and options"
+	@echo "make docs    the documentation as a site, in build/docs; needs no network"
+	@echo "make reference  the pages of settings, options and life cycles"
 	@echo "make install only the set-up      make clean    remove what make made"
 
 install: $(STAMP)
@@ -33,7 +34,7 @@ $(STAMP): requirements.lock pyproject.toml
 demo: install
 	@exec $(BIN)/rce demo $(ARGS)
 
-test: lint
+test: lint docs
 	@$(MAKE) --no-print-directory test-all
 
 test-all: install
@@ -55,6 +56,9 @@ lint: install
 format: install
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+docs: install
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 reference: install
 	$(BIN)/python -m tools.reference

@@ -1,1 +1,1 @@
-"""What is measured of the engine, and how: ``make bench`` or ``python -m benchmarks``."""
+"""The benchmarks of the engine: ``make bench`` or ``python -m benchmarks``."""

@@ -8,7 +8,19 @@ from typing import Any
 
 import uvloop
 
-from benchmarks import abuse, bridge, containers, fanout, latched, rate, roundtrip, sandboxes, stalled, tls
+from benchmarks import (
+    abuse,
+    bridge,
+    containers,
+    fanout,
+    joining,
+    latched,
+    rate,
+    roundtrip,
+    sandboxes,
+    stalled,
+    tls,
+)
 from benchmarks.engine import RunningEngine, engine
 from benchmarks.figures import plot_round_trips, save, show
 from benchmarks.targets import RATIOS
@@ -36,6 +48,10 @@ def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awa
         "fanout": (
             "Fan-out",
             lambda e: fanout.run(e, clients=20 if quick else 200, rate=20.0, seconds=seconds),
+        ),
+        "joining": (
+            "Robots join one container",
+            lambda e: joining.run(e, robots=200 if quick else 1000),
         ),
         "abuse": (
             "Beside another user's abuse",

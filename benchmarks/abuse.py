@@ -1,4 +1,4 @@
-"""What a robot notices of another user who abuses the robot endpoint: a 100 Hz probe, with and without."""
+"""The effect of a user who abuses the robot endpoint on another robot: a 100 Hz probe, with and without."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GOAL_MORE_MS = 100.0
 
 
 CONTROL = f"none, {attacks.BUSY}"
-"""The control: what the probe notices of the processors' other work alone."""
+"""The control: the effect of other work of the processors alone on the probe."""
 BUSY_NICE = (10, 19)
 """Priorities of a process that converts large messages, and of one that attacks."""
 
@@ -86,7 +86,7 @@ async def _wire(probe: Robot) -> None:
 
 
 async def _probe(probe: Robot, seconds: float) -> list[float]:
-    """Send a small message 100 times a second; return how long each took to come back."""
+    """Send a small message 100 times a second; return the time of each round trip."""
     count = int(seconds * RATE_HZ)
     sent: list[float] = []
     times: list[float] = []
@@ -116,7 +116,7 @@ def _request(url: str, body: object, token: str = "") -> dict[str, Any]:
 
 
 def _add_user(url: str) -> None:
-    """Make the user who abuses."""
+    """Make the abusing user."""
     token = _request(f"{url}api/v1/login", {"userID": "testUser", "password": "testUser"})["token"]
     _request(f"{url}api/v1/users", {"name": attacks.USER, "password": attacks.PASSWORD}, token)
 

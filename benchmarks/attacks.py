@@ -34,10 +34,10 @@ async def robot(url: str, name: str = "a0") -> AsyncIterator[ClientConnection]:
         yield socket
 
 
-async def loop_back(socket: ClientConnection, cls: str, name: str = "a0") -> None:
-    """Join two of the robot's interfaces, so that what it sends comes back to it."""
+async def loop_back(socket: ClientConnection, message_type: str, name: str = "a0") -> None:
+    """Connect two of the robot's interfaces, so that its messages come back to it."""
     ends = [
-        {"endpointTag": name, "interfaceTag": tag, "interfaceType": kind, "className": cls}
+        {"endpointTag": name, "interfaceTag": tag, "interfaceType": kind, "className": message_type}
         for tag, kind in (("out", "SubscriberConverter"), ("in", "PublisherConverter"))
     ]
     await send(socket, "CN", {"addInterfaces": ends})
@@ -53,13 +53,13 @@ async def send(socket: ClientConnection, kind: str, data: object) -> None:
     await socket.send(json.dumps({"type": kind, "data": data}))
 
 
-def data_message(msg: str, cls: str = STRING) -> str:
+def data_message(msg: str, message_type: str = STRING) -> str:
     """The text of a data message of the looped interface."""
-    return f'{{"type":"DM","data":{{"iTag":"out","type":"{cls}","msgID":"nil","msg":{msg}}}}}'
+    return f'{{"type":"DM","data":{{"iTag":"out","type":"{message_type}","msgID":"nil","msg":{msg}}}}}'
 
 
 async def drain(socket: ClientConnection) -> None:
-    """Read whatever comes."""
+    """Read and discard all messages."""
     async for _ in socket:
         pass
 
@@ -85,7 +85,7 @@ async def frames(url: str) -> None:
         piece = (struct.pack("!BB", 0x81, 0x82) + _MASK + b"{}") * 8192
         while not reading.done():
             socket.transport.write(piece)
-            await socket.send("{}")  # waits until there is room in the buffer
+            await socket.send("{}")  # waits for room in the buffer
 
 
 async def requests(url: str) -> None:
@@ -99,7 +99,7 @@ async def requests(url: str) -> None:
 
 
 def images(picture: bytes) -> Attack:
-    """Pictures that come back as pictures: decoded and encoded again."""
+    """Pictures that are decoded and encoded again."""
 
     async def attack(url: str) -> None:
         async with robot(url) as socket:
@@ -143,7 +143,7 @@ async def slow(url: str) -> None:
 
 
 async def halves(url: str) -> None:
-    """Ten robots send 60 MB of a binary value each, but for its last byte, and begin anew."""
+    """Ten robots each send 60 MB of a binary value except its last byte, and start again."""
 
     async def one(name: str) -> None:
         size = 60_000_000
@@ -190,7 +190,7 @@ def kinds() -> dict[str, Attack]:
 
 
 async def attack(kind: str, url: str) -> None:
-    """Attack until killed; a connection that is ended is made again."""
+    """Attack until killed; reconnect after a disconnection."""
     chosen = kinds()[kind]
     print("ready", flush=True)
     while True:
@@ -210,5 +210,5 @@ def burn(nice: int) -> None:
 if __name__ == "__main__":
     if sys.argv[1] == BUSY:
         burn(int(sys.argv[2]))
-    os.nice(19)  # who attacks has a machine of their own
+    os.nice(19)  # attackers have their own machine
     uvloop.run(attack(sys.argv[1], sys.argv[2]))

@@ -1,4 +1,4 @@
-"""What ``rce-ros`` takes on a robot: memory and processor, idle and with a topic to the cloud and back."""
+"""The cost of ``rce-ros`` on a robot: memory and processor, idle and with a topic to the cloud and back."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ import psutil
 from benchmarks.engine import BIN, RunningEngine, free_ports, pss
 from rce.config.resources import configs_dir
 from rce.ros.node import Node
+from rce.ros.types import Message
 from rce.supervision.process import Child
 
 RATE_HZ = 100
@@ -79,7 +80,7 @@ async def _work(core: str, rate: int, seconds: float) -> int:
         return 0
     returned = 0
 
-    def count(_: Any) -> None:
+    def count(_: Message) -> None:
         nonlocal returned
         returned += 1
 

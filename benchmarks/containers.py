@@ -1,4 +1,4 @@
-"""How fast a container is there, and what it and each task set weigh."""
+"""The start time of containers, and the memory of containers and task sets."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ ENGINE_KINDS = {
     "rce-master": "-m rce_master",
     "rce-robot": "-m rce_robot",
     "rce-container": "-m rce_container --settings",
-    "fork server": "-m rce_container.nursery",
+    "fork server": "-m rce_container.forkserver",
 }
-"""What a process is called, and what its command line holds; of two that fit the later counts."""
+"""Names of processes, and the texts in their command lines; of two that match, the later one counts."""
 CONTAINER_KINDS = {
     "environment": "rce_container.environment",
-    "cradle": "rce_container.nursery.cradle",
+    "node fork server": "rce_container.forkserver.nodes",
     "echo node": "stringEcho.py",
     "bwrap": "bwrap",
     "holder": "read -r word",
@@ -49,7 +49,7 @@ async def start_times(running: RunningEngine, *, count: int) -> list[dict[str, A
 
 
 async def many(running: RunningEngine, *, count: int) -> list[dict[str, Any]]:
-    """Create many at once, until every one's node has answered; then what they weigh while idle."""
+    """Create many at once, until all their nodes have answered; then measure their memory while idle."""
     async with robot(running.url, "crowd") as client:
         start = perf_counter()
         await _create(client, [f"crowd{number}" for number in range(count)])
@@ -68,7 +68,7 @@ async def many(running: RunningEngine, *, count: int) -> list[dict[str, Any]]:
 
 
 async def memory(running: RunningEngine, *, after: float) -> list[dict[str, Any]]:
-    """Weigh every process of an engine with one robot and one container with an echo node, idle.
+    """Measure the memory of each process of an idle engine: one robot, one container with an echo node.
 
     Args:
         running: The engine.
@@ -96,7 +96,7 @@ def _weigh(running: RunningEngine) -> list[dict[str, Any]]:
 
 
 def _weight_of_each(running: RunningEngine, count: int) -> dict[str, float]:
-    """What one of ``count`` containers weighs on average, by kind of process."""
+    """Return the average memory of one of ``count`` containers, by kind of process."""
     weights = dict.fromkeys(CONTAINER_KINDS, 0)
     for process in running.processes():
         if kind := _kind(process, CONTAINER_KINDS):
@@ -107,13 +107,13 @@ def _weight_of_each(running: RunningEngine, count: int) -> dict[str, float]:
 
 
 def _kind(process: psutil.Process, kinds: Mapping[str, str]) -> str:
-    """Tell which of these kinds a process is; empty for none."""
+    """Return the kind of a process; empty for other processes."""
     line = words(process)
     first = Path(line[0]).name if line else ""
     if first == "bwrap":
         return first
     text = " ".join(line) if first.startswith(("python", "sh")) else ""
-    return next((kind for kind, needle in reversed(kinds.items()) if needle in text), "")
+    return next((kind for kind, needle in reversed(list(kinds.items())) if needle in text), "")
 
 
 async def _create(client: Robot, containers: list[str]) -> None:

@@ -22,7 +22,7 @@ BIN = Path(sys.executable).parent
 
 @dataclass(frozen=True)
 class RunningEngine:
-    """An engine in processes of its own."""
+    """An engine in separate processes."""
 
     url: str
     folder: Path
@@ -56,7 +56,7 @@ def words(process: psutil.Process) -> list[str]:
 def pss(process: psutil.Process) -> int:
     """Proportional set size in bytes: a page that several processes share counts for each by its part.
 
-    0 for a process that ended or may not be looked into (environments, unless the user is root).
+    0 for a process that ended or may not be inspected (environments, unless the user is root).
     """
     with contextlib.suppress(psutil.Error):
         return int(process.memory_full_info().pss)
@@ -64,9 +64,9 @@ def pss(process: psutil.Process) -> int:
 
 
 class Meter:
-    """Tells how much processor time the data path's processes used, by kind of process.
+    """Measures the processor time of the data path's processes, by kind of process.
 
-    On a machine that does other things too, this says more than the clock.
+    On a machine with other load, this is more accurate than the clock.
     """
 
     KINDS: ClassVar[dict[str, str]] = {
@@ -96,7 +96,7 @@ def cpu_seconds(process: psutil.Process) -> float:
 
 
 def free_ports(count: int) -> list[int]:
-    """TCP ports that nobody uses now."""
+    """Return unused TCP ports."""
     with contextlib.ExitStack() as stack:
         sockets = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
         return [sock.getsockname()[1] for sock in sockets]
@@ -104,7 +104,7 @@ def free_ports(count: int) -> list[int]:
 
 @contextlib.asynccontextmanager
 async def engine(runtime: str = "auto") -> AsyncIterator[RunningEngine]:
-    """Run ``rce up --dev`` on ports of its own."""
+    """Run ``rce up --dev`` on separate ports."""
     folder = Path(tempfile.mkdtemp(prefix="rce-bench-", dir="/tmp"))
     names = ("--http-port", "--control-port", "--ws-port", "--robot-link-port", "--container-link-port")
     ports = free_ports(len(names))

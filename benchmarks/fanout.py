@@ -1,4 +1,4 @@
-"""One publisher, many clients: latency at each and what the robot task set costs."""
+"""One publisher, many clients: latency at each client and the load of the robot task set."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SIZE = 256
 
 
 async def run(running: RunningEngine, *, clients: int, rate: float, seconds: float) -> list[dict[str, Any]]:
-    """A robot publishes at ``rate``; ``clients`` other robots hear it through the engine."""
+    """A robot publishes at ``rate``; ``clients`` other robots receive the messages through the engine."""
     async with contextlib.AsyncExitStack() as stack:
         source = await stack.enter_async_context(robot(running.url, "source"))
         listeners = [
@@ -62,9 +62,9 @@ async def wire(source: Robot, listeners: list[Robot]) -> None:
 
 
 class _Ear(asyncio.Protocol):
-    """Takes the place of a client's WebSocket protocol, and does no more than note when messages come.
+    """Replaces a client's WebSocket protocol, and only records when messages arrive.
 
-    200 clients of the library's in one process would need more time than the engine, and be measured.
+    200 clients of the library in one process would need more time than the engine, and distort the result.
     """
 
     def __init__(self, latencies: list[float]) -> None:

@@ -19,7 +19,7 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def percentile(values: Sequence[float], share: float) -> float:
-    """The value that ``share`` of the sorted values do not exceed (nearest rank)."""
+    """Return the value that ``share`` of the sorted values do not exceed (nearest rank)."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(share * len(ordered)))]
 
@@ -32,7 +32,7 @@ def spread(seconds: Sequence[float]) -> dict[str, float]:
 
 
 def machine() -> dict[str, Any]:
-    """What was measured on."""
+    """Return the machine of the measurement."""
     return {
         "commit": commit(),
         "processor": processor(),
@@ -58,7 +58,7 @@ def commit() -> str:
 
 
 def processor() -> str:
-    """The processor's name; empty where the kernel does not tell it."""
+    """Return the processor's name; empty if the kernel does not report it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Latched messages: what a robot that comes late waits for one map, and for a burst of many at once."""
+"""Latched messages: how long a late robot waits for one map, and for a burst of many at once."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from benchmarks.engine import RunningEngine, pss
 from benchmarks.figures import percentile
 from benchmarks.wire import STRING, serialized_string
-from rce_client import Connection, Publisher
+from rce_client import Connection, Publisher, Serialized
 
 SIZE = 4_000_000
 """Bytes of a map of 2000 x 2000 cells."""
@@ -18,7 +18,7 @@ LONGEST_S = 120.0
 
 
 async def run(running: RunningEngine, *, passes: int) -> list[dict[str, Any]]:
-    """A robot latches maps, each of a source of its own; another one comes again and again."""
+    """A robot latches maps, each of a separate source; another one connects repeatedly."""
     payload = serialized_string(SIZE)
     rows = []
     async with Connection(running.url, "testUser", "testUser", "mapper") as mapper:
@@ -45,7 +45,7 @@ async def run(running: RunningEngine, *, passes: int) -> list[dict[str, Any]]:
 
 
 async def _come_late(
-    running: RunningEngine, source: Publisher[bytes], count: int, name: str
+    running: RunningEngine, source: Publisher[Serialized], count: int, name: str
 ) -> tuple[float, float, int]:
     """Connect a robot, and its interface with the source's.
 
@@ -55,7 +55,7 @@ async def _come_late(
     times: list[float] = []
     done = asyncio.Event()
 
-    def take(_: bytes) -> None:
+    def take(_: Serialized) -> None:
         times.append(perf_counter())
         if len(times) == count:
             done.set()

@@ -22,16 +22,10 @@ from typing import cast
 
 import uvloop
 
-from rce.control.model import (
-    ConnectionSpec,
-    EndpointKind,
-    EndpointSpec,
-    InterfaceSpec,
-    LinkAddress,
-    LinkSpec,
-)
+from rce.control.model import ConnectionSpec, EndpointKind, EndpointSpec, LinkAddress, LinkSpec
 from rce.link import Endpoint, Interface, LinkHub, Port
-from rce.protocol.names import EndpointId
+from rce.model.names import EndpointId
+from rce.model.specs import InterfaceSpec
 
 SIZES = (100, 1_000, 10_000, 100_000, 1_000_000, 10_000_000)
 ENDS = (
@@ -42,7 +36,7 @@ ENDS = (
 
 
 class Echo(Interface):
-    """The far end: what comes in on i1 goes out on i2."""
+    """The far end: sends messages from i1 back on i2."""
 
     out: Port
 
@@ -85,14 +79,14 @@ class Near(Interface):
 
 
 def spec(side: int, address: LinkAddress) -> EndpointSpec:
-    """What one side is: 0 dials."""
+    """Return one side of the link; side 0 dials."""
     numbers = range(1, len(ENDS) + 1)
     return EndpointSpec(
         id=f"user/e{side}",
         kind=EndpointKind.ROBOT,
         revision=1,
         interfaces=tuple(
-            InterfaceSpec(tag=f"i{n}", type=ends[side], cls="a/B") for n, ends in enumerate(ENDS, 1)
+            InterfaceSpec(tag=f"i{n}", type=ends[side], message_type="a/B") for n, ends in enumerate(ENDS, 1)
         ),
         links=(LinkSpec(id="L", peer=f"user/e{1 - side}", token="t", dial=side == 0, address=address),),
         connections=tuple(
@@ -102,7 +96,7 @@ def spec(side: int, address: LinkAddress) -> EndpointSpec:
 
 
 class BareEcho(asyncio.Protocol):
-    """What the socket and the loop cost without us."""
+    """A bare echo: the cost of the socket and the loop without the engine."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Keep the transport."""
@@ -114,7 +108,7 @@ class BareEcho(asyncio.Protocol):
 
 
 async def serve_far_end(folder: Path, ready: Connection) -> None:
-    """Be the far end until killed; tell the TCP ports of the link and of the bare echo."""
+    """Run the far end until killed; report the TCP ports of the link and of the bare echo."""
     loop = asyncio.get_running_loop()
     hub = LinkHub("here")
     await hub.listen_unix(folder / "link")

@@ -1,8 +1,8 @@
 """Makes the tables of the performance page from the summary of the benchmarks: ``python -m benchmarks.page``.
 
-A table stands between ``<!-- figures: NAME -->`` and ``<!-- end -->``: the name of a suite, ``roundtrips``
-for round trips side by side, or ``targets``. With ``--check`` nothing is written; a page that differs ends
-with 1.
+Each table is between ``<!-- figures: NAME -->`` and ``<!-- end -->``: the name of a suite, ``roundtrips`` for
+round trips side by side, or ``targets``. With ``--check`` the page is not written; the program ends with 1 if
+it differs.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _PATHS = ("bare websockets echo", "forwarder", "forwarder, one frame", "converte
 
 
 def made(page: str, summary: dict[str, Any]) -> str:
-    """Return a page with its tables made anew."""
+    """Return a page with updated tables."""
 
     def fill(found: re.Match[str]) -> str:
         return f"{found[1]}\n{block(found['name'], summary)}\n{found[3]}"
@@ -33,7 +33,7 @@ def made(page: str, summary: dict[str, Any]) -> str:
 
 
 def block(name: str, summary: dict[str, Any]) -> str:
-    """Return a table, and what it was measured on."""
+    """Return a table and the machine of its measurement."""
     if name == "targets":
         return "\n".join(_targets(summary)) + "\n"
     suite = "roundtrip" if name == "roundtrips" else name
@@ -71,12 +71,12 @@ def _round_trips(rows: list[dict[str, Any]]) -> Iterator[str]:
     yield f"| bytes | {' | '.join(_PATHS)} | {' | '.join(f'{path}, x bare' for path in engine)} |"
     yield "|" + "---:|" * (1 + len(_PATHS) + len(engine))
     for size in dict.fromkeys(row["bytes"] for row in rows):
-        cells = [str(size)]
+        control_groups = [str(size)]
         for path in _PATHS:
             row = found.get((path, size))
-            cells.append(f"{row['p10_ms']:.2f} / {row['p50_ms']:.2f}" if row else "")
-        cells += [_shown(found.get((path, size), {}).get("x bare", "")) for path in engine]
-        yield f"| {' | '.join(cells)} |"
+            control_groups.append(f"{row['p10_ms']:.2f} / {row['p50_ms']:.2f}" if row else "")
+        control_groups += [_shown(found.get((path, size), {}).get("x bare", "")) for path in engine]
+        yield f"| {' | '.join(control_groups)} |"
 
 
 def _targets(summary: dict[str, Any]) -> Iterator[str]:
@@ -89,19 +89,19 @@ def _targets(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def _judged(target: Target, figure: float | None) -> str:
-    wanted = f"{'≥' if target.at_least else '≤'} {target.limit:g} {target.unit}"
+    wanted = f"{'≥' if target.at_least else '≤'} {target.limit:g} {target.incarnation}"
     if figure is None:
         return f"not measured | {wanted} | "
     verdict = "met" if target.is_met(figure) else "**missed**"
-    return f"{figure:g} {target.unit} | {wanted} | {verdict}"
+    return f"{figure:g} {target.incarnation} | {wanted} | {verdict}"
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def main(check: bool) -> int:
-    """Write the page, or tell whether it is current."""
+    """Write the page, or check whether it is current."""
     summary = json.loads(SUMMARY.read_text(encoding="utf-8"))
     page = PAGE.read_text(encoding="utf-8")
     wanted = made(page, summary)

@@ -21,7 +21,7 @@ BYTES_PER_PASS = 60_000_000
 MAX_ROUNDS = 300
 MIN_ROUNDS = 5
 TURNS = 5
-"""In how many parts the trips of a size are measured in each pass."""
+"""The number of parts in which the trips of a size are measured in each pass."""
 
 Trip = Callable[[int], Awaitable[None]]
 
@@ -97,7 +97,7 @@ def service_trip(client: Robot) -> Trip:
 
 
 async def run(running: RunningEngine, *, passes: int, sizes: tuple[int, ...] = SIZES) -> list[dict[str, Any]]:
-    """Measure all paths in turn, a few trips each, so that a drift of the machine meets all of them."""
+    """Measure all paths in turn, a few trips each, so that a drift of the machine affects all of them."""
     times: dict[tuple[str, int], list[float]] = {}
     costs: dict[tuple[str, int], list[float]] = {}
     async with (

@@ -1,4 +1,4 @@
-"""How fast other ways to start a program in namespaces are, beside the engine's containers."""
+"""The start time of other sandboxes with namespaces, for comparison with the engine's containers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rce_container.runtimes.namespace import interpreter_paths
 
 TRUE = ("/bin/sh", "-c", "echo")
 NODE = (sys.executable, "-c", "import rce.ros.node; print()")
-"""What the engine's nodes import before they do anything."""
+"""The modules that the engine's nodes import at their start."""
 
 # crun refuses machines that have controllers in cgroups of both versions: one is hidden from it.
 _PODMAN = """

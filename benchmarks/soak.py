@@ -22,13 +22,13 @@ import uvloop
 from benchmarks.engine import RunningEngine, engine, words
 from benchmarks.figures import save, show
 from benchmarks.wire import Robot, robot, serialized_string, wire_echo
-from tests.support.leaks import Traces, footprint
+from tools.leaks import Traces, footprint
 
 BATCHES = 10
 MAX_GROWTH_MB = 32.0
-"""By how much a flood may let memory and logs grow."""
+"""The maximum growth of memory and logs by a flood."""
 SERIAL = 4
-"""One in so many containers is made when the one before is gone; the others by :data:`WORKERS` at a time."""
+"""One of this many containers is made after the former one has ended; others :data:`WORKERS` at a time."""
 WORKERS = 4
 SETTLE_S = 60.0
 WORTH_KEEPING = 1000
@@ -39,7 +39,7 @@ PROGRAMS = {
     "master": "rce_master",
     "robot": "rce_robot",
     "manager": "rce_container",
-    "nursery": "rce_container.nursery",
+    "fork server": "rce_container.forkserver",
 }
 FLOOD = f"""
 import os, sys, time
@@ -88,11 +88,11 @@ class Soak:
             await asyncio.sleep(0.2)
 
     def left(self) -> list[str]:
-        """What is there now beside the programs."""
+        """Return the engine's remains beside its programs."""
         return self._traces.left(self._programs)
 
     def row(self) -> dict[str, Any]:
-        """What there is now."""
+        """Return the present counts."""
         left = Counter(text.split()[0] for text in self.left())
         row: dict[str, Any] = {"made": self._made, "seconds": round(perf_counter() - self._start)}
         for kind, pid in self._pids.items():
@@ -119,7 +119,7 @@ def find(running: RunningEngine, module: str) -> int:
 
 
 async def soak(count: int, runtime: str) -> list[str]:
-    """Run it; returns what was left, in words."""
+    """Run it; return a text about the remains."""
     rows = []
     async with engine(runtime) as running, AsyncExitStack() as stack:
         workers = [await stack.enter_async_context(robot(running.url, f"worker{n}")) for n in range(WORKERS)]
@@ -142,7 +142,7 @@ async def soak(count: int, runtime: str) -> list[str]:
 
 
 async def flood(megabytes: int, runtime: str) -> list[str]:
-    """Have a node flood its log; returns what is not as it should be."""
+    """Have a node flood its log; return a text about the faults."""
     async with engine(runtime) as running, robot(running.url, "flooder") as client:
         await wire_echo(client, "Forwarder", "flooded")
         environment = find(running, "rce_container.environment")

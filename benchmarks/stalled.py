@@ -1,4 +1,4 @@
-"""A client that stops reading large messages: what the others get meanwhile, and what it costs in memory."""
+"""A client that stops reading large messages: the effect on other clients and on memory."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ HEALTHY = 2
 
 @dataclass
 class Reading:
-    """A client that counts what it gets."""
+    """A client that counts received messages."""
 
     client: Robot
     received: int = 0
 
     async def run(self) -> None:
-        """Read for ever."""
+        """Read messages until the connection ends."""
         while True:
             await self.client.receive_binary()
             self.received += 1

@@ -1,4 +1,4 @@
-"""What the engine should reach, and which row of which suite tells whether it does."""
+"""The targets of the engine, and the rows of the suites that show whether they are reached."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ RATIOS["forwarder, one frame"] = RATIOS["forwarder"]
 
 @dataclass(frozen=True)
 class Target:
-    """A figure that is wanted."""
+    """A target figure."""
 
     what: str
     suite: str
     read: Callable[[Rows], float | None]
-    """Finds the figure; None: the rows do not hold it."""
+    """Finds the figure; None if the rows do not contain it."""
     limit: float
-    unit: str
+    incarnation: str
     at_least: bool = False
 
     def is_met(self, figure: float) -> bool:
-        """Tell whether a figure is good enough."""
+        """Return whether a figure reaches the target."""
         return figure >= self.limit if self.at_least else figure <= self.limit
 
 
-def _column(column: str, **where: Any) -> Callable[[Rows], float | None]:
+def _column(column: str, **where: object) -> Callable[[Rows], float | None]:
     """Read a column of the last row in which other columns have these values."""
 
     def read(rows: Rows) -> float | None:
@@ -43,7 +43,7 @@ def _column(column: str, **where: Any) -> Callable[[Rows], float | None]:
     return read
 
 
-def _number(value: Any) -> float | None:
+def _number(value: object) -> float | None:
     """Read a figure; texts such as ``7.6 s`` by their number."""
     return None if value is None else float(str(value).split()[0])
 
@@ -95,12 +95,36 @@ TARGETS = [
     ),
     Target("fan-out to 200 at 20 Hz, p95", "fanout", _column("p95_ms", clients=200), 20, "ms"),
     Target(
+        "1000 robots join one container: control bytes of the last hundred, 1.0 is linear",
+        "joining",
+        _column("x first hundred (bytes)", robots=1000),
+        1.1,
+        "x first hundred",
+    ),
+    Target(
+        "1000 robots join one container: CPU of the last hundred, 1.0 is linear",
+        "joining",
+        _column("x first hundred (CPU)", robots=1000),
+        1.3,
+        "x first hundred",
+    ),
+    Target(
         "one client stalls: what the others get",
         "stalled",
         _column("share %", phase="it still stalls"),
         95,
         "%",
         at_least=True,
+    ),
+    *(
+        Target(
+            f"a pose of a driving robot at the planner, {robots} robots",
+            "fleet.planner",
+            _column("driving, us per pose", robots=robots),
+            50,
+            "us",
+        )
+        for robots in (50, 2000)
     ),
     Target("container start to first message, p50", "start", _column("p50_ms"), 250, "ms"),
     Target("100 containers at once", "many", _column("all at once", containers=100), 20, "s"),

@@ -1,4 +1,4 @@
-"""What TLS on the robot's connection costs: round trips to a node with and without it, in turn."""
+"""The cost of TLS on the robot's connection: round trips to a node with and without it, in turn."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ async def tls_endpoint(
     """Run another robot endpoint of the engine, whose robots connect in TLS.
 
     Yields:
-        Its URL, what trusts it, and its process.
+        Its URL, a TLS context that trusts it, and its process.
     """
     certificates = CertificateFolder(running.folder / "bench-certificates")
     certificates.make_authority()
@@ -70,7 +70,7 @@ async def run(running: RunningEngine, *, passes: int) -> list[dict[str, Any]]:
     """Measure both, trip by trip in turn, with new containers in each pass."""
     times: Figures = {}
     costs: Figures = {}
-    plain_url = await locate(running.url)  # while there is one endpoint only
+    plain_url = await locate(running.url)  # while only one endpoint runs
     (endpoint,) = running.named("rce_robot")
     async with tls_endpoint(running) as (url, trusting, secured_endpoint):
         endpoints = {"plain": endpoint, "tls": secured_endpoint}
@@ -91,7 +91,7 @@ async def run(running: RunningEngine, *, passes: int) -> list[dict[str, Any]]:
 
 
 async def _measure(form: str, trips: dict[str, Trip], times: Figures) -> None:
-    """Take the time of each trip."""
+    """Measure the time of each trip."""
     for size in SIZES:
         gc.collect()
         for number in range(WARM_UP + PAIRS):
@@ -105,7 +105,7 @@ async def _measure(form: str, trips: dict[str, Trip], times: Figures) -> None:
 async def _weigh(
     form: str, trips: dict[str, Trip], endpoints: dict[str, psutil.Process], costs: Figures
 ) -> None:
-    """Take the processor time of the robot endpoint, which says more than the clock on a busy machine."""
+    """Measure the processor time of the robot endpoint, more accurate than the clock on a busy machine."""
     for size in SIZES:
         for name, trip in trips.items():
             before = cpu_seconds(endpoints[name])

@@ -1,4 +1,4 @@
-"""A robot for measurements: the client protocol with as little of its own around it as possible.
+"""A robot for measurements: a minimal client of the client protocol.
 
 Its JSON is read and written by msgspec, as in ``rce_client``; with the standard library's ``json`` the client
 would take most of the time of a large message.
@@ -39,7 +39,7 @@ class Robot:
         self.name = name
         self.status: dict[str, bool] = {}
 
-    async def send(self, kind: str, data: Any) -> None:
+    async def send(self, kind: str, data: object) -> None:
         """Send a message without binary values."""
         await self.socket.send(_write({"type": kind, "data": data}), text=True)
 
@@ -78,7 +78,7 @@ class Robot:
                     self._note(_read(frame))
 
     async def wait_inactive(self, *tags: str, timeout: float = 60) -> None:
-        """Wait until no one of these interfaces is active."""
+        """Wait until all of these interfaces are inactive."""
         async with asyncio.timeout(timeout):
             while any(self.status.get(tag) for tag in tags):
                 frame = await self.socket.recv()
@@ -86,16 +86,18 @@ class Robot:
                     self._note(_read(frame))
 
     async def send_forwarded(
-        self, tag: str, payload: bytes, *, number: str = "nil", cls: str = STRING
+        self, tag: str, payload: bytes, *, number: str = "nil", message_type: str = STRING
     ) -> None:
         """Send a serialized message: its text frame and its binary frame."""
-        data = {"iTag": tag, "type": cls, "msgID": number, "msg*": _ID.decode()}
+        data = {"iTag": tag, "type": message_type, "msgID": number, "msg*": _ID.decode()}
         await self.socket.send(_write({"type": "DM", "data": data}), text=True)
         await self.socket.send(_ID + payload)
 
-    async def send_single(self, tag: str, payload: bytes, *, number: str = "nil", cls: str = STRING) -> None:
+    async def send_single(
+        self, tag: str, payload: bytes, *, number: str = "nil", message_type: str = STRING
+    ) -> None:
         """Send a serialized message in one frame; for robots that asked for it."""
-        header = _write({"iTag": tag, "type": cls, "msgID": number})
+        header = _write({"iTag": tag, "type": message_type, "msgID": number})
         await self.socket.send(_SINGLE.pack(1, len(header)) + header + payload)
 
 
@@ -134,13 +136,13 @@ async def wire_echo(client: Robot, form: str, container: str = "bench") -> None:
         ("service", "ServiceClient", "ServiceProvider", ECHO, "/stringEchoService"),
     ]
     interfaces = []
-    for tag, inside, outside, cls, address in ends:
+    for tag, inside, outside, message_type, address in ends:
         interfaces.append(
             {
                 "endpointTag": container,
                 "interfaceTag": tag,
                 "interfaceType": f"{inside}Interface",
-                "className": cls,
+                "className": message_type,
             }
             | {"addr": address}
         )
@@ -149,7 +151,7 @@ async def wire_echo(client: Robot, form: str, container: str = "bench") -> None:
                 "endpointTag": client.name,
                 "interfaceTag": tag,
                 "interfaceType": f"{outside}{form}",
-                "className": cls,
+                "className": message_type,
             }
         )
     node = {"containerTag": container, "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}

@@ -1,6 +1,6 @@
 """RCE: a cloud robotics engine.
 
-``rce`` holds what every task set and client shares; the programs live in
+``rce`` holds the code that task sets and clients share; the programs are in
 ``rce_master``, ``rce_robot``, ``rce_container`` and ``rce_client``.
 """
 

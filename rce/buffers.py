@@ -1,4 +1,4 @@
-"""Memory for what is read from sockets, and writing of several buffers at once."""
+"""Memory for reads from sockets, and writing of several buffers at once."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _new_bytes.argtypes = (ctypes.c_char_p, ctypes.c_ssize_t)
 
 
 def unfilled(size: int) -> io.BytesIO:
-    """Return a buffer of a size with whatever was in its memory before.
+    """Return a buffer of a size whose memory is not initialized.
 
     ``getbuffer`` lends the memory to be filled, and ``getvalue`` then hands it over as ``bytes``; neither
     copies. Setting it to zero first would take as long as filling it. All of it must be filled before

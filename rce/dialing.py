@@ -1,9 +1,9 @@
-"""Connecting to a host by its name.
+"""Connections to a host by its name.
 
-An event loop's own ``create_connection`` is not used with names. uvloop's looks a name up in a future of its
-own; when the call is cancelled meanwhile (a timeout is enough), the lookup's failure is reported on stderr as
-an exception that was never retrieved. And a program whose event loop looks a name up cannot end until the
-name server has answered (:mod:`rce.lookups`).
+An event loop's own ``create_connection`` is not used with names, for two reasons. uvloop looks a name up in a
+future of its own; if the call is cancelled meanwhile (a timeout is enough), the lookup's failure is reported
+on stderr as an exception that was never retrieved. And a program whose event loop looks a name up cannot end
+until the name server has answered (:mod:`rce.lookups`).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ async def open_socket(host: str, port: int) -> socket.socket:
         A connected socket that does not block and sends without delay.
 
     Raises:
-        OSError: The name cannot be resolved (``socket.gaierror``), or nobody answers.
+        OSError: The name cannot be resolved (``socket.gaierror``), or no address answers.
     """
     return await connect_first(await resolve(host, port))
 
@@ -60,12 +60,12 @@ async def open_url_socket(url: str) -> socket.socket:
     """Connect to the host of a WebSocket or HTTP URL as :func:`open_socket` does.
 
     Raises:
-        OSError: The name cannot be resolved (``socket.gaierror``), or nobody answers.
-        ValueError: The URL names no host, or its port is not a number.
+        OSError: The name cannot be resolved (``socket.gaierror``), or no address answers.
+        ValueError: The URL has no host, or its port is not a number.
     """
     parts = urlsplit(url)
     if not parts.hostname:
-        raise ValueError(f"{url!r} names no host")
+        raise ValueError(f"{url!r} has no host")
     return await open_socket(parts.hostname, parts.port or _PORTS.get(parts.scheme, 80))
 
 
@@ -73,7 +73,7 @@ async def connect_first(addresses: list[Address]) -> socket.socket:
     """Connect to the first of some addresses that answers, as :func:`open_socket` does.
 
     Raises:
-        OSError: Nobody answers, with the reason of each address.
+        OSError: No address answers; the text has the reason of each.
     """
     errors: list[OSError] = []
     for family, address in addresses:

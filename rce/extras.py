@@ -1,4 +1,4 @@
-"""What must be installed beside the base for each role, and how to say what is missing.
+"""The extras that each role needs beside the base, and messages for missing ones.
 
 The base is what a robot needs. ``pyproject.toml`` names the packages of each extra.
 """
@@ -37,7 +37,7 @@ def extra_of(module: str) -> str:
 
 
 def missing_for(module: str) -> str | None:
-    """Return what to do before a module of the project can be used; None if all is installed."""
+    """Return how to install the missing packages of a module of the project; None if all are installed."""
     extra = extra_of(module)
     parts = (SERVER, FLEET) if extra == ALL else (extra,)
     names = {name for part in parts for name in _MODULES.get(part, ())}

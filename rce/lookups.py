@@ -1,9 +1,9 @@
-"""Look up host names without holding up the event loop or the program's end.
+"""Look up host names without delaying the event loop or the program's end.
 
 ``socket.getaddrinfo`` blocks for half a minute and more while a name server does not answer, and cannot be
 cancelled. Event loops run it in threads that the program waits for when it ends, and of which there are few:
 some names without an answer then delay all others. Here each name that is being looked up has one thread,
-shared by all who ask for it, which ends with the program.
+shared by all callers, which ends with the program.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Lookups:
         self._pose = pose
         self._lock = threading.Lock()
         self._open: dict[_Key, list[_Waiter]] = {}
-        """Who waits for each answer."""
+        """The futures that wait for each answer."""
         self._queue: deque[tuple[_Key, Question]] = deque()
         """Questions that wait for a thread."""
         self.threads = 0
@@ -109,7 +109,7 @@ class Lookups:
                 _answer(self._open.pop(key), OSError(errno.EAGAIN, f"no name can be looked up: {error}"))
 
     def _forget(self, key: _Key, waiter: _Waiter) -> None:
-        """Take out one who waits no longer; a question that waits for a thread goes with the last one."""
+        """Remove a waiting future; with the last one, remove its question if that has no thread yet."""
         waiters = self._open.get(key, [])
         if waiter not in waiters:
             return
@@ -154,4 +154,4 @@ def _settle(future: asyncio.Future[Any], result: Any) -> None:
 
 
 LOOKUPS = Lookups()
-"""Of this program."""
+"""The program's shared lookups."""

@@ -1,39 +1,39 @@
-"""What a client has asked the engine for: the memory that a reconnect restores from. Pure."""
+"""What a client requested from the engine, to restore it after a reconnect. Pure."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, assert_never
 
 from msgspec.structs import replace
 
-from rce.protocol.messages import (
+from rce.model.requests import (
     AddInterface,
     AddNode,
     ConfigureComponents,
     ConfigureConnections,
     Connection,
     CreateContainer,
-    DeleteParam,
+    DeleteParameter,
     DestroyContainer,
     RemoveInterface,
     RemoveNode,
     ResizeContainer,
-    SetParam,
+    SetParameter,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rce.protocol.messages import Request
+    from rce.model.requests import Request
 
 Item = TypeVar("Item")
 
 
 class Desired:
-    """Everything that was made and not removed again.
+    """Everything that was created and not removed.
 
     Invariant: what belongs to a container or an interface is forgotten with it; so what :meth:`restore`
-    returns never names something that it does not make itself, unless somebody else made it.
+    returns never names something that it does not make itself, unless another client made it.
     """
 
     def __init__(self) -> None:
@@ -42,7 +42,7 @@ class Desired:
         """By the tag of a container of ours; what several requests said, in one."""
         self.nodes: dict[tuple[str, str], AddNode] = {}
         """By container tag and node tag."""
-        self.parameters: dict[tuple[str, str], SetParam] = {}
+        self.parameters: dict[tuple[str, str], SetParameter] = {}
         """By container tag and name."""
         self.interfaces: dict[tuple[str, str], AddInterface] = {}
         """By endpoint tag and interface tag."""
@@ -50,14 +50,14 @@ class Desired:
         """By the two interfaces' paths; which of them is named first means nothing."""
 
     def apply(self, request: Request) -> None:
-        """Remember a request that goes to the engine."""
+        """Store a request that is sent to the engine."""
         match request:
             case CreateContainer():
-                self.containers[request.container_tag] = request
+                self.containers[request.tag] = request
             case ResizeContainer():
                 self._resize(request)
             case DestroyContainer():
-                self._forget_container(request.container_tag)
+                self._forget_container(request.tag)
             case ConfigureComponents():
                 self._configure(request)
             case ConfigureConnections():
@@ -65,6 +65,8 @@ class Desired:
                     self.connections.pop(frozenset((item.tag_a, item.tag_b)), None)
                 for item in request.connect:
                     self.connections[frozenset((item.tag_a, item.tag_b))] = item
+            case _:
+                assert_never(request)
 
     def restore(self) -> list[Request]:
         """Return the requests that make everything again; the engine takes what is there already silently."""
@@ -88,51 +90,48 @@ class Desired:
             requests.append(ConfigureConnections(disconnect=tuple(self.connections.values())))
         components = ConfigureComponents(
             remove_nodes=tuple(
-                RemoveNode(container_tag=item.container_tag, node_tag=item.node_tag)
-                for item in self._outside(self.nodes)
+                RemoveNode(container=item.container, tag=item.node.tag) for item in self._outside(self.nodes)
             ),
             remove_interfaces=tuple(
-                RemoveInterface(endpoint_tag=item.endpoint_tag, interface_tag=item.interface_tag)
+                RemoveInterface(endpoint=item.endpoint, tag=item.interface.tag)
                 for item in self._outside(self.interfaces)
             ),
             delete_param=tuple(
-                DeleteParam(container_tag=item.container_tag, name=item.name)
+                DeleteParameter(container=item.container, name=item.parameter.name)
                 for item in self._outside(self.parameters)
             ),
         )
         if components != ConfigureComponents():
             requests.append(components)
-        requests += [DestroyContainer(container_tag=tag) for tag in self.containers]
+        requests += [DestroyContainer(tag=tag) for tag in self.containers]
         return requests
 
     def _outside(self, items: dict[tuple[str, str], Item]) -> Iterable[Item]:
-        """Yield what does not vanish with a container of ours."""
+        """Yield what is not removed with one of our containers."""
         return (item for (endpoint, _), item in items.items() if endpoint not in self.containers)
 
     def _resize(self, request: ResizeContainer) -> None:
-        if request.container_tag not in self.containers:
-            return  # whoever made it makes it again
-        before, now = self.sizes.get(request.container_tag), request.container_data
+        if request.tag not in self.containers:
+            return  # the client that created it restores it
+        before = self.sizes.get(request.tag)
         if before is not None:
-            given = {key: getattr(now, key) for key in now.__struct_fields__}
-            changed = {key: value for key, value in given.items() if value is not None}
-            request = replace(request, container_data=replace(before.container_data, **changed))
-        self.sizes[request.container_tag] = request
+            request = replace(request, changes=replace(before.changes, **request.changes.given()))
+        self.sizes[request.tag] = request
 
     def _configure(self, request: ConfigureComponents) -> None:
         for node in request.remove_nodes:
-            self.nodes.pop((node.container_tag, node.node_tag), None)
+            self.nodes.pop((node.container, node.tag), None)
         for removed in request.remove_interfaces:
-            self.interfaces.pop((removed.endpoint_tag, removed.interface_tag), None)
-            self._forget_connections(f"{removed.endpoint_tag}/{removed.interface_tag}")
+            self.interfaces.pop((removed.endpoint, removed.tag), None)
+            self._forget_connections(f"{removed.endpoint}/{removed.tag}")
         for deleted in request.delete_param:
-            self.parameters.pop((deleted.container_tag, deleted.name), None)
+            self.parameters.pop((deleted.container, deleted.name), None)
         for parameter in request.set_param:
-            self.parameters[parameter.container_tag, parameter.name] = parameter
+            self.parameters[parameter.container, parameter.parameter.name] = parameter
         for interface in request.add_interfaces:
-            self.interfaces[interface.endpoint_tag, interface.interface_tag] = interface
+            self.interfaces[interface.endpoint, interface.interface.tag] = interface
         for added in request.add_nodes:
-            self.nodes[added.container_tag, added.node_tag] = added
+            self.nodes[added.container, added.node.tag] = added
 
     def _forget_container(self, tag: str) -> None:
         self.containers.pop(tag, None)

@@ -15,8 +15,8 @@ from urllib.parse import urlencode, urlsplit
 import h11
 
 from rce.dialing import open_socket
-from rce_client.backoff import judge, judge_status
 from rce_client.exceptions import RefusedError, UnavailableError, UntrustedError
+from rce_client.failures import judge, judge_status
 
 if TYPE_CHECKING:
     import ssl
@@ -29,7 +29,7 @@ _PORTS = {"http": 80, "https": 443}
 
 
 class Endpoint(NamedTuple):
-    """Where a robot is to connect."""
+    """The endpoint that a robot connects to."""
 
     url: str
     """WebSocket URL."""
@@ -55,10 +55,10 @@ async def locate(
         timeout: Seconds for the whole exchange.
 
     Raises:
-        RefusedError: The master does not take this client, or the URL is none.
-        UntrustedError: The master does not prove who it is, or a URL with ``https`` leads to an endpoint
+        RefusedError: The master refuses this client, or the URL is not valid.
+        UntrustedError: The master's certificate is not trusted, or a URL with ``https`` leads to an endpoint
             without TLS.
-        UnavailableError: It may on another attempt.
+        UnavailableError: The master cannot be reached now.
     """
     parts = urlsplit(url)
     try:
@@ -66,7 +66,7 @@ async def locate(
     except (KeyError, ValueError) as error:
         raise RefusedError(0, f"{url!r} is not an http or https URL") from error
     if not parts.hostname:
-        raise RefusedError(0, f"{url!r} names no host")
+        raise RefusedError(0, f"{url!r} has no host")
     target = f"{parts.path or '/'}?{urlencode({'userID': user, 'version': version, 'auth': 'bearer'})}"
     try:
         async with asyncio.timeout(timeout):
@@ -87,8 +87,8 @@ async def locate(
     found = _read_answer(url, status, body)
     if parts.scheme == "https" and urlsplit(found.url).scheme != "wss":
         raise UntrustedError(
-            f"the master at {url} sends robots to {found.url}, which is not encrypted: what proves who"
-            " this robot is would travel in clear; run rce-robot with --tls, or behind a proxy with"
+            f"the master at {url} sends robots to {found.url}, which is not encrypted and would show this"
+            " robot's credential; run rce-robot with --tls, or behind a proxy with"
             " --public-url wss://...",
         )
     return found
@@ -97,7 +97,7 @@ async def locate(
 async def _get(
     reader: asyncio.StreamReader, writer: asyncio.StreamWriter, host: str, target: str
 ) -> tuple[int, bytes]:
-    """Do one GET request.
+    """Send one GET request.
 
     Returns:
         Status and body.
@@ -131,7 +131,7 @@ def _read_answer(url: str, status: int, body: bytes) -> Endpoint:
         answer = json.loads(text)
         found = answer["url"]
     except (ValueError, KeyError, TypeError) as error:
-        raise UnavailableError(f"{url} did not answer as a master does") from error
+        raise UnavailableError(f"{url} did not answer as a master does; is it the master's URL?") from error
     if not isinstance(found, str) or urlsplit(found).scheme not in ("ws", "wss"):
-        raise UnavailableError(f"the master gave {found!r}, which is not a WebSocket URL")
+        raise UnavailableError(f"the master answered with {found!r}, which is not a WebSocket URL")
     return Endpoint(found, answer.get("auth") == "bearer")

@@ -1,24 +1,24 @@
-"""What can go wrong at the robot's side of the engine.
+"""Errors of :mod:`rce_client`.
 
 ::
 
     ClientError
-    +-- RefusedError          the engine says no, and asking again will not help (credentials, version)
-    |   +-- UntrustedError    the engine cannot prove who it is: certificate, or no TLS where there was some
-    +-- UnavailableError      nobody answers, or not now: worth another try
+    +-- RefusedError          the engine refuses the client; trying again does not help (credentials, version)
+    |   +-- UntrustedError    the engine's certificate is not trusted, or it offers no TLS although it must
+    +-- UnavailableError      the engine cannot be reached now; try again
     |   +-- InUseError        another client has this robotID
     |   +-- LostError         the connection broke
-    +-- NotConnectedError     nothing can be sent at this moment
-    +-- InterfaceError        an interface cannot be used as the program tries to
+    +-- NotConnectedError     nothing can be sent now
+    +-- InterfaceError        an interface does not support this use
     +-- CallError             a service call failed
-        +-- CallTimeoutError  ... because no answer came in time
+        +-- CallTimeoutError  no answer arrived in time
 """
 
 from __future__ import annotations
 
 
 class ClientError(Exception):
-    """Base of all faults of :mod:`rce_client`."""
+    """Base of the errors of :mod:`rce_client`."""
 
 
 class RefusedError(ClientError):
@@ -26,7 +26,7 @@ class RefusedError(ClientError):
 
     Attributes:
         status: HTTP status, 0 if there was no answer.
-        reason: What the engine said.
+        reason: The engine's explanation.
     """
 
     def __init__(self, status: int, reason: str) -> None:
@@ -39,9 +39,9 @@ class RefusedError(ClientError):
 
 
 class UntrustedError(RefusedError):
-    """The engine does not prove who it is: its certificate is not good, or it offers no TLS where it must.
+    """The engine's certificate is not trusted, or it offers no TLS although it must.
 
-    Nothing was told to it. A client that was connected before goes on trying, as the operator can repair it.
+    No credential was sent. A client that was connected before keeps trying, as the operator can repair it.
     """
 
     def __init__(self, reason: str) -> None:
@@ -52,7 +52,7 @@ class UnavailableError(ClientError):
     """The engine cannot be reached or has no room now.
 
     Attributes:
-        reason: What happened.
+        reason: The cause.
         status: HTTP status, 0 if there was no answer.
     """
 
@@ -69,7 +69,7 @@ class InUseError(UnavailableError):
     """Another client is connected with this robotID; the text says from where and since when."""
 
     def __str__(self) -> str:
-        return f"waiting until the robotID is free: {self.reason}"
+        return f"the robotID is in use; waiting until it is free: {self.reason}"
 
 
 class LostError(UnavailableError):
@@ -77,16 +77,16 @@ class LostError(UnavailableError):
 
 
 class NotConnectedError(ClientError):
-    """Nothing can be sent: the connection is away, or closed for good."""
+    """Nothing can be sent: the connection is not established, or it was closed."""
 
 
 class InterfaceError(ClientError):
-    """An interface is used in a way that it cannot be."""
+    """An interface does not support this use."""
 
 
 class CallError(ClientError):
-    """A service call failed; the text is the engine's or the provider's."""
+    """A service call failed; the text comes from the engine or the provider."""
 
 
 class CallTimeoutError(CallError, TimeoutError):
-    """No answer to a service call came in time. The call may have been carried out."""
+    """No answer to a service call arrived in time. The service may have processed the call."""

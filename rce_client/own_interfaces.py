@@ -1,54 +1,77 @@
-"""The interfaces of a robot's own, as methods that make them."""
+"""Methods that create a robot's own interfaces."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+import asyncio
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
 
-from rce_client.ends import Publisher, ServiceClient, ServiceProvider, Subscriber
+from rce.model.requests import AddInterface, ConfigureComponents
+from rce.model.specs import InterfaceSpec
+from rce_client.services import ServiceClient, ServiceProvider
+from rce_client.topics import Publisher, Subscriber
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rce_client.ends import End, LatchListener, Way
+    from rce_client.interfaces import ClientInterface, LatchListener
+    from rce_client.session import Session
 
-E = TypeVar("E", bound="End")
+InterfaceT = TypeVar("InterfaceT", bound="ClientInterface")
 
 Json = dict[str, Any]
 """A message as an object of its fields; binary values are bytes-like."""
+Serialized = bytes | bytearray | memoryview
+"""A serialized ROS message. A received one is a memoryview of its frame, not a copy."""
 
 
-class OwnInterfaces(ABC):
-    """Makes a robot's publishers, subscribers, service clients and service providers."""
+class OwnInterfaces:
+    """Creates a robot's publishers, subscribers, service clients and service providers.
 
-    @property
-    @abstractmethod
-    def _way(self) -> Way:
-        """What the ends send through."""
+    The engine creates an interface shortly after these methods return, and keeps it until it is closed.
+    :meth:`rce_client.Connection.wait_active` waits until it is connected to a peer. If the engine refuses an
+    interface, ``on_error`` gets an error text.
+    """
 
-    @abstractmethod
-    async def _add_end(self, end: E) -> E:
-        """Ask the engine for the interface of an end."""
+    robot_id: str
+    _session: Session
 
     @overload
-    async def publisher(self, tag: str, cls: str) -> Publisher[Json]: ...
+    async def publisher(self, tag: str, message_type: str) -> Publisher[Json]: ...
     @overload
-    async def publisher(self, tag: str, cls: str, *, raw: Literal[True]) -> Publisher[bytes]: ...
-    async def publisher(self, tag: str, cls: str, *, raw: bool = False) -> Publisher[Any]:
-        """Make an interface of this robot that sends messages.
+    async def publisher(
+        self, tag: str, message_type: str, *, raw: Literal[True]
+    ) -> Publisher[Serialized]: ...
+    async def publisher(self, tag: str, message_type: str, *, raw: bool = False) -> Publisher[Any]:
+        """Create an interface of this robot that sends messages.
+
+        Cancelling does not withdraw the request: the engine creates the interface. Call the method again with
+        the same tag to get it.
 
         Args:
             tag: Interface tag.
-            cls: Message class, ``package/Type``.
-            raw: Messages are serialized ROS messages (a Forwarder) in place of objects (a Converter).
+            message_type: Message type, ``package/Type``.
+            raw: Messages are serialized ROS messages (a Forwarder) instead of objects (a Converter).
+
+        Raises:
+            InterfaceError: This program already has an interface with this tag.
+            RefusedError: The engine refused this client permanently.
+            NotConnectedError: The program closed the connection, or has not opened it yet.
+
+        Example:
+            ```python
+            names = await robot.publisher("names", "std_msgs/String")
+            await robot.connect("testRobot/names", "brain/names")
+            await names.wait_active(timeout=30)
+            names.publish({"data": "Ada"})
+            ```
         """
-        return await self._add_end(Publisher[Any](self._way, tag, cls, raw=raw))
+        return await self._open(Publisher[Any](self._session, tag, message_type, raw=raw))
 
     @overload
     async def subscriber(
         self,
         tag: str,
-        cls: str,
+        message_type: str,
         callback: Callable[[Json], Awaitable[None] | None] | None = None,
         *,
         queue_size: int = ...,
@@ -58,71 +81,169 @@ class OwnInterfaces(ABC):
     async def subscriber(
         self,
         tag: str,
-        cls: str,
-        callback: Callable[[bytes], Awaitable[None] | None] | None = None,
+        message_type: str,
+        callback: Callable[[Serialized], Awaitable[None] | None] | None = None,
         *,
         raw: Literal[True],
         queue_size: int = ...,
-        latches: LatchListener[bytes] | None = ...,
-    ) -> Subscriber[bytes]: ...
+        latches: LatchListener[Serialized] | None = ...,
+    ) -> Subscriber[Serialized]: ...
     async def subscriber(
         self,
         tag: str,
-        cls: str,
+        message_type: str,
         callback: Callable[[Any], Awaitable[None] | None] | None = None,
         *,
         raw: bool = False,
         queue_size: int = 64,
         latches: LatchListener[Any] | None = None,
     ) -> Subscriber[Any]:
-        """Make an interface of this robot that receives messages; see :class:`rce_client.ends.Subscriber`.
+        """Create an interface of this robot that receives messages.
+
+        Cancelling does not withdraw the request, as for :meth:`publisher`.
 
         Args:
             tag: Interface tag.
-            cls: Message class, ``package/Type``.
-            callback: Takes the messages.
-            raw: As for :meth:`publisher`.
-            queue_size: How many messages wait for an ``async`` callback, or for ``async for``.
-            latches: Takes the latched messages in place of the callback, if the engine tells which they are.
+            message_type: Message type, ``package/Type``.
+            callback: Called with each message. A plain function must not block; a coroutine function is
+                awaited before the next message. Without a callback, iterate over the subscriber.
+            raw: Messages are serialized ROS messages, as for :meth:`publisher`, each a memoryview.
+            queue_size: How many messages may wait for a coroutine function or an iteration; a full queue
+                drops the oldest.
+            latches: Gets the latched messages instead of the callback, if the engine marks them.
+
+        Raises:
+            InterfaceError: This program already has an interface with this tag.
+            RefusedError: The engine refused this client permanently.
+            NotConnectedError: The program closed the connection, or has not opened it yet.
+
+        Example:
+            ```python
+            def show(message):
+                print(message["data"])
+
+            await robot.subscriber("greetings", "std_msgs/String", show)
+            await robot.connect("brain/greetings", "testRobot/greetings")
+            ```
         """
-        return await self._add_end(
+        return await self._open(
             Subscriber[Any](
-                self._way, tag, cls, raw=raw, callback=callback, queue_size=queue_size, latches=latches
+                self._session,
+                tag,
+                message_type,
+                raw=raw,
+                callback=callback,
+                queue_size=queue_size,
+                latches=latches,
             )
         )
 
     @overload
-    async def service_client(self, tag: str, cls: str) -> ServiceClient[Json]: ...
+    async def service_client(self, tag: str, message_type: str) -> ServiceClient[Json]: ...
     @overload
-    async def service_client(self, tag: str, cls: str, *, raw: Literal[True]) -> ServiceClient[bytes]: ...
-    async def service_client(self, tag: str, cls: str, *, raw: bool = False) -> ServiceClient[Any]:
-        """Make an interface of this robot that calls a service."""
-        return await self._add_end(ServiceClient[Any](self._way, tag, cls, raw=raw))
+    async def service_client(
+        self, tag: str, message_type: str, *, raw: Literal[True]
+    ) -> ServiceClient[Serialized]: ...
+    async def service_client(self, tag: str, message_type: str, *, raw: bool = False) -> ServiceClient[Any]:
+        """Create an interface of this robot that calls a service.
+
+        Cancelling does not withdraw the request, as for :meth:`publisher`.
+
+        Args:
+            tag: Interface tag.
+            message_type: Service type, ``package/Type``.
+            raw: Requests and answers are serialized ROS messages, as for :meth:`publisher`; received ones
+                are memoryviews.
+
+        Raises:
+            InterfaceError: This program already has an interface with this tag.
+            RefusedError: The engine refused this client permanently.
+            NotConnectedError: The program closed the connection, or has not opened it yet.
+
+        Example:
+            ```python
+            ask = await robot.service_client("ask", "Test/StringEcho")
+            await robot.connect("testRobot/ask", "brain/echo")
+            await ask.wait_active(timeout=30)
+            print(await ask({"data": "hello"}))
+            ```
+        """
+        return await self._open(ServiceClient[Any](self._session, tag, message_type, raw=raw))
 
     @overload
     async def service_provider(
-        self, tag: str, cls: str, handler: Callable[[Json], Awaitable[Json] | Json], *, max_calls: int = ...
+        self,
+        tag: str,
+        message_type: str,
+        handler: Callable[[Json], Awaitable[Json] | Json],
+        *,
+        max_calls: int = ...,
     ) -> ServiceProvider[Json]: ...
     @overload
     async def service_provider(
         self,
         tag: str,
-        cls: str,
-        handler: Callable[[bytes], Awaitable[bytes] | bytes],
+        message_type: str,
+        handler: Callable[[Serialized], Awaitable[Serialized] | Serialized],
         *,
         raw: Literal[True],
         max_calls: int = ...,
-    ) -> ServiceProvider[bytes]: ...
+    ) -> ServiceProvider[Serialized]: ...
     async def service_provider(
         self,
         tag: str,
-        cls: str,
+        message_type: str,
         handler: Callable[[Any], Awaitable[Any] | Any],
         *,
         raw: bool = False,
         max_calls: int = 64,
     ) -> ServiceProvider[Any]:
-        """Make an interface of this robot that answers a service; what ``handler`` raises goes to callers."""
-        return await self._add_end(
-            ServiceProvider[Any](self._way, tag, cls, handler, raw=raw, max_calls=max_calls)
+        """Create an interface of this robot that answers a service.
+
+        Cancelling does not withdraw the request, as for :meth:`publisher`.
+
+        Args:
+            tag: Interface tag.
+            message_type: Service type, ``package/Type``.
+            handler: Called with a request; returns the answer. A plain function must not block; coroutine
+                functions run concurrently. Its exceptions are logged, and the caller gets their text as the
+                error.
+            raw: Requests and answers are serialized ROS messages, as for :meth:`publisher`; received ones
+                are memoryviews.
+            max_calls: How many calls are handled at the same time; further calls get an error.
+
+        Raises:
+            InterfaceError: This program already has an interface with this tag.
+            RefusedError: The engine refused this client permanently.
+            NotConnectedError: The program closed the connection, or has not opened it yet.
+
+        Example:
+            ```python
+            async def shout(request):
+                return {"data": request["data"].upper()}
+
+            await robot.service_provider("shout", "Test/StringEcho", shout)
+            await robot.connect("brain/shout", "testRobot/shout")
+            ```
+        """
+        return await self._open(
+            ServiceProvider[Any](self._session, tag, message_type, handler, raw=raw, max_calls=max_calls)
         )
+
+    async def _open(self, interface: InterfaceT) -> InterfaceT:
+        """Ask the engine for an interface."""
+        session = self._session
+        session.check_open()
+        session.interfaces.add(interface)
+        added = AddInterface(
+            endpoint=self.robot_id,
+            interface=InterfaceSpec(
+                tag=interface.tag, type=interface.interface_type, message_type=interface.message_type
+            ),
+        )
+        try:
+            await session.request(ConfigureComponents(add_interfaces=(added,)))
+        except asyncio.CancelledError:  # the program has no hold of it, and may make it again
+            session.interfaces.remove(interface)
+            raise
+        return interface

@@ -32,7 +32,7 @@ class Reminder:
         self._due = 0.0
 
     def is_due(self, words: str) -> bool:
-        """Tell whether the words are new or were said long ago; if so, they count as said now."""
+        """Return whether the words are new or were said long ago; if so, they count as said now."""
         now = self._clock()
         if words == self._last and now < self._due:
             return False

@@ -7,6 +7,7 @@ from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rce.aio.queues import BoundedQueue
 from rce_client.exceptions import LostError
 
 if TYPE_CHECKING:
@@ -17,28 +18,30 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class QueueLimits:
-    """How much may wait to be sent. A topic's queue always takes one message, however large."""
+    """Limits of the messages that wait to be sent. A topic's queue always accepts one message of any size."""
 
     topic_messages: int = 64
+    """Messages of one topic; beyond it, the oldest is dropped."""
     topic_bytes: int = 16 << 20
+    """Bytes of the messages of one topic; beyond it, the oldest are dropped."""
     control_messages: int = 1024
-    """Service messages and requests; sending another waits."""
+    """Service messages; beyond it, calls fail. Requests are always accepted."""
 
 
 @dataclass(eq=False, slots=True)
-class Parcel:
+class QueuedMessage:
     """The frames of one message."""
 
     frames: Sequence[Frame]
     size: int
     key: str | None = None
-    """A message with a key is dropped only for a newer one of the same key: what is latched, by source."""
+    """A message with a key is dropped only for a newer one with this key. Latched messages: the source."""
     sent: asyncio.Future[None] | None = None
-    """Completed when the message was handed to the network, or could not be."""
+    """Completed when the message was handed to the network, or failed."""
 
     @classmethod
-    def of(cls, frames: Sequence[Frame], key: str | None = None) -> Parcel:
-        """Make a parcel of frames as :mod:`rce.protocol.codec` writes them."""
+    def of(cls, frames: Sequence[Frame], key: str | None = None) -> QueuedMessage:
+        """Make a queued message of frames as :mod:`rce.protocol.codec` writes them."""
         return cls(frames, sum(map(len, frames)), key)
 
 
@@ -50,9 +53,8 @@ class SendQueue:
 
     def __init__(self, limits: QueueLimits) -> None:
         self._limits = limits
-        self._control: deque[Parcel] = deque()
-        self._topics: OrderedDict[str, deque[Parcel]] = OrderedDict()
-        self._bytes: Counter[str] = Counter()
+        self._control: deque[QueuedMessage] = deque()
+        self._topics: OrderedDict[str, BoundedQueue[QueuedMessage]] = OrderedDict()
         self._filled = asyncio.Event()
         self.dropped: Counter[str] = Counter()
         """Interface tag to the number of its messages that were thrown away."""
@@ -65,60 +67,43 @@ class SendQueue:
         """Whether the control lane holds as much as it should."""
         return len(self._control) >= self._limits.control_messages
 
-    def put_control(self, parcel: Parcel) -> None:
+    def put_control(self, queued: QueuedMessage) -> None:
         """Add a message that must arrive."""
-        self._control.append(parcel)
+        self._control.append(queued)
         self._filled.set()
 
-    def put_data(self, tag: str, parcel: Parcel) -> None:
+    def put_data(self, tag: str, queued: QueuedMessage) -> None:
         """Add a message of a topic; where the queue is full the oldest is dropped and counted."""
-        queue = self._topics.setdefault(tag, deque())
-        limits = self._limits
-        while len(queue) >= limits.topic_messages or self._bytes[tag] + parcel.size > limits.topic_bytes:
-            index = _oldest_to_drop(queue, parcel.key)
-            if index is None:
-                break
-            self._bytes[tag] -= queue[index].size
-            del queue[index]
-            self.dropped[tag] += 1
-        queue.append(parcel)
-        self._bytes[tag] += parcel.size
+        queue = self._topics.get(tag)
+        if queue is None:
+            limits = self._limits
+            queue = self._topics[tag] = BoundedQueue(
+                limits.topic_messages, limits.topic_bytes, on_drop=lambda _: self.dropped.update((tag,))
+            )
+        queue.put(queued, queued.size, queued.key)
         self._filled.set()
 
-    def pop(self) -> Parcel | None:
-        """Take what is to be sent next, None if nothing waits."""
+    def pop(self) -> QueuedMessage | None:
+        """Remove and return what is to be sent next; None if nothing waits."""
         if self._control:
             return self._control.popleft()
         if not self._topics:
             return None
         tag, queue = self._topics.popitem(last=False)
-        parcel = queue.popleft()
-        self._bytes[tag] -= parcel.size
+        queued = queue.take()
         if queue:
             self._topics[tag] = queue
-        else:
-            del self._bytes[tag]
-        return parcel
+        return queued
 
-    async def get(self) -> Parcel:
-        """Wait for what is to be sent next."""
-        while (parcel := self.pop()) is None:
+    async def get(self) -> QueuedMessage:
+        """Wait until there is something to send; remove and return it. Cancelling removes nothing."""
+        while (queued := self.pop()) is None:
             self._filled.clear()
             await self._filled.wait()
-        return parcel
+        return queued
 
     def clear(self) -> None:
-        """Throw away everything, because there is no connection to send it on."""
-        while (parcel := self.pop()) is not None:
-            if parcel.sent is not None and not parcel.sent.done():
-                parcel.sent.set_exception(LostError("the connection ended before the message was sent"))
-
-
-def _oldest_to_drop(queue: Sequence[Parcel], key: str | None) -> int | None:
-    """Return the oldest message that has no key, or one that a newer message or the next one has too."""
-    newest = {parcel.key: index for index, parcel in enumerate(queue)}
-    if key is not None:
-        newest.pop(key, None)
-    return next(
-        (i for i, parcel in enumerate(queue) if parcel.key is None or newest.get(parcel.key) != i), None
-    )
+        """Remove everything, as there is no connection; senders that wait get a :class:`LostError`."""
+        while (queued := self.pop()) is not None:
+            if queued.sent is not None and not queued.sent.done():
+                queued.sent.set_exception(LostError("the connection ended before the message was sent"))

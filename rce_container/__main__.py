@@ -1,4 +1,4 @@
-"""Starts ``rce-container``: with settings handed over without what reads command lines, which takes 5 MB."""
+"""Starts ``rce-container``; handed-over settings do not load the command-line parser, which takes 5 MB."""
 
 from __future__ import annotations
 

@@ -19,24 +19,24 @@ from rce.config.secret import Secret
 from rce.control.channel import TaskSetChannel
 from rce.control.contents import ContentClient
 from rce.control.dialing import RunDialer
-from rce.control.limits import MEMORY_PER_SLOT
+from rce.control.machine import MEMORY_PER_SLOT, machine_memory
 from rce.control.messages import MachineInfo
-from rce.control.usage import machine_memory
 from rce.link.address import in_url, is_any, own_address
-from rce.link.handover import Doorman
+from rce.link.handover import LinkAcceptor
 from rce.link.listening import listen_on
+from rce.masters import Masters, split_addresses
 from rce.ros.packages import PackageIndex, installed_shares
 from rce.supervision.signals import end_signals
 from rce.tls.choice import TlsChoice
 from rce.tls.identity import Context
-from rce_container.bundles.cache import BundleCache
-from rce_container.bundles.requirements import Installer
-from rce_container.bundles.supply import Library
 from rce_container.exceptions import RuntimeUnavailableError, StateError
 from rce_container.folder import StateFolder
 from rce_container.limits import Limiter, choose_limiter
 from rce_container.manager import Manager
 from rce_container.offers import Offers, find_offers
+from rce_container.packages.cache import PackageCache
+from rce_container.packages.requirements import Installer
+from rce_container.packages.supply import Library
 from rce_container.renewal import RENEW, inherited_children
 from rce_container.runtimes.base import Runtime, source_root
 from rce_container.runtimes.namespace import NamespaceRuntime
@@ -45,7 +45,7 @@ from rce_container.runtimes.process import ProcessRuntime
 from rce_container.settings import ContainerSettings
 from rce_container.uids import UidPool
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 AUTO = "auto"
 RUNTIMES = (NamespaceRuntime.name, PodmanRuntime.name, ProcessRuntime.name)
@@ -58,7 +58,7 @@ class App:
     """A container task set that is to be run."""
 
     master: str
-    """Host of the master."""
+    """Host of the master; several are separated by commas."""
     control_port: int
     secret: Secret
     settings: ContainerSettings
@@ -78,7 +78,7 @@ class App:
             ready: Called with the task set's name and its runtime when it listens.
 
         Returns:
-            Whether the containers were let go of, so that the program can be started anew
+            Whether the containers were released, so that the program can be started again
             (:mod:`rce_container.renewal`); else they ended.
 
         Raises:
@@ -122,25 +122,28 @@ class App:
         runtimes: dict[str, Runtime] = {one.name: one for one in (namespace, podman, ProcessRuntime())}
         runtime, detail = await asyncio.to_thread(choose_runtime, self.runtime, runtimes)
         if review := runtime.review(self.settings.packages):
-            log.warning("%s", review)
+            _log.warning("%s", review)
         detail = "; ".join(filter(None, (detail, review)))
         offers = await asyncio.to_thread(find_offers, runtime, runtimes.values())
         await asyncio.to_thread(_compile_engine)
         keep = self.settings.log_days, self.settings.log_space
+        masters = self._masters(tls)
         with StateFolder(self._state_dir, run_dir(), log_days=keep[0], log_space=keep[1]) as state:
             name = state.name(self.name)
-            doorman = Doorman(tls=self.settings.tls)
+            acceptor = LinkAcceptor(tls=self.settings.tls)
             async with contextlib.AsyncExitStack() as stack:
-                stack.push_async_callback(doorman.close)
-                port = await listen_on(doorman.listen, self.host, self.link_port)
+                stack.push_async_callback(acceptor.close)
+                port = await listen_on(acceptor.listen, self.host, self.link_port)
                 limiter = await asyncio.to_thread(choose_limiter, state.token, state.cgroups)
                 stack.callback(limiter.close)
                 for one in runtimes.values():
                     stack.callback(one.close)
-                library = await asyncio.to_thread(self._library, state, tls)
+                library = await asyncio.to_thread(self._library, state, masters, tls)
                 reach = self.host
                 if is_any(reach):
-                    reach = await own_address(self.master, self.control_port, quitting.told)
+                    reach = await own_address(
+                        split_addresses(self.master)[0], self.control_port, quitting.told
+                    )
                 manager = Manager(
                     name=name,
                     info=_machine(self.settings, offers, limiter, detail),
@@ -148,49 +151,54 @@ class App:
                     runtimes=runtimes,
                     runtime=runtime,
                     state=state,
-                    doorman=doorman,
+                    acceptor=acceptor,
                     links=(reach, port),
                     limiter=limiter,
                     library=library,
-                    dialer=RunDialer(self._control_url(tls), self.secret, tls=tls),
+                    dialer=RunDialer(masters, self.secret, tls=tls),
                 )
-                await self._manage(manager, tls, quitting.of(manager), lambda: ready(name, runtime.name))
+                channel = TaskSetChannel(masters, self.secret, manager.hello, manager.handle, tls=tls)
+                await _manage(manager, channel, quitting.of(manager), lambda: ready(name, runtime.name))
 
-    def _control_url(self, tls: Context | None) -> str:
-        return f"{'ws' if tls is None else 'wss'}://{in_url(self.master)}:{self.control_port}"
+    def _masters(self, tls: Context | None) -> Masters:
+        scheme = "ws" if tls is None else "wss"
+        hosts = split_addresses(self.master)
+        return Masters(f"{scheme}://{in_url(host)}:{self.control_port}" for host in hosts)
 
-    def _library(self, state: StateFolder, tls: Context | None) -> Library:
-        """Where packages that users bring come from. Blocks."""
-        client = ContentClient(self.master, self.control_port, self.secret, tls=tls)
-        cache = BundleCache(state.library, client.piece, space=self.settings.bundle_space)
-        wish = self.settings.requirements
-        library = Library(cache=cache, installer=Installer(state.requirements, wish) if wish else None)
+    def _library(self, state: StateFolder, masters: Masters, tls: Context | None) -> Library:
+        """Return the source of the packages that users bring. Blocks."""
+        client = ContentClient(masters, self.secret, tls=tls)
+        cache = PackageCache(state.library, client.piece, space=self.settings.bundle_space)
+        requested = self.settings.requirements
+        library = Library(
+            cache=cache, installer=Installer(state.requirements, requested) if requested else None
+        )
         library.open()
         return library
 
-    async def _manage(
-        self, manager: Manager, tls: Context | None, quit_: asyncio.Event, ready: Callable[[], None]
-    ) -> None:
-        channel = TaskSetChannel(self._control_url(tls), self.secret, manager.hello, manager.handle, tls=tls)
-        manager.send = channel.send
-        async with asyncio.TaskGroup() as tasks:
-            dialing: list[asyncio.Task[None]] = []
 
-            def go() -> None:
-                dialing.append(tasks.create_task(channel.run(), name="control channel"))
-                ready()
+async def _manage(
+    manager: Manager, channel: TaskSetChannel, quit_: asyncio.Event, ready: Callable[[], None]
+) -> None:
+    manager.send = channel.send
+    async with asyncio.TaskGroup() as tasks:
+        dialing: list[asyncio.Task[None]] = []
 
-            await manager.run(go, quit_)
-            for task in dialing:
-                task.cancel()
+        def go() -> None:
+            dialing.append(tasks.create_task(channel.run(), name="control channel"))
+            ready()
+
+        await manager.run(go, quit_)
+        for task in dialing:
+            task.cancel()
 
 
-def choose_runtime(wish: str, runtimes: dict[str, Runtime]) -> tuple[Runtime, str]:
+def choose_runtime(requested: str, runtimes: dict[str, Runtime]) -> tuple[Runtime, str]:
     """Find the runtime to use. Blocks.
 
     Args:
-        wish: A runtime's name, or ``auto``: namespaces if they work here, else plain processes.
-        runtimes: All there are.
+        requested: A runtime's name, or ``auto``: namespaces if they work here, else plain processes.
+        runtimes: All runtimes.
 
     Returns:
         The runtime and what users should know of it; empty if all is well.
@@ -199,25 +207,25 @@ def choose_runtime(wish: str, runtimes: dict[str, Runtime]) -> tuple[Runtime, st
         RuntimeUnavailableError: The runtime that was asked for does not work here.
     """
     detail = ""
-    if wish in (AUTO, NamespaceRuntime.name):
+    if requested in (AUTO, NamespaceRuntime.name):
         namespace = runtimes[NamespaceRuntime.name]
         try:
             namespace.probe()
         except RuntimeUnavailableError as error:
-            if wish != AUTO:
+            if requested != AUTO:
                 raise
             detail = f"{error}; "
         else:
             return namespace, namespace.detail
-    elif wish == PodmanRuntime.name:
-        runtimes[wish].probe()
-        return runtimes[wish], runtimes[wish].detail
-    elif wish not in runtimes:
+    elif requested == PodmanRuntime.name:
+        runtimes[requested].probe()
+        return runtimes[requested], runtimes[requested].detail
+    elif requested not in runtimes:
         raise RuntimeUnavailableError(
-            wish, f"there is no such runtime; use one of {', '.join((AUTO, *runtimes))}"
+            requested, f"there is no such runtime; use one of {', '.join((AUTO, *runtimes))}"
         )
     detail += _NOT_ISOLATED
-    log.warning("%s", detail)
+    _log.warning("%s", detail)
     return runtimes[ProcessRuntime.name], detail
 
 
@@ -231,15 +239,15 @@ def package_path(given: Sequence[Path]) -> tuple[Path, ...]:
 
 
 class Quitting:
-    """Hears signals from now on; a manager that comes later ends at once what an earlier one left.
+    """Handles signals from now on; a manager that starts after a signal ends adopted containers at once.
 
     Attributes:
-        renewal: Whether the program is to let go of its containers and start anew.
+        renewal: Whether the program is to release its containers and start again.
     """
 
     def __init__(self) -> None:
         self.told = asyncio.Event()
-        """Set by the first signal."""
+        """Set by the first signal to end."""
         self._manager: Manager | None = None
         self._let_go: Callable[[], object] = lambda: None
         self.renewal = False
@@ -249,11 +257,11 @@ class Quitting:
         loop.add_signal_handler(RENEW, self._on_renewal)
 
     def on_renewal(self, let_go: Callable[[], object]) -> None:
-        """Have something called when the program is to start anew."""
+        """Register a callback for the request to start the program again."""
         self._let_go = let_go
 
     def of(self, manager: Manager) -> asyncio.Event:
-        """Return what tells a manager to end; a second signal makes it kill its containers."""
+        """Return the event that tells a manager to end; a second signal makes it kill its containers."""
         self._manager = manager
         return self.told
 
@@ -263,9 +271,9 @@ class Quitting:
         self.told.set()
 
     def _on_renewal(self) -> None:
-        if self.told.is_set() or self.renewal:  # an end that has begun goes on
+        if self.told.is_set() or self.renewal:  # a shutdown that has begun continues
             return
-        log.info("starting anew; containers stay")
+        _log.info("starting anew; containers stay")
         self.renewal = True
         self._let_go()
 
@@ -299,6 +307,6 @@ def _existing(path: Path) -> Path:
 
 
 def _compile_engine() -> None:
-    """Compile what containers import: they see it read-only, and could never keep the result."""
+    """Compile the modules that containers import: containers, which see them read-only, cannot do it."""
     for package in ("rce", "rce_container"):
         compileall.compile_dir(source_root() / package, quiet=2)

@@ -1,21 +1,36 @@
-"""What a manager decides: events in, instructions out. Pure: no I/O, no clock, no task.
+"""The manager's decisions: events in, instructions out. Pure: no I/O, no clock, no task.
 
-A container lives several lives, each with a *mark* of its own (reported as its incarnation). Events of a
-life that is over are ignored.
+A container has several incarnations, one after the other, each with its own id. Events of an ended
+incarnation are ignored.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any, Self, assert_never
 
 import msgspec
 
-from rce.control.messages import Fault, Gone, Status
-from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress, Resources
+from rce.aio.backoff import Backoff
+from rce.control.desired import DesiredState, Fit
+from rce.control.messages import Fault, Gone, PatchStatus, SpecWanted, Status
+from rce.control.model import (
+    EndpointSpec,
+    EndpointState,
+    EndpointStatus,
+    LinkAddress,
+    SpecPatch,
+    StatusPatch,
+)
+from rce.control.observed import ObservedStatus
+from rce.lifecycle import StateMachine
+from rce.model.specs import Resources
 from rce_container.events import (
     Adopted,
     Apply,
+    ApplyPatch,
+    Changed,
     Drop,
     Due,
     Event,
@@ -23,59 +38,85 @@ from rce_container.events import (
     Instruction,
     Lost,
     Made,
+    Patch,
     Put,
     Quit,
     Removed,
     Reported,
     Start,
+    StatusWanted,
     Stop,
     Sync,
     Tell,
     Wait,
 )
-from rce_container.life import ALIVE, Happening, Phase, after
+from rce_container.life import ALIVE, CONTAINER_LIFE, LifeEvent, Phase
 
-BACKOFF_S = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
-"""Pauses before a container that ended is made again: the first, second, ... time."""
+BACKOFF = Backoff(first=0.5, longest=30.0)
+"""Delays before a container that ended is recreated; the first time in a row it is recreated at once.
+"""
 STABLE_S = 30.0
-"""A container that ran for so long starts at the first pause again."""
+"""A container that ran for this long starts at the first delay again."""
 
 
 @dataclass(slots=True)
 class Container:
-    """What is known of one container."""
+    """The manager's record of one container."""
 
     id: str
-    phase: Phase
-    desired: EndpointSpec | None = None
-    """None also for an adopted one of which the master has not spoken yet."""
+    course: StateMachine[Phase, LifeEvent]
+    desired: DesiredState | None = None
+    """None also for an adopted container that the master has not mentioned yet."""
     drop_revision: int = 0
-    mark: str = ""
+    incarnation_id: str = ""
     address: LinkAddress = field(default_factory=LinkAddress)
-    reported: EndpointStatus | None = None
+    reported: ObservedStatus | None = None
     failures: int = 0
-    """How often it ended since it was stable last."""
+    """How often it has ended since it was last stable."""
     running_since: float | None = None
     ticket: int = 0
     detail: str = ""
     told: str = ""
-    """The last failure that the user was told of."""
+    """The last failure that was reported to the user."""
+    number: int = 0
+    """The number of the last report to the master."""
+
+    @property
+    def known_revision(self) -> int:
+        """The newest revision that is known of it."""
+        if self.desired is not None:
+            return self.desired.revision
+        return self.reported.header.revision if self.reported is not None else 0
+
+    @classmethod
+    def make(cls, id_: str, phase: Phase, **fields: Any) -> Self:
+        """Make a record in a phase."""
+        return cls(id_, CONTAINER_LIFE.start(phase, id_), **fields)
+
+    @property
+    def phase(self) -> Phase:
+        """The phase of the container."""
+        return self.course.state
 
     @property
     def status(self) -> EndpointStatus:
-        """What the master is told."""
-        base = self.reported
-        if base is None or self.phase not in {*ALIVE, Phase.STOPPING}:
-            base = EndpointStatus(id=self.id, revision=0, state=_STATES[self.phase])
+        """Return the status for the master."""
+        if self.reported is None or self.phase not in {*ALIVE, Phase.STOPPING}:
+            return self.describe(EndpointStatus(id=self.id, revision=0, state=_STATES[self.phase]))
+        return self.describe(self.reported.whole)
+
+    def describe(self, base: EndpointStatus) -> EndpointStatus:
+        """Add to the environment's status the fields that it does not know."""
         state = EndpointState.STOPPING if self.phase is Phase.STOPPING else base.state
         return msgspec.structs.replace(
             base,
             id=self.id,
             revision=max(0, base.revision),
             state=state,
-            incarnation=self.mark,
+            incarnation=self.incarnation_id,
             address=self.address,
             detail=self.detail,
+            number=self.number,
         )
 
 
@@ -93,8 +134,8 @@ _STATES = {
 class ManagerCore:
     """All containers of one manager.
 
-    Invariants: a container has a mark exactly while something of a life may be there; a container that is
-    gone is forgotten.
+    Invariants: a container has an incarnation id exactly while it may have processes or folders; a container
+    that is gone is forgotten.
     """
 
     def __init__(self) -> None:
@@ -104,42 +145,40 @@ class ManagerCore:
         self._now = 0.0
 
     def handle(self, event: Event, now: float) -> list[Instruction]:
-        """Take in what happened; return what is to be done about it.
+        """Handle an event; return the resulting instructions.
 
         Args:
             event: What happened.
-            now: Seconds on a clock that never goes back.
+            now: Seconds on a monotonic clock.
         """
         self._now = now
         self._out = []
         match event:
-            case Put(spec=spec):
-                self._put(spec)
-            case Drop(id=id_, revision=revision, reason=reason):
-                self._drop(id_, revision, reason)
-            case Sync(specs=specs):
-                self._sync(specs)
+            case Put() | Patch() | Drop() | Sync() | StatusWanted():
+                self._hear(event)
             case Adopted():
                 self._adopt(event)
             case Due(id=id_, ticket=ticket):
                 self._due(id_, ticket)
             case Quit():
                 self._quit()
-            case Lost(id=id_, mark="", reason=reason):
+            case Lost(id=id_, incarnation_id="", reason=reason):
                 self._not_started(id_, reason)
-            case Made() | Reported() | Faulted() | Lost() | Removed():
+            case Made() | Reported() | Changed() | Faulted() | Lost() | Removed():
                 self._life(event)
+            case _:
+                assert_never(event)
         return self._out
 
     @property
     def statuses(self) -> tuple[EndpointStatus, ...]:
-        """What there is, for the master."""
+        """Return the status of all containers, for the master."""
         return tuple(container.status for container in self.containers.values())
 
     def resources(self, id_: str) -> Resources:
-        """What a container that is desired asks for."""
+        """Return the resources that a desired container requests."""
         desired = self.containers[id_].desired
-        return desired.resources if desired is not None else Resources()
+        return desired.contents.resources if desired is not None else Resources()
 
     def validate(self) -> None:
         """Check the invariants; for tests."""
@@ -147,27 +186,55 @@ class ManagerCore:
             assert container.id == id_
             assert container.phase is not Phase.GONE, f"{id_} is gone and not forgotten"
             if container.phase is Phase.WAITING:
-                assert not container.mark, f"{id_} waits although something of it is there"
+                assert not container.incarnation_id, f"{id_} waits although something of it is there"
             if container.phase in {*ALIVE, Phase.CLEANING}:
-                assert container.mark, f"{id_} is {container.phase.value} without a life"
+                assert container.incarnation_id, f"{id_} is {container.phase.value} without an incarnation"
 
-    # The master's wishes
+    # Desired state from the master
+
+    def _hear(self, event: Put | Patch | Drop | Sync | StatusWanted) -> None:
+        match event:
+            case Put(spec=spec):
+                self._put(spec)
+            case Patch(patch=patch):
+                self._patch(patch)
+            case Drop(id=id_, revision=revision, reason=reason):
+                self._drop(id_, revision, reason)
+            case Sync(specs=specs):
+                self._sync(specs)
+            case StatusWanted(id=id_):
+                if (container := self.containers.get(id_)) is not None:
+                    self._tell(container)
+            case _:
+                assert_never(event)
 
     def _put(self, spec: EndpointSpec) -> None:
         if self._quitting:
             return
         container = self.containers.get(spec.id)
         if container is None:
-            container = self.containers[spec.id] = Container(spec.id, Phase.GONE)
+            container = self.containers[spec.id] = Container.make(spec.id, Phase.GONE)
         elif container.desired is not None and spec.revision < container.desired.revision:
             return
-        container.desired = spec
+        container.desired = DesiredState(spec)
         was = container.phase
-        container.phase = after(was, Happening.DESIRE)
+        container.course.advance(LifeEvent.DESIRE)
         if was is Phase.GONE:
             self._start(container)
-        elif container.phase in {*ALIVE, Phase.STARTING} and container.mark:
-            self._out.append(Apply(spec.id, container.mark, spec))
+        elif container.phase in {*ALIVE, Phase.STARTING} and container.incarnation_id:
+            self._out.append(Apply(spec.id, container.incarnation_id, spec))
+
+    def _patch(self, patch: SpecPatch) -> None:
+        if self._quitting:
+            return
+        container = self.containers.get(patch.id)
+        desired = None if container is None else container.desired
+        if container is None or desired is None or (fit := desired.fit(patch)) is Fit.GAP:
+            self._out.append(Tell(SpecWanted(id=patch.id)))
+        elif fit is Fit.NEXT:
+            desired.patch(patch)
+            if container.phase in {*ALIVE, Phase.STARTING} and container.incarnation_id:
+                self._out.append(ApplyPatch(patch.id, container.incarnation_id, patch))
 
     def _drop(self, id_: str, revision: int, reason: str) -> None:
         container = self.containers.get(id_)
@@ -182,8 +249,7 @@ class ManagerCore:
         desired = {spec.id: spec for spec in specs}
         for id_, container in list(self.containers.items()):
             if id_ not in desired:
-                known = container.desired or container.reported
-                self._drop(id_, known.revision if known else 0, "it is not desired here any more")
+                self._drop(id_, container.known_revision, "it is not desired here any more")
         for spec in desired.values():
             self._put(spec)
 
@@ -195,69 +261,87 @@ class ManagerCore:
 
     def _release(self, container: Container, reason: str) -> None:
         was = container.phase
-        container.phase = after(was, Happening.RELEASE)
+        container.course.advance(LifeEvent.RELEASE)
         if container.phase is Phase.GONE:
             self._forget(container)
         elif was in {*ALIVE, Phase.STARTING}:
-            if container.mark:
-                self._out.append(Stop(container.id, container.mark, reason))
+            if container.incarnation_id:
+                self._out.append(Stop(container.id, container.incarnation_id, reason))
             self._tell(container)
 
-    # What happens to containers
+    # Events of containers
 
     def _adopt(self, event: Adopted) -> None:
         id_ = event.status.id
         assert id_ not in self.containers, "containers are adopted before anything else happens"
         is_ill = event.status.state is EndpointState.DEGRADED
         phase = Phase.DEGRADED if is_ill else Phase.RUNNING
-        container = self.containers[id_] = Container(id_, phase, mark=event.mark, address=event.address)
-        container.reported = event.status
+        container = self.containers[id_] = Container.make(
+            id_, phase, incarnation_id=event.incarnation_id, address=event.address
+        )
+        container.reported = ObservedStatus(event.status)
         container.running_since = self._now
 
-    def _life(self, event: Made | Reported | Faulted | Lost | Removed) -> None:
+    def _life(self, event: Made | Reported | Changed | Faulted | Lost | Removed) -> None:
         container = self.containers.get(event.id)
         if container is None:
             return
         if isinstance(event, Made):
             self._made(container, event)
             return
-        if event.mark != container.mark:
+        if event.incarnation_id != container.incarnation_id:
             return
         match event:
             case Reported(status=status):
                 self._report(container, status)
+            case Changed(patch=patch):
+                self._change(container, patch)
             case Faulted(text=text):
                 self._fault(container, text)
             case Lost(reason=reason):
                 self._lost(container, reason)
             case Removed():
                 self._removed(container)
+            case _:
+                assert_never(event)
 
     def _made(self, container: Container, event: Made) -> None:
-        container.mark = event.mark
+        container.incarnation_id = event.incarnation_id
         container.address = event.address
         if container.phase is not Phase.STARTING or container.desired is None:
-            self._out.append(Stop(container.id, event.mark, "it is not desired any more"))
+            self._out.append(Stop(container.id, event.incarnation_id, "it is not desired any more"))
             return
-        self._out.append(Apply(container.id, event.mark, container.desired))
+        self._out.append(Apply(container.id, event.incarnation_id, container.desired.whole))
         self._tell(container)
 
     def _report(self, container: Container, status: EndpointStatus) -> None:
         was = container.phase
         is_ill = status.state is EndpointState.DEGRADED
-        container.phase = after(was, Happening.ILLNESS if is_ill else Happening.REPORT)
-        container.reported = status
+        container.course.advance(LifeEvent.ILLNESS if is_ill else LifeEvent.REPORT)
+        container.reported = ObservedStatus(status)
         if was is Phase.STARTING:
             container.running_since = self._now
             container.detail = ""
         if container.phase in {*ALIVE, Phase.STOPPING}:
             self._tell(container)
 
+    def _change(self, container: Container, patch: StatusPatch) -> None:
+        """Apply a patch to an environment's report; a whole report came before it."""
+        if container.reported is None:
+            return
+        container.reported.patch(patch)
+        is_ill = patch.status.state is EndpointState.DEGRADED
+        container.course.advance(LifeEvent.ILLNESS if is_ill else LifeEvent.REPORT)
+        if container.phase in {*ALIVE, Phase.STOPPING}:
+            container.number += 1
+            told = msgspec.structs.replace(patch, status=container.describe(patch.status))
+            self._out.append(Tell(PatchStatus(patch=told)))
+
     def _lost(self, container: Container, reason: str) -> None:
         was = container.phase
         if was is Phase.CLEANING:
             return
-        container.phase = after(was, Happening.LOSS)
+        container.course.advance(LifeEvent.LOSS)
         if container.phase is not Phase.CLEANING:
             return
         if container.running_since is not None and self._now - container.running_since >= STABLE_S:
@@ -268,13 +352,13 @@ class ManagerCore:
     def _removed(self, container: Container) -> None:
         if container.phase not in (Phase.STOPPING, Phase.CLEANING):
             self._lost(container, "its processes ended")
-        container.phase = after(container.phase, Happening.REMOVED)
-        container.mark = ""
+        container.course.advance(LifeEvent.REMOVED)
+        container.incarnation_id = ""
         container.address = LinkAddress()
         container.reported = None
         if container.phase is Phase.GONE:
             self._revive_or_forget(container)
-        elif container.desired is None:  # adopted, and the master has not spoken of it yet
+        elif container.desired is None:  # adopted, and the master has not mentioned it yet
             del self.containers[container.id]
         else:
             self._pause(container)
@@ -283,11 +367,9 @@ class ManagerCore:
         container = self.containers.get(id_)
         if container is None:
             return
-        if container.phase is Phase.STOPPING:
-            container.phase = Phase.GONE
+        if container.course.advance(LifeEvent.NOT_STARTED) is Phase.GONE:
             self._revive_or_forget(container)
             return
-        container.phase = Phase.WAITING
         self._failed(container, f"cannot be started: {reason}")
         self._pause(container)
 
@@ -295,16 +377,16 @@ class ManagerCore:
         container = self.containers.get(id_)
         if container is None or container.phase is not Phase.WAITING or container.ticket != ticket:
             return
-        container.phase = after(container.phase, Happening.DUE)
+        container.course.advance(LifeEvent.DUE)
         self._start(container)
 
-    # What is done about it
+    # Instructions
 
     def _start(self, container: Container) -> None:
         self._out.append(Start(container.id))
 
     def _pause(self, container: Container) -> None:
-        delay = BACKOFF_S[min(container.failures, len(BACKOFF_S)) - 1]
+        delay = BACKOFF.pause_after(container.failures - 1)
         container.ticket += 1
         self._out.append(Wait(container.id, container.ticket, delay))
         self._tell(container)
@@ -313,7 +395,7 @@ class ManagerCore:
         if container.desired is None or self._quitting:
             self._forget(container)
             return
-        container.phase = after(Phase.GONE, Happening.DESIRE)
+        container.course.advance(LifeEvent.DESIRE)
         container.detail = ""
         self._start(container)
 
@@ -335,4 +417,5 @@ class ManagerCore:
         self._out.append(Tell(Fault(id=container.id, text=f"container {tag}: {text}")))
 
     def _tell(self, container: Container) -> None:
+        container.number += 1
         self._out.append(Tell(Status(status=container.status)))

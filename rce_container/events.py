@@ -1,18 +1,25 @@
-"""What can happen to a manager's containers (events), and what it decides to do (instructions)."""
+"""The events of a manager's containers, and the instructions that it decides on."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from rce.control.messages import ToMaster
-from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress
+from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, SpecPatch, StatusPatch
 
 
 @dataclass(frozen=True, slots=True)
 class Put:
-    """The master desires a container like this."""
+    """The master desires a container with this specification."""
 
     spec: EndpointSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """The master changed its specification of a container."""
+
+    patch: SpecPatch
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +33,7 @@ class Drop:
 
 @dataclass(frozen=True, slots=True)
 class Sync:
-    """The master desires exactly these."""
+    """The master desires exactly these containers."""
 
     specs: tuple[EndpointSpec, ...]
 
@@ -35,17 +42,17 @@ class Sync:
 class Adopted:
     """A container was found that an earlier manager had started; its environment has reported."""
 
-    mark: str
+    incarnation_id: str
     status: EndpointStatus
     address: LinkAddress
 
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """The processes of a new life were started."""
+    """The processes of a new incarnation were started."""
 
     id: str
-    mark: str
+    incarnation_id: str
     address: LinkAddress
 
 
@@ -54,34 +61,50 @@ class Reported:
     """An environment reported."""
 
     id: str
-    mark: str
+    incarnation_id: str
     status: EndpointStatus
 
 
 @dataclass(frozen=True, slots=True)
-class Faulted:
-    """An environment has a fault to tell the user of."""
+class Changed:
+    """An environment reported what changed since its last report."""
 
     id: str
-    mark: str
+    incarnation_id: str
+    patch: StatusPatch
+
+
+@dataclass(frozen=True, slots=True)
+class StatusWanted:
+    """The master misses a container's status."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Faulted:
+    """An environment reports a fault for the user."""
+
+    id: str
+    incarnation_id: str
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """An environment is gone, or could not be started (``mark`` is empty then)."""
+    """An environment is gone, or could not be started (``incarnation_id`` is empty then)."""
 
     id: str
-    mark: str
+    incarnation_id: str
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class Removed:
-    """Nothing is left of a life."""
+    """An incarnation has been removed completely."""
 
     id: str
-    mark: str
+    incarnation_id: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +120,27 @@ class Quit:
     """The manager is to end, with all its containers."""
 
 
-Event = Put | Drop | Sync | Adopted | Made | Reported | Faulted | Lost | Removed | Due | Quit
+Event = (
+    Put
+    | Patch
+    | Drop
+    | Sync
+    | StatusWanted
+    | Adopted
+    | Made
+    | Reported
+    | Changed
+    | Faulted
+    | Lost
+    | Removed
+    | Due
+    | Quit
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Start a new life; answered by :class:`Made` or :class:`Lost`."""
+    """Start a new incarnation; answered by :class:`Made` or :class:`Lost`."""
 
     id: str
 
@@ -112,18 +150,27 @@ class Apply:
     """Give a specification to an environment."""
 
     id: str
-    mark: str
+    incarnation_id: str
     spec: EndpointSpec
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
-    """End a life, nodes first; answered by :class:`Removed` in the end."""
+class ApplyPatch:
+    """Give an environment the changes of its specification."""
 
     id: str
-    mark: str
+    incarnation_id: str
+    patch: SpecPatch
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """End an incarnation, nodes first; finally answered by :class:`Removed`."""
+
+    id: str
+    incarnation_id: str
     reason: str = ""
-    """Why, for the record of that life."""
+    """The reason, for the record of that incarnation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,4 +189,4 @@ class Tell:
     message: ToMaster
 
 
-Instruction = Start | Apply | Stop | Wait | Tell
+Instruction = Start | Apply | ApplyPatch | Stop | Wait | Tell

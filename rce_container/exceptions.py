@@ -1,4 +1,4 @@
-"""What goes wrong in the Container Task Set.
+"""The errors of the Container Task Set.
 
 ContainerError
 ├── RuntimeUnavailableError   no runtime of that name works on this machine
@@ -39,11 +39,11 @@ class NetworkError(ContainerError):
 
 
 class KillError(ContainerError):
-    """Processes of a container do not die, not even by SIGKILL."""
+    """Processes of a container do not end, even after SIGKILL."""
 
 
 class LimitError(ContainerError):
-    """A limit of a container could not be put in force; the text says what to do."""
+    """A limit of a container could not be applied; the text says what to do."""
 
 
 class LimitsUnavailableError(ContainerError):

@@ -1,4 +1,4 @@
-"""Joins commands in containers with the users who run them, by way of the master."""
+"""Connects commands in containers with the users who run them, through the master."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from websockets.exceptions import ConnectionClosed, WebSocketException
 
+from rce.aio.tasks import run_until_first
 from rce.control.execution import MAX_DATA, NOT_RUN, Command, ended_frame
 from rce_container.exceptions import ExecutionError
 
@@ -20,14 +21,14 @@ if TYPE_CHECKING:
     from rce.control.dialing import RunDialer
     from rce.control.messages import Execute
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 Start = Callable[[str, Command, socket.socket], None]
 """Hands a command and a socket to a container (by its endpoint id); raises ExecutionError."""
 
 
 class Executions:
-    """Carries the frames of runs between the master and environments; looks into none of them.
+    """Carries the frames of runs between the master and environments without reading them.
 
     Args:
         dialer: Connects to the master.
@@ -44,7 +45,7 @@ class Executions:
             async with self._dialer.dial(message.run) as master:
                 await self._join(message, master)
         except (OSError, TimeoutError, WebSocketException) as error:
-            log.warning("a command in %s is ended: %s", message.id, error)
+            _log.warning("a command in %s is ended: %s", message.id, error)
 
     async def _join(self, message: Execute, master: ClientConnection) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -60,7 +61,7 @@ class Executions:
 
 
 async def _carry(sock: socket.socket, master: ClientConnection) -> None:
-    """Carry frames both ways until either side is gone."""
+    """Carry frames both ways until either side disconnects."""
     loop = asyncio.get_running_loop()
 
     async def upwards() -> None:
@@ -70,18 +71,8 @@ async def _carry(sock: socket.socket, master: ClientConnection) -> None:
     async def downwards() -> None:
         async for frame in master:
             if isinstance(frame, bytes) and frame:
-                with contextlib.suppress(
-                    OSError
-                ):  # the command has ended; what it said last is still carried
+                with contextlib.suppress(OSError):  # the command has ended; its last output is still carried
                     await loop.sock_sendall(sock, frame)
 
-    tasks = [asyncio.create_task(upwards()), asyncio.create_task(downwards())]
-    try:
-        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        for task in done:
-            with contextlib.suppress(ConnectionClosed, OSError):  # either side may go at any time
-                task.result()
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+    with contextlib.suppress(ConnectionClosed, OSError):  # either side may disconnect at any time
+        await run_until_first(upwards(), downwards())

@@ -1,4 +1,4 @@
-"""Where a container task set keeps what it needs on disk.
+"""The folders of a container task set on disk.
 
 ``STATE/name``, one folder per life of a container, ``STATE/containers/MARK`` (record, private home), and its
 logs, which outlive it (:mod:`rce_container.archive`), are in the state directory; the container's sockets are
@@ -19,36 +19,35 @@ from pathlib import Path
 from typing import Self
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, field
 
 from rce_container.archive import LOG_DAYS, LOG_SPACE, LogArchive
 from rce_container.environment import proc
 from rce_container.exceptions import StateBusyError, StateError
-from rce_container.trees import remove
-from rce_container.writing import write_whole
+from rce_container.files import remove, write_whole
 
-_MARK = re.compile(r"[0-9a-f]{12}")
+_INCARNATION_ID = re.compile(r"[0-9a-f]{12}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}")
 _MAX_SOCKET_PATH = 107
 
 
 class Record(Struct, frozen=True, kw_only=True):
-    """What a manager must know of a container that an earlier manager started."""
+    """The record by which a manager adopts a container that an earlier manager started."""
 
     id: str
-    mark: str
+    incarnation_id: str = field(name="mark")
     runtime: str
     pid: int
     """The outermost process of the container."""
     start: int
-    """Its start time, so that a reused pid is told apart."""
+    """Its start time, which distinguishes it from a process with a reused pid."""
     namespaces_pid: int = 0
     """See :attr:`rce_container.runtimes.base.Handle.namespaces_pid`."""
     environment: int = 0
     """The environment's pid, if it does not descend from the outermost process; else 0."""
     environment_start: int = 0
     group: str = ""
-    """The group whose private network it is in; empty if it is in none."""
+    """The group whose private network it is in; empty without one."""
     address: str = ""
     """Its address there, with the prefix."""
     revision: int = 0
@@ -56,23 +55,23 @@ class Record(Struct, frozen=True, kw_only=True):
 
 
 class ContainerFolder:
-    """The paths of one life of one container.
+    """The paths of one incarnation of one container.
 
     Args:
-        root: Holds the folders of all lives.
+        root: Holds the folders of all incarnations.
         run: Holds those for sockets.
-        mark: Names the life.
+        incarnation_id: Names the incarnation.
         logs: Where its logs are; by default in its own folder.
     """
 
-    def __init__(self, root: Path, run: Path, mark: str, logs: Path | None = None) -> None:
-        self.mark = mark
-        self.path = root / mark
-        self.run = run / mark
+    def __init__(self, root: Path, run: Path, incarnation_id: str, logs: Path | None = None) -> None:
+        self.incarnation_id = incarnation_id
+        self.path = root / incarnation_id
+        self.run = run / incarnation_id
         self.home = self.path / "home"
         self.logs = logs or self.path / "logs"
         self.etc = self.path / "etc"
-        self.bundles = self.path / "bundles"
+        self.user_packages = self.path / "bundles"
         self.hosts = self.etc / "hosts"
         self.control_socket = self.run / "control.sock"
         self.link_socket = self.run / "link.sock"
@@ -87,8 +86,8 @@ class ContainerFolder:
             for path in (self.path, self.run, self.home, self.etc):
                 path.mkdir(mode=0o700, parents=True)
             self.logs.mkdir(mode=0o700, exist_ok=True)
-            self.bundles.mkdir()
-            self.bundles.chmod(0o755)  # for whomever the container runs as; nobody else comes by
+            self.user_packages.mkdir()
+            self.user_packages.chmod(0o755)  # readable by the container's user, who alone can reach it
         except OSError as error:
             raise StateError(f"cannot make {error.filename}: {error.strerror}") from error
 
@@ -108,7 +107,7 @@ class ContainerFolder:
         return sock
 
     def write_record(self, record: Record) -> None:
-        """Note who the container is, atomically.
+        """Write the record of the container, atomically.
 
         Raises:
             StateError: It cannot be written.
@@ -119,14 +118,14 @@ class ContainerFolder:
             raise StateError(f"cannot write {error.filename}: {error.strerror}") from error
 
     def read_record(self) -> Record | None:
-        """The record; None if it was never written whole."""
+        """Return the record; None if it was never completely written."""
         try:
             return msgspec.json.decode((self.path / "record.json").read_bytes(), type=Record)
         except (OSError, msgspec.DecodeError):
             return None
 
     def note_revision(self, revision: int) -> None:
-        """Note the newest revision that the environment was given; a later manager believes no other.
+        """Write the newest revision that the environment was given; a later manager trusts only this one.
 
         Raises:
             StateError: It cannot be written.
@@ -136,7 +135,7 @@ class ContainerFolder:
             self.write_record(msgspec.structs.replace(record, revision=revision))
 
     def remove(self) -> None:
-        """Remove everything, also what a node made unreadable. Blocks; may be repeated."""
+        """Remove everything, including files that a node made unreadable. Blocks; may be repeated."""
         for path in (self.run, self.path):
             remove(path)
             if path.exists():
@@ -145,7 +144,7 @@ class ContainerFolder:
 
 
 def _make_accessible(root: Path) -> None:
-    """Undo what a node did to the permissions of its folders. Follows no links."""
+    """Undo a node's changes to the permissions of its folders. Does not follow links."""
     waiting = [str(root)]
     while waiting:
         folder = waiting.pop()
@@ -212,7 +211,7 @@ class StateFolder:
         os.pwrite(self._lock, f"{own.pid} {own.start}\n".encode() if own is not None else b"", 0)
 
     def owner(self) -> proc.Process | None:
-        """Return the process that has the state directory; None if it does not run or did not note itself."""
+        """Return the process that holds the state directory; None if it does not run or left no note."""
         try:
             pid, start = map(int, (self._state / "lock").read_text().split())
         except (OSError, ValueError):
@@ -227,21 +226,23 @@ class StateFolder:
             os.close(self._lock)
             self._lock = -1
 
-    def name(self, wish: str) -> str:
-        """The task set's name: ``wish``, or the one it had before, or a new one. It is kept.
+    def name(self, requested: str) -> str:
+        """Return the task set's name: ``requested``, or its former one, or a new one. It is kept.
 
         Raises:
-            StateError: ``wish`` cannot be a name.
+            StateError: ``requested`` cannot be a name.
         """
-        if wish:
-            if not _NAME.fullmatch(wish):
-                raise StateError(f"{wish!r} cannot name a task set: use letters, digits, '_', '-' and '.'")
-            self._keep(self._state / "name", wish)
+        if requested:
+            if not _NAME.fullmatch(requested):
+                raise StateError(
+                    f"{requested!r} cannot name a task set: use letters, digits, '_', '-' and '.'"
+                )
+            self._keep(self._state / "name", requested)
         return self._word("name", f"container-{secrets.token_hex(4)}")
 
     @property
     def token(self) -> str:
-        """Names this state directory on its machine, for ever."""
+        """A permanent name of this state directory on its machine."""
         return self._word("run", secrets.token_hex(4))
 
     @property
@@ -251,7 +252,7 @@ class StateFolder:
 
     @property
     def requirements(self) -> Path:
-        """Where is kept what those packages asked for."""
+        """Where the requirements of those packages are kept."""
         return self._state / "requirements"
 
     @property
@@ -260,30 +261,30 @@ class StateFolder:
         return self._state / "cgroups"
 
     def create(self, id_: str) -> ContainerFolder:
-        """Make the folder of a new life of a container.
+        """Make the folder of a new incarnation of a container.
 
         Raises:
             StateError: It cannot be made.
         """
-        mark = secrets.token_hex(6)
-        logs = self.archive.begin(id_, mark, time.time())
-        folder = ContainerFolder(self._containers, self._run, mark, logs)
+        incarnation_id = secrets.token_hex(6)
+        logs = self.archive.begin(id_, incarnation_id, time.time())
+        folder = ContainerFolder(self._containers, self._run, incarnation_id, logs)
         try:
             folder.make()
         except StateError as error:
             folder.remove()
-            self.archive.end(id_, mark, str(error), time.time())
+            self.archive.end(id_, incarnation_id, str(error), time.time())
             raise
         return folder
 
     def existing(self) -> list[ContainerFolder]:
-        """All folders of lives of containers that are there, by mark."""
-        marks = {path.name for parent in (self._containers, self._run) for path in parent.iterdir()}
+        """Return all existing folders of incarnations, by id."""
+        incarnation_ids = {path.name for parent in (self._containers, self._run) for path in parent.iterdir()}
         logs = self.archive.folders()
         return [
-            ContainerFolder(self._containers, self._run, mark, logs.get(mark))
-            for mark in sorted(marks)
-            if _MARK.fullmatch(mark)
+            ContainerFolder(self._containers, self._run, incarnation_id, logs.get(incarnation_id))
+            for incarnation_id in sorted(incarnation_ids)
+            if _INCARNATION_ID.fullmatch(incarnation_id)
         ]
 
     def _word(self, file: str, default: str) -> str:

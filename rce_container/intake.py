@@ -1,7 +1,8 @@
-"""What a manager takes from an environment: no more than a sound one would say, and no faster.
+"""Limits the messages that a manager accepts from an environment, in content, size and rate.
 
-An environment runs beside its container's nodes, so it may be in their hands. Whatever it says is of its own
-container, has the sizes of a container, and costs the manager, the master and other users no more than that.
+An environment runs beside its container's nodes, so they may control it. Its messages can concern only its
+own container, within the sizes of a container, and cost the manager, the master and other users no more than
+that.
 """
 
 from __future__ import annotations
@@ -14,41 +15,52 @@ from typing import TypeVar
 import msgspec
 from msgspec.structs import asdict, replace
 
-from rce.control.model import EndpointState, EndpointStatus, InterfaceUsage, LinkAddress, NodeStatus
+from rce.control.model import (
+    EndpointState,
+    EndpointStatus,
+    InterfaceUsage,
+    LinkAddress,
+    NodeStatus,
+    StatusPatch,
+)
 from rce.control.tags import Unknown
-from rce.protocol.names import is_name
+from rce.model.names import is_name
 from rce.protocol.printable import one_line
 from rce_container.environment import messages as m
 
 T = TypeVar("T")
 
 MAX_TEXT = 2000
-"""Characters of a text for people."""
+"""Characters of a text for users."""
 MAX_ITEMS = 4096
-"""Nodes, and interfaces, of one container."""
+"""Nodes of one container."""
+MAX_INTERFACES = 16384
+"""Of one container; more than the master allows users to make."""
 MAX_CONNECTIONS = 65536
 _MAX_NUMBER = 2**53
-"""Whatever is counted; JSON readers everywhere take numbers up to here."""
+"""The largest value of a counter; all JSON readers take numbers up to here."""
 _MAX_CODE = 255
 _STATES = frozenset({EndpointState.RUNNING, EndpointState.DEGRADED, EndpointState.STOPPING})
 
 BYTES_PER_S = 4_000_000.0
-"""What an environment may say in the long run."""
+"""The long-term rate of an environment's messages."""
 BURST = 40_000_000.0
-"""What it may say at once; a whole line and more."""
+"""The size of a burst; more than a whole line."""
 PER_LINE = 2_000
-"""What a line costs beside its bytes."""
+"""The cost of a line in addition to its bytes."""
 PER_FAULT = 200_000
-"""The same for one that somebody is told of and that is kept."""
+"""The same for a line that is reported to a user and kept."""
+PER_PART = 500
+"""The same for each interface and connection of a specification that it requests again."""
 PER_LOOK = 100_000
-"""The same for one that makes the manager look for processes."""
+"""The same for a line that makes the manager search for processes."""
 
 
 def read(line: bytes) -> m.ToManager | Unknown:
     """Read a message of an environment.
 
     Raises:
-        msgspec.DecodeError: It is none.
+        msgspec.DecodeError: It is not a message.
     """
     try:
         return m.decode_to_manager(line)
@@ -56,18 +68,18 @@ def read(line: bytes) -> m.ToManager | Unknown:
         raise msgspec.DecodeError(str(error)) from error
 
 
-def sound_text(text: str) -> str:
-    """Cut a text that is too long for people, and take out what their terminals would obey."""
+def sanitize_text(text: str) -> str:
+    """Shorten a text that is too long for users, and remove terminal control characters."""
     text = one_line(text)
     return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]} ..."
 
 
-def sound_status(id_: str, status: EndpointStatus, newest: int) -> EndpointStatus:
-    """Take of a report what can be true of a container.
+def sanitize_status(id_: str, status: EndpointStatus, newest: int) -> EndpointStatus:
+    """Return the plausible parts of a container's report.
 
     Args:
-        id_: The container, whatever it calls itself.
-        status: What its environment says.
+        id_: The container; replaces the id in the report.
+        status: The environment's report.
         newest: The newest revision that it was given.
     """
     nodes = {node.tag: node for node in islice(status.nodes, MAX_ITEMS) if is_name(node.tag)}
@@ -78,15 +90,24 @@ def sound_status(id_: str, status: EndpointStatus, newest: int) -> EndpointStatu
         state=status.state if status.state in _STATES else EndpointState.RUNNING,
         incarnation="",
         detail="",
-        nodes=tuple(map(_sound_node, nodes.values())),
+        nodes=tuple(map(_sanitize_node, nodes.values())),
         interfaces=_named(status.interfaces),
         connections=tuple(map(_whole, status.connections[:MAX_CONNECTIONS])),
         address=LinkAddress(),
     )
 
 
-def sound_counters(said: m.Counters) -> m.Counters:
-    """Take of counters what can be true of a container's links and interfaces."""
+def sanitize_patch(id_: str, patch: StatusPatch, newest: int) -> StatusPatch:
+    """Return the plausible parts of a patch of a container's report; as :func:`sanitize_status`."""
+    return StatusPatch(
+        status=sanitize_status(id_, patch.status, newest),
+        removed_interfaces=tuple(filter(is_name, patch.removed_interfaces[:MAX_INTERFACES])),
+        lost_connections=tuple(map(_whole, patch.lost_connections[:MAX_CONNECTIONS])),
+    )
+
+
+def sanitize_counters(said: m.Counters) -> m.Counters:
+    """Return the plausible counters of a container's links and interfaces."""
     return m.Counters(
         interfaces={
             tag: InterfaceUsage(**{key: _whole(value) for key, value in asdict(one).items()})
@@ -96,19 +117,19 @@ def sound_counters(said: m.Counters) -> m.Counters:
     )
 
 
-def _sound_node(node: NodeStatus) -> NodeStatus:
+def _sanitize_node(node: NodeStatus) -> NodeStatus:
     code = node.exit_code
     return replace(
         node,
         pid=_whole(node.pid),
         exit_code=None if code is None else max(-_MAX_CODE, min(code, _MAX_CODE)),
         restarts=_whole(node.restarts),
-        detail=sound_text(node.detail),
+        detail=sanitize_text(node.detail),
     )
 
 
 def _named(things: Mapping[str, T]) -> dict[str, T]:
-    return {tag: thing for tag, thing in islice(things.items(), MAX_ITEMS) if is_name(tag)}
+    return {tag: thing for tag, thing in islice(things.items(), MAX_INTERFACES) if is_name(tag)}
 
 
 def _whole(number: int, *, least: int = 0) -> int:
@@ -116,10 +137,10 @@ def _whole(number: int, *, least: int = 0) -> int:
 
 
 class Pace:
-    """Says how long an environment has to wait until more of it is heard; meanwhile it writes into its pipe.
+    """Limits the rate at which an environment is read; unread messages stay in its pipe.
 
     Args:
-        clock: Seconds that never go back.
+        clock: Seconds of a monotonic clock.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -128,12 +149,12 @@ class Pace:
         self._since = clock()
 
     def pay(self, cost: float) -> None:
-        """Note what was heard, in bytes or their like."""
+        """Count what was read, in bytes or their equivalent."""
         now = self._clock()
         self._left = min(BURST, self._left + (now - self._since) * BYTES_PER_S) - cost
         self._since = now
 
     @property
     def pause(self) -> float:
-        """Seconds; 0 as long as it has said no more than it may."""
+        """Seconds until the next read; 0 within the allowed rate."""
         return max(0.0, -self._left / BYTES_PER_S)

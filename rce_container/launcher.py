@@ -8,23 +8,23 @@ import resource
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from rce.control.model import Network, Resources
-from rce.protocol.names import EndpointId
+from rce.model.names import EndpointId
+from rce.model.specs import Network, Resources
 from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.exceptions import ContainerError, StartError, StateError
 from rce_container.folder import ContainerFolder, Record
-from rce_container.limits import Cell, limits_of
+from rce_container.limits import ControlGroup, limits_of
 from rce_container.runtimes.base import Handle, Order
 
 if TYPE_CHECKING:
     from rce_container.limits import Limiter
     from rce_container.network import Networks
-    from rce_container.network.networks import Seat
+    from rce_container.network.networks import Membership
     from rce_container.runtimes.base import Runtime
     from rce_container.settings import ContainerSettings
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 ROS_PORT = 11311
 LOOPBACK = "127.0.0.1"
@@ -33,10 +33,10 @@ PODMAN = "podman"
 
 
 class Launched(NamedTuple):
-    """What there is of a container whose processes were started."""
+    """The parts of a container whose processes were started."""
 
     handle: Handle
-    cell: Cell
+    control_group: ControlGroup
     isolated: bool
     """See :attr:`rce_container.runtimes.base.Runtime.isolated`."""
 
@@ -71,16 +71,16 @@ class Launcher:
         self._networks = networks
 
     def launch(self, id_: str, folder: ContainerFolder, resources: Resources) -> Launched:
-        """Start a container's first process, and note in its folder who it is.
+        """Start a container's first process, and write its record to its folder.
 
         Raises:
-            ContainerError: It cannot be started. What was made of it is removed by :meth:`undo`.
-            OSError: The machine has no more of something.
+            ContainerError: It cannot be started. :meth:`undo` removes what was made of it.
+            OSError: A resource of the machine is exhausted.
         """
         runtime = self._runtime_for(resources)
-        cell = self._limiter.create(folder.mark, limits_of(resources, self._settings))
-        seat = self._enroll(id_, folder, resources)
-        boot = self._boot(id_, folder, resources, runtime, cell, seat)
+        control_group = self._limiter.create(folder.incarnation_id, limits_of(resources, self._settings))
+        membership = self._enroll(id_, folder, resources)
+        boot = self._boot(id_, folder, resources, runtime, control_group, membership)
         with folder.listen(folder.control_socket) as control, folder.listen(folder.link_socket) as links:
             order = Order(
                 EndpointId.parse(id_).tag,
@@ -89,41 +89,41 @@ class Launcher:
                 self._settings.packages,
                 control.fileno(),
                 links.fileno(),
-                join=cell.join,
+                join=control_group.join,
                 host_network=resources.network is Network.HOST,
-                switch=seat.path if seat else "",
+                switch=membership.path if membership else "",
                 image=resources.image or runtime.image,
             )
             handle = runtime.start(order)
         process = handle.process
         record = Record(
             id=id_,
-            mark=folder.mark,
+            incarnation_id=folder.incarnation_id,
             runtime=runtime.name,
             pid=process.pid,
             start=process.start,
-            group=resources.group if seat else "",
-            address=str(seat.address) if seat else "",
+            group=resources.group if membership else "",
+            address=str(membership.address) if membership else "",
         )
         try:
             folder.write_record(record)
         except StateError:
-            proc.kill(process)  # all of the container ends with it
+            proc.kill(process)  # all processes of the container end with it
             raise
-        return Launched(handle, cell, runtime.isolated)
+        return Launched(handle, control_group, runtime.isolated)
 
-    async def undo(self, mark: str) -> None:
-        """Remove a container's cell, with all that is in it, and its place in a network."""
-        cell = self._limiter.adopt(mark)
+    async def undo(self, incarnation_id: str) -> None:
+        """Remove a container's control group with all its processes, and its place in a network."""
+        control_group = self._limiter.adopt(incarnation_id)
         try:
-            await asyncio.to_thread(cell.kill)
-            await asyncio.to_thread(cell.remove)
+            await asyncio.to_thread(control_group.kill)
+            await asyncio.to_thread(control_group.remove)
         except ContainerError as error:
-            log.error("a container that did not start: %s", error)  # noqa: TRY400 - its text says it all
-        await self._networks.detach(mark)
+            _log.error("a container that did not start: %s", error)
+        await self._networks.detach(incarnation_id)
 
     def _runtime_for(self, resources: Resources) -> Runtime:
-        """The runtime that makes a container: an image needs one that can run images.
+        """Return the runtime that makes a container: an image needs one that can run images.
 
         Raises:
             StartError: None here can.
@@ -137,11 +137,11 @@ class Launcher:
             raise StartError(f"the runtime {runtime.name} has no networks of groups")
         return runtime
 
-    def _enroll(self, id_: str, folder: ContainerFolder, resources: Resources) -> Seat | None:
+    def _enroll(self, id_: str, folder: ContainerFolder, resources: Resources) -> Membership | None:
         if resources.network is not Network.GROUP:
             return None
         return self._networks.enroll(
-            EndpointId.parse(id_), resources.group, resources.group_ip, folder.mark, folder.hosts
+            EndpointId.parse(id_), resources.group, resources.group_ip, folder.incarnation_id, folder.hosts
         )
 
     def _boot(
@@ -150,33 +150,33 @@ class Launcher:
         folder: ContainerFolder,
         resources: Resources,
         runtime: Runtime,
-        cell: Cell,
-        seat: Seat | None,
+        control_group: ControlGroup,
+        membership: Membership | None,
     ) -> m.Boot:
         settings = self._settings
         own_network = runtime.isolated and resources.network is not Network.HOST
         return m.Boot(
             id=id_,
-            mark=folder.mark,
+            mark=folder.incarnation_id,
             machine=settings.machine,
             tls=settings.tls,
             home="",
             logs="",
             ros_port=ROS_PORT if own_network else 0,
             isolated=runtime.isolated,
-            address=str(seat.address.ip) if seat else LOOPBACK,
-            rlimits=_rlimits(cell, isolated=runtime.isolated),
+            address=str(membership.address.ip) if membership else LOOPBACK,
+            rlimits=_rlimits(control_group, isolated=runtime.isolated),
             packages=tuple(map(str, settings.packages)),
-            bundles=runtime.bundles(folder),
+            user_packages=runtime.user_packages(folder),
             grace=settings.grace,
             interrupt_timeout=settings.interrupt_timeout,
             terminate_timeout=settings.terminate_timeout,
         )
 
 
-def _rlimits(cell: Cell, *, isolated: bool) -> dict[int, int]:
-    """What the container's processes limit themselves."""
-    rlimits = dict(cell.rlimits)
+def _rlimits(control_group: ControlGroup, *, isolated: bool) -> dict[int, int]:
+    """Return the limits that the container's processes set for themselves."""
+    rlimits = dict(control_group.rlimits)
     if not isolated:
-        rlimits.pop(resource.RLIMIT_NPROC, None)  # would count all processes of this user
+        rlimits.pop(resource.RLIMIT_NPROC, None)  # the kernel would count all processes of this user
     return rlimits

@@ -1,11 +1,13 @@
-"""The life of a container as its manager sees it: phases, what may happen in each, and what follows.
+"""The life cycle of a container in its manager: phases, the events of each, and the transitions.
 
-What the master calls requested, placed and lost is before and between the lives that a manager sees.
+The master's states requested, placed and lost are before and between the incarnations that a manager sees.
 """
 
 from __future__ import annotations
 
 from enum import Enum
+
+from rce.lifecycle import LifeCycle
 
 
 class Phase(Enum):
@@ -27,7 +29,7 @@ class Phase(Enum):
     """Nothing of it is there, and it is not desired. The manager forgets it."""
 
 
-class Happening(Enum):
+class LifeEvent(Enum):
     """What can happen to a container."""
 
     REPORT = "report"
@@ -35,7 +37,9 @@ class Happening(Enum):
     ILLNESS = "illness"
     """Its environment reported that not all is well."""
     LOSS = "loss"
-    """Its environment is gone, or could not be started."""
+    """Its environment is gone."""
+    NOT_STARTED = "not started"
+    """It could not be started; nothing of it is there."""
     REMOVED = "removed"
     """No process and no folder of it is left."""
     RELEASE = "release"
@@ -46,65 +50,58 @@ class Happening(Enum):
     """It waited long enough."""
 
 
-NEXT: dict[Phase, dict[Happening, Phase]] = {
-    Phase.STARTING: {
-        Happening.REPORT: Phase.RUNNING,
-        Happening.ILLNESS: Phase.DEGRADED,
-        Happening.LOSS: Phase.CLEANING,
-        Happening.RELEASE: Phase.STOPPING,
-        Happening.DESIRE: Phase.STARTING,
+CONTAINER_LIFE: LifeCycle[Phase, LifeEvent] = LifeCycle(
+    "container",
+    {
+        Phase.STARTING: {
+            LifeEvent.REPORT: Phase.RUNNING,
+            LifeEvent.ILLNESS: Phase.DEGRADED,
+            LifeEvent.LOSS: Phase.CLEANING,
+            LifeEvent.NOT_STARTED: Phase.WAITING,
+            LifeEvent.RELEASE: Phase.STOPPING,
+            LifeEvent.DESIRE: Phase.STARTING,
+        },
+        Phase.RUNNING: {
+            LifeEvent.REPORT: Phase.RUNNING,
+            LifeEvent.ILLNESS: Phase.DEGRADED,
+            LifeEvent.LOSS: Phase.CLEANING,
+            LifeEvent.RELEASE: Phase.STOPPING,
+            LifeEvent.DESIRE: Phase.RUNNING,
+        },
+        Phase.DEGRADED: {
+            LifeEvent.REPORT: Phase.RUNNING,
+            LifeEvent.ILLNESS: Phase.DEGRADED,
+            LifeEvent.LOSS: Phase.CLEANING,
+            LifeEvent.RELEASE: Phase.STOPPING,
+            LifeEvent.DESIRE: Phase.DEGRADED,
+        },
+        Phase.STOPPING: {
+            LifeEvent.REPORT: Phase.STOPPING,
+            LifeEvent.ILLNESS: Phase.STOPPING,
+            LifeEvent.LOSS: Phase.STOPPING,
+            LifeEvent.REMOVED: Phase.GONE,
+            LifeEvent.NOT_STARTED: Phase.GONE,
+            LifeEvent.RELEASE: Phase.STOPPING,
+            LifeEvent.DESIRE: Phase.STOPPING,
+        },
+        Phase.CLEANING: {
+            LifeEvent.REPORT: Phase.CLEANING,
+            LifeEvent.ILLNESS: Phase.CLEANING,
+            LifeEvent.REMOVED: Phase.WAITING,
+            LifeEvent.RELEASE: Phase.STOPPING,
+            LifeEvent.DESIRE: Phase.CLEANING,
+        },
+        Phase.WAITING: {
+            LifeEvent.DUE: Phase.STARTING,
+            LifeEvent.RELEASE: Phase.GONE,
+            LifeEvent.DESIRE: Phase.WAITING,
+        },
+        Phase.GONE: {
+            LifeEvent.DESIRE: Phase.STARTING,
+            LifeEvent.RELEASE: Phase.GONE,
+        },
     },
-    Phase.RUNNING: {
-        Happening.REPORT: Phase.RUNNING,
-        Happening.ILLNESS: Phase.DEGRADED,
-        Happening.LOSS: Phase.CLEANING,
-        Happening.RELEASE: Phase.STOPPING,
-        Happening.DESIRE: Phase.RUNNING,
-    },
-    Phase.DEGRADED: {
-        Happening.REPORT: Phase.RUNNING,
-        Happening.ILLNESS: Phase.DEGRADED,
-        Happening.LOSS: Phase.CLEANING,
-        Happening.RELEASE: Phase.STOPPING,
-        Happening.DESIRE: Phase.DEGRADED,
-    },
-    Phase.STOPPING: {
-        Happening.REPORT: Phase.STOPPING,
-        Happening.ILLNESS: Phase.STOPPING,
-        Happening.LOSS: Phase.STOPPING,
-        Happening.REMOVED: Phase.GONE,
-        Happening.RELEASE: Phase.STOPPING,
-        Happening.DESIRE: Phase.STOPPING,
-    },
-    Phase.CLEANING: {
-        Happening.REPORT: Phase.CLEANING,
-        Happening.ILLNESS: Phase.CLEANING,
-        Happening.REMOVED: Phase.WAITING,
-        Happening.RELEASE: Phase.STOPPING,
-        Happening.DESIRE: Phase.CLEANING,
-    },
-    Phase.WAITING: {
-        Happening.DUE: Phase.STARTING,
-        Happening.RELEASE: Phase.GONE,
-        Happening.DESIRE: Phase.WAITING,
-    },
-    Phase.GONE: {
-        Happening.DESIRE: Phase.STARTING,
-        Happening.RELEASE: Phase.GONE,
-    },
-}
+)
 
 ALIVE = frozenset({Phase.RUNNING, Phase.DEGRADED})
-"""The phases in which a container's environment reports, and is to go on."""
-
-
-def after(phase: Phase, happening: Happening) -> Phase:
-    """The phase that follows.
-
-    Raises:
-        ValueError: This cannot happen in that phase.
-    """
-    found = NEXT[phase].get(happening)
-    if found is None:
-        raise ValueError(f"{happening.value} cannot happen to a container that is {phase.value}")
-    return found
+"""The phases in which a container's environment reports, and is to continue."""

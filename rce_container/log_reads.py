@@ -1,13 +1,13 @@
-"""Reads logs for the master, beside everything else that the master asks."""
+"""Reads logs for the master, concurrently with its other requests."""
 
 from __future__ import annotations
 
 import asyncio
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import BackgroundTasks
 from rce.control.messages import LogChunk, ReadLog
 from rce.guard.turns import CrowdedError, Turns
-from rce.link.tasks import TaskScope
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -17,7 +17,7 @@ MAX_WAITING = 256
 
 
 class LogReads:
-    """Reads for several users at once; who asks much waits for their own turns.
+    """Reads for several users at once; a user with many requests delays only their own.
 
     Args:
         read: Reads a piece of a log. Blocks; runs in a thread.
@@ -28,17 +28,17 @@ class LogReads:
         self._read = read
         self._send = send
         self._turns = Turns(AT_ONCE, waiting=MAX_WAITING)
-        self._tasks = TaskScope()
+        self._tasks = BackgroundTasks()
         self._closed = False
 
     def take(self, message: ReadLog) -> None:
-        """Answer a question, some time later."""
+        """Queue a request; the answer follows later."""
         if self._closed:
             return
-        self._tasks.spawn(self._answer(message), f"read of the log of {message.id}")
+        self._tasks.spawn(self._answer(message), name=f"read of the log of {message.id}")
 
     async def close(self) -> None:
-        """Answer nothing any more."""
+        """Stop answering."""
         self._closed = True
         await self._tasks.close()
 

@@ -1,4 +1,4 @@
-"""Reading the logs that environments write. A container's nodes can do with these files what they like."""
+"""Reads the logs that environments write. A container's nodes may change these files in any way."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rce_container.environment.logs.streams import FRAGMENT_BYTES, text_of
 
 MAX_CHUNK = 1 << 20
 _MIN_FRAGMENTS = 2 * (FRAGMENT_BYTES + 2)
-"""Enough to find the beginning of a fragment, and the whole of it."""
+"""Bytes; enough to find the beginning of a fragment, and to read it whole."""
 _FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
@@ -23,7 +23,7 @@ class Chunk(NamedTuple):
 
     text: str
     offset: int
-    """Where the next read goes on."""
+    """Where the next read continues."""
 
 
 class _Raw(NamedTuple):
@@ -31,7 +31,7 @@ class _Raw(NamedTuple):
     offset: int
     """Of its first byte."""
     is_start: bool
-    """Whether nothing before it is kept."""
+    """Whether it is the beginning of what is kept."""
 
 
 def read_log(folder: Path, name: str, offset: int, limit: int) -> Chunk:
@@ -40,12 +40,11 @@ def read_log(folder: Path, name: str, offset: int, limit: int) -> Chunk:
     Args:
         folder: The container's log folder.
         name: The log's name.
-        offset: Bytes since the log began; negative counts from its end. What is not kept
-            any more is passed over.
+        offset: Bytes since the log began; negative counts from its end. Skips data that is not kept any more.
         limit: Bytes to read at most.
 
     Raises:
-        OSError: The log cannot be read; ``FileNotFoundError`` if there is none.
+        OSError: The log cannot be read; ``FileNotFoundError`` if it does not exist.
     """
     raw = _raw(folder, name, offset, max(1, min(limit, MAX_CHUNK)))
     text, used = _decode(raw.data)
@@ -59,9 +58,9 @@ def read_node_log(folder: Path, tag: str, offset: int, limit: int, letters: byte
         folder: The container's log folder.
         tag: The node.
         offset: As for :func:`read_log`; within a line, the next one is meant.
-        limit: Bytes of the log to read at most, though never less than it takes to get on.
-        letters: Of which streams (:func:`rce_container.environment.logs.streams.letters_of`). What is
-            left out is passed over: the text may be empty though the log goes on.
+        limit: Maximum of bytes of the log to read, but at least one whole fragment.
+        letters: Of which streams (:func:`rce_container.environment.logs.streams.letters_of`). Other streams
+            are skipped: the text may be empty although the log continues.
 
     Raises:
         OSError: As for :func:`read_log`.
@@ -69,14 +68,14 @@ def read_node_log(folder: Path, tag: str, offset: int, limit: int, letters: byte
     raw = _raw(folder, tag, offset, max(_MIN_FRAGMENTS, min(limit, MAX_CHUNK)), before=1)
     begin = 0 if raw.is_start else raw.data.find(b"\n") + 1
     end = raw.data.rfind(b"\n") + 1
-    if not end:  # nothing yet, or nothing that an environment wrote
+    if not end:  # empty, or not written by an environment
         used = len(raw.data) if len(raw.data) >= _MIN_FRAGMENTS or not raw.is_start else 0
         return Chunk("", raw.offset + used)
     return Chunk(text_of(raw.data[begin:end], letters).decode(errors="replace"), raw.offset + end)
 
 
 def last_line(folder: Path, name: str = ENVIRONMENT_LOG, *, within: int = 4096) -> str:
-    """The last line of a plain log with something in it; empty if there is none to be read."""
+    """Return the last line of a plain log that is not blank; empty if none can be read."""
     try:
         text = read_log(folder, name, -within, within).text
     except OSError:
@@ -86,7 +85,7 @@ def last_line(folder: Path, name: str = ENVIRONMENT_LOG, *, within: int = 4096) 
 
 
 def _raw(folder: Path, name: str, offset: int, limit: int, *, before: int = 0) -> _Raw:
-    """Read bytes; ``before`` so many more than what was asked for, where there are any."""
+    """Read bytes, and up to ``before`` bytes in front of them."""
     kept = [(start, path, _size(path)) for start, path in segments(folder, name)]
     if not kept:
         what = {ENVIRONMENT_LOG: "the environment", ROSOUT_LOG: "ROS's log records"}.get(name, name)
@@ -120,7 +119,7 @@ def _read(path: Path, offset: int, count: int) -> bytes:
 
 
 def _decode(data: bytes) -> tuple[str, int]:
-    """Decode UTF-8; an unfinished character at the end is left for the next read if it can be."""
+    """Decode UTF-8; leave an unfinished character at the end for the next read if possible."""
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
     text = decoder.decode(data)
     rest = len(decoder.getstate()[0])

@@ -1,4 +1,4 @@
-"""The manager: does what :mod:`rce_container.core` decides, and tells it what happens."""
+"""The manager: carries out the decisions of :mod:`rce_container.core`, and feeds it events."""
 
 from __future__ import annotations
 
@@ -9,78 +9,88 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 from rce.control.execution import FEATURE as EXEC
 from rce.control.execution import Command
+from rce.control.machine import cpu_seconds, resident_bytes
 from rce.control.messages import (
     CONTROL_VERSION,
+    ClientReply,
     Drop,
     Execute,
     Hello,
     LogChunk,
+    LoginReply,
     MachineInfo,
+    Notify,
+    PatchSpec,
+    PatchStatus,
+    Probe,
     Put,
     ReadLog,
+    Refused,
+    Status,
+    StatusWanted,
     Sync,
     TaskSetKind,
     ToMaster,
     ToTaskSet,
     Usage,
+    Welcome,
 )
-from rce.control.model import EndpointStatus, LinkAddress
-from rce.control.usage import cpu_seconds, resident_bytes
-from rce.protocol.names import EndpointId
+from rce.control.model import PATCHES, EndpointStatus, LinkAddress
+from rce.model.names import EndpointId
 from rce_container import core, events
-from rce_container.bundles.supply import Library
 from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import connect
 from rce_container.environment.exceptions import ChannelError
-from rce_container.environment.process import strike_all
+from rce_container.environment.process import kill_marked
 from rce_container.exceptions import ContainerError, ExecutionError, NetworkError, StateError
 from rce_container.executions import Executions
 from rce_container.folder import ContainerFolder
+from rce_container.incarnation import Incarnation, IncarnationContext
 from rce_container.launcher import Launcher
 from rce_container.life import Phase
-from rce_container.limits import Cell
-from rce_container.limits.warden import Warden
+from rce_container.limits import ControlGroup
+from rce_container.limits.enforcer import LimitEnforcer
 from rce_container.log_reads import LogReads
 from rce_container.network import Networks
+from rce_container.packages.supply import Library
 from rce_container.reading import read_for
 from rce_container.runtimes.base import Handle
-from rce_container.unit import Office, Unit
 from rce_container.usage import Subject, UsageMeter
 
 if TYPE_CHECKING:
     from rce.control.dialing import RunDialer
-    from rce.link.handover import Doorman
+    from rce.link.handover import LinkAcceptor
     from rce_container.folder import StateFolder
     from rce_container.limits import Limiter
     from rce_container.runtimes.base import Runtime
     from rce_container.settings import ContainerSettings
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class Manager:
     """All containers of one machine, or of one task set on it.
 
     Args:
-        name: Names the task set; the same after a restart.
+        name: The task set's name; stays the same after a restart.
         info: The machine.
         settings: How containers are run.
         runtimes: All runtimes by name, for containers that an earlier manager started.
         runtime: The one for new containers.
-        state: Where everything is kept.
-        doorman: Accepts links by TCP.
-        links: Host and port where it does.
+        state: The state directory.
+        acceptor: Accepts links by TCP.
+        links: Host and port of the acceptor.
         limiter: Enforces the containers' limits.
-        library: Gives packages that users bring.
-        dialer: Connects to the master for commands that users run; without it there are none.
+        library: Provides packages that users bring.
+        dialer: Connects to the master for commands that users run; without it users cannot run commands.
 
     Attributes:
-        send: Sends a message to the master, or drops it while there is none.
+        send: Sends a message to the master, or drops it while no master is connected.
     """
 
     def __init__(
@@ -92,7 +102,7 @@ class Manager:
         runtimes: Mapping[str, Runtime],
         runtime: Runtime,
         state: StateFolder,
-        doorman: Doorman,
+        acceptor: LinkAcceptor,
         links: tuple[str, int],
         limiter: Limiter,
         library: Library,
@@ -108,6 +118,7 @@ class Manager:
         self._limiter = limiter
         self.send: Callable[[ToMaster], None] = lambda _: None
         self._core = core.ManagerCore()
+        self._master_features: frozenset[str] = frozenset()
         self._networks = Networks()
         self._launcher = Launcher(
             settings=settings,
@@ -117,43 +128,50 @@ class Manager:
             limiter=limiter,
             networks=self._networks,
         )
-        self._office = Office(
+        self._context = IncarnationContext(
             settings=settings,
-            doorman=doorman,
+            acceptor=acceptor,
             feed=self._feed,
             networks=self._networks,
             archive=state.archive,
             library=library,
         )
         self._executions = Executions(dialer, self._execute) if dialer is not None else None
-        self._units: dict[str, Unit] = {}
-        """All lives of which something may be left, by mark."""
+        self._incarnations: dict[str, Incarnation] = {}
+        """All incarnations that may have processes or folders, by id."""
         self._queue: deque[str] = deque()
-        """Containers that are to be started when fewer are starting."""
-        self._starting: set[Unit] = set()
+        """Containers that wait to be started until fewer are starting."""
+        self._starting: set[Incarnation] = set()
         self._tasks: asyncio.TaskGroup
         self._empty = asyncio.Event()
         self._meter = UsageMeter()
         self._log_reads = LogReads(self._read_log, lambda chunk: self.send(chunk))  # noqa: PLW0108 - set later
 
-    # The master's side
+    # Messages of the master
 
     def hello(self) -> Hello:
-        """Say who this is and what is there."""
+        """Return the task set's name, machine and containers."""
+        self._master_features = frozenset()
         return Hello(
             version=CONTROL_VERSION,
             kind=TaskSetKind.CONTAINER,
             process=self._name,
             machine=self._info,
             endpoints=self._core.statuses,
-            features=(EXEC,) if self._executions is not None else (),
+            features=(PATCHES, EXEC) if self._executions is not None else (PATCHES,),
         )
 
     async def handle(self, message: ToTaskSet) -> None:
-        """Do what the master says."""
+        """Handle a message of the master."""
         match message:
+            case Welcome(features=features):
+                self._master_features = frozenset(features)
             case Put(endpoint=spec):
                 self._feed(events.Put(spec))
+            case PatchSpec(patch=patch):
+                self._feed(events.Patch(patch))
+            case StatusWanted(id=id_):
+                self._feed(events.StatusWanted(id_))
             case Drop(id=id_, revision=revision, reason=reason):
                 self._feed(events.Drop(id_, revision, reason))
             case Sync(endpoints=specs):
@@ -162,30 +180,32 @@ class Manager:
                 self._log_reads.take(message)
             case Execute(id=id_) if self._executions is not None:
                 self._tasks.create_task(self._executions.execute(message), name=f"command in {id_}")
+            case Execute() | Notify() | Probe() | Welcome() | Refused() | LoginReply() | ClientReply():
+                _log.debug("not for a container task set: %s", type(message).__name__)
             case _:
-                log.debug("not for a container task set: %s", type(message).__name__)
+                assert_never(message)
 
     def _execute(self, id_: str, command: Command, sock: socket.socket) -> None:
         container = self._core.containers.get(id_)
-        unit = self._units.get(container.mark) if container is not None else None
-        if unit is None:
+        incarnation = self._incarnations.get(container.incarnation_id) if container is not None else None
+        if incarnation is None:
             raise ExecutionError("the container is not running here")
-        unit.execute(command, sock)
+        incarnation.execute(command, sock)
 
     @property
     def statuses(self) -> tuple[EndpointStatus, ...]:
-        """What there is now."""
+        """Return the present status."""
         return self._core.statuses
 
-    # Life
+    # Life cycle
 
     async def run(self, ready: Callable[[], None], quit_: asyncio.Event) -> None:
-        """Adopt what an earlier manager left, then manage until told to quit, and end all containers.
+        """Adopt the containers of an earlier manager, then manage until told to quit, and end all containers.
 
-        A manager that is cancelled leaves its containers to themselves.
+        A manager that is cancelled leaves its containers running.
 
         Args:
-            ready: Called when the past is dealt with.
+            ready: Called when all former containers are adopted or removed.
             quit_: Ends the manager.
         """
         with contextlib.closing(self._networks):
@@ -197,7 +217,7 @@ class Manager:
                 await quit_.wait()
                 self._feed(events.Quit())
                 self._start_waiting()
-                if self._units:
+                if self._incarnations:
                     await self._empty.wait()
                 usage.cancel()
                 pruning.cancel()
@@ -205,14 +225,14 @@ class Manager:
 
     def kill_all(self) -> None:
         """End all containers at once; for a quit that takes too long."""
-        for unit in self._units.values():
-            unit.kill()
+        for incarnation in self._incarnations.values():
+            incarnation.kill()
 
     async def _deal_with_the_past(self) -> None:
         folders = await asyncio.to_thread(self._state.existing)
-        await self._sweep_cells({folder.mark for folder in folders})
-        marks = {folder.mark for folder in folders}
-        await asyncio.to_thread(self._state.archive.settle, marks, time.time())
+        await self._sweep_control_groups({folder.incarnation_id for folder in folders})
+        incarnation_ids = {folder.incarnation_id for folder in folders}
+        await asyncio.to_thread(self._state.archive.settle, incarnation_ids, time.time())
         async with asyncio.TaskGroup() as tasks:
             for folder in folders:
                 tasks.create_task(self._adopt_or_prune(folder))
@@ -221,31 +241,35 @@ class Manager:
         record = folder.read_record()
         process = proc.read(record.pid) if record is not None else None
         runtime = self._runtimes.get(record.runtime, self._runtime) if record is not None else self._runtime
-        if record is None or process is None or process.start != record.start or runtime.is_unborn(record):
-            self._tasks.create_task(self._prune(folder), name=f"prune {folder.mark}")
+        if record is None or process is None or process.start != record.start or runtime.is_starting(record):
+            self._tasks.create_task(self._prune(folder), name=f"prune {folder.incarnation_id}")
             return
         if record.group:
             try:
                 self._networks.adopt(EndpointId.parse(record.id), record, folder.hosts)
             except NetworkError as error:
-                log.warning("container %s has lost its group: %s", record.id, error)
+                _log.warning("container %s has lost its group: %s", record.id, error)
         handle = runtime.adopt(process, record)
-        cell = self._limiter.adopt(folder.mark)
-        unit = self._own(record.id, folder, handle, cell, isolated=runtime.isolated)
+        control_group = self._limiter.adopt(folder.incarnation_id)
+        incarnation = self._own(record.id, folder, handle, control_group, isolated=runtime.isolated)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._settings.adopt_timeout):
-                await unit.reported.wait()
-        if unit.status is None or unit.mark not in self._units or record.id in self._core.containers:
-            log.warning("container %s of an earlier manager does not answer; it is removed", record.id)
-            unit.kill()
+                await incarnation.reported.wait()
+        if (
+            incarnation.status is None
+            or incarnation.incarnation_id not in self._incarnations
+            or record.id in self._core.containers
+        ):
+            _log.warning("container %s of an earlier manager does not answer; it is removed", record.id)
+            incarnation.kill()
             return
-        log.info("adopted container %s", record.id)
-        self._feed(events.Adopted(unit.mark, unit.status, self._address(folder)))
+        _log.info("adopted container %s", record.id)
+        self._feed(events.Adopted(incarnation.incarnation_id, incarnation.status, self._address(folder)))
 
     async def _prune(self, folder: ContainerFolder) -> None:
-        """Remove what a dead container left."""
+        """Remove the remains of an ended container."""
         with contextlib.suppress(OSError, ChannelError, TimeoutError):
-            # It may live, if its manager died before it could note who it is; or it may be just dying.
+            # It may still run, if its manager ended before it wrote the record; or it may be ending just now.
             channel = await connect(str(folder.control_socket))
             try:
                 channel.send(m.encode(m.Stop()))
@@ -254,25 +278,25 @@ class Manager:
                         pass
             finally:
                 channel.close()
-        await strike_all(folder.mark)
-        await self._launcher.undo(folder.mark)
+        await kill_marked(folder.incarnation_id)
+        await self._launcher.undo(folder.incarnation_id)
         await asyncio.to_thread(folder.remove)
-        await asyncio.to_thread(self._state.archive.settle_one, folder.mark, time.time())
+        await asyncio.to_thread(self._state.archive.settle_one, folder.incarnation_id, time.time())
 
     async def _prune_logs(self) -> None:
-        """Remove the logs of containers that ended long ago, now and then."""
+        """Periodically remove the logs of containers that ended long ago."""
         while True:
             await asyncio.to_thread(self._state.archive.prune, time.time())
             await asyncio.sleep(self._settings.prune_interval)
 
-    async def _sweep_cells(self, keep: set[str]) -> None:
-        """Remove the cells of containers of which nothing else is left."""
+    async def _sweep_control_groups(self, keep: set[str]) -> None:
+        """Remove the control groups of containers that have no other remains."""
         try:
             await asyncio.to_thread(self._limiter.sweep, keep)
         except (ContainerError, OSError) as error:
-            log.error("what earlier containers left cannot be removed: %s", error)  # noqa: TRY400
+            _log.error("what earlier containers left cannot be removed: %s", error)
 
-    # What the core decides
+    # Instructions of the core
 
     def _feed(self, event: events.Event) -> None:
         for instruction in self._core.handle(event, asyncio.get_running_loop().time()):
@@ -281,19 +305,29 @@ class Manager:
     def _perform(self, instruction: events.Instruction) -> None:
         match instruction:
             case events.Tell(message=message):
-                self.send(message)
+                self._tell(message)
             case events.Start(id=id_):
                 self._queue.append(id_)
                 self._start_waiting()
-            case events.Apply(mark=mark, spec=spec):
-                self._units[mark].apply(spec)
-            case events.Stop(mark=mark, reason=reason):
-                self._units[mark].stop(reason)
+            case events.Apply(incarnation_id=incarnation_id, spec=spec):
+                self._incarnations[incarnation_id].apply(spec)
+            case events.ApplyPatch(incarnation_id=incarnation_id, patch=patch):
+                self._incarnations[incarnation_id].apply_patch(patch)
+            case events.Stop(incarnation_id=incarnation_id, reason=reason):
+                self._incarnations[incarnation_id].stop(reason)
             case events.Wait(id=id_, ticket=ticket, delay=delay):
                 asyncio.get_running_loop().call_later(delay, self._feed, events.Due(id_, ticket))
+            case _:
+                assert_never(instruction)
+
+    def _tell(self, message: ToMaster) -> None:
+        """Send a message to the master; one of an earlier release gets whole statuses."""
+        if isinstance(message, PatchStatus) and PATCHES not in self._master_features:
+            message = Status(status=self._core.containers[message.patch.status.id].status)
+        self.send(message)
 
     def _start_waiting(self) -> None:
-        """Start the containers that wait for it, as far as there is room, and let go of those not wanted."""
+        """Start waiting containers within the limit, and drop those not desired any more."""
         waiting, self._queue = self._queue, deque()
         for id_ in waiting:
             container = self._core.containers.get(id_)
@@ -311,35 +345,48 @@ class Manager:
             self._feed(events.Lost(id_, "", str(error)))
             return
         try:
-            handle, cell, isolated = self._launcher.launch(id_, folder, self._core.resources(id_))
-        except (ContainerError, OSError) as error:  # disk, descriptors or memory of this machine ran out
-            self._tasks.create_task(self._launcher.undo(folder.mark), name=f"what was made of {id_}")
+            handle, control_group, isolated = self._launcher.launch(id_, folder, self._core.resources(id_))
+        except (
+            ContainerError,
+            OSError,
+        ) as error:  # disk, descriptors or memory are exhausted
+            self._tasks.create_task(
+                self._launcher.undo(folder.incarnation_id), name=f"what was made of {id_}"
+            )
             folder.remove()
-            self._state.archive.end(id_, folder.mark, f"cannot be started: {error}", time.time())
+            self._state.archive.end(id_, folder.incarnation_id, f"cannot be started: {error}", time.time())
             self._feed(events.Lost(id_, "", str(error)))
             return
-        unit = self._own(id_, folder, handle, cell, isolated=isolated)
-        self._starting.add(unit)
-        self._tasks.create_task(self._await_start(unit), name=f"start of {id_}")
-        self._feed(events.Made(id_, folder.mark, self._address(folder)))
+        incarnation = self._own(id_, folder, handle, control_group, isolated=isolated)
+        self._starting.add(incarnation)
+        self._tasks.create_task(self._await_start(incarnation), name=f"start of {id_}")
+        self._feed(events.Made(id_, folder.incarnation_id, self._address(folder)))
 
-    async def _await_start(self, unit: Unit) -> None:
-        await unit.reported.wait()
-        self._starting.discard(unit)
+    async def _await_start(self, incarnation: Incarnation) -> None:
+        await incarnation.reported.wait()
+        self._starting.discard(incarnation)
         self._start_waiting()
 
-    def _own(self, id_: str, folder: ContainerFolder, handle: Handle, cell: Cell, *, isolated: bool) -> Unit:
-        warden = Warden(EndpointId.parse(id_).tag, cell, self._settings)
-        unit = Unit(id_, folder, handle, warden, self._office, isolated=isolated)
-        self._units[unit.mark] = unit
-        self._tasks.create_task(self._run_unit(unit), name=f"container {id_}")
-        return unit
+    def _own(
+        self,
+        id_: str,
+        folder: ContainerFolder,
+        handle: Handle,
+        control_group: ControlGroup,
+        *,
+        isolated: bool,
+    ) -> Incarnation:
+        enforcer = LimitEnforcer(EndpointId.parse(id_).tag, control_group, self._settings)
+        incarnation = Incarnation(id_, folder, handle, enforcer, self._context, isolated=isolated)
+        self._incarnations[incarnation.incarnation_id] = incarnation
+        self._tasks.create_task(self._run_incarnation(incarnation), name=f"container {id_}")
+        return incarnation
 
-    async def _run_unit(self, unit: Unit) -> None:
-        await unit.run()
-        del self._units[unit.mark]
-        self._feed(events.Removed(unit.id, unit.mark))
-        if not self._units:
+    async def _run_incarnation(self, incarnation: Incarnation) -> None:
+        await incarnation.run()
+        del self._incarnations[incarnation.incarnation_id]
+        self._feed(events.Removed(incarnation.id, incarnation.incarnation_id))
+        if not self._incarnations:
             self._empty.set()
 
     def _address(self, folder: ContainerFolder) -> LinkAddress:
@@ -356,20 +403,25 @@ class Manager:
 
     def _read_log(self, message: ReadLog) -> LogChunk:
         container = self._core.containers.get(message.id)
-        mark = container.mark if container is not None else ""
+        incarnation_id = container.incarnation_id if container is not None else ""
         try:
-            return read_for(self._state.archive, message, mark)
+            return read_for(self._state.archive, message, incarnation_id)
         except (OSError, ValueError) as error:
             return LogChunk(request=message.request, offset=message.offset, error=str(error))
 
     async def _report_usage(self) -> None:
         while True:
             await asyncio.sleep(self._settings.usage_interval)
-            for unit in self._units.values():
-                unit.poll()
+            for incarnation in self._incarnations.values():
+                incarnation.poll()
             wanted = {
-                unit.id: Subject(unit.handle, unit.warden.cell, unit.node_pids, unit.counters)
-                for unit in self._units.values()
+                incarnation.id: Subject(
+                    incarnation.handle,
+                    incarnation.enforcer.control_group,
+                    incarnation.node_pids,
+                    incarnation.counters,
+                )
+                for incarnation in self._incarnations.values()
             }
             usage = await asyncio.to_thread(self._meter.measure, wanted)
             self.send(Usage(cpu_s=cpu_seconds(), memory=resident_bytes(), endpoints=usage))

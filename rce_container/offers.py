@@ -1,4 +1,4 @@
-"""What this machine can give to containers."""
+"""The features that this machine offers to containers."""
 
 from __future__ import annotations
 
@@ -6,32 +6,32 @@ import logging
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from rce.control.model import Network
+from rce.model.specs import Network
 from rce_container.exceptions import NetworkError, RuntimeUnavailableError
 from rce_container.network import Networks
 from rce_container.runtimes.base import Runtime
 from rce_container.runtimes.podman import PodmanRuntime
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class Offers(NamedTuple):
-    """What containers can have here."""
+    """The features that containers can have here."""
 
     runtimes: tuple[str, ...]
-    """By name, the one of containers without an image first."""
+    """Names; the runtime of containers without an image first."""
     networks: tuple[str, ...]
-    """Values of :class:`rce.control.model.Network`."""
+    """Values of :class:`rce.model.specs.Network`."""
     detail: str
-    """What is missing, in words; empty if nothing is."""
+    """The missing features, as text; empty if none is missing."""
 
 
 def find_offers(runtime: Runtime, others: Iterable[Runtime]) -> Offers:
-    """Find out what works here. Blocks.
+    """Find out which features work here. Blocks.
 
     Args:
-        runtime: The one of containers without an image; it works.
-        others: Those that containers may ask for.
+        runtime: The runtime of containers without an image, which works.
+        others: The other runtimes, which containers may ask for.
     """
     runtimes = [runtime]
     details = []
@@ -41,7 +41,7 @@ def find_offers(runtime: Runtime, others: Iterable[Runtime]) -> Offers:
         try:
             other.probe()
         except RuntimeUnavailableError as error:
-            log.info("containers with an image cannot be made here: %s", error)
+            _log.info("containers with an image cannot be made here: %s", error)
             if other.is_installed:
                 details.append(str(error))
         else:

@@ -1,4 +1,4 @@
-"""What ``rce-container`` does once its settings are read."""
+"""Runs ``rce-container`` with settings that have been read."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from rce.guard.files import raise_file_limit
 from rce.tls.choice import TlsChoice
 from rce.tls.exceptions import CertificateError
 from rce_container.app import App, package_path
-from rce_container.bundles.requirements import InstallerSettings
 from rce_container.ending import end_containers
 from rce_container.exceptions import ContainerError
+from rce_container.packages.requirements import InstallerSettings
 from rce_container.renewal import renew
 from rce_container.settings import ContainerSettings
 
@@ -31,12 +31,12 @@ def run(engine: EngineSettings, *, end: bool = False, check: bool = False, verbo
 
     Args:
         engine: The settings.
-        end: Whether only to end the containers that a killed ``rce-container`` left.
-        check: Whether only to find out whether it could start with these settings.
-        verbose: Whether all is logged.
+        end: Only end the containers that a killed ``rce-container`` left.
+        check: Only check whether it could start with these settings.
+        verbose: Log all messages.
 
     Returns:
-        The exit code; faults were told.
+        The exit code; faults were printed.
     """
     try:
         if not check:  # the file belongs to the program that runs
@@ -93,4 +93,4 @@ def run(engine: EngineSettings, *, end: bool = False, check: bool = False, verbo
 
 
 def _announce(name: str, runtime: str) -> None:
-    print(f"rce-container ready: {name} runtime={runtime}", flush=True)  # noqa: T201 - what other programs wait for
+    print(f"rce-container ready: {name} runtime={runtime}", flush=True)  # noqa: T201 - read by other programs

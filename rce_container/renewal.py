@@ -1,8 +1,8 @@
-"""Starts the program anew in its own process, while its containers live on.
+"""Executes the program again in its own process, while its containers keep running.
 
-``SIGUSR1`` asks for it, which is what ``systemctl reload rce-container`` sends: the program lets go of its
-containers, and executes itself as it is installed now, with the settings as they are now. Its pid stays, so
-whatever supervises it does not notice; the new program adopts the containers.
+``SIGUSR1`` requests it, which ``systemctl reload rce-container`` sends: the program releases its containers,
+and executes itself as installed now, with the present settings. Its pid stays, so its supervisor does not
+notice; the new program adopts the containers.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ RENEW = signal.SIGUSR1
 
 
 def renew() -> NoReturn:
-    """Execute this program anew.
+    """Execute this program again.
 
     Raises:
-        OSError: Its file is gone.
+        OSError: Its file does not exist any more.
     """
-    signal.signal(RENEW, signal.SIG_IGN)  # until the new program listens for it, it would end by it
+    signal.signal(RENEW, signal.SIG_IGN)  # the signal would end the new program before it handles it
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - itself
@@ -33,9 +33,9 @@ def renew() -> NoReturn:
 
 @contextlib.contextmanager
 def inherited_children() -> Iterator[None]:
-    """Take the exit codes of the children that the program had before it was executed anew.
+    """Collect the exit codes of the children that the program had before it executed itself again.
 
-    To be entered before the program starts children of its own. Zombies would be left otherwise.
+    Enter this before the program starts its own children. It prevents zombies.
     """
     loop = asyncio.get_running_loop()
     waiting: dict[int, int] = {}
@@ -60,9 +60,9 @@ def inherited_children() -> Iterator[None]:
 
 
 def _children() -> list[int]:
-    """Return the children of this process, which has one thread yet."""
+    """Return the children of this process, which still has only one thread."""
     pid = os.getpid()
     try:
         return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-    except OSError:  # a kernel without it: zombies stay until the program ends
+    except OSError:  # not supported by this kernel: zombies stay until the program ends
         return []

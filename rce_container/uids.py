@@ -1,4 +1,4 @@
-"""Users of the machine that belong to nobody, one for each container."""
+"""User ids of the machine without an owner, one for each container."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ UIDS = 10_000
 """The users for containers, unless others are set."""
 
 SUBUIDS = Path("/etc/subuid")
-"""Which users the machine's users may give to user namespaces of theirs: name, first one, count."""
+"""The subordinate user ids of the machine's users: name, first id, count."""
 _COLONS = 2
 
 LOCKS = Path("/run/rce/uids")
-"""One lock file for each user that was ever given out, for all engines of the machine."""
+"""One lock file for each user id that was allocated, for all engines of the machine."""
 
 
 class UidPool:
-    """Gives out users. One is taken for as long as a descriptor of its lock is open in any process.
+    """Allocates users. One stays allocated while a descriptor of its lock is open in any process.
 
-    So it stays taken when the manager dies and its containers live, and is free when the last process that
-    inherited the lock is gone, however that happened.
+    So it stays allocated when the manager ends and its containers run, and is free when the last process that
+    inherited the lock has ended for any reason.
 
     Args:
         first: The first user, and group.
@@ -40,7 +40,7 @@ class UidPool:
         self._next = 0
 
     def owners(self, subuids: Path = SUBUIDS) -> list[str]:
-        """Who has some of these users already, by the machine's files: names of users."""
+        """Return the names of users who own some of these user ids, from the machine's files."""
         end = self._first + self._count
         found = [entry.pw_name for entry in pwd.getpwall() if self._first <= entry.pw_uid < end]
         try:
@@ -58,13 +58,13 @@ class UidPool:
         return sorted(set(found))
 
     def take(self) -> tuple[int, int]:
-        """Take a user.
+        """Allocate a user.
 
         Returns:
             The user and a descriptor of its lock, for the container's processes to inherit.
 
         Raises:
-            StartError: All are taken, or the locks cannot be used.
+            StartError: All are allocated, or the locks cannot be used.
         """
         try:
             self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -85,7 +85,7 @@ class UidPool:
         )
 
     def _open(self, uid: int) -> int:
-        """Open a lock; shells use the numbers below ten for themselves."""
+        """Open a lock, as descriptor 10 or higher: shells use lower numbers themselves."""
         lock = os.open(self._folder / str(uid), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
             return fcntl.fcntl(lock, fcntl.F_DUPFD_CLOEXEC, 10)

@@ -1,4 +1,4 @@
-"""What containers and their nodes consume: from their cells' counters, else from ``/proc``."""
+"""The usage of containers and their nodes: from their control groups' counters, else from ``/proc``."""
 
 from __future__ import annotations
 
@@ -8,25 +8,28 @@ from typing import NamedTuple
 from rce.control.model import EndpointUsage, NodeUsage
 from rce_container.environment import proc
 from rce_container.environment.messages import Counters
-from rce_container.limits import Cell
+from rce_container.limits import ControlGroup
 from rce_container.runtimes.base import Handle
 
 _PSS_EVERY = 5
-"""A process's share of memory costs time to read, so it is read anew in every fifth measurement only."""
+"""A process's share of memory is slow to read, so only every fifth measurement reads it."""
 
 
 class Subject(NamedTuple):
-    """A container that is to be measured."""
+    """A container to be measured."""
 
     handle: Handle
-    cell: Cell
+    control_group: ControlGroup
     nodes: Mapping[str, int]
     """The pid of each node's first process, as the machine sees it, by tag."""
     counters: Counters
 
 
 class UsageMeter:
-    """Measures containers. The machine's processes are listed only if some container has no counting cell."""
+    """Measures containers.
+
+    Lists the machine's processes only if a container's control group does not count.
+    """
 
     def __init__(self) -> None:
         self._shares: dict[tuple[int, int], int] = {}
@@ -41,8 +44,8 @@ class UsageMeter:
             containers: By id.
 
         Returns:
-            The usage by id. A node's memory is its proportional share (PSS), or the resident size where that
-            may not be read; so is the container's, if its cell does not count.
+            The usage by id. A node's memory is its proportional share (PSS), or the resident size if that
+            cannot be read; so is the container's, if its control group does not count.
         """
         self._round += 1
         self._table, self._fresh = None, {}
@@ -51,9 +54,9 @@ class UsageMeter:
         return usage
 
     def _measure(self, subject: Subject) -> EndpointUsage:
-        cell = subject.cell
+        control_group = subject.control_group
         own = self._processes(subject)
-        counted = cell.usage()
+        counted = control_group.usage()
         cpu_s, memory = counted.cpu_s, counted.memory
         if cpu_s is None:
             cpu_s = sum(process.cpu_s for process in own)
@@ -66,9 +69,9 @@ class UsageMeter:
             throttled_s=round(counted.throttled_s, 3),
             memory=memory,
             memory_peak=counted.memory_peak,
-            memory_limit=0 if counted.memory is None else cell.limits.memory,
-            cpu_limit=cell.limits.cpu,
-            oom_kills=cell.troubles().oom_kills,
+            memory_limit=0 if counted.memory is None else control_group.limits.memory,
+            cpu_limit=control_group.limits.cpu,
+            oom_kills=control_group.troubles().oom_kills,
             io_read=counted.io_read,
             io_written=counted.io_written,
             link_in=subject.counters.traffic[0],
@@ -77,7 +80,7 @@ class UsageMeter:
         )
 
     def _processes(self, subject: Subject) -> list[proc.Process]:
-        if pids := subject.cell.pids():
+        if pids := subject.control_group.pids():
             return [process for pid in pids if (process := proc.read(pid)) is not None]
         if self._table is None:
             self._table = proc.table()
@@ -100,7 +103,7 @@ class UsageMeter:
         }
 
     def _share(self, process: proc.Process) -> int:
-        """A process's proportional share of memory, not always of this round."""
+        """Return a process's proportional share of memory, possibly of an earlier measurement."""
         key = process.pid, process.start
         if key not in self._fresh:
             share = self._shares.get(key)
@@ -111,10 +114,10 @@ class UsageMeter:
 
 
 def sort_out(nodes: Mapping[str, int], processes: Iterable[proc.Process]) -> dict[int, str]:
-    """Find out which processes belong to which node.
+    """Assign processes to nodes.
 
-    A node is a session of its own; what it started belongs to it even if that made another session, as long
-    as a process that belongs to the node is its parent.
+    A node has its own session. Its child processes belong to it even in another session, as long as their
+    parent belongs to the node.
 
     Args:
         nodes: The pid of each node's first process, by tag.

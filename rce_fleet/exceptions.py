@@ -1,20 +1,27 @@
-"""What can go wrong in the fleet room.
+"""Errors of the fleet system.
 
 ::
 
     FleetError
     +-- MapError            a map or scenario file that cannot be read
-    +-- ScenarioError       no scenario of the wanted size exists on the map
+    +-- ScenarioError       no scenario of the requested size exists on the map
     +-- OccupiedError       a box cannot stand where a robot is
     +-- TransitionError     an event that the life cycle of a robot does not allow
-    +-- InvariantError      the planner's books contradict each other: a bug
+    +-- InvariantError      the planner's records contradict each other: a bug
+    +-- PlanWorkerError     the process that makes plans ended twice over one plan
+    +-- StationError        a request to the operator station was not carried out
+    |   +-- StationUnavailableError    station or planner cannot be reached; try again later
+    |   +-- RequestRefusedError        the station refused the request
+    +-- DemoError           errors of ``rce demo``, see rce_fleet.demo.exceptions
 """
 
 from __future__ import annotations
 
+from rce.lifecycle import InvalidTransitionError
+
 
 class FleetError(Exception):
-    """Base of everything that this room raises on purpose."""
+    """Base of the errors of the fleet system."""
 
 
 class MapError(FleetError):
@@ -34,7 +41,7 @@ class MapError(FleetError):
 
 
 class ScenarioError(FleetError):
-    """No scenario of the wanted size exists on the map."""
+    """No scenario of the requested size exists on the map."""
 
 
 class OccupiedError(FleetError):
@@ -51,12 +58,46 @@ class OccupiedError(FleetError):
         super().__init__(cell, robots)
 
     def __str__(self) -> str:
-        return f"no box can stand in cell {self.cell}: {', '.join(self.robots)} is in its way"
+        return f"cell {self.cell} cannot get a box: robot {', '.join(self.robots)} is in the way"
 
 
-class TransitionError(FleetError):
-    """An event that the life cycle of a robot does not allow; nothing was changed."""
+class TransitionError(InvalidTransitionError, FleetError):
+    """An event that the life cycle of a robot or a move client does not allow; nothing was changed."""
 
 
 class InvariantError(FleetError):
-    """The planner's books contradict each other. Always a bug, never a matter of input."""
+    """The planner's records contradict each other. Always a bug."""
+
+
+class StationError(FleetError):
+    """A request to the operator station was not carried out."""
+
+
+class StationUnavailableError(StationError):
+    """The station, or the planner behind it, cannot be reached now; try again later."""
+
+
+class RequestRefusedError(StationError):
+    """The station refused a request; its text says why."""
+
+
+class PlanWorkerError(FleetError):
+    """The process that makes plans ended twice over one plan.
+
+    Attributes:
+        number: Of the plan.
+        robots: How many robots it was for.
+        status: How the process ended the second time.
+    """
+
+    def __init__(self, number: int, robots: int, status: str) -> None:
+        self.number = number
+        self.robots = robots
+        self.status = status
+        super().__init__(number, robots, status)
+
+    def __str__(self) -> str:
+        return (
+            f"plan {self.number} for {self.robots} robots was not made: the process that makes plans ended"
+            f" twice over it ({self.status}); read its output, and check that the container has enough memory"
+        )

@@ -1,15 +1,15 @@
-"""The configs of a fleet: one for each robot, one for the operator who has the planner.
+"""The client configs of a fleet: one for each robot, and one for the operator, with the planner.
 
-Robot N has a container ``cTag_0N`` of its own, in which a move client sends it from cell to cell. The
-planner lives in the operator's container ``cTag_fleet``, whose ROS graph knows the robots by their
-namespaces. So there are three kinds of wires, all of which robot N's config makes:
+Robot N has its own container ``cTag_0N``, in which a move client sends it from cell to cell. The planner runs
+in the operator's container ``cTag_fleet``, where the robots' topics are in namespaces. Robot N's config makes
+three groups of connections:
 
-* robot - own container: poses up; the goals and states of its ``move_base`` down and up;
-* robot - planner: poses and cells that turn out to be blocked;
-* own container - planner: cells to drive on, cancellations, the map; the move client's reports back.
+* robot - own container: poses to the container; goals and states of its ``move_base``;
+* robot - planner: poses, and cells that the robot found blocked;
+* own container - planner: granted cells, cancellations and the map; back, the move client's reports.
 
-``configs/robot1.config`` to ``robot3.config`` and ``fleet.config`` are what this module makes;
-``robot1-long.config`` says the same as ``robot1.config`` without bridges, in the paper's names.
+This module made ``fleet.config`` and ``robot1.config`` to ``robot3.config`` in ``configs``.
+``robot1-long.config`` is the same as ``robot1.config`` without bridges, with the paper's names.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _CELLS = "std_msgs/Int32MultiArray"
 
 
 @dataclass(frozen=True, slots=True)
-class Account:
-    """Where the engine is, and whose robots these are."""
+class FleetAccount:
+    """The engine's address, and the user account of the robots."""
 
     url: str = "http://localhost:9000/"
     user: str = "testUser"
@@ -37,14 +37,14 @@ class Account:
     robot_prefix: str = "testRobot_"
 
 
-def robot_config(number: int, account: Account | None = None) -> dict[str, Any]:
+def robot_config(number: int, account: FleetAccount | None = None) -> dict[str, Any]:
     """Return the config of robot ``number``, counted from 1.
 
     Args:
         number: Names robot (``testRobot_1``), container (``cTag_01``) and namespace (``Robot1``).
-        account: Engine and user; the development ones if None.
+        account: Engine and user; None for those of a development engine.
     """
-    account = account or Account()
+    account = account or FleetAccount()
     robot, container, namespace = f"{account.robot_prefix}{number}", f"cTag_{number:02}", f"Robot{number}"
     return {
         "url": account.url,
@@ -66,15 +66,16 @@ def robot_config(number: int, account: Account | None = None) -> dict[str, Any]:
 
 
 def fleet_config(
-    account: Account | None = None, parameters: dict[str, bool | int | float | str | list[Any]] | None = None
+    account: FleetAccount | None = None,
+    parameters: dict[str, bool | int | float | str | list[Any]] | None = None,
 ) -> dict[str, Any]:
     """Return the operator's config: the container with the planner.
 
     Args:
-        account: Engine and user; the development ones if None.
+        account: Engine and user; None for those of a development engine.
         parameters: The planner's parameters by name, such as ``rows``; those of an 8 x 8 floor if None.
     """
-    account = account or Account()
+    account = account or FleetAccount()
     given = {"rows": 8, "columns": 8, "cell_size": 1.0} if parameters is None else parameters
     return {
         "url": account.url,

@@ -1,4 +1,4 @@
-"""Starts ``rce-master``: with settings handed over without what reads command lines, which takes 5 MB."""
+"""Starts ``rce-master``; handed-over settings do not load the command-line parser, which takes 5 MB."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Advice in words: which containers are too small or too large, which machines too full. Pure.
+"""Advice for users: which containers are too small or too large, which machines too full. Pure.
 
-Every piece names what was seen and the command that mends it.
+Every piece names the observation and the command that fixes the problem.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ import math
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
-from rce.control.limits import MEGABYTE, MIN_MEMORY
-from rce.control.model import Resources
-from rce.protocol.quantities import write_cores, write_memory
+from rce.control.machine import MEGABYTE, MIN_MEMORY
+from rce.model.quantities import write_cores, write_memory
+from rce.model.specs import Resources
 from rce_master.usage import STEP_S, WINDOW_S, rates_between
 
 if TYPE_CHECKING:
@@ -23,12 +23,11 @@ if TYPE_CHECKING:
 THROTTLED = 0.1
 """A container that is held back by its CPU limit for more than this share of the time is too small."""
 NEARLY_FULL = 0.9
-"""A container that uses more than this share of its memory is too small; a machine of which more than this
-is promised is too full."""
+"""Share of memory: a container that uses more is too small; a machine that has promised more is too full."""
 HARDLY_USED = 0.25
-"""A container that never used this share of what it asked for is too large."""
+"""A container that never used this share of its request is too large."""
 OBSERVED_S = 300.0
-"""For so long it must have been watched to be called too large."""
+"""Seconds of observation before a container can count as too large."""
 _SOON_S = 20.0
 _MEMORY_STEP = 16 * MEGABYTE
 _CORES_STEP = 0.05
@@ -43,19 +42,19 @@ class Advice(NamedTuple):
     command: str
 
 
-def for_container(tag: str, wish: Resources, history: History, room: Room | None) -> list[Advice]:
-    """Tell whether a container should be resized.
+def for_container(tag: str, requested: Resources, history: History, room: Room | None) -> list[Advice]:
+    """Return advice on whether a container should be resized.
 
     Args:
         tag: The container's.
-        wish: What it asked for.
-        history: What it consumed.
-        room: Its machine, to tell whether there is room to grow; None if it is not known.
+        requested: Its request.
+        history: Its usage.
+        room: Its machine, to find out whether it has room to grow; None if unknown.
     """
-    return [*_too_small(tag, wish, history, room), *_too_large(tag, wish, history)]
+    return [*_too_small(tag, requested, history, room), *_too_large(tag, requested, history)]
 
 
-def _too_small(tag: str, wish: Resources, history: History, room: Room | None) -> Iterator[Advice]:
+def _too_small(tag: str, requested: Resources, history: History, room: Room | None) -> Iterator[Advice]:
     now, samples = history.now.usage, history.samples
     oldest = samples[0]
     watched = history.now.time - oldest.time
@@ -63,32 +62,41 @@ def _too_small(tag: str, wish: Resources, history: History, room: Room | None) -
     if kills > 0 and now.memory_limit:
         times = "once" if kills == 1 else f"{kills} times"
         text = f"its memory ran out {times} lately (limit {_mb(now.memory_limit)})"
-        yield _more_memory(tag, text, wish, room, 2 * now.memory_limit)
+        yield _more_memory(tag, text, requested, room, 2 * now.memory_limit)
     elif now.memory_limit and now.memory > NEARLY_FULL * now.memory_limit:
         text = f"uses {_mb(now.memory)} of its {_mb(now.memory_limit)} of memory"
-        yield _more_memory(tag, text, wish, room, 1.5 * now.memory_limit)
+        yield _more_memory(tag, text, requested, room, 1.5 * now.memory_limit)
     throttled = rates_between(oldest, history.now).throttled
     if now.cpu_limit and watched >= _SOON_S and throttled > THROTTLED:
         better = _steps(now.cpu_limit * (1 + throttled), _CORES_STEP)
         limit = write_cores(now.cpu_limit)
         text = f"was held back by its limit of {limit} cores for {throttled:.0%} of the time"
         change = f"--cpu {write_cores(better)}"
-        yield _grow(tag, text, change, wish, Resources(size=wish.size, cpu=better, memory=wish.memory), room)
+        yield _grow(
+            tag,
+            text,
+            change,
+            requested,
+            Resources(size=requested.size, cpu=better, memory=requested.memory),
+            room,
+        )
 
 
-def _more_memory(tag: str, text: str, wish: Resources, room: Room | None, better: float) -> Advice:
+def _more_memory(tag: str, text: str, requested: Resources, room: Room | None, better: float) -> Advice:
     memory = int(_steps(better, _MEMORY_STEP))
-    grown = Resources(size=wish.size, cpu=wish.cpu, memory=memory)
-    return _grow(tag, text, f"--memory {write_memory(memory)}", wish, grown, room)
+    grown = Resources(size=requested.size, cpu=requested.cpu, memory=memory)
+    return _grow(tag, text, f"--memory {write_memory(memory)}", requested, grown, room)
 
 
-def _grow(tag: str, text: str, change: str, wish: Resources, grown: Resources, room: Room | None) -> Advice:
-    if room is not None and (lacks := room.without(wish).shortages(grown, wish)):
+def _grow(
+    tag: str, text: str, change: str, requested: Resources, grown: Resources, room: Room | None
+) -> Advice:
+    if room is not None and (lacks := room.without(requested).shortages(grown, requested)):
         text += f"; its machine has no room for more ({room.name} {' and '.join(lacks)})"
     return Advice("too small", text, f"rce resize {tag} {change}")
 
 
-def _too_large(tag: str, wish: Resources, history: History) -> Iterator[Advice]:
+def _too_large(tag: str, requested: Resources, history: History) -> Iterator[Advice]:
     now, samples = history.now.usage, history.samples
     watched = history.now.time - samples[0].time
     if watched < OBSERVED_S:
@@ -96,26 +104,26 @@ def _too_large(tag: str, wish: Resources, history: History) -> Iterator[Advice]:
     lately = f"in the last {watched / 60:.0f} min"
     cores = max(rates_between(a, b).cpu for a, b in pairwise(samples))
     memory = history.most_memory
-    if wish.cpu and cores < HARDLY_USED * wish.cpu:
+    if requested.cpu and cores < HARDLY_USED * requested.cpu:
         better = max(_CORES_STEP, _steps(2 * cores, _CORES_STEP))
-        if better < wish.cpu:
-            text = f"used at most {write_cores(cores)} of its {write_cores(wish.cpu)} cores {lately}"
+        if better < requested.cpu:
+            text = f"used at most {write_cores(cores)} of its {write_cores(requested.cpu)} cores {lately}"
             yield Advice("too large", text, f"rce resize {tag} --cpu {write_cores(better)}")
-    if wish.memory and memory < HARDLY_USED * wish.memory:
+    if requested.memory and memory < HARDLY_USED * requested.memory:
         needed = max(MIN_MEMORY, int(_steps(2 * memory, _MEMORY_STEP)))
-        if needed < wish.memory:
-            text = f"used at most {_mb(memory)} of its {_mb(wish.memory)} of memory {lately}"
+        if needed < requested.memory:
+            text = f"used at most {_mb(memory)} of its {_mb(requested.memory)} of memory {lately}"
             yield Advice("too large", text, f"rce resize {tag} --memory {write_memory(needed)}")
-    if wish.size > 1 and not wish.cpu and not wish.memory and now.memory_limit:
-        slots = now.memory_limit / wish.size
-        if memory < HARDLY_USED * now.memory_limit and cores < HARDLY_USED * wish.size:
+    if requested.size > 1 and not requested.cpu and not requested.memory and now.memory_limit:
+        slots = now.memory_limit / requested.size
+        if memory < HARDLY_USED * now.memory_limit and cores < HARDLY_USED * requested.size:
             better_size = max(1, math.ceil(2 * memory / slots))
-            text = f"takes {wish.size} slots and used at most {_mb(memory)} of memory {lately}"
+            text = f"takes {requested.size} slots and used at most {_mb(memory)} of memory {lately}"
             yield Advice("too large", text, f"rce resize {tag} --size {better_size}")
 
 
 def for_machine(room: Room, others: list[Room]) -> list[Advice]:
-    """Tell whether a machine is too full.
+    """Return advice on whether a machine is too full.
 
     Args:
         room: The machine.

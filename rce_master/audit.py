@@ -1,7 +1,7 @@
-"""Who came in, who was refused, and who changed what: JSON lines in files that take turns.
+"""The audit log: logins, refusals and changes, as JSON lines in rotated files.
 
-Nothing of what is written here is a secret: no password, token or value of a parameter, and of unknown users
-not even the name, because people type passwords where the name belongs.
+Records contain no secrets: no passwords, tokens or values of parameters, and not even the names of unknown
+users, because users sometimes type their password as the name.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 FILE_NAME = "audit.jsonl"
 MAX_BYTES = 8 << 20
-"""Of one file; then the next one begins."""
+"""Bytes of one file; then the next one begins."""
 FILES = 10
 """How many files are kept, the one in use included."""
 KEPT = 10_000
@@ -40,34 +40,34 @@ DONE, REFUSED = "done", "refused"
 
 
 class Record(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Something that somebody did, or was refused."""
+    """An action that a user performed or was refused."""
 
     id: int
-    """Grows by one."""
+    """Increases by one."""
     time: float
     """Seconds since 1970."""
     user: str
-    """Who; empty: nobody that is known."""
+    """The user; empty if unknown."""
     action: str
     """Such as ``log_in`` or ``create_container``."""
     subject: str = ""
-    """What it was about, such as ``user/container``."""
+    """The object of the action, such as ``user/container``."""
     outcome: str = DONE
     """``done`` or ``refused``."""
     detail: str = ""
     address: str = ""
-    """Where it came from."""
+    """The address it came from."""
     via: str = ""
-    """What passed it on: a robot or a station."""
+    """The robot or station that passed it on."""
     times: int = 1
-    """How often, since the record before of the same user, action and address."""
+    """How often since the previous record of the same user, action and address."""
 
 
 class AuditLog:
-    """Keeps the newest records in memory and all of them in files, until those are too many.
+    """Keeps the newest records in memory and all records in files, up to a number of files.
 
     Args:
-        folder: Where the files are; made with the first record, for its owner only.
+        folder: The folder of the files; made with the first record, readable by its owner only.
         clock: Seconds since 1970.
         max_bytes: Of one file.
         files: How many are kept.
@@ -100,9 +100,10 @@ class AuditLog:
         outcome: str = DONE,
         times: int = 1,
     ) -> None:
-        """Write what somebody did.
+        """Record an action.
 
-        A record that cannot be written is kept in memory, and the engine's log says so: the engine goes on.
+        If a record cannot be written, it is kept in memory, the engine's log reports it, and the engine
+        continues.
         """
         record = Record(
             id=self._next_id,
@@ -121,7 +122,7 @@ class AuditLog:
         self._write(msgspec.json.encode(record) + b"\n")
 
     def refuse(self, user: str, action: str, *, detail: str = "", address: str = "") -> None:
-        """Write that somebody was refused; repetitions are counted and written once a minute at most."""
+        """Record a refusal; repetitions are counted and written at most once a minute."""
         key, now = (user, action, address), self._clock()
         since, count = self._repeated.get(key, (0.0, 0))
         if now - since < REPEAT_S:
@@ -135,7 +136,7 @@ class AuditLog:
         self.add(user, action, detail=detail, address=address, outcome=REFUSED, times=count + 1)
 
     def flush(self) -> None:
-        """Write the repetitions whose time is over."""
+        """Write the repetitions that are due."""
         now = self._clock()
         for key in [key for key, (since, _) in self._repeated.items() if now - since >= REPEAT_S]:
             self._add_missed(key, self._repeated.pop(key)[1])
@@ -144,15 +145,15 @@ class AuditLog:
         """List records after an id, oldest first; with a negative id, the newest ``-id`` ones.
 
         Args:
-            id_: The last one that is known.
-            limit: At most so many.
+            id_: The last known record.
+            limit: Maximum number of records.
             user: Only of this user; empty: of all.
         """
         found = [r for r in self._records if (id_ < 0 or r.id > id_) and (not user or r.user == user)]
         return list(islice(found[id_:] if id_ < 0 else found, limit))
 
     def close(self) -> None:
-        """Write what was counted, and close the file."""
+        """Write the counted repetitions, and close the file."""
         for key, (_, count) in self._repeated.items():
             self._add_missed(key, count)
         self._repeated.clear()
@@ -189,7 +190,7 @@ class AuditLog:
             self._turn()
 
     def _turn(self) -> None:
-        """Begin a new file; the oldest one goes."""
+        """Begin a new file; remove the oldest one."""
         self._close()
         for number in range(self._files - 1, 0, -1):
             older = self._numbered(number - 1)
@@ -216,12 +217,12 @@ class AuditLog:
 
 
 def _clean(text: str) -> str:
-    """Return a text on one line, of bounded length, without what looks like a token or password."""
+    """Return a text as one line of bounded length, without parts that look like tokens or passwords."""
     return redact(one_line(text[:MAX_TEXT]))
 
 
 def _read(file: Path) -> Iterator[Record]:
-    """Read the records of a file; a line that was cut off by a crash is left out."""
+    """Read the records of a file, except a line that was cut off by a crash."""
     try:
         lines = file.read_bytes().splitlines()
     except FileNotFoundError:

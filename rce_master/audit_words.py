@@ -1,4 +1,4 @@
-"""What a robot's request is called in the audit log: names, never values (pure)."""
+"""Describes a robot's request for the audit log: names, never values (pure)."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ if TYPE_CHECKING:
     from rce_master.state.commands import Command
 
 SHOWN = 5
-"""So many of a request's commands are named; the others are counted."""
+"""How many of a request's commands are named; the others are counted."""
 
 _UPPER = re.compile(r"(?<!^)(?=[A-Z])")
 _NAMES = ("container", "endpoint", "tag", "name", "tag_a", "tag_b")
 
 
 def describe(commands: Sequence[Command]) -> str:
-    """Return what the commands of one request do, in short."""
+    """Return a short description of the commands of one request."""
     words = [_describe(command) for command in commands[:SHOWN]]
     more = len(commands) - len(words)
     return ", ".join(words) + (f", and {more} more" if more else "")

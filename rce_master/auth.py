@@ -1,4 +1,4 @@
-"""Who may come in: passwords."""
+"""Checks passwords."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
 
 from rce.guard.turns import CrowdedError, Turns
-from rce_master.exceptions import TooManyFailures, TooManyLogins, WrongCredentials
+from rce_master.exceptions import TooManyFailuresError, TooManyLoginsError, WrongCredentialsError
 from rce_master.state.records import KnownLogin
 from rce_master.throttle import MAX_DELAY_S, FailureThrottle
 
@@ -28,46 +28,46 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 HASH_WORKERS = 2
-"""argon2 takes much memory and time on purpose; more at once would help an attacker only."""
+"""Concurrent checks; argon2 takes much memory and time by design, so more would only help an attacker."""
 MAX_WAITING = 64
-"""Unknown passwords that wait to be hashed; when there are more, the address with the most must try later."""
+"""Unknown passwords that wait to be hashed; beyond it, the address with the most must try later."""
 MAX_JOINED = 32
-"""Logins with the same password that wait for a check which is put off."""
+"""Logins with the same password that may wait for a delayed check."""
 
 
 def client_digest(password: str) -> str:
-    """What a client sends instead of a password: its SHA-256 in hex."""
+    """The SHA-256 of a password in hex, which clients send in its place."""
     return hashlib.sha256(password.encode("utf-8", "surrogatepass")).hexdigest()
 
 
 @dataclass(eq=False, slots=True)
 class _Check:
-    """A password that is being looked at; all who come with the same one meanwhile wait for it together."""
+    """A password that is being checked; concurrent logins with the same password wait for the same check."""
 
     put_off: bool
-    result: asyncio.Task[bool | TooManyLogins]
+    result: asyncio.Task[bool | TooManyLoginsError]
     joined: int = 0
 
 
 class Authenticator:
     """Checks passwords against the state's users.
 
-    A password that was right once is known again by a keyed mark of it, so that a whole fleet that reconnects
-    at once costs one argon2 and not hundreds, and is never slowed down by somebody who guesses. Marks are
-    kept in the store, also over a restart. The key is not: a copy of the store alone helps to guess no more
-    than argon2 allows.
+    A correct password is recognized later by a keyed mark of it, so that a whole fleet that reconnects at
+    once costs one argon2 and not hundreds, and attackers who guess do not slow it down. Marks are kept in the
+    store, across restarts. The key is not: a copy of the store alone does not make guessing faster than
+    argon2 allows.
 
-    Unknown passwords take turns by address, and there by user, and are slowed down where they fail often
-    (:mod:`rce_master.throttle`): the first login of a user waits for one check of each other user that is
-    guessed at from the same address, however many connections that is done with. A password that is set
+    Unknown passwords are checked in turns by address, and there by user, and delayed where they fail often
+    (:mod:`rce_master.throttle`): the first login of a user waits for one check of each other user whose
+    password is guessed from the same address, regardless of the number of connections. A password that is set
     while the master runs is known at once.
 
     Args:
         tables: The state's tables, to read users and marks from.
         hasher: How passwords are hashed.
         clock: Seconds that never go back.
-        key: Of the marks; a new one makes all of them worthless. None: a random one.
-        remember: Keeps a user's mark; without it none is kept.
+        key: The key of the marks; a new key invalidates all of them. None: a random one.
+        remember: Stores a user's mark; without it marks are not stored.
     """
 
     def __init__(
@@ -85,14 +85,14 @@ class Authenticator:
         self._key = secrets.token_bytes(32) if key is None else key
         self._remember = remember
         self._known: dict[str, str] = {}
-        """Marks by user, of this run; those of earlier ones are in the tables."""
+        """Marks by user, of this run; the tables have those of earlier runs."""
         self._throttle = FailureThrottle()
         self._workers = ThreadPoolExecutor(HASH_WORKERS, thread_name_prefix="argon2")
         self._turns = Turns(HASH_WORKERS, waiting=MAX_WAITING)
         self._checks: dict[str, _Check] = {}
         self.checks = 0
         """Passwords that were hashed to check them."""
-        # Checked for unknown users, so that the time it takes does not tell who exists.
+        # Checked for unknown users, so that the time does not reveal which users exist.
         self._nobody = self._hasher.hash(secrets.token_hex())
 
     async def verify(self, name: str, digest: str, address: str = "") -> User:
@@ -104,9 +104,9 @@ class Authenticator:
             address: Where it comes from.
 
         Raises:
-            WrongCredentials: The user is unknown or the password wrong.
-            TooManyFailures: Too many from this address were wrong lately.
-            TooManyLogins: Too many wait to be checked.
+            WrongCredentialsError: The user is unknown or the password is wrong.
+            TooManyFailuresError: Too many passwords from this address were wrong recently.
+            TooManyLoginsError: Too many passwords wait to be checked.
         """
         user = self._tables.users.get(name)
         stored = user.password if user else self._nobody
@@ -114,10 +114,10 @@ class Authenticator:
         if not self._is_known(name, mark):
             right = await self._check(name, stored, digest, mark, address)
             if not right or user is None:
-                raise WrongCredentials("unknown user or wrong password")
+                raise WrongCredentialsError("unknown user or wrong password")
             await self._know(name, mark)
         if user is None or self._tables.users.get(name) != user:
-            raise WrongCredentials("unknown user or wrong password")
+            raise WrongCredentialsError("unknown user or wrong password")
         return user
 
     async def hash(self, digest: str, asker: str = "") -> str:
@@ -128,20 +128,20 @@ class Authenticator:
             asker: The user on whose behalf it is done.
 
         Raises:
-            TooManyLogins: Too many wait for the same.
+            TooManyLoginsError: Too many logins wait for the same check.
         """
         try:
             async with self._turns.turn("", asker):
                 return await self._in_worker(self._hasher.hash, digest)
         except CrowdedError:
-            raise TooManyLogins from None
+            raise TooManyLoginsError from None
 
     async def know(self, name: str, stored: str, digest: str) -> None:
-        """Know a password from now on that was just set: its first use waits for no turn.
+        """Recognize a password that was just set: its first use is not queued.
 
         Args:
             name: The user's name.
-            stored: What :meth:`hash` gave for it.
+            stored: The result of :meth:`hash` for it.
             digest: SHA-256 of the password in hex.
         """
         await self._know(name, self._mark(name, stored, digest))
@@ -153,16 +153,16 @@ class Authenticator:
         self._workers.shutdown()
 
     async def _check(self, name: str, stored: str, digest: str, mark: str, address: str) -> bool:
-        """Check a password that is not known, or wait for somebody else's check of the same one."""
+        """Check an unknown password, or wait for a running check of the same one."""
         while True:
             check = self._checks.get(mark)
             if check is None:
                 check = self._begin(name, stored, digest, mark, address)
             elif check.put_off and check.joined >= MAX_JOINED:
-                raise TooManyFailures(MAX_DELAY_S)
+                raise TooManyFailuresError(MAX_DELAY_S)
             own = not check.joined
             check.joined += 1
-            # Not cancelled with the login that began it: others may wait for it.
+            # Not cancelled with the login that began it: other logins may wait for it.
             outcome = await asyncio.shield(check.result)
             if isinstance(outcome, bool):
                 return outcome
@@ -178,11 +178,11 @@ class Authenticator:
 
     async def _look(
         self, name: str, stored: str, digest: str, address: str, delay: float
-    ) -> bool | TooManyLogins:
+    ) -> bool | TooManyLoginsError:
         if delay:
             with self._throttle.delaying(address, name):
                 await asyncio.sleep(delay)
-        # Names that do not exist have their turns together: inventing some gives no more of them.
+        # Unknown names share one turn: invented names do not give more turns.
         member = name if name in self._tables.users else ""
         try:
             async with self._turns.turn(address, member):
@@ -190,7 +190,7 @@ class Authenticator:
                 right = await self._in_worker(self._compare, stored, digest)
         except CrowdedError:
             self._throttle.passed(address, name, self._clock())
-            return TooManyLogins()
+            return TooManyLoginsError()
         if right:
             self._throttle.passed(address, name, self._clock())
         return right
@@ -205,7 +205,7 @@ class Authenticator:
             return False
 
     def _mark(self, name: str, stored: str, digest: str) -> str:
-        # The stored hash is part of it: a changed password makes old marks worthless.
+        # The stored hash is part of it: a changed password invalidates old marks.
         text = f"{name}\0{stored}\0{digest}".encode("utf-8", "surrogatepass")
         return hashlib.blake2b(text, key=self._key, digest_size=32).hexdigest()
 

@@ -1,9 +1,9 @@
-"""Copies of a master's state: made while it runs, and put back where no master runs. Blocks.
+"""Backups of a master's state: made while it runs, restored while it does not run. Blocks.
 
-A copy is a tar file: ``master/`` (the store, users' packages, what else is in the master's folder),
-``certificates/`` if the engine has some, and, last, ``manifest.json`` with the hash of each file. The store
-is copied by SQLite in one step, so the copy is a state that the master was in. A copy holds password hashes
-and keys: its file is its owner's only.
+A copy is a tar file: ``master/`` (the store, users' packages, other files of the master's folder),
+``certificates/`` if the engine has some, and, last, ``manifest.json`` with the hash of each file. SQLite
+copies the store in one step, so the copy is consistent. A copy holds password hashes and keys: only its owner
+can read its file.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import msgspec
 
 from rce import __version__
 from rce_master.exceptions import StoreError
-from rce_master.state.records import Bundle
+from rce_master.state.records import UserPackage
 from rce_master.state.tables import Tables
 from rce_master.store.lock import FolderLock
 from rce_master.store.sqlite import FILE_NAME, SCHEMA_VERSION
@@ -42,17 +42,17 @@ _PIECE = 1 << 20
 
 
 class BackupError(StoreError):
-    """A copy cannot be made, or not be put back."""
+    """A copy cannot be made or restored."""
 
 
 @dataclass(frozen=True, slots=True)
 class Copy:
-    """What a copy holds."""
+    """The manifest of a copy."""
 
     created: float
     """Seconds since 1970."""
     version: str
-    """Of the program that made it."""
+    """Version of the program that made it."""
     files: int
     size: int
     """Bytes of all files."""
@@ -63,10 +63,10 @@ def back_up(folders: Mapping[str, Path], out: Path) -> Copy:
 
     Args:
         folders: Its parts: the master's folder, and that of certificates.
-        out: The file to make. It appears whole or not at all.
+        out: The file to make. It appears complete or not at all.
 
     Raises:
-        BackupError: There is no state, or it cannot be copied; or the file is there already.
+        BackupError: The folder has no state, the state cannot be copied, or the file exists already.
     """
     store = folders[MASTER] / FILE_NAME
     if not store.exists():
@@ -91,21 +91,21 @@ def back_up(folders: Mapping[str, Path], out: Path) -> Copy:
 
 
 def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -> tuple[Copy, list[Path]]:
-    """Put a copy's state into folders.
+    """Restore a copy's state into folders.
 
-    Everything is read and checked before anything changes.
+    The whole copy is read and checked before any file changes.
 
     Args:
         file: The copy.
-        folders: Where its parts go.
-        replace: Move state that is there aside, to ``FOLDER.before-DATE``.
+        folders: The folders of its parts.
+        replace: Move existing state aside, to ``FOLDER.before-DATE``.
 
     Returns:
-        What the copy held, and the folders in which former state is now.
+        The copy's manifest, and the folders of the former state.
 
     Raises:
-        StoreBusy: A master runs on the folder.
-        BackupError: It is not a whole copy, a newer program made it, or there is state already.
+        StoreBusyError: A master runs on the folder.
+        BackupError: The copy is incomplete or was made by a newer program, or the folder already has state.
     """
     master = folders[MASTER]
     lock = FolderLock(master)
@@ -132,7 +132,7 @@ class _PackageRemovedError(BackupError):
 
 
 def _write_again(folders: Mapping[str, Path], out: IO[bytes]) -> Copy:
-    """Write a copy, once more if packages were removed meanwhile."""
+    """Write a copy; retry if packages were removed meanwhile."""
     for _ in range(_ATTEMPTS - 1):
         try:
             return _write(folders, out)
@@ -156,7 +156,7 @@ def _write(folders: Mapping[str, Path], out: IO[bytes]) -> Copy:
             except FileNotFoundError as error:
                 if path.parent.name == BUNDLES:
                     raise _PackageRemovedError(f"{path} was removed while it was copied") from error
-                # A file of the folder that went in the meantime: the master does without it.
+                # A file that was removed meanwhile: the master does not need it.
         created = time.time()
         manifest = {
             "format": FORMAT,
@@ -176,7 +176,7 @@ def _write(folders: Mapping[str, Path], out: IO[bytes]) -> Copy:
 
 
 def _add(tar: tarfile.TarFile, name: str, source: IO[bytes], hashes: dict[str, str]) -> int:
-    """Add what a file holds now; it may grow meanwhile."""
+    """Add the present contents of a file; it may grow meanwhile."""
     status = os.fstat(source.fileno())
     info = tarfile.TarInfo(name)
     info.size, info.mode, info.mtime = status.st_size, status.st_mode & 0o700, int(status.st_mtime)
@@ -187,7 +187,7 @@ def _add(tar: tarfile.TarFile, name: str, source: IO[bytes], hashes: dict[str, s
 
 
 class _Hashing:
-    """Hashes what is read of a file."""
+    """Hashes a file while it is read."""
 
     def __init__(self, source: IO[bytes]) -> None:
         self._source = source
@@ -202,7 +202,7 @@ class _Hashing:
 
 @contextmanager
 def _snapshot(store: Path) -> Iterator[Path]:
-    """Copy the store in one step of SQLite; the copy is removed at the end."""
+    """Copy the store in one step of SQLite; remove the copy at the end."""
     with tempfile.TemporaryDirectory(prefix="rce-backup-") as name:
         path = Path(name) / FILE_NAME
         os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
@@ -220,10 +220,10 @@ def _snapshot(store: Path) -> Iterator[Path]:
 
 
 def _files(folders: Mapping[str, Path], store: Path) -> Iterator[tuple[str, Path]]:
-    """Name the files of a copy: the store, the packages that it names, and the rest of the folders."""
+    """Return the files of a copy: the store, the packages that it names, and other files of the folders."""
     yield f"{MASTER}/{FILE_NAME}", store
     master = folders[MASTER]
-    for sha256 in sorted({bundle.sha256 for bundle in _bundles(store)}):
+    for sha256 in sorted({package.sha256 for package in _packages(store)}):
         yield f"{MASTER}/{BUNDLES}/{sha256}", master / BUNDLES / sha256
     for part, folder in folders.items():
         for path in sorted(folder.rglob("*")):
@@ -233,15 +233,15 @@ def _files(folders: Mapping[str, Path], store: Path) -> Iterator[tuple[str, Path
                 yield f"{part}/{inside.as_posix()}", path
 
 
-def _bundles(store: Path) -> Iterator[Bundle]:
+def _packages(store: Path) -> Iterator[UserPackage]:
     with closing(sqlite3.connect(f"{store.as_uri()}?mode=ro", uri=True)) as database:
-        rows = database.execute("SELECT key, body FROM record WHERE kind = ?", (Tables().bundles.name,))
+        rows = database.execute("SELECT key, body FROM record WHERE kind = ?", (Tables().packages.name,))
         for _, body in rows:
-            yield msgspec.json.decode(body, type=Bundle)
+            yield msgspec.json.decode(body, type=UserPackage)
 
 
 def _check_store(path: Path) -> None:
-    """Check that a store is sound, and of a version that this program knows."""
+    """Check a store's integrity, and that this program knows its version."""
     try:
         with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as database:
             (version,) = database.execute("PRAGMA user_version").fetchone()
@@ -258,7 +258,7 @@ def _check_store(path: Path) -> None:
 
 
 def _extract(file: Path, target: Path) -> Copy:
-    """Write a copy's files below a folder, and check them all."""
+    """Extract a copy's files into a folder, and check all of them."""
     hashes: dict[str, str] = {}
     manifest: dict[str, Any] | None = None
     with file.open("rb") as source, tarfile.open(fileobj=source, mode="r:") as tar:
@@ -321,7 +321,7 @@ def _move_aside(folder: Path, stamp: str) -> Path:
 
 
 def _move(source: Path, folder: Path) -> None:
-    """Move what was extracted to its place; the store comes last, so that it is there only with all else."""
+    """Move the extracted files to their places; the store last, so that it never exists alone."""
     if not source.is_dir():
         return
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)

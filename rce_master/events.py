@@ -1,4 +1,4 @@
-"""What happened lately: a ring of numbered events that can be followed and resumed."""
+"""Recent events: a ring buffer of numbered events that clients can follow and resume."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from typing import TYPE_CHECKING
 from msgspec import Struct
 
 if TYPE_CHECKING:
-    from rce_master.state.changes import Happening
+    from rce_master.state.changes import StateEvent
 
 CAPACITY = 10_000
 
 
 class Event(Struct, frozen=True, kw_only=True):
-    """Something that happened."""
+    """An event."""
 
     id: int
-    """Grows by one, also over a restart (by more then)."""
+    """Increases by one; by more across a restart."""
     time: float
     """Seconds since 1970."""
     kind: str
     """Such as ``robot_connected`` or ``node_failed``."""
     user: str
-    """Whose it is; empty: of interest to administrators only."""
+    """The owner; empty: for administrators only."""
     subject: str
-    """What it is about, such as ``user/container/node``."""
+    """The object of the event, such as ``user/container/node``."""
     text: str = ""
 
 
@@ -36,8 +36,8 @@ class EventLog:
     """Keeps the newest events. Followers read from the ring, so a slow one costs no memory.
 
     Args:
-        start: Seconds since 1970. Event ids start at its milliseconds: so they grow over a restart, as long
-            as fewer than a thousand events a second happen on average.
+        start: Seconds since 1970. Event ids start at its milliseconds: so they increase across a restart, as
+            long as fewer than a thousand events a second happen on average.
         capacity: How many events are kept.
     """
 
@@ -54,15 +54,15 @@ class EventLog:
         """Id of the newest event."""
         return self._next_id - 1
 
-    def add(self, happening: Happening, time: float) -> None:
+    def add(self, state_event: StateEvent, time: float) -> None:
         """Add an event and wake all followers."""
         event = Event(
             id=self._next_id,
             time=time,
-            kind=happening.kind,
-            user=happening.user,
-            subject=happening.subject,
-            text=happening.text,
+            kind=state_event.kind,
+            user=state_event.user,
+            subject=state_event.subject,
+            text=state_event.text,
         )
         self._next_id += 1
         self._events.setdefault(event.user, deque()).append(event)
@@ -72,13 +72,13 @@ class EventLog:
         self.wake()
 
     def _forget_one(self) -> None:
-        """Forget the oldest event of the user who has the most: nobody's flood costs others theirs."""
+        """Drop the oldest event of the user with the most events, so that a flood does not affect others."""
         user = max(self._events, key=lambda user: len(self._events[user]))
         self._events[user].popleft()
         self._count -= 1
 
     def wake(self) -> None:
-        """Wake all followers, to see whether they may still follow."""
+        """Wake all followers, so that they check whether they may still follow."""
         self._news.set()
         self._news = asyncio.Event()
 
@@ -89,7 +89,7 @@ class EventLog:
                 await self._news.wait()
 
     def since(self, id_: int, limit: int = CAPACITY, user: str | None = None) -> list[Event]:
-        """List what came after an event, oldest first.
+        """Return the events after an event, oldest first.
 
         Args:
             id_: The event.
@@ -103,9 +103,9 @@ class EventLog:
         return sorted(found, key=lambda event: event.id)[:limit]
 
     async def wait(self, id_: int, timeout: float, user: str | None = None) -> list[Event]:
-        """Wait for what comes after an event.
+        """Wait for events after an event.
 
-        A follower who is slower than events are forgotten misses some.
+        A follower that is slower than events are dropped misses some.
 
         Args:
             id_: The event.
@@ -113,8 +113,8 @@ class EventLog:
             user: Of this user only; None: of all.
 
         Returns:
-            At most a hundred events, oldest first; none if nothing came within ``timeout`` seconds, or others
-            of them may follow now than before.
+            At most a hundred events, oldest first; none if none came within ``timeout`` seconds, or if the
+            right to follow may have changed.
         """
         if not self.since(id_, limit=1, user=user):
             await self.wait_change(timeout)

@@ -1,93 +1,96 @@
-"""What can go wrong in the master.
+"""The errors of the master.
 
 ::
 
     MasterError
-    +-- Refused                 a request was not done; the text says what was wrong and how to mend it
-    |   +-- Invalid             it can never be done like this
-    |   +-- NotFound            it names something that is not there
-    |   +-- Conflict            it contradicts what is there
-    |   +-- LimitReached        there are too many already
-    |   +-- NoRoom              no machine, or not its own, has enough of what a container asks for
-    |   +-- Forbidden           this user may not do it
-    |   +-- Busy                too much of the kind is done just now
-    |   +-- TooMuch             this user asks too much at a time; wait
+    +-- RefusedError               a request was not done; the text says what was wrong and how to mend it
+    |   +-- InvalidRequestError    it can never be done like this
+    |   +-- NotFoundError          it names something that is not there
+    |   +-- ConflictError          it contradicts what is there
+    |   +-- LimitReachedError      there are too many already
+    |   +-- NoRoomError            no machine, or not its own, has enough of what a container asks for
+    |   +-- ForbiddenError         this user may not do it
+    |   +-- BusyError              too much of the kind is done just now
+    |   +-- TooMuchError           this user asks too much at a time; wait
     +-- AuthError
-    |   +-- WrongCredentials    unknown user, wrong password, unknown or expired token
-    |   +-- TooManyFailures     too many wrong passwords; wait
-    |   +-- TooManyLogins       too many people log in just now; wait
-    +-- InvalidTransition       an event that a life cycle does not know in its present state
-    +-- StoreError              the store cannot be read or written
-    |   +-- StoreBusy           another process owns the state folder
-    +-- TaskSetAway             the task set that is to be asked is not there
+    |   +-- WrongCredentialsError  unknown user, wrong password, unknown or expired token
+    |   +-- TooManyFailuresError   too many wrong passwords; wait
+    |   +-- TooManyLoginsError     too many people log in just now; wait
+    +-- TransitionError            an event that a life cycle does not allow in the present state
+    +-- StoreError                 the store cannot be read or written
+    |   +-- StoreBusyError         another process owns the state folder
+    |   +-- StaleTermError         another master has begun a newer term
+    +-- TaskSetAwayError           the task set that is to be asked is not there
 """
 
 from __future__ import annotations
 
 import math
 
+from rce.lifecycle import InvalidTransitionError
+
 
 class MasterError(Exception):
     """Base of all errors of the master."""
 
 
-class Refused(MasterError):  # noqa: N818
-    """A request was not done and nothing was changed by it.
+class RefusedError(MasterError):
+    """A request was refused and changed nothing.
 
     Attributes:
-        status: The HTTP status that tells the same.
+        status: The matching HTTP status.
     """
 
     status = 400
 
 
-class Invalid(Refused):
-    """The request can never be done like this."""
+class InvalidRequestError(RefusedError):
+    """The request is invalid."""
 
     status = 422
 
 
-class NotFound(Refused):
-    """The request names something that is not there."""
+class NotFoundError(RefusedError):
+    """The request names an object that does not exist."""
 
     status = 404
 
 
-class Conflict(Refused):
-    """The request contradicts what is there."""
+class ConflictError(RefusedError):
+    """The request conflicts with the present state."""
 
     status = 409
 
 
-class LimitReached(Refused):
-    """There are too many of the kind already."""
+class LimitReachedError(RefusedError):
+    """The maximum number of objects of this kind is reached."""
 
     status = 409
 
 
-class NoRoom(Refused):
-    """No machine, or not its own, has enough of what a container asks for."""
+class NoRoomError(RefusedError):
+    """No machine, or not the container's own one, has the resources that it asks for."""
 
     status = 409
 
 
-class Forbidden(Refused):
+class ForbiddenError(RefusedError):
     """The user may not do it."""
 
     status = 403
 
 
-class Busy(Refused):
-    """Too much of the kind is done just now."""
+class BusyError(RefusedError):
+    """Too many requests of this kind are in progress."""
 
     status = 503
 
 
-class TooMuch(Refused):
-    """A user asks too much at a time.
+class TooMuchError(RefusedError):
+    """A user exceeds their rate of requests.
 
     Attributes:
-        retry_after: Seconds after which it can be tried again.
+        retry_after: Seconds until the next attempt.
     """
 
     status = 429
@@ -98,18 +101,18 @@ class TooMuch(Refused):
 
 
 class AuthError(MasterError):
-    """Somebody could not prove who they are."""
+    """Authentication failed."""
 
 
-class WrongCredentials(AuthError):  # noqa: N818
-    """Unknown user, wrong password, unknown or expired token: deliberately not told apart."""
+class WrongCredentialsError(AuthError):
+    """Unknown user, wrong password, unknown or expired token: deliberately not distinguished."""
 
 
-class TooManyFailures(AuthError):  # noqa: N818
+class TooManyFailuresError(AuthError):
     """Too many wrong passwords for this user from this address.
 
     Attributes:
-        retry_after: Seconds until the next attempt is looked at.
+        retry_after: Seconds until the next attempt is checked.
     """
 
     def __init__(self, retry_after: float) -> None:
@@ -123,37 +126,44 @@ class TooManyFailures(AuthError):  # noqa: N818
         )
 
 
-class TooManyLogins(AuthError):  # noqa: N818
+class TooManyLoginsError(AuthError):
     """Too many logins from this address wait to be checked."""
 
     def __str__(self) -> str:
         return "too many log in at the same time; try again in a moment"
 
 
-class InvalidTransition(MasterError):  # noqa: N818
-    """An event that a life cycle does not know in its present state.
-
-    Attributes:
-        state: The present state.
-        event: The event.
-    """
-
-    def __init__(self, state: str, event: str) -> None:
-        self.state = state
-        self.event = event
-        super().__init__(state, event)
-
-    def __str__(self) -> str:
-        return f"{self.event} is impossible while {self.state}"
+class TransitionError(InvalidTransitionError, MasterError):
+    """An event that the life cycle of a robot or container does not allow in the present state."""
 
 
 class StoreError(MasterError):
     """The store cannot be read or written."""
 
 
-class StoreBusy(StoreError):  # noqa: N818
+class StoreBusyError(StoreError):
     """Another process owns the state folder."""
 
 
-class TaskSetAway(MasterError):  # noqa: N818
-    """The task set that is to be asked is not connected, or did not answer in time."""
+class StaleTermError(StoreError):
+    """Another master has begun a newer term: this one must not write any more.
+
+    Args:
+        term: The term of the refused write.
+        newest: The newest term of the store.
+    """
+
+    def __init__(self, term: int, newest: int) -> None:
+        super().__init__(term, newest)
+        self.term = term
+        self.newest = newest
+
+    def __str__(self) -> str:
+        return (
+            f"the store is in term {self.newest}, and this master writes in term {self.term}: another master"
+            " has taken over; restart this one"
+        )
+
+
+class TaskSetAwayError(MasterError):
+    """The task set to ask is not connected, or did not answer in time."""

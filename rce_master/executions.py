@@ -1,4 +1,4 @@
-"""Brings users who run commands in containers together with the task sets that dial for them."""
+"""Connects users who run commands in containers with the task sets that dial for them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from websockets.exceptions import ConnectionClosed
 
 from rce.control.execution import FEATURE
 from rce.control.messages import Execute
-from rce_master.exceptions import LimitReached, TaskSetAway
+from rce_master.exceptions import LimitReachedError, TaskSetAwayError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from rce_master.reconciler import Peer
 
 DIAL_S = 10.0
-"""How long a task set may take to dial."""
+"""Seconds that a task set may take to dial."""
 PER_USER = 32
-"""Commands of one user that run at the same time."""
+"""Commands of one user that may run at the same time."""
 
 
 class _Waiting:
@@ -45,7 +45,7 @@ class Executions:
 
     @contextlib.asynccontextmanager
     async def open(self, peer: Peer, id_: str, command: Command) -> AsyncIterator[ServerConnection]:
-        """Have a task set run a command; gives the connection that carries the run's frames.
+        """Have a task set run a command; provide the connection that carries the run's frames.
 
         Args:
             peer: The container's task set.
@@ -53,17 +53,17 @@ class Executions:
             command: What to run.
 
         Raises:
-            LimitReached: The container's user runs too many commands already.
-            TaskSetAway: The task set cannot do it, or did not dial in time.
+            LimitReachedError: The container's user runs too many commands already.
+            TaskSetAwayError: The task set does not support it, or did not dial in time.
         """
         tag = id_.partition("/")[2]
         if FEATURE not in peer.features:
-            raise TaskSetAway(
+            raise TaskSetAwayError(
                 f"the machine of container {tag!r} runs an earlier release, which runs no commands"
             )
         user = id_.partition("/")[0]
         if self._running[user] >= PER_USER:
-            raise LimitReached(f"user {user!r} runs {PER_USER} commands already; end one of them")
+            raise LimitReachedError(f"user {user!r} runs {PER_USER} commands already; end one of them")
         run = secrets.token_hex(16)
         waiting = self._waiting[run] = _Waiting()
         self._running[user] += 1
@@ -73,7 +73,7 @@ class Executions:
                 async with asyncio.timeout(DIAL_S):
                     socket = await waiting.arrived
             except TimeoutError as error:
-                raise TaskSetAway(f"the machine of container {tag!r} does not answer") from error
+                raise TaskSetAwayError(f"the machine of container {tag!r} does not answer") from error
             yield socket
         finally:
             waiting.finished.set()
@@ -83,7 +83,7 @@ class Executions:
                 del self._running[user]
 
     async def arrived(self, run: str, socket: ServerConnection) -> None:
-        """Take the connection that a task set dialed; returns when the run has ended (for the server)."""
+        """Handle a connection that a task set dialed; return when the run has ended (for the server)."""
         waiting = self._waiting.get(run)
         if waiting is None or waiting.arrived.done():
             return

@@ -1,29 +1,29 @@
-"""Reads what people write for a user's limits (pure)."""
+"""Reads the texts of a user's limits (pure)."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.protocol.quantities import read_cores, read_memory
-from rce_master.exceptions import Invalid
+from rce.model.quantities import read_cores, read_memory
+from rce_master.exceptions import InvalidRequestError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 DEFAULT = "default"
-"""As for all users."""
+"""The text for the limit of all users."""
 _MOST = 10**9
 
 
 def read_limit(kind: str, value: object) -> float | None:
-    """Return a limit as a number; None for that of all users.
+    """Return a limit as a number; None for the limit of all users.
 
     Args:
         kind: One of :data:`rce_master.state.limits.KINDS`.
         value: A number, or a text such as ``8G``.
 
     Raises:
-        Invalid: It is not an amount of this kind.
+        InvalidRequestError: It is not an amount of this kind.
 
     Example:
         >>> read_limit("containers", "16"), read_limit("memory", "default")
@@ -34,7 +34,7 @@ def read_limit(kind: str, value: object) -> float | None:
     try:
         return _READERS.get(kind, _count)(value)
     except ValueError as error:
-        raise Invalid(f"{kind}: {error}") from None
+        raise InvalidRequestError(f"{kind}: {error}") from None
 
 
 def _count(value: object) -> float:
@@ -46,7 +46,7 @@ def _count(value: object) -> float:
 
 
 _DIGITS = 20
-"""Python reads no more than 4300; the largest limit has fewer."""
+"""Maximum number of digits. Python reads at most 4300; the largest limit has fewer."""
 _READERS: dict[str, Callable[[object], float]] = {
     "cpu": read_cores,
     "memory": read_memory,

@@ -1,4 +1,4 @@
-"""Finds logs where they are: at the machine of a container, or wherever it lived before."""
+"""Finds logs at the machine of a container, or at its earlier machines."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import NamedTuple, Protocol
 import msgspec
 
 from rce.control.exceptions import ControlError
-from rce.control.logs import LogWish
+from rce.control.logs import LogQuery
 from rce.control.messages import LogChunk, TaskSetKind
-from rce.protocol.names import EndpointId, is_name
-from rce_master.exceptions import NotFound, TaskSetAway
+from rce.model.names import EndpointId, is_name
+from rce_master.exceptions import NotFoundError, TaskSetAwayError
 from rce_master.state.records import Container
 from rce_master.state.tables import Tables
 
 
 class LogReader(Protocol):
-    """A connected task set, as far as its logs go."""
+    """The log interface of a connected task set."""
 
     async def read_log(
         self,
@@ -26,13 +26,13 @@ class LogReader(Protocol):
         node: str,
         offset: int = 0,
         limit: int = 65536,
-        wish: LogWish = LogWish(),  # noqa: B008 - it is frozen
+        query: LogQuery = LogQuery(),  # noqa: B008 - it is frozen
     ) -> LogChunk:
         """Read a piece of a log."""
 
 
 class LogRequest(NamedTuple):
-    """What is to be read."""
+    """The log to read."""
 
     id: str
     """Endpoint id of the container."""
@@ -40,45 +40,47 @@ class LogRequest(NamedTuple):
     """Node tag; empty for the environment's own log."""
     offset: int = 0
     limit: int = 65536
-    wish: LogWish = LogWish()
+    query: LogQuery = LogQuery()
 
 
 async def read_log(tables: Tables, peers: Mapping[str, LogReader], request: LogRequest) -> LogChunk:
-    """Read a log of a container that lives, or of an earlier life of it that some machine still knows.
+    """Read a log of an existing container, or of an earlier incarnation that a machine still keeps.
 
     Args:
         tables: The state.
         peers: The connected task sets by name.
-        request: What is to be read.
+        request: The log to read.
 
     Raises:
-        NotFound: There is no such container, node or log.
-        TaskSetAway: Its task set is not connected or does not answer.
+        NotFoundError: The container, node or log does not exist.
+        TaskSetAwayError: Its task set is not connected or does not answer.
     """
     user, _, tag = request.id.partition("/")
     if not is_name(user) or not is_name(tag):
-        raise NotFound(f"there is no container {tag!r}: a name has letters, digits and '_', a letter first")
+        raise NotFoundError(
+            f"there is no container {tag!r}: a name has letters, digits and '_', a letter first"
+        )
     container = tables.container(request.id)
     if container is None or not _is_present(tables, request):
-        wish = msgspec.structs.replace(request.wish, since=_owner_since(tables, request.id))
-        request = request._replace(wish=wish)
-    wish = request.wish
+        query = msgspec.structs.replace(request.query, since=_owner_since(tables, request.id))
+        request = request._replace(query=query)
+    query = request.query
     if container is None:
         return await _read_anywhere(tables, peers, request)
-    if wish.previous or wish.life:
+    if query.previous or query.incarnation:
         return await _read_earlier(tables, peers, request, container)
     if request.node and request.node not in container.nodes:
-        raise NotFound(f"container {container.tag!r} has no node {request.node!r}")
+        raise NotFoundError(f"container {container.tag!r} has no node {request.node!r}")
     chunk = await _ask(peers.get(container.task_set), request)
     if chunk.error:
-        raise NotFound(chunk.error)
+        raise NotFoundError(chunk.error)
     return chunk
 
 
 async def _read_earlier(
     tables: Tables, peers: Mapping[str, LogReader], request: LogRequest, container: Container
 ) -> LogChunk:
-    """Read of an earlier life: where the container is, or else where it was before."""
+    """Read the log of an earlier incarnation: at the container's machine, or else at earlier ones."""
     if container.task_set in peers:
         chunk = await _ask(peers[container.task_set], request)
         if not chunk.error:
@@ -87,7 +89,7 @@ async def _read_earlier(
 
 
 async def _read_anywhere(tables: Tables, peers: Mapping[str, LogReader], request: LogRequest) -> LogChunk:
-    """Ask all machines; of several answers that of the life that ended last counts."""
+    """Ask all machines; of several answers, use that of the incarnation that ended last."""
     asked = [
         peer
         for process, peer in peers.items()
@@ -99,7 +101,9 @@ async def _read_anywhere(tables: Tables, peers: Mapping[str, LogReader], request
         tag = EndpointId.parse(request.id).tag
         reasons = {answer.error for answer in answers if isinstance(answer, LogChunk)}
         text = next(iter(sorted(reasons)), "no machine is connected that could have its logs")
-        raise NotFound(f"there is no container {tag!r}" if tables.container(request.id) is None else text)
+        raise NotFoundError(
+            f"there is no container {tag!r}" if tables.container(request.id) is None else text
+        )
     return max(found, key=lambda chunk: chunk.ended or float("inf"))
 
 
@@ -109,7 +113,7 @@ def _chunks(answers: Iterable[LogChunk | BaseException]) -> list[LogChunk]:
         if isinstance(answer, LogChunk):
             if not answer.error:
                 found.append(answer)
-        elif not isinstance(answer, TaskSetAway):
+        elif not isinstance(answer, TaskSetAwayError):
             raise answer
     return found
 
@@ -117,23 +121,23 @@ def _chunks(answers: Iterable[LogChunk | BaseException]) -> list[LogChunk]:
 async def _ask(peer: LogReader | None, request: LogRequest) -> LogChunk:
     tag = EndpointId.parse(request.id).tag
     if peer is None:
-        raise TaskSetAway(f"container {tag!r} cannot be reached now")
+        raise TaskSetAwayError(f"container {tag!r} cannot be reached now")
     try:
         return await peer.read_log(
-            request.id, request.node, offset=request.offset, limit=request.limit, wish=request.wish
+            request.id, request.node, offset=request.offset, limit=request.limit, query=request.query
         )
     except ControlError as error:
-        raise TaskSetAway(f"container {tag!r} cannot be reached: {error}") from error
+        raise TaskSetAwayError(f"container {tag!r} cannot be reached: {error}") from error
 
 
 def _is_present(tables: Tables, request: LogRequest) -> bool:
-    """Whether the present life is meant, which is its owner's whatever its machine's clock says."""
+    """Whether the present incarnation is requested, whatever the time of the machine's clock."""
     status = tables.container_live(request.id).status
-    wish = request.wish
-    return not wish.previous and wish.life in ("", status.incarnation if status is not None else "")
+    query = request.query
+    return not query.previous and query.incarnation in ("", status.incarnation if status is not None else "")
 
 
 def _owner_since(tables: Tables, id_: str) -> float:
-    """When the owner came to be: what a user of the same name left behind is not theirs."""
+    """When the owner was created: logs of a former user of the same name are not theirs."""
     user = tables.users.get(EndpointId.parse(id_).user)
     return user.created if user is not None else 0.0

@@ -9,6 +9,8 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rce.control.messages import TYPED_REQUESTS
+from rce.control.model import PATCHES
 from rce.control.server import ControlServer
 from rce.guard.proxies import TrustedProxies
 from rce.tls.choice import plain_warning
@@ -17,19 +19,19 @@ from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_master.audit import AuditLog
 from rce_master.auth import Authenticator, client_digest
-from rce_master.bundles.contents import ContentStore
-from rce_master.bundles.office import PackageOffice
-from rce_master.desk import Desk
+from rce_master.control_handler import ControlHandler
 from rce_master.events import EventLog
 from rce_master.exceptions import MasterError
 from rce_master.executions import Executions
 from rce_master.http.routes import Services
 from rce_master.http.server import make_app
+from rce_master.packages.contents import ContentStore
+from rce_master.packages.service import PackageService
 from rce_master.quotas import Quotas
-from rce_master.realm import Realm
 from rce_master.reconciler import Reconciler
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
+from rce_master.state_service import StateService
 from rce_master.tokens import Tokens
 
 if TYPE_CHECKING:
@@ -42,31 +44,31 @@ if TYPE_CHECKING:
     from rce_master.state.changes import Changes
     from rce_master.store import Store
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 TICK_S = 0.5
 _ACCESS = ("users", "tokens")
-"""Tables that say who may follow what."""
+"""Tables that determine permissions to follow events."""
 DEV_USER = "testUser"
 
 
 @dataclass(frozen=True, slots=True)
 class RunningMaster:
-    """What a running master can be reached by."""
+    """The addresses of a running master."""
 
     url: str
     """Of the HTTP server."""
     control_port: int
-    realm: Realm
+    state_service: StateService
 
 
 class Master:
     """Runs a master on a store.
 
     Args:
-        settings: What was set.
-        secret: What task sets prove to have.
-        store: Where the desired state is kept; stays open, whoever opened it closes it.
+        settings: Its settings.
+        secret: The secret by which task sets authenticate.
+        store: Keeps the desired state; the caller closes it.
         hasher: How passwords are hashed.
     """
 
@@ -94,31 +96,31 @@ class Master:
             MasterError: A port cannot be used.
             CertificateError: A certificate cannot be used.
         """
-        realm = await Realm.open(self._store, self._settings.state)
-        if not self._settings.dev and not len(realm.tables.users):
-            logger.warning(
+        state_service = await StateService.open(self._store, self._settings.state)
+        if not self._settings.dev and not len(state_service.tables.users):
+            _log.warning(
                 "there are no users, so no one can log in: stop this program and run"
                 " `rce user add NAME --admin --state-dir %s`",
                 self._settings.state_dir,
             )
         events = EventLog(time.time())
-        realm.listeners.append(lambda changes: _log_events(events, changes))
-        reconciler = Reconciler(realm)
+        state_service.listeners.append(lambda changes: _log_events(events, changes))
+        reconciler = Reconciler(state_service)
         authenticator = Authenticator(
-            realm.tables,
+            state_service.tables,
             hasher=self._hasher,
             key=self._secret.derive("known logins"),
-            remember=lambda login: realm.enqueue([commands.RememberLogin(login=login)]),
+            remember=lambda login: state_service.enqueue([commands.RememberLogin(login=login)]),
         )
-        tokens = Tokens(realm.tables)
+        tokens = Tokens(state_service.tables)
         quotas = Quotas(self._settings.quotas)
         audit = AuditLog(self._settings.state_dir / "audit", time.time)
-        desk = Desk(realm, reconciler, authenticator, tokens, quotas, audit)
+        control_handler = ControlHandler(state_service, reconciler, authenticator, tokens, quotas, audit)
         lifetime = self._settings.token_lifetime
         self._contents = ContentStore(self._settings.state_dir / "bundles")
-        packages = PackageOffice(realm, self._contents)
+        packages = PackageService(state_service, self._contents)
         services = Services(
-            realm=realm,
+            state_service=state_service,
             reconciler=reconciler,
             authenticator=authenticator,
             events=events,
@@ -137,24 +139,26 @@ class Master:
                 workers = [
                     group.create_task(work)
                     for work in (
-                        realm.run(),
-                        desk.run(),
+                        state_service.run(),
+                        control_handler.run(),
                         packages.run(),
-                        services.tokens.run(realm),
-                        _tick(realm, audit),
+                        services.tokens.run(state_service),
+                        _tick(state_service, audit),
                     )
                 ]
                 try:
-                    await self._serve(services, desk, on_ready)
+                    await self._serve(services, control_handler, on_ready)
                 finally:
-                    # Only now: task sets that leave while the servers close still need the realm.
+                    # Last: task sets that leave while the servers close still need the state service.
                     for worker in workers:
                         worker.cancel()
         finally:
             authenticator.close()
             audit.close()
 
-    async def _serve(self, services: Services, desk: Desk, on_ready: Callable[[RunningMaster], None]) -> None:
+    async def _serve(
+        self, services: Services, control_handler: ControlHandler, on_ready: Callable[[RunningMaster], None]
+    ) -> None:
         settings = self._settings
         if settings.dev:
             await make_dev_user(services)
@@ -163,9 +167,9 @@ class Master:
         app = make_app(services, allowed_origins=settings.allowed_origins, names=names)
         control = ControlServer(
             self._secret,
-            on_hello=desk.on_hello,
-            on_message=desk.on_message,
-            on_gone=desk.on_gone,
+            on_hello=control_handler.on_hello,
+            on_message=control_handler.on_message,
+            on_gone=control_handler.on_gone,
             master="rce-master",
             host=settings.bind,
             port=settings.control_port,
@@ -173,25 +177,26 @@ class Master:
             tls=for_task_sets.mutual_server if for_task_sets else None,
             is_revoked=for_task_sets.is_revoked if for_task_sets else None,
             on_execution=services.executions.arrived,
+            features=(PATCHES, TYPED_REQUESTS),
         )
         http = HttpServer(app, settings.bind, settings.http_port, for_clients.server if for_clients else None)
         if for_clients is None or for_task_sets is None:
             what = "passwords travel" if for_clients is None else "what task sets tell each other travels"
             if text := plain_warning(what, settings.bind):
-                logger.warning("%s", text)
+                _log.warning("%s", text)
         async with AsyncExitStack() as stack:
             try:
                 await stack.enter_async_context(control)
                 await stack.enter_async_context(http)
             except OSError as error:
                 raise MasterError(f"cannot listen: {error}") from error
-            on_ready(RunningMaster(http.url, control.port, services.realm))
+            on_ready(RunningMaster(http.url, control.port, services.state_service))
             await watch_expiry([one.files for one in (for_clients, for_task_sets) if one is not None])
 
 
 async def make_dev_user(services: Services) -> None:
-    """Make the user of development mode, if it is not there."""
-    if DEV_USER in services.realm.tables.users:
+    """Make the user of development mode, if it does not exist."""
+    if DEV_USER in services.state_service.tables.users:
         return
     user = User(
         name=DEV_USER,
@@ -199,22 +204,22 @@ async def make_dev_user(services: Services) -> None:
         password=await services.authenticator.hash(client_digest(DEV_USER)),
         created=services.clock(),
     )
-    await services.realm.submit(commands.AddUser(user=user))
+    await services.state_service.submit(commands.AddUser(user=user))
 
 
-async def _tick(realm: Realm, audit: AuditLog) -> None:
+async def _tick(state_service: StateService, audit: AuditLog) -> None:
     while True:
         await asyncio.sleep(TICK_S)
         audit.flush()
-        (outcome,) = await realm.submit_all([commands.Tick()])
+        (outcome,) = await state_service.submit_all([commands.Tick()])
         if outcome is not None:
-            logger.error("grace times were not looked at: %s", outcome)
+            _log.error("grace times were not looked at: %s", outcome)
 
 
 def _log_events(events: EventLog, changes: Changes) -> None:
     now = time.time()
     if any(table in _ACCESS for table, _ in changes.written()):
         events.wake()
-    for happening in changes.happenings:
-        events.add(happening, now)
-        logger.info("%s %s %s", happening.kind, happening.subject, happening.text)
+    for state_event in changes.events:
+        events.add(state_event, now)
+        _log.info("%s %s %s", state_event.kind, state_event.subject, state_event.text)

@@ -1,4 +1,4 @@
-"""What ``rce-master`` does once its settings are read."""
+"""Runs ``rce-master`` with settings that have been read."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def run(engine: EngineSettings, *, verbose: bool = False) -> int:
 
     Args:
         engine: The settings.
-        verbose: Whether all is logged.
+        verbose: Log all messages.
 
     Returns:
-        The exit code; faults were told.
+        The exit code; faults were printed.
     """
     faults: tuple[BaseException, ...] = ()
     try:
@@ -47,12 +47,12 @@ def run(engine: EngineSettings, *, verbose: bool = False) -> int:
     except* (LogFileError, MasterError, SecretError, RunDirError, CertificateError) as group:
         faults = group.exceptions
     for fault in faults:
-        print(f"rce-master: {fault}", file=sys.stderr)  # noqa: T201 - for whoever started it
+        print(f"rce-master: {fault}", file=sys.stderr)  # noqa: T201 - for the user
     return 1 if faults else 0
 
 
 def _settings(engine: EngineSettings) -> MasterSettings:
-    """Make the master's own settings of the engine's."""
+    """Derive the master's settings from the engine's."""
     own = engine.master
     return MasterSettings(
         bind=own.bind,
@@ -81,7 +81,7 @@ async def _run(settings: MasterSettings, secret: Secret) -> None:
     assert task is not None
 
     def stop() -> None:
-        if not task.cancelling():  # a second time would cut short how it ends
+        if not task.cancelling():  # a second cancellation would interrupt the shutdown
             task.cancel()
 
     for number in end_signals():
@@ -95,4 +95,4 @@ async def _run(settings: MasterSettings, secret: Secret) -> None:
 
 
 def _announce(master: RunningMaster) -> None:
-    print(f"rce-master ready: {master.url}", flush=True)  # noqa: T201 - what other programs wait for
+    print(f"rce-master ready: {master.url}", flush=True)  # noqa: T201 - read by other programs

@@ -1,7 +1,6 @@
-"""How much of the master one user may have at a time: requests, streams, reads of logs.
+"""Quotas of one user's requests, streams and reads of logs.
 
-One user's use costs another nothing but their own share: all of it is counted by user. Administrators have no
-quotas.
+Usage is counted per user, so that one user does not affect another. Quotas do not apply to administrators.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from rce.guard.rates import Rates
 from rce.guard.turns import CrowdedError, Turns
-from rce_master.exceptions import TooMuch
+from rce_master.exceptions import TooMuchError
 from rce_master.state.records import UserRole
 
 if TYPE_CHECKING:
@@ -25,19 +24,19 @@ if TYPE_CHECKING:
 
 READS_AT_ONCE = 32
 READS_WAITING = 512
-"""Reads of logs of all users that wait; when there are more, the user with the most is told to try later."""
+"""Waiting reads of logs of all users; beyond it, the user with the most is told to try later."""
 ITEMS_PER_REQUEST = 20
-"""So many nodes, interfaces, parameters, ... in one request count as one more request."""
+"""How many nodes, interfaces, parameters, ... in one request count as one more request."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QuotaSettings:
-    """What one user may have."""
+    """The quotas of one user."""
 
     requests: float = 100.0
     """Requests over REST each second, and as many over all WebSockets of their robots; 0 for no limit."""
     request_burst: int = 2000
-    """Requests that may come at once, after a rest."""
+    """The burst of requests after a pause."""
     streams: int = 64
     """Streams of events and of usage at the same time; 0 for no limit."""
     log_reads: int = 4
@@ -45,10 +44,10 @@ class QuotaSettings:
 
 
 class Quotas:
-    """Counts what users do.
+    """Counts the requests of users.
 
     Args:
-        settings: What one user may have.
+        settings: The quotas of one user.
         clock: Seconds that never go back.
     """
 
@@ -65,7 +64,7 @@ class Quotas:
         """Count a request over REST.
 
         Raises:
-            TooMuch: There were too many.
+            TooMuchError: There were too many requests.
         """
         self._take(self._rest, user, 1)
 
@@ -73,24 +72,24 @@ class Quotas:
         """Count a request of a robot.
 
         Args:
-            user: Whose robot.
-            items: How many nodes, interfaces, ... it is about.
+            user: The robot's user.
+            items: How many nodes, interfaces, ... it contains.
 
         Raises:
-            TooMuch: There were too many.
+            TooMuchError: There were too many requests.
         """
         self._take(self._robots, user, 1 + items // ITEMS_PER_REQUEST)
 
     @contextlib.contextmanager
     def stream(self, user: User) -> Iterator[None]:
-        """Count a stream for as long as the context lasts.
+        """Count a stream as long as the context lasts.
 
         Raises:
-            TooMuch: There are too many.
+            TooMuchError: There are too many streams.
         """
         most = self._settings.streams
         if most and user.role is not UserRole.ADMIN and self._streams[user.name] >= most:
-            raise TooMuch(
+            raise TooMuchError(
                 f"you follow {most} streams of events or usage already, and may not follow more; end one", 1
             )
         self._streams[user.name] += 1
@@ -103,16 +102,16 @@ class Quotas:
 
     @contextlib.asynccontextmanager
     async def log_read(self, user: User) -> AsyncIterator[None]:
-        """Wait until a user may read of a log.
+        """Wait until a user may read a log.
 
         Raises:
-            TooMuch: Too many of the user's reads wait.
+            TooMuchError: Too many of the user's reads wait.
         """
         turn = self._reads.turn(user.name)
         try:
             await turn.__aenter__()
         except CrowdedError:
-            raise TooMuch(
+            raise TooMuchError(
                 "too many of your reads of logs wait already; read one after the other", 1
             ) from None
         try:
@@ -131,7 +130,7 @@ class Quotas:
             return
         wait = rates.take(user.name, self._clock(), cost)
         if wait:
-            raise TooMuch(
+            raise TooMuchError(
                 f"too many requests: you may make {self._settings.requests:g} a second; "
                 f"try again in {math.ceil(wait)} s",
                 wait,

@@ -1,29 +1,36 @@
-"""Makes the task sets do what is desired, and the state know what they report."""
+"""Sends the desired state to the task sets, and their reports to the state."""
 
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, assert_never
 
 from rce.control.exceptions import PeerRefusedError
-from rce.control.logs import LogWish
+from rce.control.logs import LogQuery
 from rce.control.messages import (
+    ClientRequest,
     Drop,
     Fault,
     Gone,
     Hello,
     Left,
     LogChunk,
+    Login,
     Notify,
+    PatchSpec,
+    PatchStatus,
     Probe,
     Put,
+    SpecWanted,
     Status,
+    StatusWanted,
     Sync,
     ToMaster,
     ToTaskSet,
     Usage,
 )
-from rce_master.exceptions import NotFound, Refused, TaskSetAway
+from rce.control.model import PATCHES
+from rce_master.exceptions import NotFoundError, RefusedError, TaskSetAwayError
 from rce_master.logs import LogReader, LogRequest, read_log
 from rce_master.state import commands
 from rce_master.state.lifecycle import RobotSession
@@ -32,10 +39,10 @@ from rce_master.usage import UsageBook
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rce_master.realm import Realm
-    from rce_master.state.changes import Changes, Notice
+    from rce_master.state.changes import Changes, Notice, Touched
+    from rce_master.state_service import StateService
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class Peer(LogReader, Protocol):
@@ -47,52 +54,62 @@ class Peer(LogReader, Protocol):
 
     @property
     def features(self) -> frozenset[str]:
-        """What it can do that one of an earlier release could not."""
+        """Its features that earlier releases do not have."""
 
     def send(self, message: ToTaskSet) -> None:
-        """Send a message; one that does not get through is made up for by the next ``Sync``."""
+        """Send a message; the next ``Sync`` makes up for a lost one."""
 
 
 class Reconciler:
     """Sends every change to the task sets that it concerns.
 
-    Changes of one endpoint are never added up: its whole spec goes out, with a new revision, to where it is
-    placed. Listens to the realm, so nothing goes out that is not stored.
+    A change of an endpoint goes to its task set, as a patch of the revision that was last sent there; as a
+    whole, without such a revision or if the task set does not take patches. Listens to the state service, so
+    only stored changes are sent.
 
     Attributes:
-        book: What the connected task sets told of what they consume.
+        book: The usage reports of the connected task sets.
     """
 
-    def __init__(self, realm: Realm) -> None:
+    def __init__(self, state_service: StateService) -> None:
         self.book = UsageBook()
-        self._realm = realm
+        self._state_service = state_service
         self._peers: dict[str, Peer] = {}
         self._arriving: dict[str, Peer] = {}
-        realm.listeners.append(self.on_changes)
+        self._sent: dict[str, dict[str, int]] = {}
+        """The last revision of each endpoint that was sent to a connected task set, by process and id."""
+        self._asked: set[tuple[str, str]] = set()
+        """Endpoints whose whole status was requested, with their process."""
+        state_service.listeners.append(self.on_changes)
 
     # From the task sets
 
     async def on_hello(self, peer: Peer, hello: Hello) -> None:
-        """Take a task set that just connected: adopt what runs there and tell it what is desired.
+        """Handle a task set that just connected: adopt what runs there and send the desired state.
 
         Raises:
             PeerRefusedError: Its name cannot be used.
-            StoreError: It cannot be stored; the task set is not taken.
+            StoreError: It cannot be stored; the task set is refused.
         """
         self._arriving[peer.process] = peer
         try:
-            await self._realm.submit(commands.TaskSetArrived(hello=hello))
-        except Refused as error:
+            await self._state_service.submit(commands.TaskSetArrived(hello=hello))
+        except RefusedError as error:
             raise PeerRefusedError(str(error)) from error
         finally:
             self._arriving.pop(peer.process, None)
 
     async def on_message(self, process: str, message: ToMaster) -> None:
-        """Note a report. It is done in the order of arrival, though not yet when this returns."""
+        """Queue a report. Reports are applied in the order of arrival, after this returns."""
         command: commands.Command
         match message:
             case Status():
+                self._asked.discard((process, message.status.id))
                 command = commands.StatusReported(process=process, status=message.status)
+            case PatchStatus():
+                command = commands.StatusPatched(process=process, patch=message.patch)
+            case SpecWanted():
+                command = commands.SpecRequested(process=process, id=message.id)
             case Gone():
                 command = commands.EndpointGone(process=process, id=message.id)
             case Fault():
@@ -100,20 +117,22 @@ class Reconciler:
             case Left():
                 command = commands.RobotLeft(process=process, id=message.id, reason=message.reason)
             case Usage():
-                placed = {e.id for e in self._realm.tables.endpoints.by("task_set", process)}
+                placed = {e.id for e in self._state_service.tables.endpoints.by("task_set", process)}
                 self.book.note(process, message, placed)
                 return
-            case _:
-                logger.warning("%s sent a %s, which means nothing here", process, type(message).__name__)
+            case Hello() | Login() | ClientRequest() | LogChunk():
+                _log.warning("%s sent a %s, which means nothing here", process, type(message).__name__)
                 return
-        await self._realm.enqueue([command])
+            case _:
+                assert_never(message)
+        await self._state_service.enqueue([command])
 
     async def on_gone(self, peer: Peer) -> None:
         """Note that a task set's channel ended."""
         if self._peers.get(peer.process) is peer:
-            del self._peers[peer.process]
+            self._forget(peer.process)
             self.book.forget(peer.process)
-            await self._realm.submit(commands.TaskSetLeft(process=peer.process))
+            await self._state_service.submit(commands.TaskSetLeft(process=peer.process))
 
     async def read_log(
         self,
@@ -121,70 +140,113 @@ class Reconciler:
         node: str,
         offset: int,
         limit: int,
-        wish: LogWish = LogWish(),  # noqa: B008 - it is frozen
+        query: LogQuery = LogQuery(),  # noqa: B008 - it is frozen
     ) -> LogChunk:
         """Read the log of a container's node where it is (:func:`rce_master.logs.read_log`).
 
         Raises:
-            NotFound: There is no such container, node or log.
-            TaskSetAway: Its task set is not connected or does not answer.
+            NotFoundError: The container, node or log does not exist.
+            TaskSetAwayError: Its task set is not connected or does not answer.
         """
-        request = LogRequest(id_, node, offset, limit, wish)
-        return await read_log(self._realm.tables, self._peers, request)
+        request = LogRequest(id_, node, offset, limit, query)
+        return await read_log(self._state_service.tables, self._peers, request)
 
     def task_set_of(self, id_: str) -> Peer:
         """Return the connected task set of a container.
 
         Raises:
-            NotFound: There is no such container.
-            TaskSetAway: Its task set is not connected, or it waits for a machine.
+            NotFoundError: The container does not exist.
+            TaskSetAwayError: Its task set is not connected, or it waits for a machine.
         """
-        container = self._realm.tables.container(id_)
+        container = self._state_service.tables.container(id_)
         tag = id_.partition("/")[2]
         if container is None:
-            raise NotFound(f"there is no container {tag!r}")
+            raise NotFoundError(f"there is no container {tag!r}")
         peer = self._peers.get(container.task_set)
         if peer is None:
-            raise TaskSetAway(f"container {tag!r} cannot be reached now")
+            raise TaskSetAwayError(f"container {tag!r} cannot be reached now")
         return peer
 
     @property
     def usage(self) -> Mapping[str, Usage]:
-        """What each connected task set last told of what it consumes, by process name."""
+        """The last usage report of each connected task set, by process name."""
         return self.book.newest
 
     # To the task sets
 
     def on_changes(self, changes: Changes) -> None:
-        """Send what follows from a change."""
+        """Send the messages that follow from a change."""
         for withdrawal in changes.withdrawals:
             message = Drop(id=withdrawal.id, revision=withdrawal.revision, reason=withdrawal.reason)
+            self._sent.get(withdrawal.process, {}).pop(withdrawal.id, None)
             self._send(withdrawal.process, message)
-        for id_ in changes.touched:
-            endpoint = self._realm.tables.endpoints.get(id_)
-            if endpoint is not None and id_ != changes.answered:
-                self._send(endpoint.task_set, Put(endpoint=self._realm.spec(id_)))
-                copy = self._realm.copy_spec(id_)
-                if copy is not None:
-                    self._send(copy[0], Put(endpoint=copy[1]))
+        for id_, touched in changes.touched.items():
+            endpoint = self._state_service.tables.endpoints.get(id_)
+            if endpoint is None:
+                continue
+            if id_ == changes.answered:
+                # The answer's revision is not known yet, so the next change goes as a whole.
+                self._sent.get(endpoint.task_set, {}).pop(id_, None)
+            else:
+                self._send_change(endpoint.task_set, id_, touched)
+        for process, id_ in changes.wanted_specs:
+            self._send_whole(process, id_)
+        for process, id_ in changes.wanted_statuses:
+            self._ask_status(process, id_)
         if changes.arrived:
             self._sync(changes.arrived)
         for notice in changes.notices:
             self._notify(notice)
 
     def probe(self, robot: str) -> None:
-        """Have the task set of a robot find out whether the robot is still there."""
-        found = self._realm.tables.robot(robot)
+        """Ask the task set of a robot whether the robot still responds."""
+        found = self._state_service.tables.robot(robot)
         if found is not None:
             self._send(found.task_set, Probe(id=robot))
 
+    def _send_change(self, process: str, id_: str, touched: Touched) -> None:
+        """Send the changes of an endpoint to its task set, and to the one it moves to."""
+        peer = self._peers.get(process)
+        if peer is not None and self._sent[process].get(id_) == touched.since and PATCHES in peer.features:
+            patch = self._state_service.patch(id_, touched)
+            self._sent[process][id_] = patch.revision
+            peer.send(PatchSpec(patch=patch))
+        else:
+            self._send_whole(process, id_)
+        copy = self._state_service.copy_spec(id_)
+        if copy is not None:
+            self._send(copy[0], Put(endpoint=copy[1]))
+
+    def _send_whole(self, process: str, id_: str) -> None:
+        peer = self._peers.get(process)
+        if peer is not None:
+            spec = self._state_service.spec(id_)
+            self._sent[process][id_] = spec.revision
+            peer.send(Put(endpoint=spec))
+
+    def _ask_status(self, process: str, id_: str) -> None:
+        """Ask for the whole status of an endpoint, once until it arrives."""
+        peer = self._peers.get(process)
+        if peer is not None and (process, id_) not in self._asked:
+            self._asked.add((process, id_))
+            peer.send(StatusWanted(id=id_))
+
     def _sync(self, process: str) -> None:
+        self._forget(process)
         peer = self._peers[process] = self._arriving[process]
-        placed = self._realm.tables.endpoints.by("task_set", process)
-        peer.send(Sync(endpoints=tuple(self._realm.spec(endpoint.id) for endpoint in placed)))
+        placed = self._state_service.tables.endpoints.by("task_set", process)
+        specs = tuple(self._state_service.spec(endpoint.id) for endpoint in placed)
+        self._sent[process] = {spec.id: spec.revision for spec in specs}
+        peer.send(Sync(endpoints=specs))
+
+    def _forget(self, process: str) -> None:
+        """Forget the revisions of a connection that ended."""
+        self._peers.pop(process, None)
+        self._sent.pop(process, None)
+        self._asked = {asked for asked in self._asked if asked[0] != process}
 
     def _notify(self, notice: Notice) -> None:
-        tables = self._realm.tables
+        tables = self._state_service.tables
         user, slash, _ = notice.to.partition("/")
         robots = [tables.robot(notice.to)] if slash else tables.robots(user)
         connected = (

@@ -1,164 +1,132 @@
-"""Turns a client's request (``CC``, ``RC``, ``DC``, ``CN``, ``CX``) into commands on the state."""
+"""Converts users' requests to commands on the state."""
 
 from __future__ import annotations
 
 from functools import singledispatch
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, assert_never
 
-from rce.control.model import InterfaceSpec, Network, NodeSpec, Resources, RestartPolicy
-from rce.protocol import messages
+from rce.model import requests
 from rce.protocol.exceptions import MessageError
-from rce.protocol.quantities import read_bandwidth, read_cores, read_memory
-from rce.protocol.reading import read_request
+from rce.protocol.requests import read_request
 from rce_master.state import commands
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from msgspec import Struct
+    from rce.control.messages import ClientRequest
+    from rce.model.requests import Component, Request
 
 
-def count_items(data: Any) -> int:
-    """Count, without reading them, the nodes, interfaces, ... that a request is about."""
-    lists = data.values() if isinstance(data, dict) else ()
-    return sum(len(items) for items in lists if isinstance(items, list))
+def count_items(request: ClientRequest) -> int:
+    """Count the nodes, interfaces, ... in a client's request, without reading them."""
+    content = request.content
+    if content is not None:
+        lists: Any = [getattr(content, name) for name in content.__struct_fields__ if name != "faults"]
+    else:
+        lists = request.data.values() if isinstance(request.data, dict) else ()
+    return sum(len(items) for items in lists if isinstance(items, list | tuple))
 
 
-def read(user: str, kind: str, data: Any) -> tuple[list[commands.Request], list[str]]:
-    """Read a request.
-
-    What a ``CN`` or ``CX`` removes is removed first, so that one message can replace something; parameters
-    are set and interfaces made before nodes start, so that a node finds them.
-
-    Args:
-        user: Who asks.
-        kind: ``CC``, ``RC``, ``DC``, ``CN`` or ``CX``.
-        data: The message's ``data``, as it came.
+def read(user: str, request: ClientRequest) -> tuple[list[commands.Request], list[str]]:
+    """Read a client's request. Task sets of the previous release send it in the client's form.
 
     Returns:
         The commands in the order in which they are to be done, and a text for each item that cannot be read.
     """
-    try:
-        message = read_request(kind, data)
-    except MessageError as error:
-        return [], [f"{kind}: {error}"]
-    faults = getattr(message, "faults", ())
-    return list(_commands(message, user)), [f"{kind}: {fault}" for fault in faults]
+    content = request.content
+    if content is None:
+        try:
+            content = read_request(request.type, request.data)
+        except MessageError as error:
+            return [], [f"{request.type}: {error}"]
+    faults = getattr(content, "faults", ())
+    return list(commands_of(content, user)), [f"{request.type}: {fault}" for fault in faults]
 
 
-def _commands(message: messages.Request, user: str) -> Iterator[commands.Request]:
-    items: list[Struct]
-    match message:
-        case messages.ConfigureComponents():
-            items = [
-                *message.remove_nodes,
-                *message.remove_interfaces,
-                *message.delete_param,
-                *message.set_param,
-                *message.add_interfaces,
-                *message.add_nodes,
+def commands_of(request: Request | Component, user: str) -> Iterator[commands.Request]:
+    """Return the commands of a request, in the order in which they are to be done.
+
+    Removals come first, so that one request can replace an object; parameters are set and interfaces made
+    before nodes start, so that a node finds them.
+
+    Args:
+        request: The request.
+        user: The requesting user.
+    """
+    match request:
+        case requests.ConfigureComponents():
+            items: list[Component] = [
+                *request.remove_nodes,
+                *request.remove_interfaces,
+                *request.delete_param,
+                *request.set_param,
+                *request.add_interfaces,
+                *request.add_nodes,
             ]
             yield from (_command(item, user) for item in items)
-        case messages.ConfigureConnections():
-            for pair in message.disconnect:
+        case requests.ConfigureConnections():
+            for pair in request.disconnect:
                 yield commands.Disconnect(user=user, tag_a=pair.tag_a, tag_b=pair.tag_b)
-            for pair in message.connect:
+            for pair in request.connect:
                 yield commands.Connect(user=user, tag_a=pair.tag_a, tag_b=pair.tag_b)
+        case requests.CreateContainer() | requests.ResizeContainer() | requests.DestroyContainer():
+            yield _command(request, user)
+        case (
+            requests.AddNode() | requests.RemoveNode() | requests.AddInterface() | requests.RemoveInterface()
+        ):
+            yield _command(request, user)
+        case requests.SetParameter() | requests.DeleteParameter():
+            yield _command(request, user)
         case _:
-            yield _command(message, user)
+            assert_never(request)
 
 
 @singledispatch
-def _command(item: Struct, user: str) -> commands.Request:
-    raise TypeError(f"{type(item).__name__} of {user} is no request")
+def _command(item: object, user: str) -> commands.Request:
+    raise TypeError(f"{type(item).__name__} of {user} is not a request")
 
 
 @_command.register
-def _(item: messages.CreateContainer, user: str) -> commands.Request:
-    data = item.container_data
-    return commands.CreateContainer(
-        user=user, tag=item.container_tag, resources=resources(data), wait=data.wait
-    )
+def _(item: requests.CreateContainer, user: str) -> commands.Request:
+    return commands.CreateContainer(user=user, tag=item.tag, resources=item.resources, wait=item.wait)
 
 
 @_command.register
-def _(item: messages.ResizeContainer, user: str) -> commands.Request:
-    data = item.container_data
-    return commands.ResizeContainer(
-        user=user,
-        tag=item.container_tag,
-        size=data.size,
-        cpu=None if data.cpu is None else read_cores(data.cpu),
-        memory=None if data.memory is None else read_memory(data.memory),
-        bandwidth=None if data.bandwidth is None else read_bandwidth(data.bandwidth),
-    )
+def _(item: requests.ResizeContainer, user: str) -> commands.Request:
+    return commands.ResizeContainer(user=user, tag=item.tag, changes=item.changes)
 
 
 @_command.register
-def _(item: messages.DestroyContainer, user: str) -> commands.Request:
-    return commands.DestroyContainer(user=user, tag=item.container_tag)
+def _(item: requests.DestroyContainer, user: str) -> commands.Request:
+    return commands.DestroyContainer(user=user, tag=item.tag)
 
 
 @_command.register
-def _(item: messages.AddNode, user: str) -> commands.Request:
-    return commands.AddNode(user=user, container=item.container_tag, node=node_spec(item))
+def _(item: requests.AddNode, user: str) -> commands.Request:
+    return commands.AddNode(user=user, container=item.container, node=item.node)
 
 
 @_command.register
-def _(item: messages.RemoveNode, user: str) -> commands.Request:
-    return commands.RemoveNode(user=user, container=item.container_tag, tag=item.node_tag)
+def _(item: requests.RemoveNode, user: str) -> commands.Request:
+    return commands.RemoveNode(user=user, container=item.container, tag=item.tag)
 
 
 @_command.register
-def _(item: messages.AddInterface, user: str) -> commands.Request:
-    interface = InterfaceSpec(
-        tag=item.interface_tag, type=item.interface_type, cls=item.class_name, addr=item.addr
-    )
-    return commands.AddInterface(user=user, endpoint=item.endpoint_tag, interface=interface)
+def _(item: requests.AddInterface, user: str) -> commands.Request:
+    return commands.AddInterface(user=user, endpoint=item.endpoint, interface=item.interface)
 
 
 @_command.register
-def _(item: messages.RemoveInterface, user: str) -> commands.Request:
-    return commands.RemoveInterface(user=user, endpoint=item.endpoint_tag, tag=item.interface_tag)
+def _(item: requests.RemoveInterface, user: str) -> commands.Request:
+    return commands.RemoveInterface(user=user, endpoint=item.endpoint, tag=item.tag)
 
 
 @_command.register
-def _(item: messages.SetParam, user: str) -> commands.Request:
-    return commands.SetParameter(user=user, container=item.container_tag, name=item.name, value=item.value)
+def _(item: requests.SetParameter, user: str) -> commands.Request:
+    name, value = item.parameter.name, item.parameter.value
+    return commands.SetParameter(user=user, container=item.container, name=name, value=value)
 
 
 @_command.register
-def _(item: messages.DeleteParam, user: str) -> commands.Request:
-    return commands.DeleteParameter(user=user, container=item.container_tag, name=item.name)
-
-
-def resources(data: messages.ContainerData) -> Resources:
-    """Read what a container asks for."""
-    return Resources(
-        group=data.group,
-        group_ip=data.group_ip,
-        network=Network.GROUP if data.joins_group else Network(data.network or Network.NONE.value),
-        image=data.image,
-        size=max(1, data.size),
-        cpu=read_cores(data.cpu),
-        memory=read_memory(data.memory),
-        bandwidth=read_bandwidth(data.bandwidth),
-        special_features=data.features,
-    )
-
-
-def node_spec(item: messages.AddNode) -> NodeSpec:
-    """Read a node."""
-    return NodeSpec(
-        tag=item.node_tag,
-        pkg=item.pkg,
-        exe=item.exe,
-        args=item.args,
-        name=item.name,
-        namespace=item.namespace,
-        restart=RestartPolicy(item.restart),
-        max_restarts=item.max_restarts,
-        after=item.after,
-        heartbeat=item.heartbeat,
-        heartbeat_timeout=item.heartbeat_timeout,
-    )
+def _(item: requests.DeleteParameter, user: str) -> commands.Request:
+    return commands.DeleteParameter(user=user, container=item.container, name=item.name)

@@ -1,4 +1,4 @@
-"""Everything that can be set on a master."""
+"""The settings of a master."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CONTROL_PORT = 8080
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MasterSettings:
-    """Everything that can be set on a master. Port 0 takes a free one."""
+    """The settings of a master. Port 0 takes a free one."""
 
     bind: str = ANYWHERE
     http_port: int = HTTP_PORT
@@ -34,13 +34,13 @@ class MasterSettings:
     tls: TlsChoice = field(default_factory=TlsChoice)
     allowed_origins: tuple[str, ...] = ()
     public_names: tuple[str, ...] = ()
-    """Names by which the server may be asked for, beside its address, its host name and ``localhost``."""
+    """Allowed host names of the server, beside its address, its host name and ``localhost``."""
     trusted_proxies: tuple[str, ...] = ()
-    """Addresses or networks of proxies whose ``X-Forwarded-For`` is believed."""
+    """Addresses or networks of proxies whose ``X-Forwarded-For`` is trusted."""
     token_lifetime: float = TOKEN_LIFETIME_S
     """Seconds."""
     quotas: QuotaSettings = field(default_factory=QuotaSettings)
-    """What one user may ask of the master at a time."""
+    """The quotas of one user."""
     state: StateSettings = field(default_factory=StateSettings)
 
 

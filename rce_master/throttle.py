@@ -1,10 +1,10 @@
-"""Slows down who guesses passwords, by address and user (pure: the time is an argument).
+"""Slows down the guessing of passwords, by address and user (pure: the time is an argument).
 
 A check that fails costs a token of two buckets: that of the address and user, and that of the address.
 
 When the first is empty the next check has to wait for a token, and is refused when that takes longer than
-anybody waits at a door. When the second is empty checks wait for a moment, but are not refused: many robots
-and people share an address behind a router, and who guesses there must not keep them out.
+a login at a door may wait. When the second is empty checks wait for a moment, but are not refused: many
+robots and people share an address behind a router, and an attacker there must not lock them out.
 
 A check that succeeds costs nothing, so a fleet behind one address is never slowed down by itself, and wrong
 passwords from one address cost those at other addresses nothing.
@@ -17,7 +17,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from rce.guard.rates import Rates
-from rce_master.exceptions import TooManyFailures
+from rce_master.exceptions import TooManyFailuresError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -59,20 +59,20 @@ class FailureThrottle:
             Seconds to wait before the check.
 
         Raises:
-            TooManyFailures: It would have to wait too long; nothing was counted.
+            TooManyFailuresError: It would have to wait too long; nothing was counted.
         """
         pair = _pair(address, user)
         delay = self._pairs.reserve(pair, now)
         if delay > MAX_DELAY_S:
             self._pairs.give_back(pair, now)
-            raise TooManyFailures(delay)
+            raise TooManyFailuresError(delay)
         others = self._addresses.reserve(address, now)
         if others > MAX_ADDRESS_DELAY_S:
             self._addresses.give_back(address, now)  # who is not refused must not owe more and more
         delay = max(delay, min(others, MAX_ADDRESS_DELAY_S))
         if delay and self.delayed.total() >= MAX_DELAYED and self.delayed[pair]:
             self.passed(address, user, now)
-            raise TooManyFailures(max(1.0, delay))
+            raise TooManyFailuresError(max(1.0, delay))
         return delay
 
     @contextlib.contextmanager

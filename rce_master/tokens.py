@@ -8,7 +8,7 @@ import secrets
 import time
 from typing import TYPE_CHECKING, Protocol
 
-from rce_master.exceptions import WrongCredentials
+from rce_master.exceptions import WrongCredentialsError
 from rce_master.state import commands
 from rce_master.state.records import Token
 
@@ -53,7 +53,7 @@ def new_token(
 
 
 class _Submits(Protocol):
-    """Carries out commands: :class:`rce_master.realm.Realm`."""
+    """Carries out commands: :class:`rce_master.state_service.StateService`."""
 
     async def submit_all(self, commands: Sequence[commands.Command]) -> object:
         """Do commands."""
@@ -78,13 +78,13 @@ class Tokens:
         """Return whose token it is, and what is kept of it.
 
         Raises:
-            WrongCredentials: It is unknown, expired or was revoked.
+            WrongCredentialsError: It is unknown, expired or was revoked.
         """
         now = self._clock()
         record = self._tables.tokens.get(token_digest(token))
         user = self._tables.users.get(record.user) if record else None
         if record is None or user is None or record.is_expired(now):
-            raise WrongCredentials("unknown or expired token; log in again")
+            raise WrongCredentialsError("unknown or expired token; log in again")
         self._used[record.digest] = now
         return user, record
 
@@ -97,9 +97,9 @@ class Tokens:
         used, self._used = self._used, {}
         return commands.NoteTokenUses(used=used)
 
-    async def run(self, realm: _Submits) -> None:
+    async def run(self, state_service: _Submits) -> None:
         """Note the uses again and again, until cancelled."""
         while True:
             await asyncio.sleep(NOTE_EVERY_S)
             if self._used:
-                await realm.submit_all([self.uses()])
+                await state_service.submit_all([self.uses()])

@@ -1,7 +1,7 @@
-"""What containers consume over time: rates of the moment, and enough of the past to give advice.
+"""The usage of containers over time: current rates, and a history for advice.
 
 Task sets tell counters every other second. Kept are the newest two of each container, for rates, and one
-every :data:`STEP_S` for the last :data:`WINDOW_S`; so much for each container, whatever it does.
+every :data:`STEP_S` for the last :data:`WINDOW_S`; the same amount for each container.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ NO_RATES = Rates()
 
 
 def rates_between(before: Sample, now: Sample) -> Rates:
-    """Tell what happened in a second between two samples of one life of a container."""
+    """Tell what happened in a second between two samples of one incarnation of a container."""
     elapsed = now.time - before.time
     if elapsed < _LEAST_S:
         return NO_RATES
@@ -70,7 +70,7 @@ def rates_between(before: Sample, now: Sample) -> Rates:
 
 @dataclass(slots=True)
 class History:
-    """One life of a container."""
+    """One incarnation of a container."""
 
     before: Sample
     now: Sample
@@ -106,7 +106,7 @@ class History:
 
     @property
     def samples(self) -> Sequence[Sample]:
-        """All that is kept, from old to new."""
+        """The kept samples, from old to new."""
         return [*self.steps, *([self.now] if self.now is not self.steps[-1] else [])]
 
     def node_cpu(self, node: str) -> float:
@@ -120,7 +120,7 @@ class History:
 
 
 class UsageBook:
-    """What all task sets last told of what they consume, and the history of each container.
+    """The last usage report of each task set, and the history of each container.
 
     Args:
         clock: Seconds that never go back.

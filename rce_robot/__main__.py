@@ -1,4 +1,4 @@
-"""Starts ``rce-robot``: with settings handed over without what reads command lines, which takes 5 MB."""
+"""Starts ``rce-robot``; handed-over settings do not load the command-line parser, which takes 5 MB."""
 
 from __future__ import annotations
 

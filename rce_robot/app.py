@@ -16,25 +16,24 @@ from rce.config.exceptions import ShippedFileError
 from rce.config.folders import run_dir
 from rce.config.resources import examples_dir
 from rce.control.channel import TaskSetChannel
+from rce.control.machine import machine_memory
 from rce.control.messages import MachineInfo
 from rce.control.model import LinkAddress
-from rce.control.usage import machine_memory
 from rce.guard.lobby import Lobby
-from rce.guard.proxies import TrustedProxies
 from rce.link import LinkHub
 from rce.link.address import in_url, is_any, own_address
 from rce.link.listening import listen_on
 from rce.link.unix import remove_stale_sockets, socket_name
 from rce.lookups import LOOKUPS
+from rce.masters import Masters, split_addresses
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.supervision.signals import end_signals
 from rce.tls.choice import TlsChoice, plain_warning
 from rce.tls.expiry import name_warning
 from rce_robot.conversion import ConversionPool
+from rce_robot.doors.client.door import ClientDoor
 from rce_robot.factory import FormFactory
-from rce_robot.gate import Gate
-from rce_robot.server import serve_robots
 from rce_robot.settings import RobotSettings
 from rce_robot.taskset import RobotTaskSet
 
@@ -43,6 +42,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rce.config.secret import Secret
+    from rce_robot.doors.base import Door
 
 _log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class App:
     """A robot task set that is to be run."""
 
     master: str
-    """Host of the master."""
+    """Host of the master; several are separated by commas."""
     control_port: int
     secret: Secret
     packages: Sequence[Path]
@@ -63,7 +63,7 @@ class App:
         """Run until SIGINT or SIGTERM.
 
         Args:
-            ready: Called with the WebSocket URL when robots can come.
+            ready: Called with the WebSocket URL when robots can connect.
 
         Raises:
             OSError: A port cannot be taken.
@@ -74,7 +74,7 @@ class App:
         for number in end_signals():
             loop.add_signal_handler(number, stop.set)
         async with self.started(ready, stop):
-            # What is there now stays; to look through it for garbage again and again takes 20 ms each time.
+            # The present objects stay; each garbage collection of them would take 20 ms.
             gc.collect()
             gc.freeze()
             await stop.wait()
@@ -83,18 +83,18 @@ class App:
     async def started(
         self, ready: Callable[[str], None], stop: asyncio.Event | None = None
     ) -> AsyncIterator[None]:
-        """Run for as long as the context lasts.
+        """Run as long as the context lasts.
 
         Args:
             ready: As for :meth:`run`.
-            stop: Set when the context is to be left at once: nothing is waited for at its start then.
+            stop: Set when the context is to be left at once: then its start does not wait.
         """
         settings = self.settings
         for_robots, for_task_sets = self.tls.for_clients(), self.tls.for_task_sets()
         machine = settings.machine or socket.gethostname()
         reach = settings.public_host or settings.host
         if is_any(reach):
-            reach = await own_address(self.master, self.control_port, stop)
+            reach = await own_address(split_addresses(self.master)[0], self.control_port, stop)
         name = f"robot_{secrets.token_hex(4)}"
         packages = _package_index(self.packages)
         types = TypeRegistry(packages)
@@ -123,23 +123,20 @@ class App:
                 lobby=lobby,
                 pool=pool,
             )
-            control = f"{'wss' if for_task_sets else 'ws'}://{in_url(self.master)}:{self.control_port}"
+            scheme = "wss" if for_task_sets else "ws"
+            hosts = split_addresses(self.master)
             channel = TaskSetChannel(
-                control,
+                Masters(f"{scheme}://{in_url(host)}:{self.control_port}" for host in hosts),
                 self.secret,
                 task_set.hello,
                 task_set.handle,
                 tls=for_task_sets.client if for_task_sets else None,
             )
             task_set.use(channel)
-            gate = Gate(
-                task_set, settings.session, settings.origins, TrustedProxies(settings.trusted_proxies)
-            )
+            door: Door = ClientDoor(settings, listener, lobby, for_robots.server if for_robots else None)
             async with asyncio.TaskGroup() as tasks:
                 running = [tasks.create_task(channel.run())]
-                async with serve_robots(
-                    gate, settings, listener, lobby, for_robots.server if for_robots else None
-                ):
+                async with door.opened(task_set):
                     running.append(tasks.create_task(task_set.run()))
                     running.append(tasks.create_task(_announce(channel, url, ready)))
                     yield
@@ -156,7 +153,7 @@ def _warn(text: str | None) -> None:
 
 
 def _package_index(given: Sequence[Path]) -> PackageIndex:
-    """Return the packages on the given path, then on the environment's, then those that are shipped."""
+    """Return the packages on the given path, then on the environment's, then the shipped ones."""
     path = [*given, *PackageIndex.from_environ().path]
     with contextlib.suppress(ShippedFileError):
         path.append(examples_dir())
@@ -164,7 +161,7 @@ def _package_index(given: Sequence[Path]) -> PackageIndex:
 
 
 async def _announce(channel: TaskSetChannel, url: str, ready: Callable[[str], None]) -> None:
-    """Say that robots can come, once the master knows where to send them."""
+    """Report that robots can connect, once the master knows where to send them."""
     await channel.wait_connected()
     ready(url)
 
@@ -172,7 +169,7 @@ async def _announce(channel: TaskSetChannel, url: str, ready: Callable[[str], No
 async def _listen(
     hub: LinkHub, machine: str, name: str, reach: str, settings: RobotSettings, *, tls: bool
 ) -> LinkAddress:
-    """Accept links on a unix socket and on TCP; return where."""
+    """Accept links on a unix socket and on TCP; return the addresses."""
     remove_stale_sockets(run_dir(), "robot_*.sock")
     path = run_dir() / socket_name(name)
     await hub.listen_unix(path)
@@ -181,7 +178,7 @@ async def _listen(
 
 
 async def _bind(host: str, port: int) -> socket.socket:
-    """Take the WebSocket port, so that its number is known before anything is told to the master."""
+    """Bind the WebSocket port, so that its number is known before the first message to the master."""
     infos = await LOOKUPS.addresses(host or None, port, flags=socket.AI_PASSIVE)
     family, _, _, _, address = infos[0]
     listener = socket.socket(family, socket.SOCK_STREAM)

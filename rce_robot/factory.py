@@ -1,18 +1,18 @@
-"""Chooses what reads and writes the messages of a robot's interface, by its type and class."""
+"""Chooses the form of a robot's interface, by its type and class."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from rce.link import InterfaceError
-from rce.protocol.names import Form as FormName
-from rce.protocol.names import InterfaceType, Role
+from rce.model.names import Form as FormName
+from rce.model.names import InterfaceType, Role
 from rce.ros.types import TypesError
 from rce_robot.converters import Converters
 from rce_robot.forms import ConverterForm, ForwarderForm
 
 if TYPE_CHECKING:
-    from rce.control.model import InterfaceSpec
+    from rce.model.specs import InterfaceSpec
     from rce.ros.types import MessageType, TypeRegistry
     from rce_robot.forms import Form
 
@@ -28,7 +28,7 @@ class FormFactory:
         """Return the forms from and to the robot.
 
         Raises:
-            InterfaceError: The interface is none of a robot, or its class is not known.
+            InterfaceError: The interface is not one of a robot, or its class is unknown.
         """
         if type_.form is FormName.INTERFACE:
             raise InterfaceError(f"{type_} is a container's; a robot has Converters and Forwarders")
@@ -42,9 +42,9 @@ class FormFactory:
         """Return the message types from and to the robot."""
         try:
             if not role.is_service:
-                message = self._types.message(spec.cls)
+                message = self._types.message(spec.message_type)
                 return message, message
-            service = self._types.service(spec.cls)
+            service = self._types.service(spec.message_type)
         except TypesError as error:
             raise InterfaceError(str(error)) from error
         if role is Role.SERVICE_PROVIDER:  # the robot asks

@@ -1,4 +1,4 @@
-"""How a message looks at the robot's end: a JSON object (Converter) or its serialized bytes (Forwarder)."""
+"""The forms of messages at the robot's end: a JSON object (Converter) or serialized bytes (Forwarder)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import msgspec
 
 from rce.protocol.codec import encode_data
-from rce.ros.types.message import element_min_size
+from rce.ros.types.fields import element_min_size
 from rce_robot.exceptions import UnreadableError
 from rce_robot.outgoing import Outgoing, Serialized
 
@@ -24,40 +24,40 @@ _BINARY = (bytes, bytearray, memoryview)
 
 
 class Form(Protocol):
-    """Reads what the robot sends at an interface and writes what it gets there."""
+    """Reads the robot's messages at an interface and writes messages to it."""
 
     costly: bool
-    """Whether :meth:`read` and :meth:`show` may take so long that they belong in another process."""
+    """Whether :meth:`read` and :meth:`show` may take long enough to need another process."""
     readable: bool
-    """Whether there is a message that :meth:`read` takes and that is JSON as a whole."""
+    """Whether :meth:`read` accepts messages that are entirely JSON."""
 
     def is_heavy(self, payload: Buffer) -> bool:
-        """Tell whether :meth:`show` takes so long for this payload that it belongs in another process."""
+        """Return whether :meth:`show` takes long enough for this payload to need another process."""
 
     def read(self, msg: Any, warn: Callable[[str], None]) -> Buffer:
         """Return the serialized message.
 
         Args:
             msg: ``msg`` of a data message.
-            warn: Told of what was ignored.
+            warn: Called for ignored fields.
 
         Raises:
-            UnreadableError: It is no such message.
+            UnreadableError: It is not such a message.
         """
 
     def show(self, payload: Buffer) -> Any:
-        """Return what stands for a serialized message in ``msg``.
+        """Return the form of a serialized message in ``msg``.
 
         Raises:
-            UnreadableError: The payload is no such message.
+            UnreadableError: The payload is not such a message.
         """
 
-    def pack(self, tag: str, cls: str, msg_id: str, msg: Any) -> Rendered:
-        """Return the data message that carries what :meth:`show` returned."""
+    def pack(self, tag: str, message_type: str, msg_id: str, msg: Any) -> Rendered:
+        """Return the data message that carries the result of :meth:`show`."""
 
 
 class ForwarderForm:
-    """Serialized messages travel as binary values and are never looked into."""
+    """Serialized messages travel as binary values and are not parsed."""
 
     costly = False
     readable = False
@@ -67,7 +67,7 @@ class ForwarderForm:
         return False
 
     def read(self, msg: Any, warn: Callable[[str], None]) -> Buffer:  # noqa: ARG002 - nothing is ignored here
-        """Return the bytes as they came."""
+        """Return the received bytes unchanged."""
         if not isinstance(msg, _BINARY):
             raise UnreadableError("a Forwarder takes a serialized message as binary value 'msg*'")
         return msg
@@ -76,9 +76,9 @@ class ForwarderForm:
         """Return the payload."""
         return payload
 
-    def pack(self, tag: str, cls: str, msg_id: str, msg: Buffer) -> Serialized:
-        """Put names beside the payload, which is not copied."""
-        names = b'"iTag":"%b","type":"%b","msgID":%b' % (tag.encode(), cls.encode(), _json(msg_id))
+    def pack(self, tag: str, message_type: str, msg_id: str, msg: Buffer) -> Serialized:
+        """Add names to the payload, which is not copied."""
+        names = b'"iTag":"%b","type":"%b","msgID":%b' % (tag.encode(), message_type.encode(), _json(msg_id))
         return Serialized(names, msg)
 
 
@@ -95,17 +95,17 @@ class ConverterForm:
         self._element_size = _element_size(converter.kind)
 
     def is_heavy(self, payload: Buffer) -> bool:
-        """Tell by the type and the payload's size how many values it may hold, and how long its texts are."""
+        """Estimate from the type and the payload's size how many values and how long texts it holds."""
         size = len(payload)
         if self.costly or size > _MAX_LIGHT:
             return True
         if self._element_size:
             return size > _MAX_LIGHT_ELEMENTS * self._element_size
-        # A text beyond ASCII takes ten times as long; what leaves as binary values takes no time.
+        # A text beyond ASCII takes ten times as long; binary values take no time.
         return size > _ANY_CHARACTERS and not self._holds_bytes and not _is_ascii(payload)
 
     def read(self, msg: Any, warn: Callable[[str], None]) -> Buffer:
-        """Serialize the object; fields that the message does not have are ignored with a warning."""
+        """Serialize the object; unknown fields are ignored with a warning."""
         payload, ignored = self._converter.decode(msg)
         for field in ignored:
             warn(f"unknown field {field} was ignored")
@@ -115,15 +115,15 @@ class ConverterForm:
         """Make an object of the payload."""
         return self._converter.encode(payload)
 
-    def pack(self, tag: str, cls: str, msg_id: str, msg: Any) -> Outgoing:
+    def pack(self, tag: str, message_type: str, msg_id: str, msg: Any) -> Outgoing:
         """Write the object as JSON."""
-        if self._is_plain:  # no search for binary values, and no way through a str
-            names = (tag.encode(), cls.encode(), _json(msg_id))
+        if self._is_plain:  # without a search for binary values or a str in between
+            names = (tag.encode(), message_type.encode(), _json(msg_id))
             packed = bytearray(b'{"type":"DM","data":{"iTag":"%b","type":"%b","msgID":%b,"msg":' % names)
-            _json_into(msg, packed, -1)  # in place: a large message is not copied once more
+            _json_into(msg, packed, -1)  # in place: avoids another copy of a large message
             packed += b"}}"
             return Outgoing(packed)
-        text, *binaries = encode_data(tag, cls, msg, msg_id)
+        text, *binaries = encode_data(tag, message_type, msg, msg_id)
         assert isinstance(text, str)
         return Outgoing(text.encode(), tuple((b"", frame) for frame in binaries if isinstance(frame, bytes)))
 
@@ -136,11 +136,11 @@ _FIXED = 64
 
 
 _SLICE = 64 << 10
-"""Bytes of a payload that are looked at at a time: no large copy is made."""
+"""Bytes of a payload that are checked at a time, to avoid a large copy."""
 
 
 def _is_ascii(payload: Buffer) -> bool:
-    """Tell whether all that may be text is plain."""
+    """Return whether all possible texts are ASCII."""
     view = memoryview(payload)
     return all(bytes(view[i : i + _SLICE]).isascii() for i in range(_FIXED, len(view), _SLICE))
 

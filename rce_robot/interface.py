@@ -1,92 +1,91 @@
-"""What the four roles of a robot's interfaces have in common."""
+"""The base of the four roles of a robot's interfaces."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from typing import TYPE_CHECKING, Any, Protocol
 
+from rce.aio.queues import OverflowPolicy
 from rce.link import Interface
-from rce.protocol.messages import NO_ID
-from rce_robot.exceptions import MisdirectedError, UnreadableError
+from rce_robot.exceptions import MisdirectedError, RobotError, UnreadableError
 from rce_robot.offload import Offload, Read
-from rce_robot.outbox import Overflow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
     from rce.guard.holdings import Holding
     from rce.link import Port
-    from rce.protocol.messages import DataMessage
+    from rce.protocol.messages import CallId, DataMessage
     from rce.protocol.stream import LargeData
     from rce_robot.conversion import Result
     from rce_robot.conversion.jobs import Job
+    from rce_robot.doors.base import Queued
     from rce_robot.forms import Form
-    from rce_robot.outbox import Queued
     from rce_robot.outgoing import Buffer, Rendered
 
 URGENT_BELOW = 64 << 10
-"""Service messages smaller than so many bytes go in the control lane."""
+"""Service messages smaller than this (bytes) go in the control lane."""
 
 MAX_WARNINGS = 256
-"""Different warnings that one interface gives."""
+"""Maximum number of different warnings of one interface."""
 
 
 class RobotSide(Protocol):
-    """What an interface may do with its robot. Nothing here blocks or raises."""
+    """The interface of a role to its robot. These methods do not block or raise."""
 
     @property
     def connected(self) -> bool:
-        """Whether the robot is there."""
+        """Whether the robot is connected."""
 
-    def send_data(self, tag: str, message: Queued, overflow: Overflow) -> bool:
+    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
         """Send in the data lane; False if the queue refuses or the robot is away."""
 
     def send_urgent(self, message: Queued) -> bool:
         """Send in the control lane; False if that is full or the robot is away."""
 
-    def report(self, text: str) -> None:
-        """Send an ``ER``."""
+    def report(self, problem: str, call: CallId | None = None) -> None:
+        """Send an ``ER``; with a call: that it failed."""
 
     def show_active(self, tag: str, active: bool) -> None:
         """Send an ``ST``."""
 
     @property
     def knows_sources(self) -> bool:
-        """Whether the robot is there and names the sources of latched messages."""
+        """Whether the robot is connected and names the sources of latched messages."""
 
     def send_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
         """Send a latched message in the data lane: it is not dropped, but replaced.
 
         Args:
             tag: Of the interface.
-            source: Whose message it is.
-            message: Takes the place of an earlier one of the source that was not sent yet.
-            shared: Its bytes are kept elsewhere too, and counted there.
+            source: The source of the message.
+            message: Replaces an unsent one of the same source.
+            shared: Whether its bytes are also kept elsewhere and counted there.
         """
 
     def send_sources(self, tag: str, sources: Sequence[str]) -> None:
-        """Tell the robot, if it knows of sources, which ones' latched messages are in force."""
+        """Tell a robot that supports sources which ones' latched messages are in force."""
 
     def drop_latched(self, tag: str, source: str) -> None:
-        """Take :meth:`send_latched` back, if the message was not sent yet."""
+        """Undo :meth:`send_latched`, if the message was not sent yet."""
 
     def hold(self, size: int, give_up: Callable[[], object] | None = None) -> Holding:
         """Count bytes that are held outside all queues; see :class:`rce.guard.holdings.Holdings`."""
 
     async def convert(self, job: Job, parts: Sequence[Buffer]) -> tuple[Result, list[memoryview]]:
-        """Have a conversion done in another process; raises :class:`ConversionFailed`."""
+        """Have a conversion done in another process; raises :class:`ConversionFailedError`."""
 
     def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
-        """Have a large message come again when the binary values that it refers to are there."""
+        """Handle a large message again when the binary values that it refers to have arrived."""
 
     def run(self, work: Coroutine[Any, Any, None]) -> bool:
-        """Run something until the robot leaves; False (and nothing done) if too much runs already."""
+        """Run a coroutine until the robot leaves; return False (without effect) if too many run already."""
 
     def count_dropped(self, tag: str) -> None:
-        """A message was thrown away before it was queued."""
+        """Count a message that was dropped before it was queued."""
 
     def closed(self, interface: RobotInterface) -> None:
-        """The interface is gone."""
+        """Note that the interface was removed."""
 
 
 class Delivery:
@@ -101,7 +100,7 @@ class Delivery:
         self.size = len(payload)
 
     def render(self) -> Rendered | None:
-        """Convert the message; a failure is reported to the robot and to whoever waits for an answer."""
+        """Convert the message; report a failure to the robot and to the caller that waits for an answer."""
         interface = self._interface
         try:
             return interface.pack(interface.form_out.show(self._payload), self._msg_id)
@@ -126,7 +125,7 @@ class RobotInterface(Interface):
         self.form_in = form_in
         self.form_out = form_out
         self.tag = port.spec.tag
-        self.cls = port.spec.cls
+        self.message_type = port.spec.message_type
         self.offload = Offload(robot, port.spec)
         self.active = False
         self._warned: set[str] = set()
@@ -140,47 +139,46 @@ class RobotInterface(Interface):
         """
 
     def take_large(self, large: LargeData) -> None:
-        """Handle a data message that was not parsed yet, because that takes long.
+        """Handle an unparsed data message, whose parsing takes long.
 
         Raises:
             RobotError: It is refused.
         """
-        raise MisdirectedError(
-            f"{self._name(large.address.msg_id)}: the interface takes nothing from the robot"
-        )
+        problem = "the interface takes nothing from the robot"
+        raise MisdirectedError.at(self.tag, large.address.msg_id, problem)
 
     def keep_latched(self, sources: Sequence[str]) -> None:
-        """Take note that the robot's sources other than these ended."""
+        """Note that the robot's sources other than these ended."""
 
     def refused(self, msg_id: str, problem: str) -> None:
-        """Take note that a message of the robot with this id was refused, which the robot knows."""
+        """Note that a message of the robot with this id was refused; the robot has been told."""
 
     def on_active(self, active: bool) -> None:
-        """Tell the robot."""
+        """Tell the robot whether the interface is in use."""
         self.active = active
         self.robot.show_active(self.tag, active)
 
     def robot_joined(self) -> None:
-        """Give the robot that (again) connected what it must know."""
+        """Send a newly connected robot the state of the interface."""
         if self.active:
             self.robot.show_active(self.tag, True)
 
     def robot_left(self) -> None:
-        """Give up what waits for the robot."""
+        """Fail the calls that wait for the robot."""
 
     def not_rendered(self, msg_id: str, problem: str) -> None:
-        """Deal with a message to the robot that could not be converted."""
-        self.robot.report(f"{self._name(msg_id)}: {problem}")
+        """Handle a message to the robot that could not be converted."""
+        self._report(problem, msg_id)
 
     def pack(self, msg: Any, msg_id: str) -> Rendered:
         """Return the data message that carries ``msg`` to the robot."""
-        return self.form_out.pack(self.tag, self.cls, msg_id, msg)
+        return self.form_out.pack(self.tag, self.message_type, msg_id, msg)
 
     async def start(self) -> None:
-        """Do nothing: a robot's interface can be used as soon as it is there."""
+        """Do nothing: a robot's interface is usable as soon as it exists."""
 
     async def close(self) -> None:
-        """Tell the robot's side that it is gone."""
+        """Tell the robot's side that the interface was removed."""
         self.robot_left()
         self.robot.closed(self)
 
@@ -188,34 +186,36 @@ class RobotInterface(Interface):
         try:
             return self.form_in.read(message.msg, warn)
         except UnreadableError as error:
-            raise UnreadableError(f"{self._name(message.msg_id)}: {error}") from error
+            raise UnreadableError.at(self.tag, message.msg_id, str(error)) from error
 
     async def read_large(self, large: LargeData) -> Read:
-        """Convert a message that was not parsed yet; one that needs binary values comes again with them."""
+        """Convert an unparsed message; one that needs binary values is handled again with them."""
         read = await self.offload.read_text(large)
         if read.ids:
             self.robot.await_binaries(large, read.ids)
         return read
 
     def _warn(self, text: str) -> None:
-        """Report something that was ignored, once."""
+        """Report an ignored field, once."""
         if text not in self._warned and len(self._warned) < MAX_WARNINGS:
             self._warned.add(text)
             self.robot.report(f"{self.tag}: {text}")
 
-    def _name(self, msg_id: str) -> str:
-        return self.tag if msg_id == NO_ID else f"{self.tag}, msgID {msg_id}"
+    def _report(self, problem: str, msg_id: str) -> None:
+        """Report a fault of one message to the robot, with or without a service call."""
+        error = RobotError.at(self.tag, msg_id, problem)
+        self.robot.report(error.problem, error.call)
 
     async def _send_service(self, payload: Buffer, msg_id: str) -> bool:
-        """Send a request or an answer to the robot; False if too much waits.
+        """Send a request or an answer to the robot; return False if too many wait.
 
         Raises:
-            UnreadableError: It is large, and no message of the type.
+            UnreadableError: It is large and not a message of the type.
         """
         if self.form_out.is_heavy(payload):
             outgoing = await self.offload.show(payload, msg_id)
-            return self.robot.send_data(self.tag, outgoing, Overflow.REFUSE)
+            return self.robot.send_data(self.tag, outgoing, OverflowPolicy.REFUSE)
         delivery = Delivery(self, payload, msg_id)
         if len(payload) < URGENT_BELOW:
             return self.robot.send_urgent(delivery)
-        return self.robot.send_data(self.tag, delivery, Overflow.REFUSE)
+        return self.robot.send_data(self.tag, delivery, OverflowPolicy.REFUSE)

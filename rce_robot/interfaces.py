@@ -1,6 +1,6 @@
 """The robot's end of connections: four roles, each with messages as JSON objects or serialized.
 
-Roles are named from the engine's side (:class:`rce.protocol.names.Role`):
+Roles are named from the engine's side (:class:`rce.model.names.Role`):
 
 =================  ======================================  ==================================
 role               from the robot                          to the robot
@@ -14,9 +14,9 @@ ServiceClient      answers                                 requests of peers
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
-from rce.protocol.names import Role
+from rce.model.names import Role
 from rce_robot.services import AnsweredByRobot, AskedByRobot
 from rce_robot.topics import FromRobot, ToRobot
 
@@ -39,3 +39,5 @@ def make_interface(
             return AskedByRobot(port, robot, form_in, form_out)
         case Role.SERVICE_CLIENT:
             return AnsweredByRobot(port, robot, form_in, form_out, call_timeout=call_timeout)
+        case _:
+            assert_never(role)

@@ -1,36 +1,36 @@
-"""When freed memory goes back to the kernel (sans-I/O).
+"""Decides when to return freed memory to the kernel (sans-I/O).
 
-The allocator keeps what large messages freed, because it is soon needed again: up to 128 MB at the end of the
-heap, and whatever lies before a block that is still used. Nothing but a look from time to time bounds the
-latter, and nothing gives the former back when no more large messages come.
+The allocator keeps the memory of large messages for reuse: up to 128 MB at the end of the heap, and all
+memory before a block that is still used. Without periodic checks the latter is not bounded, and the former is
+not returned after the last large message.
 """
 
 from __future__ import annotations
 
 MOST_UNUSED = 128 << 20
-"""Bytes beyond what is in use that are given back even while large messages come."""
+"""Unused bytes that are returned even while large messages arrive."""
 LEAST_UNUSED = 16 << 20
-"""Bytes beyond what is in use that are not worth the trouble."""
+"""Unused bytes that are too few to return."""
 
 
 class UnusedMemory:
-    """Tells when to give memory back.
+    """Decides when to return memory.
 
     Args:
         resident: Bytes of the process before the first message.
 
     Attributes:
-        idle: Whether memory was, or is to be, given back since messages last came.
+        idle: Whether memory was, or is to be, returned since the last messages.
     """
 
     def __init__(self, resident: int) -> None:
         self._own = self._left = resident
-        """What the process needs without any message, and what was left when memory was last given back."""
+        """Bytes of the process without messages, and bytes after memory was last returned."""
         self._growths = 0
         self.idle = False
 
     def is_due(self, resident: int, held: int, growths: int) -> bool:
-        """Tell whether freed memory is to be given back now; then call :meth:`given_back`.
+        """Return whether freed memory is to be returned now; then call :meth:`given_back`.
 
         Args:
             resident: Bytes of the process.
@@ -42,13 +42,13 @@ class UnusedMemory:
             self._growths = growths
             self.idle = False
             return used - self._left > MOST_UNUSED
-        # What was left while messages came may have been theirs, so it is looked at once more.
+        # The rest may have belonged to arriving messages, so it is checked once more.
         due = used - (self._left if self.idle else self._own) > LEAST_UNUSED
         self.idle = self.idle or due
         return due
 
     def given_back(self, resident: int, held: int) -> None:
-        """Take note of what is left: asking again at once would give nothing back.
+        """Note the remaining memory: another attempt at once would have no effect.
 
         Args:
             resident: Bytes of the process now.

@@ -1,4 +1,4 @@
-"""One robot as the engine knows it, connected or not: its endpoint, its interfaces and its session.
+"""One robot, connected or not: its endpoint, its interfaces and its session.
 
 The endpoint outlives connections: while a robot is away its interfaces and their connections stay, until
 the master drops the robot or it comes back.
@@ -13,65 +13,66 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
-from rce.control.model import EndpointState, EndpointStatus, EndpointUsage
+from rce.aio.queues import OverflowPolicy
+from rce.control.model import EndpointUsage, InterfaceUsage
 from rce.guard.holdings import Holdings
 from rce.link import Endpoint, InterfaceError
-from rce.protocol.calls import call_at
-from rce.protocol.http import LATCH
-from rce.protocol.names import EndpointId, InterfaceType
+from rce.model.names import EndpointId, InterfaceType
 from rce_robot.exceptions import MisdirectedError
 from rce_robot.interfaces import make_interface
+from rce_robot.reporting import RobotReporter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
-    from rce.control.model import EndpointSpec, InterfaceSpec, LinkAddress
+    from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, SpecPatch, StatusPatch
     from rce.guard.budget import Ledger
     from rce.guard.holdings import Holding
     from rce.link import Interface, LinkHub, Port
-    from rce.protocol.calls import CallId
-    from rce.protocol.messages import DataMessage, Request
+    from rce.model.requests import Request
+    from rce.model.specs import InterfaceSpec
+    from rce.protocol.messages import CallId, DataMessage
     from rce.protocol.stream import LargeData
     from rce_robot.conversion import ConversionPool, Result
     from rce_robot.conversion.jobs import Job
+    from rce_robot.doors.base import DoorSession, Queued
     from rce_robot.forms import Form
     from rce_robot.interface import RobotInterface
-    from rce_robot.outbox import Overflow, Queued
     from rce_robot.outgoing import Buffer
-    from rce_robot.session import Session
 
 
+_UNUSED = InterfaceUsage()
 COLLECT_AFTER = 16 << 20
-"""Bytes given up after which it is made sure that they are free."""
+"""Dropped bytes after which a garbage collection makes sure that they are free."""
 
 
 class Forms(Protocol):
-    """Makes what reads and writes an interface's messages."""
+    """Makes the forms of interfaces."""
 
     def pair(self, spec: InterfaceSpec, type_: InterfaceType) -> tuple[Form, Form]:
-        """Return the forms from and to the robot; raises :class:`rce.link.InterfaceError` for a bad spec."""
+        """Return the forms from and to the robot; raise :class:`rce.link.InterfaceError` for a bad spec."""
 
 
-class Headquarters(Protocol):
-    """What a namespace tells and asks the task set."""
+class NamespaceListener(Protocol):
+    """The interface of a namespace to the task set."""
 
     def changed(self, namespace: Namespace) -> None:
         """The robot's status changed."""
 
     def failed(self, namespace: Namespace, text: str) -> None:
-        """Something failed that the robot's user must know."""
+        """Report a fault to the robot's user."""
 
     def robot_left(self, namespace: Namespace, reason: str) -> None:
         """The robot's connection ended."""
 
     async def ask_master(self, id: EndpointId, request: Request) -> tuple[str, ...]:  # noqa: A002
-        """Have the master carry out a robot's request; return what went wrong."""
+        """Have the master carry out a robot's request; return the faults."""
 
 
 class Namespace:
     """A robot.
 
-    Implements :class:`rce_robot.interface.RobotSide`, :class:`rce_robot.session.Owner` and
+    Implements :class:`rce_robot.interface.RobotSide`, :class:`rce_robot.doors.base.Owner` and
     :class:`rce.guard.budget.Holder`.
 
     Invariants: at most one session; ``_interfaces`` holds exactly what the endpoint has made and not closed.
@@ -82,7 +83,7 @@ class Namespace:
         id: EndpointId,  # noqa: A002
         hub: LinkHub,
         forms: Forms,
-        headquarters: Headquarters,
+        listener: NamespaceListener,
         address: LinkAddress,
         *,
         call_timeout: float,
@@ -91,35 +92,46 @@ class Namespace:
     ) -> None:
         self.id = id
         self.revision = 0
-        self._address = address
-        self.session: Session | None = None
-        """The session from handshake to end, also while it cannot send (yet, or any more)."""
+        self.session: DoorSession | None = None
+        """The session from handshake to end, including times when it cannot send (yet, or any more)."""
         self.dropped: Counter[str] = Counter()
-        self._live: Session | None = None
+        self._live: DoorSession | None = None
         self._forms = forms
-        self._headquarters = headquarters
+        self._listener = listener
         self._call_timeout = call_timeout
         self._interfaces: dict[str, RobotInterface] = {}
         self._applying = asyncio.Lock()
         self._pool = pool
         self._given_up = 0
-        """Bytes, since the last look for garbage."""
+        """Bytes dropped since the last garbage collection."""
         self._holdings = Holdings(self._note)
         self._account = ledger.open(id.user, self)
         self._endpoint = Endpoint(
             id, self._make, hub, on_change=self._changed, on_fault=self._failed, on_growth=self._account.note
         )
+        self._reporter = RobotReporter(self._endpoint, address)
 
     async def apply(self, spec: EndpointSpec) -> None:
         """Make interfaces and connections as desired; an older revision than the applied one is ignored."""
         async with self._applying:
             if spec.revision >= self.revision:
-                self.revision = spec.revision
                 await self._endpoint.apply(spec)
+                self.revision = spec.revision
         self._changed()
 
+    async def patch(self, patch: SpecPatch) -> bool:
+        """Apply a patch as :meth:`apply` a spec; return False if its base revision is not applied."""
+        async with self._applying:
+            if patch.revision > self.revision:
+                if patch.base != self.revision:
+                    return False
+                await self._endpoint.patch(patch)
+                self.revision = patch.revision
+        self._changed()
+        return True
+
     async def close(self, reason: str) -> None:
-        """End the connection, if there is one, and give up everything."""
+        """End the connection, if any, and remove all interfaces."""
         if self.session is not None:
             await self.session.close(reason)
         async with self._applying:
@@ -127,28 +139,32 @@ class Namespace:
         self._account.close()
 
     def status(self) -> EndpointStatus:
-        """Return what the master is told."""
-        return EndpointStatus(
-            id=str(self.id),
-            revision=self.revision,
-            state=EndpointState.RUNNING if self.session is not None else EndpointState.ABSENT,
-            interfaces=dict(self._endpoint.interfaces),
-            connections=tuple(self._endpoint.connections),
-            address=self._address,
-            client=self.session.client if self.session is not None else "",
-        )
+        """Return the whole status for the master."""
+        return self._reporter.whole(self.revision, self.session)
+
+    def next_status(self, *, in_patches: bool) -> EndpointStatus | StatusPatch:
+        """Return the next report for the master; a patch if ``in_patches``."""
+        return self._reporter.next(self.revision, self.session, in_patches=in_patches)
 
     def usage(self) -> EndpointUsage:
-        """Return the counters, with what was dropped on the way to the robot added."""
+        """Return the counters of the interfaces that were used.
+
+        Messages dropped on the way to the robot are added.
+        """
         return EndpointUsage(
             interfaces={
-                tag: msgspec.structs.replace(usage, dropped=usage.dropped + self.dropped[tag])
-                for tag, usage in self._endpoint.usage().items()
+                tag: usage
+                for tag, counted in self._endpoint.usage().items()
+                if (usage := self._with_dropped(tag, counted)) != _UNUSED
             }
         )
 
+    def _with_dropped(self, tag: str, usage: InterfaceUsage) -> InterfaceUsage:
+        dropped = self.dropped[tag]
+        return msgspec.structs.replace(usage, dropped=usage.dropped + dropped) if dropped else usage
+
     def tick(self) -> None:
-        """Do what is to be done every few seconds."""
+        """Do periodic work; called every few seconds."""
         if self._live is not None:
             self._live.tick()
 
@@ -156,12 +172,12 @@ class Namespace:
 
     @property
     def held(self) -> int:
-        """Bytes of all messages that are kept: on the way from the robot and to it, latched, being served."""
+        """Bytes of all kept messages: on the way from and to the robot, latched, being served."""
         waiting = self._endpoint.waiting_bytes + self._holdings.bytes
         return waiting + (self.session.held if self.session is not None else 0)
 
     def shed(self, size: int) -> None:
-        """Drop the oldest of what waits, on the robot's side first."""
+        """Drop the oldest waiting messages, on the robot's side first."""
         before = self.held
         goal = before - size
         if self.session is not None:
@@ -183,52 +199,53 @@ class Namespace:
         if self.session is not None:
             self.session.fail(reason)
 
-    # rce_robot.session.Owner
+    # rce_robot.doors.base.Owner
 
     def grew(self) -> None:
-        """Count what waits."""
+        """Count waiting messages."""
         self._account.note()
 
     def take(self, message: DataMessage) -> None:
-        """Give a data message of the robot to its interface.
+        """Pass a data message of the robot to its interface.
 
         Raises:
             RobotError: It is refused.
         """
         interface = self._interfaces.get(message.i_tag)
         if interface is None:
-            name = call_at(message.i_tag, message.msg_id) or message.i_tag
-            raise MisdirectedError(f"{name}: robot {self.id.tag} has no such interface")
-        if message.type != interface.cls:
-            name = call_at(message.i_tag, message.msg_id) or message.i_tag
-            problem = f"{name}: carries {interface.cls}, not {message.type}"
-            interface.refused(message.msg_id, problem)
-            raise MisdirectedError(problem)
+            problem = f"robot {self.id.tag} has no such interface"
+            raise MisdirectedError.at(message.i_tag, message.msg_id, problem)
+        if message.message_type != interface.message_type:
+            problem = f"carries {interface.message_type}, not {message.message_type}"
+            error = MisdirectedError.at(message.i_tag, message.msg_id, problem)
+            interface.refused(message.msg_id, str(error))
+            raise error
         interface.take(message)
 
     def take_large(self, large: LargeData) -> None:
-        """Give a data message that was not parsed yet to its interface.
+        """Pass an unparsed data message to its interface.
 
         Raises:
-            RobotError: It is refused; the interface knows.
+            RobotError: It is refused; the interface has been notified.
         """
         address = large.address
-        name = large.call or address.i_tag
         interface = self._interfaces.get(address.i_tag)
         if interface is None:
-            raise MisdirectedError(f"{name}: robot {self.id.tag} has no such interface")
-        if address.type and address.type != interface.cls:
-            problem = f"carries {interface.cls}, not {address.type}"
+            problem = f"robot {self.id.tag} has no such interface"
+            raise MisdirectedError.at(address.i_tag, address.msg_id, problem)
+        if address.message_type and address.message_type != interface.message_type:
+            problem = f"carries {interface.message_type}, not {address.message_type}"
         elif not interface.form_in.readable:
             problem = "a Forwarder takes a serialized message as binary value 'msg*'"
         else:
             interface.take_large(large)
             return
-        interface.refused(address.msg_id, f"{name}: {problem}")
-        raise MisdirectedError(f"{name}: {problem}")
+        error = MisdirectedError.at(address.i_tag, address.msg_id, problem)
+        interface.refused(address.msg_id, str(error))
+        raise error
 
     def keep_latched(self, i_tag: str, sources: Sequence[str]) -> None:
-        """Let what the robot's other sources latched at an interface end."""
+        """End the latched messages of the robot's other sources at an interface."""
         interface = self._interfaces.get(i_tag)
         if interface is not None:
             interface.keep_latched(sources)
@@ -240,37 +257,37 @@ class Namespace:
             interface.refused(call.msg_id, problem)
 
     async def ask_master(self, request: Request) -> tuple[str, ...]:
-        """Have a request of the robot carried out."""
-        return await self._headquarters.ask_master(self.id, request)
+        """Have a request of the robot carried out; return the faults."""
+        return await self._listener.ask_master(self.id, request)
 
-    def joined(self, session: Session) -> None:
-        """Give the robot what it must know at once."""
+    def joined(self, session: DoorSession) -> None:
+        """Send the robot its initial messages."""
         self._live = session
         for interface in list(self._interfaces.values()):
             interface.robot_joined()
 
-    def leaving(self, session: Session) -> None:
-        """Fail what waits for the robot."""
+    def leaving(self, session: DoorSession) -> None:
+        """Fail the calls that wait for the robot."""
         if self._live is session:
             self._live = None
         for interface in list(self._interfaces.values()):
             interface.robot_left()
 
-    def left(self, session: Session, reason: str) -> None:
+    def left(self, session: DoorSession, reason: str) -> None:
         """Tell the master."""
         if self.session is session:
             self.session = None
             self._changed()
-            self._headquarters.robot_left(self, reason)
+            self._listener.robot_left(self, reason)
 
     # rce_robot.interface.RobotSide
 
     @property
     def connected(self) -> bool:
-        """Whether something can be sent to the robot."""
+        """Whether messages can be sent to the robot."""
         return self._live is not None
 
-    def send_data(self, tag: str, message: Queued, overflow: Overflow) -> bool:
+    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
         """Send in the data lane."""
         return self._live is not None and self._live.send_data(tag, message, overflow)
 
@@ -278,33 +295,33 @@ class Namespace:
         """Send in the control lane."""
         return self._live is not None and self._live.send_urgent(message)
 
-    def report(self, text: str) -> None:
-        """Send an ``ER``, if the robot is there."""
+    def report(self, problem: str, call: CallId | None = None) -> None:
+        """Send an ``ER``, if the robot is connected."""
         if self._live is not None:
-            self._live.report(text)
+            self._live.report(problem, call)
 
     def show_active(self, tag: str, active: bool) -> None:
-        """Send an ``ST``, if the robot is there."""
+        """Send an ``ST``, if the robot is connected."""
         if self._live is not None:
             self._live.show_active(tag, active)
 
     @property
     def knows_sources(self) -> bool:
-        """Whether the robot is there and names the sources of latched messages."""
-        return self._live is not None and LATCH in self._live.features
+        """Whether the robot is connected and names the sources of latched messages."""
+        return self._live is not None and self._live.knows_sources
 
     def send_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
-        """Send the latched message of a source, if the robot is there."""
+        """Send the latched message of a source, if the robot is connected."""
         if self._live is not None:
             self._live.send_latched(tag, source, message, shared=shared)
 
     def send_sources(self, tag: str, sources: Sequence[str]) -> None:
-        """Send an ``LT``, if the robot is there and knows of it."""
+        """Send an ``LT``, if the robot is connected and supports it."""
         if self._live is not None:
             self._live.send_sources(tag, sources)
 
     def drop_latched(self, tag: str, source: str) -> None:
-        """Take a latched message back, if it was not sent yet."""
+        """Withdraw a latched message that was not sent yet."""
         if self._live is not None:
             self._live.drop_latched(tag, source)
 
@@ -317,19 +334,19 @@ class Namespace:
         return await self._pool.convert(self.id.user, job, parts)
 
     def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
-        """Have a large message come again with its binary values."""
+        """Handle a large message again when its binary values have arrived."""
         if self._live is not None:
             self._live.await_binaries(large, ids)
 
     def run(self, work: Coroutine[Any, Any, None]) -> bool:
-        """Run something until the robot leaves."""
+        """Run a coroutine until the robot leaves."""
         if self._live is None:
             work.close()
             return False
         return self._live.spawn(work)
 
     def count_dropped(self, tag: str) -> None:
-        """Count a message that was thrown away before it was queued."""
+        """Count a message that was dropped before it was queued."""
         self.dropped[tag] += 1
 
     def closed(self, interface: RobotInterface) -> None:
@@ -340,7 +357,7 @@ class Namespace:
             if self._live is not None:
                 self._live.discard(interface.tag)
 
-    # What the endpoint calls
+    # Called by the endpoint
 
     def _make(self, port: Port) -> Interface:
         try:
@@ -356,7 +373,7 @@ class Namespace:
         self._account.note()
 
     def _changed(self) -> None:
-        self._headquarters.changed(self)
+        self._listener.changed(self)
 
     def _failed(self, text: str) -> None:
-        self._headquarters.failed(self, text)
+        self._listener.failed(self, text)

@@ -1,4 +1,4 @@
-"""An interface's conversions in other processes: what is asked, and what the answer means."""
+"""An interface's conversions in other processes: requests and answers."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
-from rce_robot.conversion import ConversionFailed, ReadText, ReadValue, Show
+from rce_robot.conversion import ConversionFailedError, ReadText, ReadValue, Show
 from rce_robot.exceptions import UnreadableError
 from rce_robot.outgoing import Outgoing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rce.control.model import InterfaceSpec
+    from rce.model.specs import InterfaceSpec
     from rce.protocol.stream import LargeData
     from rce_robot.conversion import Result
     from rce_robot.interface import RobotSide
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Read(NamedTuple):
-    """What became of a message of the robot."""
+    """The result of converting a message of the robot."""
 
     payload: Buffer | None = None
     """The serialized message; None if there is a fault, or if it was a string."""
@@ -29,9 +29,9 @@ class Read(NamedTuple):
     fault: str = ""
     msg_id: str = ""
     text: str | None = None
-    """The message was a string, the word of a service."""
+    """The message was a string: a service's error text."""
     ids: tuple[str, ...] = ()
-    """Binary values that must come first."""
+    """Binary values that are still missing."""
 
 
 class Offload:
@@ -47,11 +47,11 @@ class Offload:
         self._spec = spec
 
     async def read_text(self, large: LargeData) -> Read:
-        """Parse and serialize a message of which only the text is there. Does not raise."""
+        """Parse and serialize a message from its text. Does not raise."""
         job = ReadText(
             i_tag=large.address.i_tag,
-            type=large.address.type,
-            cls=self._spec.cls,
+            stated_type=large.address.message_type,
+            message_type=self._spec.message_type,
             interface_type=self._spec.type,
             ids=tuple(large.binaries),
         )
@@ -59,19 +59,21 @@ class Offload:
 
     async def read_value(self, packed: bytes) -> Read:
         """Serialize a message that :func:`pack_value` packed. Does not raise."""
-        return await self._read(ReadValue(cls=self._spec.cls, interface_type=self._spec.type), (packed,))
+        return await self._read(
+            ReadValue(message_type=self._spec.message_type, interface_type=self._spec.type), (packed,)
+        )
 
     async def show(self, payload: Buffer, msg_id: str) -> Outgoing:
         """Make the data message that carries a payload to the robot.
 
         Raises:
-            UnreadableError: It is no message of the type, or cannot be shown.
+            UnreadableError: It is not a message of the type, or cannot be converted.
         """
         spec = self._spec
-        job = Show(i_tag=spec.tag, cls=spec.cls, interface_type=spec.type, msg_id=msg_id)
+        job = Show(i_tag=spec.tag, message_type=spec.message_type, interface_type=spec.type, msg_id=msg_id)
         try:
             result, parts = await self._robot.convert(job, (payload,))
-        except ConversionFailed as error:
+        except ConversionFailedError as error:
             raise UnreadableError(str(error)) from error
         if result.fault:
             raise UnreadableError(result.fault)
@@ -81,7 +83,7 @@ class Offload:
     async def _read(self, job: ReadText | ReadValue, parts: Sequence[Buffer]) -> Read:
         try:
             result, payload = await self._robot.convert(job, parts)
-        except ConversionFailed as error:
+        except ConversionFailedError as error:
             return Read(fault=str(error))
         return _understood(result, payload)
 
@@ -98,10 +100,10 @@ def _understood(result: Result, parts: list[memoryview]) -> Read:
 
 
 def pack_value(msg: Any) -> bytes:
-    """Pack what a data message carries for :meth:`Offload.read_value`.
+    """Pack the content of a data message for :meth:`Offload.read_value`.
 
     Raises:
-        UnreadableError: It holds an integer that no message can hold.
+        UnreadableError: It holds an integer that is out of range for every message.
     """
     try:
         return msgspec.msgpack.encode(msg)

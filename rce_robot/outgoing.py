@@ -1,4 +1,4 @@
-"""A message to the robot as it goes over the WebSocket. Pure."""
+"""The WebSocket form of messages to the robot. Pure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from rce.protocol.single import MAX_PAYLOAD, prefix
 
 if TYPE_CHECKING:
-    from rce_robot.outbox import Queued
+    from rce_robot.doors.base import Queued
 
 Buffer = bytes | bytearray | memoryview
 
@@ -19,7 +19,7 @@ _numbers = itertools.count(1)
 
 
 def fresh_id() -> str:
-    """Return 32 hex characters that were not used before: a binary value's or a service call's id."""
+    """Return a new id of 32 hex characters, for a binary value or a service call."""
     return f"{_prefix}{next(_numbers):016x}"
 
 
@@ -30,7 +30,7 @@ class Outgoing:
     text: Buffer
     """UTF-8."""
     binaries: tuple[tuple[bytes, Buffer], ...] = ()
-    """Payloads of binary frames, each in two parts, so that an id can go before bytes that nobody copies."""
+    """Payloads of binary frames, each in two parts: an id, and bytes that are not copied."""
 
     @property
     def size(self) -> int:
@@ -51,15 +51,15 @@ class Outgoing:
 
 @dataclass(frozen=True, slots=True)
 class Serialized:
-    """One message that is binary as a whole: one frame for clients that asked for it, two for others."""
+    """One entirely binary message: one frame for clients that support it, two for others."""
 
     names: bytes
-    """What ``data`` holds beside ``msg``, as JSON without braces."""
+    """The fields of ``data`` other than ``msg``, as JSON without braces."""
     payload: Buffer
 
     @property
     def size(self) -> int:
-        """Payload bytes of its frames, about."""
+        """Approximate payload bytes of its frames."""
         return len(self.names) + len(self.payload)
 
     @property
@@ -69,7 +69,7 @@ class Serialized:
 
     @property
     def prefix(self) -> bytes:
-        """What stands before the payload in one frame."""
+        """The bytes before the payload in one frame."""
         return prefix(b"{%b}" % self.names)
 
     def split(self) -> Outgoing:
@@ -87,7 +87,7 @@ Rendered: TypeAlias = Outgoing | Serialized
 
 
 class LatchedDelivery:
-    """A latched message on its way to a client that knows of sources."""
+    """A latched message for a client that supports sources."""
 
     __slots__ = ("_message", "_source", "size")
 
@@ -103,7 +103,7 @@ class LatchedDelivery:
 
 
 _DATA_HEAD = b'{"type":"DM","data":{'
-"""How every data message begins that is made here."""
+"""The beginning of all data messages of this module."""
 
 
 def _latch(source: str) -> bytes:

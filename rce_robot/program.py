@@ -1,4 +1,4 @@
-"""What ``rce-robot`` does once its settings are read."""
+"""Runs ``rce-robot`` with settings that have been read."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def run(engine: EngineSettings, *, verbose: bool = False) -> int:
 
     Args:
         engine: The settings.
-        verbose: Whether all is logged.
+        verbose: Log all messages.
 
     Returns:
-        The exit code; faults were told.
+        The exit code; faults were printed.
     """
     try:
         log_as("rce-robot", engine, verbose=verbose)
@@ -70,4 +70,4 @@ def run(engine: EngineSettings, *, verbose: bool = False) -> int:
 
 
 def _announce(url: str) -> None:
-    print(f"rce-robot ready: {url}", flush=True)  # noqa: T201 - what other programs wait for
+    print(f"rce-robot ready: {url}", flush=True)  # noqa: T201 - read by other programs

@@ -7,7 +7,7 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING, Any
 
-from rce.link import CallError, CallTimeout, Overloaded, PeerFault, PeerLost
+from rce.link import CallError, CallTimeoutError, OverloadedError, PeerFaultError, PeerLostError
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.interface import RobotInterface
 from rce_robot.offload import Read, pack_value
@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 
 
 class AskedByRobot(RobotInterface):
-    """ServiceProvider: the robot calls the peer's service. Calls run side by side."""
+    """ServiceProvider: the robot calls the peer's service. Calls run concurrently."""
 
     def take(self, message: DataMessage) -> None:
         """Start a call."""
@@ -46,7 +46,7 @@ class AskedByRobot(RobotInterface):
 
     def _run(self, work: Coroutine[Any, Any, None], msg_id: str) -> None:
         if not self.robot.run(work):
-            raise BusyError(f"{self._name(msg_id)}: too many calls wait for an answer")
+            raise BusyError.at(self.tag, msg_id, "too many calls wait for an answer")
 
     async def _convert_and_call(self, reading: Coroutine[Any, Any, Read], msg_id: str, size: int) -> None:
         """Call with a request that another process converts."""
@@ -59,11 +59,11 @@ class AskedByRobot(RobotInterface):
             await self._call(read.payload, msg_id)
         elif not read.ids:
             problem = read.fault or "a string is not an object of the fields of the request"
-            self.robot.report(f"{self._name(msg_id)}: {problem}")
+            self._report(problem, msg_id)
 
     @contextlib.contextmanager
     def _held(self, size: int, msg_id: str) -> Iterator[None]:
-        """Count what a call holds; when memory is short, the call ends."""
+        """Count the bytes of a call; when memory is short, the call ends."""
         task = asyncio.current_task()
         assert task is not None
         given_up = False
@@ -79,30 +79,30 @@ class AskedByRobot(RobotInterface):
         finally:
             holding.release()
             if given_up:
-                self.robot.report(f"{self._name(msg_id)}: memory is short; the call was given up")
+                self._report("memory is short; the call was given up", msg_id)
 
     async def _call(self, payload: Buffer, msg_id: str) -> None:
         try:
             with self._held(len(payload), msg_id):
                 answer = await self.port.call(payload)
         except CallError as error:
-            self.robot.report(f"{self._name(msg_id)}: {error}")
+            self._report(str(error), msg_id)
             return
-        except Exception:  # noqa: BLE001 - logged; the caller must hear of the end of its call
+        except Exception:  # noqa: BLE001 - logged; the caller must get an answer
             _log.exception("service call at %s", self.tag)
-            self.robot.report(f"{self._name(msg_id)}: internal error; the engine's log tells more")
+            self._report("internal error; the engine's log tells more", msg_id)
             return
         try:
             sent = await self._send_service(answer, msg_id)
         except UnreadableError as error:
-            self.robot.report(f"{self._name(msg_id)}: {error}")
+            self._report(str(error), msg_id)
             return
         if not sent:
-            self.robot.report(f"{self._name(msg_id)}: the answer was dropped, too much waits to be sent")
+            self._report("the answer was dropped, too much waits to be sent", msg_id)
 
 
 class AnsweredByRobot(RobotInterface):
-    """ServiceClient: peers call the robot's service. Calls run side by side."""
+    """ServiceClient: peers call the robot's service. Calls run concurrently."""
 
     def __init__(
         self, port: Port, robot: RobotSide, form_in: Form, form_out: Form, *, call_timeout: float
@@ -115,33 +115,33 @@ class AnsweredByRobot(RobotInterface):
         """Ask the robot.
 
         Raises:
-            CallError: It is away, leaves, is busy, answers with a fault or not in time.
+            CallError: It is away, leaves, is busy, answers with a fault, or does not answer in time.
         """
         if not self.robot.connected:
-            raise PeerLost("the robot is not connected")
+            raise PeerLostError("the robot is not connected")
         msg_id = fresh_id()
         answer: asyncio.Future[Buffer] = asyncio.get_running_loop().create_future()
         self._calls[msg_id] = answer
         try:
             async with asyncio.timeout(self._timeout):
                 if not await self._send_service(payload, msg_id):
-                    raise Overloaded("too much waits to be sent to the robot")
+                    raise OverloadedError("too much waits to be sent to the robot")
                 return await answer
         except UnreadableError as error:
-            raise PeerFault(str(error)) from error
+            raise PeerFaultError(str(error)) from error
         except TimeoutError as error:
-            raise CallTimeout(f"the robot did not answer within {self._timeout:g} s") from error
+            raise CallTimeoutError(f"the robot did not answer within {self._timeout:g} s") from error
         finally:
             del self._calls[msg_id]
-            del answer  # its error refers to this frame, and so to the request, until the collector comes
+            del answer  # its error refers to this frame, and so to the request, until it is collected
 
     def take(self, message: DataMessage) -> None:
-        """Complete a call. A string in place of ``msg`` is the robot's word for why it failed."""
+        """Complete a call. A string in place of ``msg`` is the robot's error text."""
         answer = self._calls.get(message.msg_id)
         if answer is None or answer.done():
-            raise MisdirectedError(f"{self._name(message.msg_id)}: no call waits for this answer")
+            raise MisdirectedError.at(self.tag, message.msg_id, "no call waits for this answer")
         if isinstance(message.msg, str):
-            answer.set_exception(PeerFault(message.msg))
+            answer.set_exception(PeerFaultError(message.msg))
             return
         if self.form_in.costly:
             packed = pack_value(message.msg)
@@ -150,19 +150,19 @@ class AnsweredByRobot(RobotInterface):
         try:
             answer.set_result(self._read(message, self._warn))
         except UnreadableError as error:
-            answer.set_exception(PeerFault(f"the robot's answer cannot be read: {error}"))
+            answer.set_exception(PeerFaultError(f"the robot's answer cannot be read: {error}"))
             raise
 
     def take_large(self, large: LargeData) -> None:
         """Complete a call when its answer has been converted."""
         if large.address.msg_id not in self._calls:
-            raise MisdirectedError(f"{self._name(large.address.msg_id)}: no call waits for this answer")
+            raise MisdirectedError.at(self.tag, large.address.msg_id, "no call waits for this answer")
         self._convert(self.read_large(large), large.address.msg_id, large.size)
 
     def _convert(self, reading: Coroutine[Any, Any, Read], msg_id: str, size: int) -> None:
         if not self.robot.run(self._complete(reading, msg_id, size)):
             reading.close()
-            raise BusyError(f"{self._name(msg_id)}: too much is converted already")
+            raise BusyError.at(self.tag, msg_id, "too much is converted already")
 
     async def _complete(self, reading: Coroutine[Any, Any, Read], msg_id: str, size: int) -> None:
         """Complete a call with an answer that another process converts."""
@@ -179,24 +179,24 @@ class AnsweredByRobot(RobotInterface):
         if read.payload is not None:
             answer.set_result(read.payload)
         elif read.text is not None:
-            answer.set_exception(PeerFault(read.text))
+            answer.set_exception(PeerFaultError(read.text))
         else:
-            answer.set_exception(PeerFault(f"the robot's answer cannot be read: {read.fault}"))
-            self.robot.report(f"{self._name(msg_id)}: {read.fault}")
+            answer.set_exception(PeerFaultError(f"the robot's answer cannot be read: {read.fault}"))
+            self._report(read.fault, msg_id)
 
     def refused(self, msg_id: str, problem: str) -> None:
         """Fail the call: its answer is lost."""
         self.not_rendered(msg_id, f"the robot's answer was refused: {problem}")
 
     def robot_left(self) -> None:
-        """Fail the calls that wait."""
-        self._fail_all(PeerLost("the robot's connection ended before it answered"))
+        """Fail the waiting calls."""
+        self._fail_all(PeerLostError("the robot's connection ended before it answered"))
 
     def not_rendered(self, msg_id: str, problem: str) -> None:
-        """Fail the call; the robot did not ask for it and need not know."""
+        """Fail the call without notifying the robot, which did not ask for it."""
         answer = self._calls.get(msg_id)
         if answer is not None and not answer.done():
-            answer.set_exception(PeerFault(problem))
+            answer.set_exception(PeerFaultError(problem))
 
     def _fail_all(self, error: CallError) -> None:
         for answer in self._calls.values():

@@ -1,7 +1,7 @@
 """The robot task set: robots' namespaces on one side, the master on the other.
 
-It keeps nothing on disk: after a restart the master's ``Sync`` and the robots' return bring everything
-back. While the master is away everything goes on, except that no new robot can log in.
+It does not store data on disk: after a restart, the master's ``Sync`` and the returning robots restore its
+state. While the master is away it continues to work, but new robots cannot log in.
 """
 
 from __future__ import annotations
@@ -9,43 +9,54 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
-from typing import TYPE_CHECKING, Protocol
-
-import msgspec
+from typing import TYPE_CHECKING, Protocol, assert_never
 
 from rce.control.exceptions import ControlError
+from rce.control.machine import cpu_seconds, machine_memory, resident_bytes
 from rce.control.messages import (
     CONTROL_VERSION,
+    TYPED_REQUESTS,
+    ClientReply,
     Drop,
+    Execute,
     Fault,
     Gone,
     Hello,
     Left,
+    LoginReply,
     MachineInfo,
     Notify,
+    PatchSpec,
+    PatchStatus,
     Probe,
     Put,
+    ReadLog,
+    Refused,
+    SpecWanted,
     Status,
+    StatusWanted,
     Sync,
     TaskSetKind,
     Usage,
+    Welcome,
 )
-from rce.control.usage import cpu_seconds, machine_memory, resident_bytes
+from rce.control.model import PATCHES, StatusPatch
 from rce.guard.budget import Ledger
+from rce.model.names import EndpointId
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.messages import type_of
-from rce.protocol.names import EndpointId
+from rce.protocol.requests import write_request
 from rce.ros.tcpros.allocator import give_back_free_memory
 from rce_robot.memory import UnusedMemory
 from rce_robot.namespace import Namespace
 
 if TYPE_CHECKING:
-    from rce.control.messages import ClientReply, LoginReply, ToMaster, ToTaskSet
-    from rce.control.model import EndpointSpec, LinkAddress
+    from rce.control.messages import ToMaster, ToTaskSet
+    from rce.control.model import EndpointSpec, LinkAddress, SpecPatch
     from rce.guard.lobby import Lobby
     from rce.link import LinkHub
+    from rce.model.requests import Request
     from rce.protocol.http import Credentials
-    from rce.protocol.messages import Request
     from rce_robot.conversion import ConversionPool
     from rce_robot.namespace import Forms
     from rce_robot.settings import RobotSettings
@@ -56,7 +67,7 @@ _OK, _UNAVAILABLE = 200, 503
 
 
 class Channel(Protocol):
-    """What is needed of :class:`rce.control.channel.TaskSetChannel`."""
+    """The used part of :class:`rce.control.channel.TaskSetChannel`."""
 
     def send(self, message: ToMaster) -> None:
         """Send, or drop while the master is away."""
@@ -64,26 +75,33 @@ class Channel(Protocol):
     async def login(
         self, user: str, robot: str, password: str, address: str = "", token: str = ""
     ) -> LoginReply:
-        """Ask whether a robot may come in; raises :class:`ControlError` if the master stays away."""
+        """Ask whether a robot may log in; raise :class:`ControlError` if the master stays away."""
 
-    async def client_request(self, id: str, type: str, data: object) -> ClientReply:  # noqa: A002
-        """Have a client's request carried out; raises :class:`ControlError` likewise."""
+    async def client_request(
+        self,
+        id: str,  # noqa: A002 - wire names
+        type: str,  # noqa: A002
+        data: object = None,
+        *,
+        content: Request | None = None,
+    ) -> ClientReply:
+        """Have a client's request carried out; raise :class:`ControlError` likewise."""
 
 
 class RobotTaskSet:
-    """All robots of one process. Implements what the gate and the namespaces ask for.
+    """All robots of one process. Implements the interfaces of the gate and the namespaces.
 
-    Invariant: every robot has one namespace at most; while an old one is being closed there is no new one.
+    Invariant: every robot has at most one namespace; a new one is made only after the old one is closed.
 
     Args:
-        hub: Joins the robots' endpoints to others.
+        hub: Links the robots' endpoints to others.
         forms: Makes converters and forwarders.
-        settings: How it is run.
-        name: Names this process to the master.
-        machine: What it runs on.
-        url: Where clients are sent.
+        settings: Its settings.
+        name: The name of this process for the master.
+        machine: Its machine.
+        url: The URL for clients.
         address: Where links to any of the robots are accepted.
-        lobby: Where robots wait until they have logged in.
+        lobby: Holds robots until they have logged in.
         pool: Converts large messages.
     """
 
@@ -118,16 +136,18 @@ class RobotTaskSet:
             in_all=settings.memory or machine_memory() // 2,
         )
         self._tasks: asyncio.TaskGroup | None = None
+        self._master_features: frozenset[str] = frozenset()
         self._unused = UnusedMemory(resident_bytes())
 
-    # The master's side
+    # Messages of the master
 
     def use(self, channel: Channel) -> None:
-        """Take the channel, which was made with :meth:`hello` and :meth:`handle`."""
+        """Set the channel, which was made with :meth:`hello` and :meth:`handle`."""
         self._channel = channel
 
     def hello(self) -> Hello:
-        """Say who this is and what is there."""
+        """Return the task set's name, machine and robots."""
+        self._master_features = frozenset()
         return Hello(
             version=CONTROL_VERSION,
             kind=TaskSetKind.ROBOT,
@@ -137,13 +157,20 @@ class RobotTaskSet:
             address=self._address,
             endpoints=tuple(namespace.status() for namespace in self._namespaces.values()),
             bearer=True,
+            features=(PATCHES,),
         )
 
     async def handle(self, message: ToTaskSet) -> None:
-        """Do what the master says."""
+        """Handle a message of the master."""
         match message:
+            case Welcome():
+                self._master_features = frozenset(message.features)
             case Put():
                 await self.settle(message.endpoint)
+            case PatchSpec():
+                await self._patch(message.patch)
+            case StatusWanted():
+                self._report_whole(EndpointId.parse(message.id))
             case Drop():
                 self._drop(EndpointId.parse(message.id), message.reason or "removed", message.revision)
             case Sync():
@@ -152,17 +179,19 @@ class RobotTaskSet:
                 self._notify(message)
             case Probe():
                 self._probe(EndpointId.parse(message.id))
-            case _:
+            case Welcome() | Refused() | LoginReply() | ClientReply() | ReadLog() | Execute():
                 _log.debug("not for a robot task set: %s", type(message).__name__)
+            case _:
+                assert_never(message)
 
     def _probe(self, id_: EndpointId) -> None:
-        """End a robot's connection unless the robot answers: it wants to come in at another task set."""
+        """End a robot's connection unless the robot answers: it logs in at another task set."""
         namespace = self._namespaces.get(id_)
         if namespace is not None and namespace.session is not None and self._tasks is not None:
             self._tasks.create_task(namespace.session.probe())
 
     async def run(self) -> None:
-        """Report what is used, until cancelled; then close everything."""
+        """Report the usage, until cancelled; then close all namespaces."""
         try:
             async with asyncio.TaskGroup() as self._tasks:
                 while True:
@@ -175,20 +204,20 @@ class RobotTaskSet:
                     tasks.create_task(_end(namespace, "the robot endpoint is shutting down"))
             self._namespaces.clear()
 
-    # What the gate asks: rce_robot.gate.House
+    # Called by the gate: rce_robot.doors.base.Admission
 
     async def log_in(self, credentials: Credentials, address: str) -> EndpointSpec:
-        """Ask the master whether a robot may come in.
+        """Ask the master whether a robot may log in.
 
         Raises:
-            HandshakeError: It may not, or the master is away.
+            HandshakeError: It is refused, or the master is away.
         """
         try:
             async with asyncio.timeout(self._settings.login_timeout):
                 who = credentials
                 reply = await self._channel.login(who.user, who.robot, who.password, address, who.token)
         except (ControlError, TimeoutError) as error:
-            reason = "The master cannot be reached, so nobody can log in now. Try again."
+            reason = "The master cannot be reached, so logging in is not possible now. Try again."
             raise HandshakeError(_UNAVAILABLE, reason) from error
         if reply.endpoint is None:
             status = reply.status if reply.status != _OK else _UNAVAILABLE
@@ -196,11 +225,11 @@ class RobotTaskSet:
         return reply.endpoint
 
     def find(self, id: EndpointId) -> Namespace | None:  # noqa: A002
-        """Return the robot's namespace if there is one."""
+        """Return the robot's namespace if it exists."""
         return self._namespaces.get(id)
 
     async def settle(self, spec: EndpointSpec) -> Namespace:
-        """Return the robot's namespace, made if there is none, with the spec applied."""
+        """Return the robot's namespace with the spec applied; make it if it does not exist."""
         id_ = EndpointId.parse(spec.id)
         while (closing := self._closing.get(id_)) is not None:
             await closing.wait()
@@ -219,7 +248,13 @@ class RobotTaskSet:
         await namespace.apply(spec)
         return namespace
 
-    # What the namespaces ask: rce_robot.namespace.Headquarters
+    async def _patch(self, patch: SpecPatch) -> None:
+        """Apply a patch of a robot's spec; ask for the whole spec if it does not fit."""
+        namespace = self._namespaces.get(EndpointId.parse(patch.id))
+        if namespace is None or not await namespace.patch(patch):
+            self._channel.send(SpecWanted(id=patch.id))
+
+    # Called by the namespaces: rce_robot.namespace.NamespaceListener
 
     def changed(self, namespace: Namespace) -> None:
         """Report a robot's status, once for all changes of one moment."""
@@ -237,15 +272,19 @@ class RobotTaskSet:
             self._channel.send(Left(id=str(namespace.id), reason=reason))
 
     async def ask_master(self, id: EndpointId, request: Request) -> tuple[str, ...]:  # noqa: A002
-        """Have a client's request carried out; return what went wrong."""
+        """Have a client's request carried out; return the faults."""
         type_ = type_of(request)
         try:
-            reply = await self._channel.client_request(str(id), type_, msgspec.to_builtins(request))
+            if TYPED_REQUESTS in self._master_features:
+                reply = await self._channel.client_request(str(id), type_, content=request)
+            else:
+                data = write_request(request)
+                reply = await self._channel.client_request(str(id), type_, data=data)
         except ControlError as error:
             return (f"{type_}: not done: {error}",)
         return reply.errors
 
-    # Own
+    # Private
 
     def _is_current(self, namespace: Namespace) -> bool:
         return self._namespaces.get(namespace.id) is namespace
@@ -254,7 +293,19 @@ class RobotTaskSet:
         changed, self._changed = self._changed, set()
         for namespace in changed:
             if self._is_current(namespace):
-                self._channel.send(Status(status=namespace.status()))
+                self._report(namespace, in_patches=PATCHES in self._master_features)
+
+    def _report(self, namespace: Namespace, *, in_patches: bool) -> None:
+        told = namespace.next_status(in_patches=in_patches)
+        if isinstance(told, StatusPatch):
+            self._channel.send(PatchStatus(patch=told))
+        else:
+            self._channel.send(Status(status=told))
+
+    def _report_whole(self, id_: EndpointId) -> None:
+        namespace = self._namespaces.get(id_)
+        if namespace is not None:
+            self._report(namespace, in_patches=False)
 
     def _report_usage(self) -> None:
         for namespace in self._namespaces.values():
@@ -273,11 +324,11 @@ class RobotTaskSet:
         )
 
     def _give_back_memory(self) -> None:
-        """Keep no more of the memory of former messages than is worth it."""
+        """Return the memory of former messages to the kernel when it is worthwhile."""
         held = self._ledger.total
         if self._unused.is_due(resident_bytes(), held, self._ledger.growths):
             if self._unused.idle:
-                gc.collect()  # what ended may be in cycles that hold messages; the collector counts no bytes
+                gc.collect()  # cycles may hold messages; the collector does not count bytes
             give_back_free_memory()
             self._unused.given_back(resident_bytes(), held)
 
@@ -290,7 +341,7 @@ class RobotTaskSet:
             await self.settle(spec)
 
     def _drop(self, id_: EndpointId, reason: str, revision: int) -> None:
-        """Start to close a robot's namespace; the master hears when it is gone."""
+        """Start to close a robot's namespace; report its end to the master."""
         namespace = self._namespaces.pop(id_, None)
         if namespace is None or self._tasks is None:
             self._channel.send(Gone(id=str(id_), revision=revision))

@@ -5,12 +5,12 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from rce.aio.queues import OverflowPolicy
 from rce.protocol.messages import NO_ID
 from rce_robot.conversion import ConversionQueue
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.interface import Delivery, RobotInterface
 from rce_robot.offload import Read, pack_value
-from rce_robot.outbox import Overflow
 from rce_robot.outgoing import Outgoing
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class _Converted(NamedTuple):
-    """What becomes of a message of the robot, or which of its sources go on."""
+    """A converted message of the robot, or the sources that remain."""
 
     read: Read = Read()
     msg_id: str = NO_ID
@@ -35,9 +35,9 @@ class _Converted(NamedTuple):
 
 
 class FromRobot(RobotInterface):
-    """Subscriber: what the robot says goes to every peer.
+    """Subscriber: sends the robot's messages to every peer.
 
-    What it latches stays so while it is away, for the peers that come later.
+    Its latched messages stay while it is away, for peers that connect later.
     """
 
     def __init__(self, port: Port, robot: RobotSide, form_in: Form, form_out: Form) -> None:
@@ -45,22 +45,22 @@ class FromRobot(RobotInterface):
         self._queue = ConversionQueue[_Converted](robot, self._send, self._dropped)
 
     def take(self, message: DataMessage) -> None:
-        """Send it on."""
+        """Send the message to the peers."""
         if not (self.form_in.costly or self._queue.busy):
             self._pass_on(self._read(message, self._warn), message.latch)
             return
         try:
             packed = pack_value(message.msg)
         except UnreadableError as error:
-            raise UnreadableError(f"{self._name(message.msg_id)}: {error}") from error
+            raise UnreadableError.at(self.tag, message.msg_id, str(error)) from error
         self._put(len(packed), partial(self._convert_value, packed, message.msg_id, message.latch))
 
     def take_large(self, large: LargeData) -> None:
-        """Send it on when it has been converted; what comes after it waits for that."""
+        """Send the message after its conversion; later messages wait for it."""
         self._put(large.size, partial(self._convert_text, large))
 
     def keep_latched(self, sources: Sequence[str]) -> None:
-        """Let other sources end, after what waits to be converted."""
+        """End other sources, after the messages that wait to be converted."""
         if self._queue.busy:
             if not self._queue.put(0, partial(self._note_sources, sources)):
                 self._dropped()
@@ -68,7 +68,7 @@ class FromRobot(RobotInterface):
             self.port.keep_latched(sources)
 
     def robot_joined(self) -> None:
-        """Keep what was latched only if the robot will tell how long."""
+        """Keep latched messages only if the robot names their sources."""
         super().robot_joined()
         if not self.robot.knows_sources:
             self.port.keep_latched(())
@@ -95,7 +95,7 @@ class FromRobot(RobotInterface):
         read = converted.read
         if read.fault or read.text is not None:
             problem = read.fault or "a string is not an object of the fields of the message"
-            self.robot.report(f"{self._name(converted.msg_id)}: {problem}")
+            self._report(problem, converted.msg_id)
         for warning in read.warnings:
             self._warn(warning)
         if read.payload is not None:
@@ -114,10 +114,10 @@ class FromRobot(RobotInterface):
 
 
 class ToRobot(RobotInterface):
-    """Publisher: what the peers say goes to the robot.
+    """Publisher: sends the peers' messages to the robot.
 
-    The last latched message of each source is kept, and given again to a robot that comes back, as a latched
-    topic does to every new subscriber. Other messages that come while the robot is away are dropped.
+    The last latched message of each source is kept, and sent again to a robot that comes back, as a latched
+    topic does for every new subscriber. Other messages that arrive while the robot is away are dropped.
     """
 
     def __init__(self, port: Port, robot: RobotSide, form_in: Form, form_out: Form) -> None:
@@ -128,12 +128,12 @@ class ToRobot(RobotInterface):
         )
 
     async def start(self) -> None:
-        """Tell the robot that nothing is latched here yet, whatever a former interface of this tag said."""
+        """Tell the robot that no message is latched here yet, in place of a former interface's statement."""
         self.robot.send_sources(self.tag, ())
 
     def take(self, message: DataMessage) -> None:
-        """Refuse it."""
-        raise MisdirectedError(f"{self._name(message.msg_id)}: the interface takes nothing from the robot")
+        """Refuse the message."""
+        raise MisdirectedError.at(self.tag, message.msg_id, "the interface takes nothing from the robot")
 
     def receive(self, payload: bytes, *, latched: bool) -> None:
         """Send a peer's message to the robot."""
@@ -152,13 +152,13 @@ class ToRobot(RobotInterface):
         self._send(payload, source)
 
     def unlatch(self, sources: Collection[str]) -> None:
-        """Give a robot that comes later nothing of sources that ended."""
+        """Drop the latched messages of ended sources."""
         for source in sources:
             self._forget(source)
         self.robot.send_sources(self.tag, tuple(self._latched))
 
     def robot_joined(self) -> None:
-        """Also give it the last latched messages."""
+        """Also send the last latched messages."""
         super().robot_joined()
         for source, kept in list(self._latched.items()):
             self._send(kept.payload, source)
@@ -169,7 +169,7 @@ class ToRobot(RobotInterface):
         self._queue.clear()
 
     async def close(self) -> None:
-        """Forget the latched messages too."""
+        """Drop the latched messages too."""
         await super().close()
         for source in list(self._latched):
             self._forget(source)
@@ -180,7 +180,7 @@ class ToRobot(RobotInterface):
             kept.holding.release()
 
     def _give_up(self, source: str, kept: _Kept) -> None:
-        """Memory is short: the message is lost, which the robot's user must know."""
+        """Drop the message because memory is short, and report it to the robot's user."""
         if self._latched.get(source) is kept:
             del self._latched[source]
         self.robot.drop_latched(self.tag, source)
@@ -196,7 +196,7 @@ class ToRobot(RobotInterface):
         elif source in self._latched:
             self.robot.send_latched(self.tag, source, Delivery(self, payload, NO_ID), shared=True)
         else:
-            self.robot.send_data(self.tag, Delivery(self, payload, NO_ID), Overflow.DROP_OLDEST)
+            self.robot.send_data(self.tag, Delivery(self, payload, NO_ID), OverflowPolicy.DROP_OLDEST)
 
     async def _show(self, payload: bytes, source: str) -> tuple[Outgoing | None, str, str]:
         try:
@@ -211,7 +211,7 @@ class ToRobot(RobotInterface):
         elif source in self._latched:
             self.robot.send_latched(self.tag, source, outgoing, shared=False)
         else:
-            self.robot.send_data(self.tag, outgoing, Overflow.DROP_OLDEST)
+            self.robot.send_data(self.tag, outgoing, OverflowPolicy.DROP_OLDEST)
 
     def _dropped(self) -> None:
         self.robot.count_dropped(self.tag)

@@ -20,7 +20,7 @@ import psutil
 import pytest
 
 REQUIRE_ALL = os.environ.get("RCE_REQUIRE_ALL") == "1"
-LEAK_PATIENCE_S = 3.0
+LEAK_TIMEOUT_S = 3.0
 WORKERS_PER_CORE = 2
 
 # Nothing fails for being slow: not on a busy machine, nor at the first run, which makes hypothesis's tables.
@@ -212,7 +212,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("xdist_group"):
             continue
-        person = getattr(item, "callspec", None) and item.callspec.params.get("person")  # type: ignore[attr-defined]
+        callspec = getattr(item, "callspec", None)
+        person = callspec and callspec.params.get("person")
         if any("podman" in marker.args for marker in item.iter_markers("needs")):
             item.add_marker(pytest.mark.xdist_group("podman"))
         elif person:
@@ -230,7 +231,7 @@ def _shares_with_its_module(item: pytest.Item) -> bool:
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Remove the cgroups of test runs that were killed, once a run."""
-    from support.leaks import sweep_dead_cgroups
+    from tools.leaks import sweep_dead_cgroups
 
     if not _is_worker(session.config):
         sweep_dead_cgroups()
@@ -315,7 +316,7 @@ def _no_leaks(request: pytest.FixtureRequest) -> Iterator[None]:
     fds, threads = _descriptors(), set(threading.enumerate())
     children = {child.pid for child in psutil.Process().children(recursive=True)}
     yield
-    deadline = time.monotonic() + LEAK_PATIENCE_S
+    deadline = time.monotonic() + LEAK_TIMEOUT_S
     while leaks := _leaks(fds, children, threads):
         if time.monotonic() > deadline:
             pytest.fail("left behind: " + "; ".join(leaks))

@@ -1,1 +1,1 @@
-"""Programs for the people who work on the project."""
+"""Programs for the developers of the project."""

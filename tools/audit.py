@@ -1,7 +1,7 @@
 """Audits the pinned dependencies against a public database of vulnerabilities, as part of ``make lint``.
 
 ``python -m tools.audit [OPTIONS OF PIP-AUDIT]``. It ends with 1 if a dependency has a known vulnerability.
-Where the database cannot be reached, it says so in one line and ends with 0.
+If the database cannot be reached, it prints one line about it and ends with 0.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Makes the reference pages of settings and options, and the shipped settings file, from the code.
+"""Makes the pages of settings, options and life cycles, and the shipped settings file, from the code.
 
 ``python -m tools.reference`` writes them (``make reference``); with ``--check`` it names those that are not
 current, and ends with 1 if there are any.
@@ -9,8 +9,9 @@ from __future__ import annotations
 import sys
 import textwrap
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from enum import Enum
+from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from rce_client.ros_bridge.__main__ import app as rce_ros
 from rce_container.command import app as rce_container
 from rce_master.command import app as rce_master
 from rce_robot.command import app as rce_robot
+from tools import lifecycles
 
 ROOT = Path(__file__).resolve().parent.parent
 WIDTH = 110
@@ -89,7 +91,7 @@ def shipped_file() -> str:
 def _programs_with_sections() -> Iterator[tuple[str, Any]]:
     """Return the commands whose options are a section of the settings file."""
     rce = _rce()
-    commands = typer.main.get_command(rce).commands  # type: ignore[attr-defined]
+    commands = typer.main.get_command(rce).commands  # type: ignore[attr-defined]  # it is a group of commands
     return ((name, commands[name]) for name in PROGRAM_SECTIONS)
 
 
@@ -149,10 +151,12 @@ def _rce() -> typer.Typer:
     return build_app([EntryPoint(name, commands[name], GROUP) for name in sorted(commands)])
 
 
-PAGES = {
+PAGES: dict[str, Callable[[], str]] = {
     "configs/engine.yaml": shipped_file,
     "docs/reference/settings.md": settings_page,
     "docs/reference/options.md": options_page,
+    "docs/reference/lifecycles.md": lifecycles.page,
+    **{place: partial(str, text) for place, text in lifecycles.pictures().items()},
 }
 
 
@@ -217,7 +221,7 @@ def _commands(name: str, command: Any) -> Iterator[str]:
         yield from _commands(f"{name} {each.name}", each)
 
 
-def _option(option: Any) -> str:
+def _option(option: object) -> str:
     return "| " + " | ".join(_cells(option)) + " |"
 
 
@@ -237,10 +241,10 @@ def _cells(option: Any) -> tuple[str, str, str]:
     shown = option.show_default and kind and default not in (None, "", ()) and not callable(default)
     unset = f" (default: {default})" if shown else ""
     text = " ".join((option.help or "").split()) + unset + variable
-    return names.replace("|", r"\|"), kind.replace("|", r"\|"), text.replace("|", r"\|")
+    return names.replace("|", r"\|"), kind.replace("|", r"\|").replace("[", r"\["), text.replace("|", r"\|")
 
 
-def _kind(annotation: Any) -> str:
+def _kind(annotation: object) -> str:
     if isinstance(annotation, type) and issubclass(annotation, Enum):
         return "|".join(str(each.value) for each in annotation)
     names = {"int": "NUMBER", "float": "NUMBER", "Path": "PATH", "str": "TEXT"}
@@ -258,6 +262,7 @@ def main(check: bool) -> int:
         if check:
             print(f"{place} is not current: run `make reference`")  # noqa: T201 - its result
         else:
+            path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
     return stale if check else 0
 

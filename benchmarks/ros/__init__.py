@@ -1,1 +1,1 @@
-"""Measures ``rce.ros`` beside rospy and, where it can be compiled against, roscpp."""
+"""Compares ``rce.ros`` with rospy and, if it can be compiled, roscpp."""

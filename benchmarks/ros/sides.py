@@ -27,7 +27,7 @@ class Side:
     argv: tuple[str, ...]
     env: dict[str, str] = field(default_factory=dict)
     words: frozenset[str] = frozenset()
-    """What it can do beyond echo and idle."""
+    """Its commands beyond echo and idle."""
 
     def start(self, uri: str, *words: str) -> subprocess.Popen[str]:
         """Start its program at a master."""
@@ -68,7 +68,7 @@ def result_of(process: subprocess.Popen[str]) -> Any:
     for line in process.stdout:
         if line.startswith("{"):
             return json.loads(line)
-    raise RuntimeError(f"{process.args} printed no result")
+    raise RuntimeError(f"{process.args!r} printed no result")
 
 
 def end(process: subprocess.Popen[str]) -> None:

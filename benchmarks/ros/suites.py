@@ -19,6 +19,7 @@ from benchmarks.ros.sides import Side, end, result_of
 from benchmarks.roundtrip import SIZES
 from rce.ros.errors import RosError
 from rce.ros.node import Node
+from rce.ros.types import Message
 from rce.ros.xmlrpc import RpcClient
 
 Rows = list[dict[str, Any]]
@@ -86,7 +87,7 @@ async def fanout(uri: str, sides: list[Side], *, subscribers: int, seconds: floa
             continue
         last: dict[float, tuple[int, float]] = {}
 
-        def heard(message: Any, last: dict[float, tuple[int, float]] = last) -> None:
+        def heard(message: Message, last: dict[float, tuple[int, float]] = last) -> None:
             count, _ = last.get(message.data, (0, 0.0))
             last[message.data] = count + 1, time.monotonic() - message.data
 

@@ -15,7 +15,7 @@ from benchmarks.ros.sides import SYSTEM_PYTHON, end
 
 LONGEST_S = 300.0
 TARGET = 1.2
-"""What a tool's time at our core may be at most, of its time at a rosmaster."""
+"""The maximum of a tool's time at our core, relative to its time at a rosmaster."""
 
 COMMANDS = (
     "rosnode list",
@@ -60,7 +60,8 @@ def tools(masters: Mapping[str, str], *, passes: int) -> list[dict[str, Any]]:
         dead = {uri: dict(DEAD) for uri in masters.values()}
         for uri, nodes in dead.items():
             process = stack.enter_context(_talker(uri, STOPPED))
-            nodes[f"/{STOPPED}"] = xmlrpc.client.ServerProxy(uri).lookupNode("/bench", f"/{STOPPED}")[2]  # type: ignore[index]
+            master: Any = xmlrpc.client.ServerProxy(uri)  # a call gives any value
+            nodes[f"/{STOPPED}"] = master.lookupNode("/bench", f"/{STOPPED}")[2]
             process.send_signal(signal.SIGSTOP)
             stack.callback(process.send_signal, signal.SIGCONT)
         rows += _measure(masters, dead, f"{1 + len(DEAD)} do not answer", passes)

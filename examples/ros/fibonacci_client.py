@@ -1,6 +1,6 @@
 """Asks /fibonacci for a sequence and cancels another one: ``python fibonacci_client.py [_order:=8]``."""
 
-from rce.ros.actions import ActionClient, GoalFailed
+from rce.ros.actions import ActionClient, GoalFailedError
 from rce.ros.node import Node, run
 
 
@@ -21,7 +21,7 @@ async def main() -> None:
         endless.cancel()
         try:
             await endless.result(timeout=10)
-        except GoalFailed as error:
+        except GoalFailedError as error:
             print("ended:", error.state.name.lower())
 
 

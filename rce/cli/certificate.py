@@ -1,4 +1,4 @@
-"""``rce certificate``: the engine's own authority, and certificates for its machines and robots."""
+"""``rce certificate``: a certificate authority of the engine, certificates for machines and robots."""
 
 from __future__ import annotations
 
@@ -8,51 +8,57 @@ from typing import Annotated, TypeVar
 
 import typer
 
-from rce.cli.tls_options import Certificates
+from rce.cli.options import Certificates
 from rce.tls.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS, RENEWAL_DAYS, Details
 from rce.tls.choice import default_folder
 from rce.tls.exceptions import CertificateError
 from rce.tls.folder import AUTHORITY, CertificateFolder
 
 T = TypeVar("T")
-app = typer.Typer(no_args_is_help=True, help="Make and show the engine's certificates.")
+app = typer.Typer(no_args_is_help=True, help="Manage the engine's certificates.")
 
 
 @app.command()
 def init(
     certificates: Certificates = None,
-    days: Annotated[float, typer.Option(help="How long the authority is valid.", min=1.0)] = AUTHORITY_DAYS,
+    days: Annotated[float, typer.Option(help="Validity of the authority, days.", min=1.0)] = AUTHORITY_DAYS,
 ) -> None:
-    """Make an authority for this engine."""
+    """Create a certificate authority for this engine."""
     folder = _folder(certificates)
     _do(lambda: folder.make_authority(days))
-    typer.echo(f"made {folder.authority}: copy it to the machines that connect")
-    typer.echo(f"made {folder.key(AUTHORITY)}: it signs certificates; keep it here and secret")
+    typer.echo(f"created {folder.authority}: copy it to all machines that connect")
+    typer.echo(f"created {folder.key(AUTHORITY)}: it signs certificates; keep it on this machine, and secret")
 
 
 @app.command()
 def issue(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A robot, a machine, or engine.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a robot or machine, or engine.")],
     host: Annotated[
         list[str] | None,
-        typer.Option(help="Name or IP address that it is good for; may be repeated [as before, or NAME]."),
+        typer.Option(
+            help="Host name or IP address in the certificate; may be repeated [as before, or NAME]."
+        ),
     ] = None,
     certificates: Certificates = None,
-    days: Annotated[float, typer.Option(help="How long it is valid.", min=0.01)] = CERTIFICATE_DAYS,
+    days: Annotated[
+        float, typer.Option(help="Validity of the certificate, days.", min=0.01)
+    ] = CERTIFICATE_DAYS,
 ) -> None:
-    """Issue a certificate, or renew one."""
+    """Issue or renew a certificate."""
     folder = _folder(certificates)
     details = _do(lambda: folder.issue(name, host or (), days))
     typer.echo(
-        f"made {folder.certificate(name)} and {folder.key(name)}: for {', '.join(details.hosts)},"
+        f"created {folder.certificate(name)} and {folder.key(name)}: for {', '.join(details.hosts)},"
         f" until {details.expires:%Y-%m-%d}"
     )
-    typer.echo(f"another machine needs these two and {folder.authority}; programs that run load them anew")
+    typer.echo(
+        f"copy both and {folder.authority} to the machine that needs them; running programs reload them"
+    )
 
 
 @app.command()
 def revoke(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="As it was issued.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the certificates.")],
     certificates: Certificates = None,
 ) -> None:
     """Revoke all certificates of a name."""
@@ -65,17 +71,20 @@ def revoke(
     typer.echo(f"revoked {name} (serial number {serials}) in {folder.revoked}")
     typer.echo(
         "a master that uses this folder refuses it from now on; copy the file to the folders of other"
-        " machines. A machine that was stolen needs a new secret too: rce secret new"
+        " machines. A machine needs a new secret too: rce secret new"
     )
 
 
 @app.command("list")
 def list_(certificates: Certificates = None) -> None:
-    """List certificates, when they expire, and what was revoked."""
+    """List certificates with expiry and revocation."""
     folder = _folder(certificates)
     found = list(folder.all())
     if not found:
-        typer.echo(f"rce certificate: no certificates in {folder.path}; run: rce certificate init", err=True)
+        typer.echo(
+            f"rce certificate: no certificates in {folder.path}; first run: rce certificate init",
+            err=True,
+        )
         raise typer.Exit(1)
     revoked = {one.serial: one.since for one in _do(folder.revocations)}
     owners = _do(folder.owners)
@@ -101,7 +110,7 @@ def list_(certificates: Certificates = None) -> None:
 
 @app.command(hidden=True)
 def show(certificates: Certificates = None) -> None:
-    """List certificates, as ``list`` does."""
+    """List certificates, same as ``list``."""
     list_(certificates)
 
 

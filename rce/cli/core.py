@@ -1,4 +1,4 @@
-"""``rce core``: a ROS master and parameter server for everybody, without a ROS installation."""
+"""``rce core``: a ROS master and parameter server, without a ROS installation."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from rce.ros.core.server import DEFAULT_PORT
 from rce.ros.logfiles import log_folder
 
 GOODBYE_S = 0.1
-"""How long a core that was told to end goes on, so that whoever told it gets an answer."""
+"""Seconds between a request to end and the end, so that its sender gets an answer."""
 
 
 @from_file("core")
 def core(
-    port: Annotated[int, typer.Option(help="Port to listen on; 0 takes a free one.")] = DEFAULT_PORT,
+    port: Annotated[int, typer.Option(help="Port to listen on; 0: any free port.")] = DEFAULT_PORT,
     bind: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for all.")] = "127.0.0.1",
     advertised: Annotated[
-        str, typer.Option(help="Host name that nodes are told; default: the bound address.")
+        str, typer.Option(help="Host name in the core's URI; default: the bound address.")
     ] = "",
     log_dir: Annotated[
         Path | None,
         typer.Option(
             file_okay=False,
-            help="Where to keep RUN_ID/rosout.log; default: ROS_LOG_DIR, or log in ROS_HOME or ~/.ros.",
+            help="Folder of RUN_ID/rosout.log; default: ROS_LOG_DIR, or log in ROS_HOME or ~/.ros.",
         ),
     ] = None,
     log: Annotated[bool, typer.Option(help="Write rosout.log.")] = True,
 ) -> None:
-    """Run a ROS core: what roscore is, for nodes of any kind."""
+    """Run a ROS core, in place of roscore."""
     try:
         folder = (log_dir or log_folder(os.environ)) if log else None
         uvloop.run(_serve(bind, port, advertised or None, folder))
@@ -51,7 +51,7 @@ async def _serve(bind: str, port: int, advertised: str | None, folder: Path | No
         loop.add_signal_handler(number, stop.set)
 
     def told(reason: str) -> None:
-        typer.echo(f"rce core ends: {reason}")
+        typer.echo(f"rce core stops: {reason}")
         loop.call_later(GOODBYE_S, stop.set)
 
     async with Core(

@@ -16,7 +16,7 @@ from rce.config.logs import start_logging
 from rce.ros.errors import RosError
 from rce.ros.multimaster.discovery import Discovery
 from rce.ros.multimaster.listing import list_masters
-from rce.ros.multimaster.neighbourhood import Neighbour, PeerEvent
+from rce.ros.multimaster.peer_table import Neighbour, PeerEvent
 from rce.ros.multimaster.settings import DiscoverySettings, local_master
 
 _DEFAULT = DiscoverySettings()
@@ -25,41 +25,41 @@ _DEFAULT = DiscoverySettings()
 @from_file("discovery", leave_out=("list",))
 def discovery(
     list_: Annotated[
-        bool, typer.Option("--list", help="Print the masters that the running discovery knows, and end.")
+        bool, typer.Option("--list", help="Print the masters that the running discovery knows, and exit.")
     ] = False,
-    master_uri: Annotated[str, typer.Option(help="The master; default: ROS_MASTER_URI.")] = "",
+    master_uri: Annotated[str, typer.Option(help="URI of the local master; default: ROS_MASTER_URI.")] = "",
     name: Annotated[str, typer.Option(help="Name of this master; default: its host.")] = "",
     mcast_group: Annotated[
-        str, typer.Option(help="Multicast group as GROUP@INTERFACE; interface: a name or an address.")
+        str, typer.Option(help="Multicast group as GROUP@INTERFACE; INTERFACE is a name or an address.")
     ] = _DEFAULT.mcast_group,
     mcast_port: Annotated[int, typer.Option(help="UDP port of heartbeats.")] = _DEFAULT.mcast_port,
     rpc_port: Annotated[int, typer.Option(help="Port of the RPC server; 0: the master's plus 300.")] = 0,
     rpc_addr: Annotated[str, typer.Option(help="Address of the RPC server; default: all.")] = "",
     heartbeat_hz: Annotated[float, typer.Option(help="Heartbeats per second.")] = _DEFAULT.heartbeat_hz,
     rosmaster_hz: Annotated[
-        float, typer.Option(help="How often the master is asked for changes, per second.")
+        float, typer.Option(help="Polls of the local master per second.")
     ] = _DEFAULT.rosmaster_hz,
     measurement_intervals: Annotated[
-        float, typer.Option(help="Heartbeats over which the quality of a link is measured.")
+        float, typer.Option(help="Number of heartbeats over which link quality is measured.")
     ] = _DEFAULT.measurement_intervals,
     timeout_factor: Annotated[
-        float, typer.Option(help="Part of the measurement that may be silence before a master is offline.")
+        float, typer.Option(help="Silence after which a master is offline, as a fraction of the measurement.")
     ] = _DEFAULT.timeout_factor,
     active_request_after: Annotated[
-        float, typer.Option(help="Seconds after which a master with rare heartbeats is asked.")
+        float, typer.Option(help="Seconds of silence after which a master is asked for a heartbeat.")
     ] = _DEFAULT.active_request_after,
     remove_after: Annotated[
-        float, typer.Option(help="Seconds after which an offline master is forgotten; 0: never.")
+        float, typer.Option(help="Seconds after which an offline master is removed; 0: never.")
     ] = _DEFAULT.remove_after,
     robot_hosts: Annotated[
         list[str] | None,
-        typer.Option("--robot-host", help="HOST[:PORT] that multicast does not reach; may be repeated."),
+        typer.Option("--robot-host", help="HOST[:PORT] outside multicast; may be repeated."),
     ] = None,
-    send_mcast: Annotated[bool, typer.Option(help="Send heartbeats to the group.")] = True,
-    listen_mcast: Annotated[bool, typer.Option(help="Hear the group.")] = True,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens.")] = False,
+    send_mcast: Annotated[bool, typer.Option(help="Send heartbeats to the multicast group.")] = True,
+    listen_mcast: Annotated[bool, typer.Option(help="Receive heartbeats of the multicast group.")] = True,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show log messages.")] = False,
 ) -> None:
-    """Announce this machine's ROS master, find others, print what changes."""
+    """Announce this machine's ROS master and find others."""
     start_logging(logging.INFO if verbose else logging.WARNING, line="%(levelname)s %(message)s")
     try:
         settings = DiscoverySettings(

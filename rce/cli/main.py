@@ -1,4 +1,4 @@
-"""Puts the ``rce`` program together from the commands that the packages plug in.
+"""The ``rce`` program: its commands are entry points of the installed packages.
 
 A package adds a command by an entry point of the group ``rce.commands``: the entry point's name is the
 command, its value a function, a :class:`Plugged` or a :class:`typer.Typer` of subcommands. So ``rce`` imports
@@ -24,7 +24,7 @@ GROUP = "rce.commands"
 
 
 class Plugged(NamedTuple):
-    """A command that reads its command line in a way of its own."""
+    """A command with its own command-line settings."""
 
     function: Callable[..., None]
     settings: dict[str, Any]
@@ -42,11 +42,11 @@ def _root(
         False, "--version", callback=_version, is_eager=True, help="Print the version."
     ),
 ) -> None:
-    """RCE, a cloud robotics engine: run it, look into it, drive a fleet on it."""
+    """RCE, a cloud robotics engine: run and inspect it, drive a fleet."""
 
 
 def build_app(points: list[EntryPoint]) -> typer.Typer:
-    """Make the program with the given commands in it."""
+    """Return the program with the given commands."""
     app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
     app.callback()(_root)
     for point in points:
@@ -56,7 +56,7 @@ def build_app(points: list[EntryPoint]) -> typer.Typer:
             continue
         try:
             plugged: Any = point.load()
-        except ModuleNotFoundError as error:  # of a package that plugs in, and was installed in part
+        except ModuleNotFoundError as error:  # of a package that is installed in part
             if error.name is None or error.name.startswith("rce"):
                 raise
             _add_unavailable(app, point.name, f"the package {error.name} is missing")
@@ -71,7 +71,7 @@ def build_app(points: list[EntryPoint]) -> typer.Typer:
 
 
 def _add_unavailable(app: typer.Typer, name: str, problem: str) -> None:
-    """Add a command that only says what it misses, so that the others work without an extra's packages."""
+    """Add a command that only reports its missing package, so that the others work without it."""
 
     @app.command(
         name,
@@ -84,7 +84,7 @@ def _add_unavailable(app: typer.Typer, name: str, problem: str) -> None:
 
 
 def main() -> None:
-    """Run the ``rce`` program. A command that is named first is the only one that gets imported."""
+    """Run the ``rce`` program. If the first word is a command, only this one is imported."""
     open_missing_streams()
     points = sorted(entry_points(group=GROUP), key=lambda point: point.name)
     asked = [point for point in points if point.name == sys.argv[1]] if len(sys.argv) > 1 else []

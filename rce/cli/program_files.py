@@ -1,7 +1,7 @@
 """``--config FILE`` of the programs whose settings are their options, such as ``rce discovery``.
 
 The settings file has a section for each, by the command's name, and in it a key for each option: its name
-with ``_`` for ``-``; for an argument, what stands for it in the help. What comes later counts: default,
+with ``_`` for ``-``; for an argument, its name in the help. Later ones override earlier ones: default,
 file, environment variable, option. Example::
 
     @from_file("discovery", leave_out=("list",))
@@ -31,7 +31,7 @@ CONFIG = "settings_file"
 _OWN = (CONFIG, "help")
 
 Shared = Callable[[EngineSettings], Mapping[str, Any]]
-"""Takes from the engine's settings what the program's options say too: parameter to value."""
+"""Returns values for the program's parameters from the engine's settings."""
 
 
 def from_file(
@@ -40,9 +40,9 @@ def from_file(
     """Return the decorator that gives a command ``--config``.
 
     Args:
-        section: Of the file; one of :data:`rce.config.settings.PROGRAM_SECTIONS`.
-        leave_out: Options that are no settings.
-        shared: Gives values of other sections; those of the program's own section win.
+        section: Section of the file; one of :data:`rce.config.settings.PROGRAM_SECTIONS`.
+        leave_out: Options that are not settings.
+        shared: Returns values of other sections; those of the program's own section override them.
     """
 
     def on_config(ctx: typer.Context, value: Path | None) -> Path | None:
@@ -56,7 +56,7 @@ def from_file(
             raise typer.Exit(2) from None
         return value
 
-    # Typer looks the types of a callback up, which are texts in this module.
+    # Typer evaluates the callback's annotations, which are strings in this module.
     on_config.__annotations__ = {"ctx": typer.Context, "value": Path | None}
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
@@ -65,7 +65,7 @@ def from_file(
             metavar="FILE",
             is_eager=True,
             callback=on_config,
-            help=f"Settings file (YAML), of which the section {section} counts; options win.",
+            help=f"Settings file (YAML) with a section {section}; options override it.",
         )
         parameter = inspect.Parameter(
             CONFIG,
@@ -136,11 +136,11 @@ def _read(
 
 
 def _checked(ctx: typer.Context, parameter: Any, value: Any) -> Any:
-    """Return a value of the file as the command line would give it.
+    """Return a value of the file in the form of the command line.
 
     Raises:
-        typer.BadParameter: It does not fit.
-        ValueError: It is of another kind.
+        typer.BadParameter: The value is not valid.
+        ValueError: It has another type.
     """
     several = parameter.multiple or parameter.nargs != 1
     if several and not isinstance(value, list):

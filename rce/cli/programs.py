@@ -1,4 +1,4 @@
-"""The programs of a server, which say what is missing where only the base is installed."""
+"""The programs of a server; they report missing packages of the extra ``server``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``rce relay FROM TO``: a topic under another name, as topic_tools' relay and throttle."""
+"""``rce relay FROM TO``: publish a topic under another name, like topic_tools' relay and throttle."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from rce.ros.node import Node
 
 @from_file("relay")
 def relay(
-    source: Annotated[str, typer.Argument(metavar="FROM", help="Topic to take, of any type.")],
+    source: Annotated[str, typer.Argument(metavar="FROM", help="Topic to subscribe to, of any type.")],
     target: Annotated[str, typer.Argument(metavar="TO", help="Topic to publish.")],
     throttle: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Let at most so many messages pass per second.")
+        float | None, typer.Option(metavar="HZ", help="Maximum number of messages per second.")
     ] = None,
-    max_bytes: Annotated[
-        float | None, typer.Option(help="Let at most so many bytes pass per second.")
-    ] = None,
+    max_bytes: Annotated[float | None, typer.Option(help="Maximum number of bytes per second.")] = None,
     window: Annotated[float, typer.Option(help="Seconds over which --max-bytes is averaged.")] = 1.0,
-    lazy: Annotated[bool, typer.Option(help="Take messages only while they are subscribed to.")] = False,
-    latch: Annotated[bool, typer.Option(help="Keep the last message for later subscribers.")] = False,
+    lazy: Annotated[bool, typer.Option(help="Subscribe only while the output has subscribers.")] = False,
+    latch: Annotated[
+        bool, typer.Option(help="Latch the output: keep the last message for later subscribers.")
+    ] = False,
     name: Annotated[str, typer.Option(help="Name of the node; default: a unique one.")] = "",
-    master_uri: Annotated[str, typer.Option(help="The master; default: ROS_MASTER_URI.")] = "",
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens.")] = False,
+    master_uri: Annotated[str, typer.Option(help="URI of the master; default: ROS_MASTER_URI.")] = "",
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show log messages.")] = False,
 ) -> None:
-    """Publish under one name what is published under another."""
+    """Publish a topic under another name."""
     level = logging.INFO if verbose else logging.WARNING
     start_logging(level, line="%(levelname)s %(message)s")
     try:
@@ -60,12 +60,12 @@ def relay(
 
 def _check(node: Node, source: str, target: str) -> None:
     if node.resolve(source) == node.resolve(target):
-        raise ValueError(f"{source} cannot be relayed to itself")
+        raise ValueError(f"{source} cannot be relayed to itself; give another topic")
 
 
 def _throttle(hertz: float | None, max_bytes: float | None, window: float) -> Throttle | None:
     if hertz is not None and max_bytes is not None:
-        raise ValueError("choose --throttle or --max-bytes, not both")
+        raise ValueError("give --throttle or --max-bytes, not both")
     if hertz is not None:
         return MessageThrottle(hertz)
     return ByteThrottle(max_bytes, window) if max_bytes is not None else None
@@ -79,5 +79,5 @@ async def _run(node: Node, topic_relay: TopicRelay) -> None:
     with contextlib.suppress(asyncio.CancelledError):
         async with node, asyncio.TaskGroup() as group:
             work = group.create_task(topic_relay.run(node))
-            await node.spin()  # ends when the master or rosnode kill says so
+            await node.spin()  # until the master or rosnode kill stops it
             work.cancel()

@@ -35,15 +35,15 @@ _PROGRAMS = {
 
 UserUnit = Annotated[
     bool | None,
-    typer.Option("--user/--system", help="A unit of this user, or of the machine (default: as root)"),
+    typer.Option("--user/--system", help="Install for this user, or for the machine (default for root)"),
 ]
 
 
 def install_service(
-    role: Annotated[Role, typer.Argument(help="engine is all in one, by rce up.")],
+    role: Annotated[Role, typer.Argument(help="Program to run; engine: all in one (rce up).")],
     arguments: Annotated[
         list[str] | None,
-        typer.Argument(help="More arguments of the program, after --, such as: -- 10.0.0.1"),
+        typer.Argument(help="Arguments of the program, after --, such as: -- 10.0.0.1"),
     ] = None,
     *,
     user_unit: UserUnit = None,
@@ -51,11 +51,11 @@ def install_service(
         Path | None, typer.Option(help="Settings file (default: engine.yaml in /etc/rce or ~/.config/rce)")
     ] = None,
     run_as: Annotated[
-        str, typer.Option(help="User of master and robot units of the machine; made if there is none.")
+        str, typer.Option(help="User of master and robot services of the machine; created if missing.")
     ] = USER,
-    show: Annotated[bool, typer.Option("--print", help="Only print the unit.")] = False,
+    show: Annotated[bool, typer.Option("--print", help="Print the unit, install nothing.")] = False,
 ) -> None:
-    """Install a unit of systemd, and start it."""
+    """Install a systemd service and start it."""
     system = _is_system(user_unit)
     service = make_service(role, tuple(arguments or ()), system=system, config=config, run_as=run_as)
     text = unit(service)
@@ -74,11 +74,11 @@ def install_service(
 
 
 def uninstall_service(role: Role, *, user_unit: UserUnit = None) -> None:
-    """Stop a unit that install-service made, and remove it; state and settings stay."""
+    """Stop and remove a systemd service; keep state and settings."""
     system = _is_system(user_unit)
     path = _units(system=system) / f"rce-{role}.service"
     if not path.exists():
-        _fail(f"there is no {path}")
+        _fail(f"{path} does not exist: this service is not installed")
     _systemctl(system, ["disable", "--now", path.name])
     path.unlink()
     _systemctl(system, ["daemon-reload"])
@@ -88,7 +88,7 @@ def uninstall_service(role: Role, *, user_unit: UserUnit = None) -> None:
 def make_service(
     role: Role, arguments: tuple[str, ...], *, system: bool, config: Path | None, run_as: str
 ) -> Service:
-    """Put a service together from the settings file that it will have."""
+    """Return the service for a settings file."""
     folder = SYSTEM_CONFIG if system else platformdirs.user_config_path("rce")
     default = folder / "engine.yaml"
     file = default if config is None and default.exists() else config
@@ -135,7 +135,7 @@ def _units(*, system: bool) -> Path:
 
 
 def _check(service: Service) -> None:
-    """Refuse what would not start."""
+    """Check what the service needs to start."""
     if not service.program.exists():
         _fail(f"{service.program} is not installed; install RCE with the extra 'server'")
     closed = next(filter(None, map(_closed_folder, _needed(service.program))), None)
@@ -147,14 +147,15 @@ def _check(service: Service) -> None:
         )
     if service.secret is not None and not service.secret.exists():
         _fail(
-            f"there is no secret: make it with `rce secret new {service.secret}`, or copy it from the master"
+            f"the secret {service.secret} is missing: create it with `rce secret new {service.secret}`,"
+            " or copy it from the master"
         )
     if not service.system and not default_secret_file().exists():
-        typer.echo(f"note: there is no secret in {default_secret_file()} yet (rce secret new)")
+        typer.echo(f"note: {default_secret_file()} has no secret yet; create one with: rce secret new")
 
 
 def _needed(program: Path) -> tuple[Path, ...]:
-    """Return where a program, its Python and this package are."""
+    """Return the folders of a program, its Python and this package."""
     return program, Path(sys.executable).resolve(), Path(sys.base_prefix), Path(__file__).resolve()
 
 
@@ -170,18 +171,18 @@ def _make_user(name: str) -> None:
         argv = ["useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", name]
         done = subprocess.run(argv, check=False, capture_output=True, text=True)  # noqa: S603 - fixed words
         if done.returncode:
-            _fail(f"cannot make the user {name}: {done.stderr.strip()}")
-        typer.echo(f"made the user {name}")
+            _fail(f"cannot create the user {name}: {done.stderr.strip()}")
+        typer.echo(f"created the user {name}")
 
 
 def _systemctl(system: bool, *commands: list[str]) -> None:
-    """Tell systemd, or say what to tell it where it does not run."""
+    """Run systemctl, or print the command if systemd does not run."""
     scope = [] if system else ["--user"]
     runs = Path("/run/systemd/system").is_dir() and shutil.which("systemctl")
     for command in commands:
         argv = ["systemctl", *scope, *command]
         if not runs:
-            typer.echo(f"systemd does not run here; on the machine: {' '.join(argv)}")
+            typer.echo(f"systemd does not run here; on the machine, run: {' '.join(argv)}")
         elif subprocess.run(argv, check=False).returncode:  # noqa: S603 - fixed words and a unit's name
             _fail(f"{' '.join(argv)} failed")
 

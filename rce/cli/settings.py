@@ -1,7 +1,7 @@
-"""Makes the options of a program from the engine's settings, and reads settings from them.
+"""Makes a program's options from the engine's settings, and reads the settings from the command line.
 
-A program says which settings are its options; each has ``--config FILE`` and ``--settings JSON`` beside them.
-What comes later counts: defaults, the file, the document, the single options. Example::
+A program lists the settings that are its options; each program also has ``--config FILE`` and
+``--settings JSON``. Later ones override earlier ones: defaults, file, document, options. Example::
 
     OPTIONS = SettingsOptions("robot", "container.package_path", "secret_file", "dev")
 
@@ -28,7 +28,7 @@ from rce.config.loading import load_settings, read_document
 from rce.config.settings import EngineSettings
 
 COMMON = ("dev", "secret_file", "machine", "log_level", "log_dir", "log_size", "log_count")
-"""Settings that every program of the engine has as options."""
+"""Settings that are options of every program of the engine."""
 MASTER_IP = "MASTER_IP"
 
 _PANELS = {
@@ -42,11 +42,11 @@ _PANELS = {
 
 @dataclass(frozen=True, slots=True)
 class SettingOption:
-    """An option that sets a setting.
+    """An option for a setting.
 
     Attributes:
-        place: Section and name; the section is empty for what all programs share.
-        name: Of the option, without dashes.
+        place: Section and name; the section is empty for settings that all programs share.
+        name: Name of the option, without dashes.
     """
 
     place: tuple[str, str]
@@ -60,14 +60,14 @@ class SettingOption:
 
     @property
     def help(self) -> str:
-        """Its sentence, and what holds if it is not given."""
+        """Help text with the default."""
         shown = self.field.shown_default
         unset = f" (default: {shown})" if shown and not self.field.is_flag else ""
         again = " May be repeated." if self.field.is_list else ""
         return (self.field.setting.help + again + unset).replace("`", "")
 
     def declare(self, *, panel: str | None = None) -> inspect.Parameter:
-        """Return the parameter that Typer makes the option of."""
+        """Return the parameter for Typer."""
         flag = self.field.is_flag
         names = [f"--{self.name}" + (f"/--no-{self.name}" if flag and self.name != "dev" else "")]
         option = typer.Option(
@@ -81,10 +81,10 @@ class SettingOption:
         return _parameter(self.parameter, kind, option)
 
     def read(self, value: Any) -> Any:
-        """Read what the command line says.
+        """Return the value on the command line.
 
         Raises:
-            typer.BadParameter: It does not fit.
+            typer.BadParameter: The value is not valid.
         """
         try:
             return self.field.read(value, text=True)
@@ -98,8 +98,8 @@ class SettingsOptions:
     Args:
         places: Sections, settings of a section (``master.control_port``), or settings that all programs
             share.
-        master: Whether the program's argument is where the master is.
-        up: The options of ``rce up`` have names of their own, and only some settings have one.
+        master: Whether the program's argument is the master's address.
+        up: Use the option names of ``rce up``; only some settings have one.
     """
 
     def __init__(self, *places: str, master: bool = False, up: bool = False) -> None:
@@ -111,7 +111,7 @@ class SettingsOptions:
         """Return the decorator of a command whose first parameter is the engine's settings.
 
         Args:
-            program: Its name, for errors.
+            program: Name of the program, for errors.
         """
 
         def decorate(function: Callable[..., None]) -> Callable[..., None]:
@@ -135,34 +135,34 @@ class SettingsOptions:
         return decorate
 
     def parameters(self) -> list[inspect.Parameter]:
-        """Return the parameters of a function that Typer makes the options of."""
+        """Return the parameters for Typer."""
         declared = [option.declare(panel=self._panel(option)) for option in self.options]
         if self._master:
-            help_ = "Host or address of the master; master_host of the settings file does as well."
+            help_ = "Host or address of the master [master_host of the settings file]."
             declared.insert(
                 0, _parameter("master", str | None, typer.Argument(metavar=MASTER_IP, help=help_))
             )
         if self._up:
-            help_ = "Settings file (YAML), as --config; see configs/engine.yaml."
+            help_ = "Settings file (YAML), same as --config; see configs/engine.yaml."
             declared.insert(0, _parameter("file", Path | None, typer.Argument(metavar="FILE", help=help_)))
-        help_ = "Settings file (YAML); options win."
+        help_ = "Settings file (YAML); options override it."
         declared.append(
             _parameter("config", Path | None, typer.Option("--config", metavar="FILE", help=help_))
         )
-        help_ = "Settings as a JSON document, over those of the file."
+        help_ = "Settings as a JSON document; override those of the file."
         option = typer.Option("--settings", metavar="JSON", help=help_)
         return [*declared, _parameter("document", str | None, option)]
 
     def read(self, program: str, values: dict[str, Any]) -> EngineSettings:
-        """Read the settings from what Typer found on the command line.
+        """Return the settings from the parameters that Typer parsed.
 
         Args:
             program: The program's name, for errors.
             values: The values of :meth:`parameters`.
 
         Raises:
-            typer.BadParameter: An option does not fit.
-            typer.Exit: The file or the document does not; what is wrong was told.
+            typer.BadParameter: An option is not valid.
+            typer.Exit: The file or the document is not valid; the errors were printed.
         """
         if values["config"] is not None and values.get("file") is not None:
             raise typer.BadParameter("give one settings file, as FILE or as --config")
@@ -222,4 +222,4 @@ def _parse(document: str) -> Any:
         return json.loads(document)
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
-        raise ConfigError("--settings", [Fault(place, f"no valid JSON: {error.msg}")]) from None
+        raise ConfigError("--settings", [Fault(place, f"not valid JSON: {error.msg}")]) from None

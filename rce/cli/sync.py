@@ -1,4 +1,4 @@
-"""``rce sync``: registers what other ROS masters have at the local one, as master_sync does."""
+"""``rce sync``: registers topics and services of other ROS masters at the local one, like master_sync."""
 
 from __future__ import annotations
 
@@ -26,59 +26,59 @@ from rce.ros.names import is_graph_name, is_private
 
 
 def _names(help_: str, *flags: str) -> Any:
-    return typer.Option(*flags, help=f"{help_} May be repeated or hold commas; * stands for anything.")
+    return typer.Option(*flags, help=f"{help_} Separated by commas or repeated; * matches anything.")
 
 
 @from_file("sync")
 def sync(
-    topics: Annotated[list[str] | None, _names("Topics to take.", "--topics", "--sync-topics")] = None,
+    topics: Annotated[list[str] | None, _names("Topics to sync.", "--topics", "--sync-topics")] = None,
     services: Annotated[
-        list[str] | None, _names("Services to take.", "--services", "--sync-services")
+        list[str] | None, _names("Services to sync.", "--services", "--sync-services")
     ] = None,
-    nodes: Annotated[list[str] | None, _names("Nodes to take.", "--nodes", "--sync-nodes")] = None,
-    hosts: Annotated[list[str] | None, _names("Masters to take from.", "--hosts", "--sync-hosts")] = None,
+    nodes: Annotated[list[str] | None, _names("Nodes to sync.", "--nodes", "--sync-nodes")] = None,
+    hosts: Annotated[list[str] | None, _names("Masters to sync with.", "--hosts", "--sync-hosts")] = None,
     ignore: Annotated[
-        list[str] | None, _names("Topics and services to leave out; wins over the others.", "--ignore")
+        list[str] | None, _names("Topics and services to leave out; overrides the others.", "--ignore")
     ] = None,
     ignore_topics: Annotated[list[str] | None, _names("Topics to leave out.")] = None,
     ignore_services: Annotated[list[str] | None, _names("Services to leave out.")] = None,
     ignore_nodes: Annotated[list[str] | None, _names("Nodes to leave out.")] = None,
     ignore_hosts: Annotated[list[str] | None, _names("Masters to leave out.")] = None,
     sync_remote_nodes: Annotated[
-        bool, typer.Option(help="Take also nodes that run on another machine than their master.")
+        bool, typer.Option(help="Also sync nodes that run on another machine than their master.")
     ] = False,
     interface: Annotated[
         Path | None,
         typer.Option(
-            exists=True, dir_okay=False, help="YAML file with these lists, as master_sync reads it."
+            exists=True, dir_okay=False, help="YAML file with these lists, in the format of master_sync."
         ),
     ] = None,
     distinct_names: Annotated[
-        bool, typer.Option(help="Register nodes as NODE_at_MASTER, so that equal names do not clash.")
+        bool, typer.Option(help="Register nodes as NODE_at_MASTER to avoid name conflicts.")
     ] = False,
     as_: Annotated[
         list[str] | None,
         typer.Option(
             "--as",
-            help="NAMESPACE, or MASTER=NAMESPACE: have the master's names in a namespace here, by relaying.",
+            help="NAMESPACE or MASTER=NAMESPACE: relay the master's topics into a namespace.",
         ),
     ] = None,
     relay: Annotated[
         list[str] | None,
-        typer.Option(help="HOST[:PORT]: relay everything over one connection to the rce sync there."),
+        typer.Option(help="HOST[:PORT] of an rce sync: relay everything over one connection to it."),
     ] = None,
     relay_listen: Annotated[
-        int | None, typer.Option(help=f"Take relay connections on this port (usual: {RELAY_PORT}).")
+        int | None, typer.Option(help=f"Accept relay connections on this port (usual: {RELAY_PORT}).")
     ] = None,
-    relay_addr: Annotated[str, typer.Option(help="Address to take relay connections on; default: all.")] = "",
+    relay_addr: Annotated[str, typer.Option(help="Address for relay connections; default: all.")] = "",
     relay_token: Annotated[
-        str, typer.Option(envvar="RCE_RELAY_TOKEN", help="Secret that both ends of a relay must have.")
+        str, typer.Option(envvar="RCE_RELAY_TOKEN", help="Shared secret of both ends of a relay.")
     ] = "",
-    relay_name: Annotated[str, typer.Option(help="This side's name on relays; default: the master's.")] = "",
-    master_uri: Annotated[str, typer.Option(help="The local master; default: ROS_MASTER_URI.")] = "",
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens.")] = False,
+    relay_name: Annotated[str, typer.Option(help="Name of this end on relays; default: the master's.")] = "",
+    master_uri: Annotated[str, typer.Option(help="URI of the local master; default: ROS_MASTER_URI.")] = "",
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show log messages.")] = False,
 ) -> None:
-    """Have topics and services of other ROS masters at the local one; needs a discovery."""
+    """Sync topics and services of other ROS masters; needs rce discovery."""
     start_logging(logging.INFO if verbose else logging.WARNING, line="%(levelname)s %(message)s")
     chosen = {
         "sync_topics": _split(topics),
@@ -91,7 +91,7 @@ def sync(
         "ignore_hosts": _split(ignore_hosts),
     }
     if not nodes:
-        # Who names topics wants no services with them, and the reverse.
+        # With a list of topics no services are synced, and the reverse.
         chosen["ignore_services"] += ["*"] if topics and not services else []
         chosen["ignore_topics"] += ["*"] if services and not topics else []
     try:
@@ -110,7 +110,7 @@ def sync(
         )
         uvloop.run(_run(settings))
     except OSError as error:
-        typer.echo(f"rce sync: cannot take relay connections: {error.strerror or error}", err=True)
+        typer.echo(f"rce sync: cannot listen for relay connections: {error.strerror or error}", err=True)
         raise typer.Exit(1) from error
     except (RosError, ValueError) as error:
         typer.echo(f"rce sync: {error}", err=True)
@@ -118,7 +118,7 @@ def sync(
 
 
 def _split(*options: list[str] | None) -> list[str]:
-    """Take options that were given several times or with commas, or both."""
+    """Split values that were repeated or separated by commas."""
     return [name for option in options for text in option or () for name in text.split(",") if name]
 
 
@@ -127,7 +127,7 @@ def _namespaces(texts: list[str]) -> dict[str, str]:
     found = {master or "*": namespace for master, _, namespace in pairs}
     for namespace in found.values():
         if not is_graph_name(namespace) or is_private(namespace):
-            raise MultimasterError(f"{namespace!r} is no namespace")
+            raise MultimasterError(f"{namespace!r} is not a namespace")
     return found
 
 

@@ -1,4 +1,4 @@
-"""``rce up``: a whole engine in one terminal, each task set a process of its own."""
+"""``rce up``: a whole engine in one terminal, with one process per task set."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from rce.cli.settings import SettingsOptions
 from rce.config.fields import SettingError, fields_of
 from rce.config.loading import as_document
 from rce.config.settings import LOOPBACK, EngineSettings, MasterSettings
-from rce.supervision.plan import Plan
-from rce.supervision.program import Program
+from rce.supervision.plan import Plan, Program
 from rce.tls.choice import WARNED_VARIABLE, plain_warning
 
 OPTIONS = SettingsOptions(
@@ -43,10 +42,10 @@ ROBOT_LINK_PORT, CONTAINER_LINK_PORT = 10030, 10031
 def up(
     settings: EngineSettings,
     bind: Annotated[
-        str | None, typer.Option(metavar="HOST", help="Address on which all programs listen.")
+        str | None, typer.Option(metavar="HOST", help="Address that all programs listen on.")
     ] = None,
 ) -> None:
-    """Run master, robot and container task sets; restart one that dies; stop all on Ctrl-C."""
+    """Run an engine: master, robot and container task sets."""
     try:
         plan(settings if bind is None else bound_to(bind, settings)).hand_over()
     except OSError as error:
@@ -58,7 +57,7 @@ def bound_to(bind: str, settings: EngineSettings) -> EngineSettings:
     """Return the settings with every program listening on one address.
 
     Raises:
-        typer.BadParameter: It is no address.
+        typer.BadParameter: It is not an address.
     """
     try:
         host = fields_of(MasterSettings)["bind"].read(bind)
@@ -73,11 +72,13 @@ def bound_to(bind: str, settings: EngineSettings) -> EngineSettings:
 
 
 def plan(settings: EngineSettings) -> Plan:
-    """Return what to run, and what to say of it."""
+    """Return the programs to run and the lines to print."""
     ready = [f"RCE ready: {settings.http_url}"]
     certified = {}
     if settings.tls.enabled:
-        ready.append(f"RCE authority, which clients need: {settings.certificates.absolute()}/authority.pem")
+        ready.append(
+            f"RCE authority (clients need this file): {settings.certificates.absolute()}/authority.pem"
+        )
         certified = _document(settings)
     text = warning(settings)
     return Plan(
@@ -90,7 +91,7 @@ def plan(settings: EngineSettings) -> Plan:
 
 
 def warning(settings: EngineSettings) -> str | None:
-    """Return what is to be said of an engine that serves other machines without TLS."""
+    """Return the warnings for an engine that serves other machines without TLS."""
     if settings.tls.enabled:
         return None
     return plain_warning(
@@ -99,7 +100,7 @@ def warning(settings: EngineSettings) -> str | None:
 
 
 def programs(settings: EngineSettings) -> Iterable[Program]:
-    """The programs of an engine, in the order in which they start. Each gets all settings as one document."""
+    """Return the engine's programs in start order; each gets all settings as one document."""
     document = _document(settings)
     yield _program("master", "rce_master", document)
     robot = settings.robot

@@ -1,1 +1,1 @@
-"""What users write: client config files, engine settings, the shared secret; and where shipped files are."""
+"""Client config files, engine settings, the shared secret, and the places of shipped files."""

@@ -1,4 +1,4 @@
-"""The short form of a robot's wiring: ``bridges``, of which interfaces and connections are made.
+"""The short form of a robot's wiring: ``bridges``, which expand to interfaces and connections.
 
 ::
 
@@ -15,15 +15,17 @@ from __future__ import annotations
 import hashlib
 import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, assert_never, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from rce.config.exceptions import Fault
-from rce.config.items import ClassName, Interface, Link, RosName
+from rce.config.items import MessageTypeName, RosName
 from rce.config.validation import Strict
-from rce.protocol.messages import ROS_NAME_PATTERN
-from rce.protocol.names import MAX_NAME_LENGTH, Form, InterfaceType, Role, is_name
+from rce.model.names import MAX_NAME_LENGTH, Form, InterfaceType, Role, is_name
+from rce.model.requests import AddInterface, Connection
+from rce.model.specs import InterfaceSpec
+from rce.model.written import ROS_NAME_PATTERN
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -55,7 +57,7 @@ class Part(NamedTuple):
 
     name: str
     """Below the bridge's name; empty for the bridge itself."""
-    cls: str
+    message_type: str
     source: Role
     """The role of the interfaces at the bridge's first end; the others have its complement."""
     forward: bool = True
@@ -104,18 +106,18 @@ class Bridge(Strict):
     topic: RosName | None = None
     service: RosName | None = None
     action: RosName | None = None
-    type: ClassName | None = None
+    type: MessageTypeName | None = None
     """Of the messages, the service or the action; None: as the robot's graph has it."""
     source: EndText | None = Field(default=None, alias="from")
-    """Where a topic's messages come from."""
+    """The end that a topic's messages come from."""
     to: EndTexts | None = None
-    """Where they go to."""
+    """The ends that they go to."""
     server: EndText | None = None
-    """Where a service's or an action's server is."""
+    """The end with the server of a service or an action."""
     clients: EndTexts | None = None
-    """Where it is used."""
+    """The ends with its clients."""
     form: Literal["forwarder", "converter"] = "forwarder"
-    """How messages look at the robot's end: serialized, or as JSON."""
+    """The form of messages at the robot's end: serialized, or JSON."""
 
     @model_validator(mode="after")
     def _check_keys(self) -> Self:
@@ -136,7 +138,7 @@ class Bridge(Strict):
 
     @property
     def kind(self) -> Kind:
-        """What it carries."""
+        """The kind of the bridge: topic, service or action."""
         return "topic" if self.topic is not None else "service" if self.service is not None else "action"
 
     @property
@@ -152,11 +154,11 @@ class Bridge(Strict):
 
     @property
     def robot_name(self) -> str | None:
-        """What it is called in the robot's graph; None if no end is the robot's."""
+        """Its name in the robot's graph; None if no end is the robot's."""
         return next((end.name or self.name for end in self.ends if end.endpoint == ROBOT), None)
 
     def parts(self, type_: str) -> Iterator[Part]:
-        """Take it to pieces.
+        """Return the topics and services of the bridge.
 
         Args:
             type_: The type of the messages, the service or the action.
@@ -173,6 +175,8 @@ class Bridge(Strict):
                 yield Part("status", "actionlib_msgs/GoalStatusArray", Role.SUBSCRIBER)
                 yield Part("feedback", f"{action}ActionFeedback", Role.SUBSCRIBER)
                 yield Part("result", f"{action}ActionResult", Role.SUBSCRIBER)
+            case _:
+                assert_never(self.kind)
 
     def _place(self, end: End) -> tuple[str, str]:
         return end.endpoint, (end.name or self.name).lstrip("/")
@@ -197,14 +201,14 @@ class Wiring:
     """
 
     robot: str
-    interfaces: list[Interface]
-    connections: list[Link]
+    interfaces: list[AddInterface]
+    connections: list[Connection]
     origins: dict[tuple[str, int], str] = field(default_factory=dict)
-    """Key and index of what was made, and the bridge that it was made for, as a place in the file."""
+    """Key and index of each made item, and the bridge that it was made for, as a place in the file."""
     faults: list[Fault] = field(default_factory=list)
 
     def add(self, index: int, bridge: Bridge, type_: str) -> None:
-        """Make what a bridge needs and is not there yet.
+        """Make the interfaces and connections that a bridge needs and that do not exist yet.
 
         Args:
             index: Of the bridge in the file.
@@ -221,32 +225,34 @@ class Wiring:
     def _join(self, place: str, bridge: Bridge, part: Part, source: End, target: End) -> None:
         a = self._interface(place, bridge, part, source, part.source)
         b = self._interface(place, bridge, part, target, part.source.complement)
-        link = Link.model_validate({"tagA": a.path, "tagB": b.path})
-        if not any({one.a, one.b} == {link.a, link.b} for one in self.connections):
+        pair = {a.path, b.path}
+        if not any({one.tag_a, one.tag_b} == pair for one in self.connections):
             self.origins["connections", len(self.connections)] = place
-            self.connections.append(link)
+            self.connections.append(Connection(tag_a=a.path, tag_b=b.path))
 
-    def _interface(self, place: str, bridge: Bridge, part: Part, end: End, role: Role) -> Interface:
+    def _interface(self, place: str, bridge: Bridge, part: Part, end: End, role: Role) -> AddInterface:
         """Find or make the interface at one end."""
         on_robot = end.endpoint == ROBOT
         endpoint = self.robot if on_robot else end.endpoint
         addr = "/".join(filter(None, (end.name or bridge.name, part.name)))
         for index, one in enumerate(self.interfaces):
-            if one.endpoint == endpoint and one.kind.role is role and _same(one.addr, addr):
-                if one.cls != part.cls:
+            spec = one.interface
+            if one.endpoint == endpoint and spec.kind.role is role and _same(spec.addr, addr):
+                if spec.message_type != part.message_type:
                     where = self.origins.get(("interfaces", index), f"interfaces[{index}]")
-                    problem = f"{endpoint}:{addr} carries {part.cls} here and {one.cls} in {where}"
+                    here, there = part.message_type, spec.message_type
+                    problem = f"{endpoint}:{addr} carries {here} here and {there} in {where}"
                     self.faults.append(Fault(place, problem))
                 return one
         form = Form.INTERFACE if not on_robot else Form(bridge.form.capitalize())
-        made = Interface.model_validate(
-            {
-                "eTag": endpoint,
-                "iTag": self._tag(endpoint, addr, role),
-                "iType": str(InterfaceType(role, form)),
-                "iCls": part.cls,
-                "addr": addr,
-            }
+        made = AddInterface(
+            endpoint=endpoint,
+            interface=InterfaceSpec(
+                tag=self._tag(endpoint, addr, role),
+                type=str(InterfaceType(role, form)),
+                message_type=part.message_type,
+                addr=addr,
+            ),
         )
         self.origins["interfaces", len(self.interfaces)] = place
         self.interfaces.append(made)
@@ -260,7 +266,7 @@ class Wiring:
         """
         words = [addr.strip("~/").replace("/", "_"), _WORDS[role]]
         tag = "_".join(words if endpoint == self.robot else [self.robot, *words])
-        taken = {one.tag for one in self.interfaces if one.endpoint == endpoint}
+        taken = {one.interface.tag for one in self.interfaces if one.endpoint == endpoint}
         if len(tag) > MAX_NAME_LENGTH or tag in taken:
             digest = hashlib.sha256(addr.encode()).hexdigest()[:8]
             tag = f"{tag[: MAX_NAME_LENGTH - len(digest) - 1]}_{digest}"
@@ -275,8 +281,8 @@ def expand(
     bridges: Sequence[Bridge],
     types: Mapping[int, str],
     robot: str,
-    interfaces: Iterable[Interface],
-    connections: Iterable[Link],
+    interfaces: Iterable[AddInterface],
+    connections: Iterable[Connection],
 ) -> Wiring:
     """Make the long form of bridges.
 

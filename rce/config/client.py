@@ -1,4 +1,4 @@
-"""The config file of ``rce-ros``: which robot this is, and what it wants in the cloud.
+"""The config file of ``rce-ros``: the robot, and its containers, nodes and connections in the cloud.
 
 Keys are those of the RoboEarth Cloud Engine's files (``docs/protocol.md``).
 """
@@ -6,33 +6,45 @@ Keys are those of the RoboEarth Cloud Engine's files (``docs/protocol.md``).
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, Field, SecretStr, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, ValidationError
 
 from rce.config import client_checks
 from rce.config.bridges import Bridge, expand
 from rce.config.documents import parse, read_file
 from rce.config.exceptions import ConfigError, Fault
-from rce.config.items import Container, Interface, Link, Name, Node, Parameter
+from rce.config.items import Container, Interface, ItemOf, Link, Name, Node, Parameter
 from rce.config.validation import Strict, faults_of
-from rce.protocol.messages import (
+from rce.masters import split_addresses
+from rce.model.requests import (
     AddInterface,
+    AddNode,
     ConfigureComponents,
     ConfigureConnections,
     Connection,
     CreateContainer,
-    DeleteParam,
+    DeleteParameter,
     DestroyContainer,
     RemoveInterface,
     RemoveNode,
     Request,
-    SetParam,
+    SetParameter,
 )
+from rce.model.specs import InterfaceSpec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+
+def _check_urls(given: Any) -> Any:
+    """Take one address or a list of them; return them as one text, separated by commas."""
+    urls = given if isinstance(given, list | tuple) and given else [given]
+    if not all(isinstance(url, str) for url in urls):
+        raise ValueError("must be the master's address such as http://master:9000/, or a list of addresses")
+    parts = [part for url in urls for part in split_addresses(url) or ("",)]
+    return ",".join(map(_check_url, parts))
 
 
 def _check_url(url: str) -> str:
@@ -53,10 +65,11 @@ def _check_authority(text: str) -> str:
 
 
 class ClientConfig(Strict):
-    """All that one robot's file says."""
+    """The contents of one robot's file."""
 
-    url: Annotated[str, AfterValidator(_check_url)]
-    """The master's address."""
+    url: Annotated[str, BeforeValidator(_check_urls)]
+    """The master's address; several, which are separated by commas here and may be a list in the file, are
+    tried in turn."""
     user: Name = Field(alias="userID")
     password: SecretStr = SecretStr("")
     """The user's password; empty if there is a token."""
@@ -81,9 +94,9 @@ class ClientConfig(Strict):
         return {index: bridge for index, bridge in enumerate(self.bridges) if bridge.type is None}
 
     @property
-    def robot_interfaces(self) -> tuple[Interface, ...]:
+    def robot_interfaces(self) -> tuple[InterfaceSpec, ...]:
         """The interfaces of the robot itself."""
-        return tuple(item for item in self.interfaces if item.endpoint == self.robot)
+        return tuple(item.interface for item in self.interfaces if item.endpoint == self.robot)
 
     @property
     def authority_file(self) -> Path | None:
@@ -92,66 +105,47 @@ class ClientConfig(Strict):
 
     def setup(self) -> list[Request]:
         """Return the requests that make everything, in the order in which they must be sent."""
-        requests: list[Request] = [
-            CreateContainer(container_tag=item.tag, container_data=item.data()) for item in self.containers
-        ]
+        requests: list[Request] = [*self.containers]
         if self.nodes or self.parameters or self.interfaces:
-            requests.append(self._components())
+            requests.append(
+                ConfigureComponents(
+                    set_param=self.parameters, add_nodes=self.nodes, add_interfaces=self.interfaces
+                )
+            )
         if self.connections:
-            requests.append(ConfigureConnections(connect=self._links()))
+            requests.append(ConfigureConnections(connect=self.connections))
         return requests
 
     def teardown(self) -> list[Request]:
         """Return the requests that remove everything again, in order."""
         requests: list[Request] = []
         if self.connections:
-            requests.append(ConfigureConnections(disconnect=self._links()))
+            requests.append(ConfigureConnections(disconnect=self.connections))
         if self.nodes or self.parameters or self.interfaces:
             requests.append(
                 ConfigureComponents(
                     remove_interfaces=tuple(
-                        RemoveInterface(endpoint_tag=item.endpoint, interface_tag=item.tag)
+                        RemoveInterface(endpoint=item.endpoint, tag=item.interface.tag)
                         for item in self.interfaces
                     ),
                     remove_nodes=tuple(
-                        RemoveNode(container_tag=item.container, node_tag=item.tag) for item in self.nodes
+                        RemoveNode(container=item.container, tag=item.node.tag) for item in self.nodes
                     ),
                     delete_param=tuple(
-                        DeleteParam(container_tag=item.container, name=item.name) for item in self.parameters
+                        DeleteParameter(container=item.container, name=item.parameter.name)
+                        for item in self.parameters
                     ),
                 )
             )
-        requests += [DestroyContainer(container_tag=item.tag) for item in self.containers]
+        requests += [DestroyContainer(tag=item.tag) for item in self.containers]
         return requests
-
-    def _components(self) -> ConfigureComponents:
-        return ConfigureComponents(
-            set_param=tuple(
-                SetParam(container_tag=item.container, name=item.name, value=item.value)
-                for item in self.parameters
-            ),
-            add_nodes=tuple(item.message() for item in self.nodes),
-            add_interfaces=tuple(
-                AddInterface(
-                    endpoint_tag=item.endpoint,
-                    interface_tag=item.tag,
-                    interface_type=item.type,
-                    class_name=item.cls,
-                    addr=item.addr,
-                )
-                for item in self.interfaces
-            ),
-        )
-
-    def _links(self) -> tuple[Connection, ...]:
-        return tuple(Connection(tag_a=item.a, tag_b=item.b) for item in self.connections)
 
 
 def load(path: Path) -> ClientConfig:
     """Read a config file, JSON or YAML.
 
     Raises:
-        ConfigError: It cannot be read, or something is wrong in it; every fault is listed.
+        ConfigError: It cannot be read, or has faults; every fault is listed.
     """
     return loads(read_file(path), str(path))
 
@@ -168,7 +162,7 @@ def loads(
         draft: Leave bridges out whose type is not known, instead of refusing the file.
 
     Raises:
-        ConfigError: Something is wrong in it; every fault is listed.
+        ConfigError: It has faults; every fault is listed.
     """
     data = parse(text, source)
     if not isinstance(data, dict):
@@ -208,10 +202,10 @@ def loads(
 
 _NO_TYPE = "is missing; only rce-ros can read it, from the robot's ROS graph"
 
-_ITEMS: dict[str, type[Strict]] = {
-    "containers": Container,
-    "nodes": Node,
-    "parameters": Parameter,
-    "interfaces": Interface,
-    "connections": Link,
+_ITEMS: dict[str, ItemOf[Any]] = {
+    "containers": ItemOf(CreateContainer),
+    "nodes": ItemOf(AddNode),
+    "parameters": ItemOf(SetParameter),
+    "interfaces": ItemOf(AddInterface),
+    "connections": ItemOf(Connection),
 }

@@ -1,7 +1,7 @@
-"""What must fit together in a client's config file.
+"""Checks of references within a client's config file.
 
-A file may refer to containers and interfaces that it does not make itself: other robots of the same user make
-them. So a reference is only wrong if the file itself says that it cannot work.
+A file may refer to containers and interfaces that other robots of the same user make. So a reference is wrong
+only if the file itself shows that it cannot work.
 """
 
 from __future__ import annotations
@@ -12,40 +12,43 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from rce.config.exceptions import Fault
-from rce.protocol.names import Form, Role, is_name
-from rce.protocol.wishes import container_faults, find_circle
+from rce.config.items import SPELLING
+from rce.model.checks import find_circle
+from rce.model.faults import join_path
+from rce.model.names import Form, Role, is_name
+from rce.model.requests import AddInterface, AddNode, Connection, CreateContainer, SetParameter, faults_of
+from rce.model.specs import Network
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Iterator, Mapping
     from typing import Self
 
-    from rce.config.items import Container, Interface, Link, Node, Parameter
-    from rce.config.validation import Strict
+    from rce.config.items import ItemOf
 
 
 @dataclass
 class Parts:
-    """The items of a file that are right in themselves, each with its index."""
+    """The valid items of a file, each with its index."""
 
     robot: str | None
     complete: bool = True
     """Whether every interface of the file is among them."""
-    containers: list[tuple[int, Container]] = field(default_factory=list)
-    nodes: list[tuple[int, Node]] = field(default_factory=list)
-    parameters: list[tuple[int, Parameter]] = field(default_factory=list)
-    interfaces: list[tuple[int, Interface]] = field(default_factory=list)
-    connections: list[tuple[int, Link]] = field(default_factory=list)
+    containers: list[tuple[int, CreateContainer]] = field(default_factory=list)
+    nodes: list[tuple[int, AddNode]] = field(default_factory=list)
+    parameters: list[tuple[int, SetParameter]] = field(default_factory=list)
+    interfaces: list[tuple[int, AddInterface]] = field(default_factory=list)
+    connections: list[tuple[int, Connection]] = field(default_factory=list)
     origins: Mapping[tuple[str, int], str] = field(default_factory=dict)
-    """Where the file asks for items that it does not list itself, by key and index."""
+    """Places in the file that ask for items that it does not list itself, by key and index."""
 
     def place(self, key: str, index: int, field_: str = "") -> str:
-        """Say where in the file an item, or one of its fields, is."""
+        """Return the place of an item, or of one of its fields, in the file."""
         origin = self.origins.get((key, index))
         return origin or (f"{key}[{index}].{field_}" if field_ else f"{key}[{index}]")
 
     @classmethod
-    def salvage(cls, data: Mapping[str, Any], kinds: Mapping[str, type[Strict]]) -> Self:
-        """Take the valid items out of a document of which others may be wrong."""
+    def salvage(cls, data: Mapping[str, Any], kinds: Mapping[str, ItemOf[Any]]) -> Self:
+        """Return the valid items of a document; others may be wrong."""
         robot = data.get("robotID")
         parts = cls(robot if isinstance(robot, str) and is_name(robot) else None)
         for key, kind in kinds.items():
@@ -53,7 +56,7 @@ class Parts:
             good = getattr(parts, key)
             for index, item in enumerate(items if isinstance(items, list) else []):
                 try:
-                    good.append((index, kind.model_validate(item)))
+                    good.append((index, kind.read(item)))
                 except ValidationError:
                     continue  # reported with the whole document
             if key == "interfaces" and (not isinstance(items, list) or len(good) < len(items)):
@@ -68,16 +71,16 @@ def credential_faults(data: Mapping[str, Any]) -> list[Fault]:
     if len(given) == 1:
         return []
     if given:
-        return [Fault("token", "must not be there beside a password; leave one of the two out")]
+        return [Fault("token", "cannot be given beside a password; leave one of the two out")]
     what = "must be the user's password, or leave it out and give a token (rce robot add ROBOT)"
     return [Fault("password", f"is missing: {what}" if "password" not in data else what)]
 
 
 def check(parts: Parts) -> list[Fault]:
-    """Find everything that does not fit together."""
+    """Find every conflict between items."""
     return [
         *_check_tags(parts),
-        *_check_wishes(parts),
+        *_check_containers(parts),
         *_check_order(parts),
         *_check_interfaces(parts),
         *_check_connections(parts),
@@ -89,15 +92,18 @@ def _check_tags(parts: Parts) -> Iterator[Fault]:
         if container.tag == parts.robot:
             yield Fault(f"containers[{index}].cTag", f"{container.tag!r} is the robot's own name")
     yield from _repeated(parts, "containers", "cTag", ((i, item.tag) for i, item in parts.containers))
-    yield from _repeated(parts, "nodes", "nTag", ((i, (item.container, item.tag)) for i, item in parts.nodes))
     yield from _repeated(
-        parts, "parameters", "name", ((i, (item.container, item.name)) for i, item in parts.parameters)
+        parts, "nodes", "nTag", ((i, (item.container, item.node.tag)) for i, item in parts.nodes)
     )
     yield from _repeated(
-        parts, "interfaces", "iTag", ((i, (item.endpoint, item.tag)) for i, item in parts.interfaces)
+        parts,
+        "parameters",
+        "name",
+        ((i, (item.container, item.parameter.name)) for i, item in parts.parameters),
     )
+    yield from _repeated(parts, "interfaces", "iTag", ((i, item.path) for i, item in parts.interfaces))
     yield from _repeated(
-        parts, "connections", "", ((i, frozenset((item.a, item.b))) for i, item in parts.connections)
+        parts, "connections", "", ((i, frozenset((item.tag_a, item.tag_b))) for i, item in parts.connections)
     )
     for index, node in parts.nodes:
         if node.container == parts.robot:
@@ -116,27 +122,28 @@ def _repeated(parts: Parts, key: str, field_: str, items: Iterable[tuple[int, Ha
         first.setdefault(identity, index)
 
 
-def _check_wishes(parts: Parts) -> Iterator[Fault]:
+def _check_containers(parts: Parts) -> Iterator[Fault]:
     addresses: dict[Hashable, int] = {}
     for index, container in parts.containers:
         place = f"containers[{index}]"
-        data = container.data()
-        for fault in container_faults(data):
-            yield Fault(f"{place}.{fault.key}", fault.problem)
-        if data.joins_group and data.group_ip:
-            first = addresses.setdefault((data.group, data.group_ip.partition("/")[0]), index)
+        for fault in faults_of(container):
+            key = join_path(SPELLING.path(CreateContainer, fault.path))
+            yield Fault(f"{place}.{key}", fault.problem)
+        wanted = container.resources
+        if wanted.network is Network.GROUP and wanted.group_ip:
+            first = addresses.setdefault((wanted.group, wanted.group_ip.partition("/")[0]), index)
             if first != index:
-                problem = f"is the address of containers[{first}] in the group {data.group!r}"
+                problem = f"is the address of containers[{first}] in the group {wanted.group!r}"
                 yield Fault(f"{place}.groupIp", problem)
 
 
 def _check_order(parts: Parts) -> Iterator[Fault]:
-    """Find nodes that wait for one another, in a circle."""
+    """Find nodes that wait for one another in a cycle."""
     after: dict[str, dict[str, tuple[str, ...]]] = {}
     for _, node in parts.nodes:
-        after.setdefault(node.container, {})[node.tag] = node.after
+        after.setdefault(node.container, {})[node.node.tag] = node.node.after
     for index, node in parts.nodes:
-        circle = find_circle(node.tag, after[node.container])
+        circle = find_circle(node.node.tag, after[node.container])
         if circle:
             yield Fault(f"nodes[{index}].after", f"goes round in a circle: {' after '.join(circle)}")
 
@@ -144,15 +151,16 @@ def _check_order(parts: Parts) -> Iterator[Fault]:
 def _check_interfaces(parts: Parts) -> Iterator[Fault]:
     containers = {item.tag for _, item in parts.containers}
     for index, item in parts.interfaces:
-        if item.kind.form is Form.INTERFACE:
-            if not item.addr:
-                problem = f"is missing; a {item.type} needs the ROS name in the container"
+        type_ = item.interface.type
+        if item.interface.kind.form is Form.INTERFACE:
+            if not item.interface.addr:
+                problem = f"is missing; a {type_} needs the ROS name in the container"
                 yield Fault(parts.place("interfaces", index, "addr"), problem)
             if item.endpoint == parts.robot:
-                problem = f"a {item.type} belongs in a container; a robot has Converters and Forwarders"
+                problem = f"a {type_} belongs in a container; a robot has Converters and Forwarders"
                 yield Fault(parts.place("interfaces", index, "iType"), problem)
         elif item.endpoint in containers:
-            problem = f"a {item.type} belongs on a robot; a container has Interfaces"
+            problem = f"a {type_} belongs on a robot; a container has Interfaces"
             yield Fault(parts.place("interfaces", index, "iType"), problem)
 
 
@@ -161,26 +169,29 @@ def _check_connections(parts: Parts) -> Iterator[Fault]:
     ours = {item.tag for _, item in parts.containers} | {parts.robot}
     providers: dict[str, int] = {}
     for index, link in parts.connections:
-        for key, path in (("tagA", link.a), ("tagB", link.b)):
+        for key, path in (("tagA", link.tag_a), ("tagB", link.tag_b)):
             item = interfaces.get(path)
             if item is None:
                 if parts.complete and path.partition("/")[0] in ours:
                     place = parts.place("connections", index, key)
                     yield Fault(place, f"there is no interface {path!r} in this file")
-            elif item.kind.role is Role.SERVICE_PROVIDER:
+            elif item.interface.kind.role is Role.SERVICE_PROVIDER:
                 if path in providers:
                     other = parts.place("connections", providers[path])
                     problem = f"{path!r} takes one connection, and that is in {other}"
                     yield Fault(parts.place("connections", index, key), problem)
                 providers.setdefault(path, index)
-        if link.a in interfaces and link.b in interfaces:
+        if link.tag_a in interfaces and link.tag_b in interfaces:
             place = parts.place("connections", index)
-            yield from _check_pair(place, interfaces[link.a], interfaces[link.b])
+            yield from _check_pair(place, interfaces[link.tag_a], interfaces[link.tag_b])
 
 
-def _check_pair(place: str, a: Interface, b: Interface) -> Iterator[Fault]:
-    if a.kind.role is not b.kind.role.complement:
-        needed = a.kind.role.complement.value
-        yield Fault(place, f"{a.path} is a {a.type} and needs a {needed}, but {b.path} is a {b.type}")
-    if a.cls != b.cls:
-        yield Fault(place, f"{a.path} carries {a.cls}, but {b.path} carries {b.cls}")
+def _check_pair(place: str, a: AddInterface, b: AddInterface) -> Iterator[Fault]:
+    one, other = a.interface, b.interface
+    needed = one.kind.role.complement
+    if other.kind.role is not needed:
+        problem = f"{a.path} is a {one.type} and needs a {needed.value}, but {b.path} is a {other.type}"
+        yield Fault(place, problem)
+    if one.message_type != other.message_type:
+        problem = f"{a.path} carries {one.message_type}, but {b.path} carries {other.message_type}"
+        yield Fault(place, problem)

@@ -1,4 +1,4 @@
-"""Reads JSON or YAML text into plain values, and finds what a parser would let pass: keys that come twice."""
+"""Reads JSON or YAML text into plain values, and finds duplicate keys, which a parser would accept."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MAX_SIZE = 4 * 2**20
 
 
 def read_file(path: Path) -> str:
-    """Read a text file of bearable size.
+    """Read a text file, up to a limit of size.
 
     Raises:
         ConfigError: It cannot be read.
@@ -40,7 +40,7 @@ def parse(text: str, source: str) -> Any:
         source: Its file's name, for errors.
 
     Raises:
-        ConfigError: It is no JSON or YAML, or has keys that come twice.
+        ConfigError: It is not JSON or YAML, or has duplicate keys.
     """
     if source.endswith(".json") or (
         text.lstrip().startswith(("{", "[")) and not source.endswith((".yaml", ".yml"))
@@ -52,7 +52,7 @@ def parse(text: str, source: str) -> Any:
 
 
 class _Object(dict[str, Any]):
-    """A JSON object that knows which of its keys came twice."""
+    """A JSON object that knows its duplicate keys."""
 
     repeated: tuple[str, ...] = ()
 
@@ -70,9 +70,9 @@ def _parse_json(text: str, source: str) -> Any:
         value = json.loads(text, object_pairs_hook=_make_object)
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
-        raise ConfigError(source, [Fault(place, f"no valid JSON: {error.msg}")]) from error
+        raise ConfigError(source, [Fault(place, f"not valid JSON: {error.msg}")]) from error
     except (ValueError, RecursionError) as error:
-        raise ConfigError(source, [Fault("", f"no valid JSON: {error}")]) from error
+        raise ConfigError(source, [Fault("", f"not valid JSON: {error}")]) from error
     faults = list(_repeated_keys(value, ""))
     if faults:
         raise ConfigError(source, faults)

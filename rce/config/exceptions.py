@@ -1,4 +1,4 @@
-"""What can be wrong with a config file, the settings or the secret."""
+"""Errors of config files, the settings and the secret."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class SecretError(Exception):
 
 
 class RunDirError(Exception):
-    """The folder for sockets cannot be used, for instance because it belongs to somebody else."""
+    """The folder for sockets cannot be used, for instance because another user owns it."""
 
 
 class LogFileError(Exception):

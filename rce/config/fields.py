@@ -1,4 +1,4 @@
-"""How settings are declared: types with their checks, and what is said of each for options and pages.
+"""Declaration of settings: types with their checks, and the texts for options and pages.
 
 A section is a :class:`Section` whose fields carry a :class:`Setting`::
 
@@ -27,7 +27,8 @@ from msgspec.structs import fields as struct_fields
 
 from rce.config.documents import join
 from rce.config.exceptions import Fault
-from rce.protocol.quantities import read_cores, read_memory, write_memory
+from rce.masters import split_addresses
+from rce.model.quantities import read_cores, read_memory, write_memory
 
 _WORDS = {
     "int": "an integer",
@@ -36,7 +37,7 @@ _WORDS = {
     "str": "a text",
     "array": "a list",
 }
-"""What msgspec calls the kinds of values, and people do."""
+"""msgspec's words for the kinds of values, and those for users."""
 
 
 class Section(Struct, frozen=True, kw_only=True):
@@ -45,16 +46,16 @@ class Section(Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What is said of a setting beside its type and its default."""
+    """The texts and option names of a setting, beside its type and its default."""
 
     help: str
-    """One sentence; it stands in the program's help, on the page and in the shipped file."""
+    """One sentence, for the program's help, the reference page and the shipped file."""
     option: str | None = None
     """Name of the program's option without dashes; None: the field's name; empty: no option."""
     up: str = ""
     """Name of the option of ``rce up``; empty: none."""
     unset: str = ""
-    """What holds while it is not set, where the default does not tell."""
+    """Text on the effect while it is not set, where the default does not show it."""
     example: str = ""
     """A value for the shipped file, where the default is none or depends on the machine."""
 
@@ -64,7 +65,7 @@ class Reader:
     """Reads a value that people may write in several ways; of a list, each of its values."""
 
     read: Callable[[Any], Any]
-    """Raises ValueError: it is none; the text says what would be one."""
+    """Raises ValueError if the value is not valid; the text says what is valid."""
     write: Callable[[Any], Any]
     """Writes a value so that :attr:`read` reads the same."""
     metavar: str
@@ -92,12 +93,12 @@ class Field:
 
     @property
     def bare(self) -> Any:
-        """The type without what is said of it."""
+        """The type without its annotations."""
         return self.type.__origin__ if hasattr(self.type, "__metadata__") else self.type
 
     @property
     def metavar(self) -> str:
-        """What kind of value it takes, as help texts show it."""
+        """The kind of its value, as help texts show it."""
         if self.reader is not None:
             return self.reader.metavar
         inner = str(get_args(self.bare)[0] if get_args(self.bare) else self.bare)
@@ -106,7 +107,7 @@ class Field:
 
     @property
     def shown_default(self) -> str:
-        """What holds while it is not set, for people; empty: nothing."""
+        """The default as users read it; empty if there is none."""
         if self.setting.unset:
             return self.setting.unset
         if isinstance(self.default, int | float) and not isinstance(self.default, bool):
@@ -152,7 +153,7 @@ class Field:
         return found
 
     def write(self, value: Any) -> Any:
-        """Return the value as it stands in a document."""
+        """Return the value in the form of a document."""
         if value is None:
             return None
         write = _plain if self.reader is None else self.reader.write
@@ -189,7 +190,7 @@ def read_section(
     """Read those values that a document holds.
 
     Args:
-        section: What it should be.
+        section: The section's class.
         data: The document, as plain values.
         place: Where it stands, for faults.
         faults: Gets every fault.
@@ -223,7 +224,7 @@ def read_section(
 
 
 def write_section(settings: Section, base: Section) -> dict[str, Any]:
-    """Return what differs from other settings of the same kind, as :func:`read_section` reads it."""
+    """Return the differences to other settings of the same kind, as :func:`read_section` reads them."""
     document: dict[str, Any] = {}
     for name, field in fields_of(type(settings)).items():
         value = getattr(settings, name)
@@ -274,6 +275,12 @@ def _read_host(value: Any) -> Any:
     return value
 
 
+def _read_hosts(value: Any) -> Any:
+    for host in split_addresses(value) if isinstance(value, str) else [value]:
+        _read_host(host)
+    return value
+
+
 def _read_network(value: Any) -> Any:
     try:
         ipaddress.ip_network(value, strict=False)
@@ -312,12 +319,14 @@ def _same(value: Any) -> Any:
 
 Host = Annotated[str, Reader(_read_host, _same, "HOST")]
 """A host name or an IP address; empty for none."""
+Hosts = Annotated[str, Reader(_read_hosts, _same, "HOST")]
+"""As :data:`Host`, or several, separated by commas."""
 Networks = Annotated[tuple[str, ...], Reader(_read_network, _same, "ADDRESS")]
 """IP addresses or networks."""
 Port = Annotated[int, Meta(ge=0, le=65535)]
 """A TCP port; 0 takes a free one."""
 Finite = Annotated[float, Reader(_read_finite, _same, "NUMBER")]
-"""A number, neither endless nor NaN."""
+"""A number, neither infinite nor NaN."""
 Seconds = Annotated[float, Meta(ge=0), Reader(_read_finite, _same, "SECONDS")]
 Cores = Annotated[float, Reader(read_cores, _same, "CORES")]
 """A share of the processors: cores, or a text such as ``50%``."""

@@ -1,4 +1,4 @@
-"""Where the engine keeps its state and its sockets."""
+"""The engine's folders for its state and its sockets."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
 
 
 def default_state_dir() -> Path:
-    """Return where state is kept if nothing else was said, such as ``~/.local/state/rce``. Makes nothing."""
+    """Return the default folder for state, such as ``~/.local/state/rce``. Does not create it."""
     return platformdirs.user_state_path("rce")
 
 
 def run_dir(environ: Mapping[str, str] | None = None) -> Path:
-    """Return this user's folder for sockets, ``$XDG_RUNTIME_DIR/rce`` or ``/tmp/rce-UID``; made if need be.
+    """Return this user's folder for sockets, ``$XDG_RUNTIME_DIR/rce`` or ``/tmp/rce-UID``; make it if needed.
 
     It is short, because the path of a unix socket may have at most 107 bytes, and only its owner may enter.
     ``$XDG_RUNTIME_DIR`` counts only if it is this user's: ``su`` and ``sudo`` may hand on another one's.
 
     Raises:
-        RunDirError: It cannot be made, is no folder, or belongs to somebody else.
+        RunDirError: It cannot be made, is not a folder, or another user owns it.
     """
     environ = os.environ if environ is None else environ
     runtime = environ.get("XDG_RUNTIME_DIR", "")
@@ -45,10 +45,10 @@ def _is_mine(path: Path) -> bool:
 
 
 def private_folder(path: Path) -> Path:
-    """Make a folder that only its owner may enter, or check that the one which is there is such.
+    """Make a folder that only its owner may enter, or check that an existing one is such a folder.
 
     Raises:
-        RunDirError: It cannot be made, is no folder, or belongs to somebody else.
+        RunDirError: It cannot be made, is not a folder, or another user owns it.
     """
     try:
         path.mkdir(mode=0o700, exist_ok=True)

@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 
 def handed_over(arguments: Sequence[str], *, master: bool = False) -> EngineSettings | None:
-    """Read a command line that is nothing but ``--settings JSON``.
+    """Read a command line that consists of ``--settings JSON`` only.
 
     Args:
         arguments: The command line without the program.
         master: Whether the settings must say where the master is.
 
     Returns:
-        The settings. None if the command line says anything else, or if the document has a fault: then the
-        program's own reader of command lines reads it, and tells what is wrong.
+        The settings. None if the command line has anything else, or if the document has a fault: then the
+        program's own reader of command lines reads it, and reports the fault.
     """
     match arguments:
         case ["--settings", document]:

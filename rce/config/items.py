@@ -1,195 +1,182 @@
 """The items that a robot's file lists: containers, nodes, parameters, interfaces and connections.
 
-Keys are those of the RoboEarth Cloud Engine's files (``docs/protocol.md``).
+Each is a request of :mod:`rce.model.requests`, spelled with the keys of the RoboEarth Cloud Engine's files
+(``docs/protocol.md``). The pydantic models that read them are made from their fields.
 """
 
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Annotated, Any
+import types
+from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar, get_args, get_origin
 
-from pydantic import AfterValidator, BeforeValidator, Field
+import msgspec
+from msgspec import Meta
+from pydantic import AfterValidator, BeforeValidator, create_model
+from pydantic import Field as Option
+from pydantic_core import core_schema
 
 from rce.config.validation import Strict
-from rce.protocol import messages
-from rce.protocol.messages import CHOICES, HUMAN_PATTERNS, AddNode, ContainerData
-from rce.protocol.names import InterfaceType
-from rce.protocol.quantities import read_bandwidth, read_cores, read_memory
+from rce.model import written
+from rce.model.requests import (
+    AddInterface,
+    AddNode,
+    Connection,
+    CreateContainer,
+    Item,
+    SetParameter,
+)
+from rce.model.specs import InterfaceSpec, NodeSpec
+from rce.model.spelling import Field, Spelling, camel, fields_of
+from rce.model.written import HUMAN_PATTERNS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from pydantic import GetCoreSchemaHandler
+    from pydantic_core.core_schema import CoreSchema
 
-def _matches(kind: Any) -> AfterValidator:
-    """Check with the rule that the protocol has for the same value."""
-    (meta,) = kind.__metadata__
-    pattern = re.compile(meta.pattern)
+T = TypeVar("T", bound=CreateContainer | Item)
+
+SPELLING = Spelling(
+    camel,
+    {
+        (CreateContainer, "tag"): "cTag",
+        (AddNode, "container"): "cTag",
+        (NodeSpec, "tag"): "nTag",
+        (SetParameter, "container"): "cTag",
+        (AddInterface, "endpoint"): "eTag",
+        (InterfaceSpec, "tag"): "iTag",
+        (InterfaceSpec, "type"): "iType",
+        (InterfaceSpec, "message_type"): "iCls",
+    },
+)
+"""The names of the fields in config files."""
+
+
+class ItemOf(Generic[T]):
+    """Has pydantic read an item of a file: ``Annotated[AddNode, ItemOf(AddNode)]``."""
+
+    def __init__(self, cls: type[T]) -> None:
+        self._cls = cls
+
+    @property
+    def model(self) -> type[Strict]:
+        """The pydantic model of its keys."""
+        return model_of(self._cls)
+
+    def read(self, data: object) -> T:
+        """Read an item.
+
+        Raises:
+            ValidationError: The item has a fault.
+        """
+        return self._make(self.model.model_validate(data))
+
+    def _make(self, item: Strict) -> T:
+        made, faults = SPELLING.try_read(self._cls, item.model_dump(by_alias=True, exclude_unset=True))
+        if made is None:
+            raise ValueError("; ".join(map(str, faults)))
+        return made
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(
+            self._make,
+            handler.generate_schema(self.model),
+            serialization=core_schema.plain_serializer_function_ser_schema(SPELLING.write),
+        )
+
+
+Container = Annotated[CreateContainer, ItemOf(CreateContainer)]
+Node = Annotated[AddNode, ItemOf(AddNode)]
+Parameter = Annotated[SetParameter, ItemOf(SetParameter)]
+Interface = Annotated[AddInterface, ItemOf(AddInterface)]
+Link = Annotated[Connection, ItemOf(Connection)]
+
+
+_MODELS: dict[type[Any], type[Strict]] = {}
+
+
+def model_of(cls: type[Any]) -> type[Strict]:
+    """Make the pydantic model of an item from its fields."""
+    if cls not in _MODELS:
+        options: dict[str, Any] = {}
+        for field in fields_of(cls):
+            # Fields that are not given are left out of the result, so the default here has no effect.
+            default = ... if field.required else None
+            options[field.name] = (_annotation(field), Option(default, alias=SPELLING.key(field)))
+        _MODELS[cls] = create_model(cls.__name__, __base__=Strict, **options)
+    return _MODELS[cls]
+
+
+def _annotation(field: Field) -> Any:
+    """Return pydantic's annotation of the values that users may write in a field."""
+    rule = field.rule
+    if field.choices:
+        return Annotated[Any, BeforeValidator(_one_of(field.choices))]
+    if rule.words:
+        return Annotated[Any, AfterValidator(_fitting(rule.type, rule.words))]
+    if get_origin(rule.type) is tuple:
+        items: Any = types.GenericAlias(tuple, (_text_or_number(get_args(rule.type)[0]), ...))
+        return Annotated[items, Option(strict=False)]
+    if get_origin(rule.type) is Annotated or rule.type is bool:
+        return Annotated[_text_or_number(rule.type), AfterValidator(_checked(rule.read))]
+    return Annotated[Any, AfterValidator(_checked(rule.read))]
+
+
+def _text_or_number(kind: Any) -> Any:
+    """Return pydantic's annotation of a type of one value, from msgspec's."""
+    if kind is bool:
+        return bool
+    plain, meta = get_args(kind)
+    if plain is str:
+        return Annotated[str, AfterValidator(_matching(meta))]
+    return Annotated[plain, Option(ge=meta.ge, le=meta.le)]
+
+
+def _matching(meta: Meta) -> Callable[[str], str]:
+    pattern = re.compile(meta.pattern or "")
 
     def check(text: str) -> str:
         if not pattern.match(text):
-            raise ValueError(HUMAN_PATTERNS[meta.pattern])
+            raise ValueError(HUMAN_PATTERNS[pattern.pattern])
         if meta.max_length is not None and len(text) > meta.max_length:
             raise ValueError(f"must have at most {meta.max_length} characters")
         return text
 
-    return AfterValidator(check)
+    return check
 
 
-def _check_type(text: str) -> str:
-    InterfaceType.parse(text)
-    return text
+def _one_of(choices: tuple[str, ...]) -> Callable[[Any], Any]:
+    def check(value: Any) -> Any:
+        if value not in choices:
+            raise ValueError(f"must be one of {', '.join(choices)}")
+        return value
+
+    return check
 
 
-def _check_value(value: Any) -> Any:
-    for item in value if isinstance(value, list) else [value]:
-        if not isinstance(item, bool | int | float | str):
-            raise ValueError("must be a number, a boolean, a string, or a list of such")  # noqa: TRY004 - pydantic's
-    return value
-
-
-def _check_features(value: Any) -> Any:
-    if not all(isinstance(item, str) for item in (value if isinstance(value, list) else [value])):
-        raise ValueError("must be a string or a list of strings")
-    return value
-
-
-def _quantity(read: Callable[[object], float]) -> AfterValidator:
-    """Check an amount with the reader that the protocol has for it; it stays as it was written."""
+def _checked(read: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Check a value with its reader; the value stays as it was written."""
 
     def check(value: Any) -> Any:
         read(value)
         return value
 
-    return AfterValidator(check)
+    return check
 
 
-def _one_of(key: str) -> BeforeValidator:
+def _fitting(kind: Any, words: str) -> Callable[[Any], Any]:
     def check(value: Any) -> Any:
-        if value not in CHOICES[key]:
-            raise ValueError(f"must be one of {', '.join(CHOICES[key])}")
+        try:
+            msgspec.convert(value, kind)
+        except msgspec.ValidationError as error:
+            raise ValueError(words) from error
         return value
 
-    return BeforeValidator(check)
+    return check
 
 
-Name = Annotated[str, _matches(messages.Name)]
-PackageName = Annotated[str, _matches(messages.PackageName)]
-Text = Annotated[str, _matches(messages.Text)]
-RosName = Annotated[str, _matches(messages.RosName)]
-ClassName = Annotated[str, _matches(messages.ClassName)]
-InterfacePath = Annotated[str, _matches(messages.InterfacePath)]
-
-
-class Container(Strict):
-    """A container to make; zero or empty means no wish."""
-
-    tag: Name = Field(alias="cTag")
-    group: Text = ""
-    group_ip: Text = Field(default="", alias="groupIp")
-    network: Annotated[Any, _one_of("network")] = ""
-    image: Text = ""
-    size: int = Field(default=1, ge=0, le=2**16)
-    """Slots of the machine."""
-    cpu: Annotated[Any, _quantity(read_cores)] = 0
-    """Cores, or a text such as ``50%``."""
-    memory: Annotated[Any, _quantity(read_memory)] = 0
-    """MB, or a text such as ``256M``."""
-    bandwidth: Annotated[Any, _quantity(read_bandwidth)] = 0
-    """Bytes per second, or a text such as ``10Mbit``."""
-    wait: bool = False
-    """Wait for room if no machine has any."""
-    special_features: Annotated[Any, AfterValidator(_check_features)] = Field(
-        default="", alias="specialFeatures"
-    )
-    """Labels that the machine must have: a list of strings, or one string of words."""
-
-    def data(self) -> ContainerData:
-        """The same as the protocol has it."""
-        return ContainerData(
-            group=self.group,
-            group_ip=self.group_ip,
-            network=self.network,
-            image=self.image,
-            size=self.size,
-            cpu=self.cpu,
-            memory=self.memory,
-            bandwidth=self.bandwidth,
-            special_features=self.special_features,
-            wait=self.wait,
-        )
-
-
-class Node(Strict):
-    """A node to start in a container."""
-
-    container: Name = Field(alias="cTag")
-    tag: Name = Field(alias="nTag")
-    pkg: PackageName
-    exe: Annotated[str, _matches(messages.Executable)]
-    args: Text = ""
-    name: Annotated[str, _matches(messages.OptionalName)] = ""
-    namespace: Annotated[str, _matches(messages.OptionalNamespace)] = ""
-    restart: Annotated[Any, _one_of("restart")] = "never"
-    """When it is started again after it ended by itself."""
-    max_restarts: int = Field(default=5, alias="maxRestarts", ge=0, lt=2**31)
-    """In a row; 0 for no limit."""
-    after: tuple[Name, ...] = Field(default=(), strict=False)
-    """Tags of nodes that must be ready before it starts."""
-    heartbeat: Annotated[str, _matches(messages.OptionalRosName)] = ""
-    """A topic that it publishes as long as it is well."""
-    heartbeat_timeout: float = Field(default=5.0, alias="heartbeatTimeout", ge=0.1, le=86400)
-    """Seconds."""
-
-    def message(self) -> AddNode:
-        """The same as the protocol has it."""
-        return AddNode(
-            container_tag=self.container,
-            node_tag=self.tag,
-            pkg=self.pkg,
-            exe=self.exe,
-            args=self.args,
-            name=self.name,
-            namespace=self.namespace,
-            restart=self.restart,
-            max_restarts=self.max_restarts,
-            after=self.after,
-            heartbeat=self.heartbeat,
-            heartbeat_timeout=self.heartbeat_timeout,
-        )
-
-
-class Parameter(Strict):
-    """A parameter to set in a container."""
-
-    container: Name = Field(alias="cTag")
-    name: RosName
-    value: Annotated[Any, AfterValidator(_check_value)]
-    """Integer, number, boolean, string, or a list of such."""
-
-
-class Interface(Strict):
-    """An interface to make."""
-
-    endpoint: Name = Field(alias="eTag")
-    tag: Name = Field(alias="iTag")
-    type: Annotated[str, AfterValidator(_check_type)] = Field(alias="iType")
-    cls: ClassName = Field(alias="iCls")
-    addr: Annotated[str, _matches(messages.OptionalRosName)] = ""
-    """ROS name of the topic or service: in the container, or (Forwarders) in the robot's own graph."""
-
-    @property
-    def path(self) -> str:
-        """``ENDPOINT/INTERFACE``."""
-        return f"{self.endpoint}/{self.tag}"
-
-    @property
-    def kind(self) -> InterfaceType:
-        """The parsed type."""
-        return InterfaceType.parse(self.type)
-
-
-class Link(Strict):
-    """Two interfaces to join."""
-
-    a: InterfacePath = Field(alias="tagA")
-    b: InterfacePath = Field(alias="tagB")
+Name = Annotated[str, AfterValidator(_matching(get_args(written.Name)[1]))]
+RosName = Annotated[str, AfterValidator(_matching(get_args(written.RosName)[1]))]
+MessageTypeName = Annotated[str, AfterValidator(_matching(get_args(written.MessageTypeName)[1]))]

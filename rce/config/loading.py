@@ -1,4 +1,4 @@
-"""Puts the engine's settings together: defaults, the file, and over it what the command line says."""
+"""Combines the engine's settings: defaults, the file, and the command line, which overrides it."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _LOOPBACK_ONLY: dict[str, Any] = {
 def load_settings(path: Path | None = None, *over: dict[str, Any]) -> EngineSettings:
     """Read the engine's settings.
 
-    In development mode every program binds loopback only, whatever the file says; what the command line says
-    counts.
+    In development mode every program binds loopback only, whatever the file says; the command line
+    overrides that.
 
     Args:
         path: A YAML (or JSON) file; all defaults if None.
         over: Values that were read already (:func:`read_document`), each layer over those before it.
 
     Raises:
-        ConfigError: The file cannot be read, or something is wrong in it; every fault is listed.
+        ConfigError: The file cannot be read, or has faults; every fault is listed.
 
     Example::
 
@@ -57,7 +57,7 @@ def read_document(data: Any, source: str) -> dict[str, Any]:
         The values that it sets, section by section.
 
     Raises:
-        ConfigError: Something is wrong in it; every fault is listed.
+        ConfigError: The document has faults; every fault is listed.
     """
     if data is not None and not isinstance(data, dict):
         raise ConfigError(
@@ -71,7 +71,7 @@ def read_document(data: Any, source: str) -> dict[str, Any]:
 
 
 def as_document(settings: EngineSettings) -> dict[str, Any]:
-    """Return the settings as plain values for another program: what differs from what it would take else."""
+    """Return the settings as plain values for another program: only the differences to its defaults."""
     base = load_settings(None, {"dev": settings.dev})
     return write_section(settings, base) | ({"dev": True} if settings.dev else {})
 

@@ -1,4 +1,4 @@
-"""How all programs of the engine log, so that no password, token or secret gets into a log."""
+"""Logging of all programs of the engine, without passwords, tokens and secrets."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 _TALKATIVE = ("websockets", "aiosqlite", "aiohttp", "asyncio", "httpx", "urllib3")
-"""Libraries that tell in detail what they carry: requests with credentials, rows with hashes."""
+"""Libraries whose detailed logs contain their data: requests with credentials, rows with hashes."""
 
 _CREDENTIALS = re.compile(
     r"""
@@ -29,7 +29,7 @@ _CREDENTIALS = re.compile(
 
 
 class RedactingFormatter(logging.Formatter):
-    """Formats a record, traceback included, with ``***`` in place of what looks like a credential."""
+    """Formats a record, traceback included, with ``***`` in place of anything like a credential."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line or lines of a record."""
@@ -45,8 +45,8 @@ def start_logging(level: int | str, *, line: str = FORMAT, handler: logging.Hand
     """Log to the standard error stream, or elsewhere.
 
     Args:
-        line: How a line looks, as :mod:`logging` writes formats.
-        level: The least level that is written. Libraries that would tell credentials stay at warnings.
+        line: The format of a line, as for :mod:`logging`.
+        level: The least level that is written. Libraries that would log credentials stay at warnings.
         handler: Where to; None for the standard error stream.
     """
     handler = handler or logging.StreamHandler()
@@ -61,7 +61,7 @@ def log_as(program: str, settings: EngineSettings, *, verbose: bool = False) -> 
 
     Args:
         program: Name of the program, and of its file.
-        settings: They say what is logged, and where.
+        settings: The level and the place of the log.
         verbose: Log all.
 
     Raises:
@@ -79,11 +79,11 @@ def log_as(program: str, settings: EngineSettings, *, verbose: bool = False) -> 
 
 
 def rotating_file(path: Path, *, size: int, count: int) -> logging.Handler:
-    """Return a handler that writes a file and puts it aside when it is large.
+    """Return a handler that writes a file and rotates it when it is large.
 
     Args:
         path: The file; its folder is made.
-        size: Bytes at which it is put aside as ``NAME.1``, that as ``NAME.2``, and so on.
+        size: Bytes at which it is renamed to ``NAME.1``, that to ``NAME.2``, and so on.
         count: How many of these are kept.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Finds files that ship with the project, in a checkout as in an installed package."""
+"""Finds files that ship with the project, in a checkout or an installed package."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ MIN_LENGTH = 8
 
 
 class Secret:
-    """A secret that does not show in logs, tracebacks or ``repr``."""
+    """A secret that is hidden in logs, tracebacks and ``repr``."""
 
     __slots__ = ("_text",)
 
@@ -58,7 +58,7 @@ class Secret:
         return hmac.compare_digest(self._text.encode(), text.encode("utf-8", "surrogateescape"))
 
     def derive(self, purpose: str) -> bytes:
-        """Make a key of it that is good for one purpose, and tells nothing of the secret."""
+        """Derive a key for one purpose, which reveals nothing of the secret."""
         return hmac.digest(self._text.encode(), f"rce {purpose}".encode(), "sha256")
 
     def __eq__(self, other: object) -> bool:
@@ -76,13 +76,13 @@ class Secret:
 class SecretFile(Secret):
     """The secret in a file, which may change while programs run.
 
-    Each line is a secret: the first is the current one, the others are still accepted. So a secret is changed
-    without an end to anything: the new one goes before the old one (:func:`rotate_secret`), then into every
-    machine's file, and at last the old one goes (:func:`retire_secrets`). A file that cannot be read for a
-    moment changes nothing.
+    Each line is a secret: the first is the current one, the others are still accepted. So a secret can be
+    changed without ending a connection: put the new one before the old one (:func:`rotate_secret`), copy it
+    into every machine's file, then remove the old one (:func:`retire_secrets`). If the file cannot be read,
+    the secrets that were read last stay in use.
 
     Raises:
-        SecretError: The file cannot be read, holds no good secret, or others can read it.
+        SecretError: The file cannot be read, has no valid secret, or others can read it.
     """
 
     __slots__ = ("_file", "_refused", "_seen", "_texts")
@@ -100,7 +100,7 @@ class SecretFile(Secret):
         return next((text for text in self._texts if text not in self._refused), self._texts[0])
 
     def matches(self, text: str) -> bool:
-        """Compare with all that are accepted, in a time that does not depend on where they differ."""
+        """Compare with all accepted secrets, in a time that does not depend on where they differ."""
         self._look()
         given = text.encode("utf-8", "surrogateescape")
         found = [hmac.compare_digest(known.encode(), given) for known in self._texts]
@@ -136,11 +136,11 @@ def load_secret(
     """Find the secret.
 
     The first of: ``file``; the variable ``RCE_SECRET``; the file that ``RCE_SECRET_FILE`` names; in
-    development mode the one of this user and machine, which is made when there is none; else the one that
+    development mode the one of this user and machine, which is made if it does not exist; else the one that
     ``rce secret new`` made for this user.
 
     Raises:
-        SecretError: There is none, or it is too short, or others can read its file.
+        SecretError: No secret was found, or it is too short, or others can read its file.
     """
     environ = os.environ if environ is None else environ
     if file is not None:
@@ -162,7 +162,7 @@ def load_secret(
 
 
 def default_secret_file() -> Path:
-    """Return where a user's secret is, if nothing else was said, such as ``~/.config/rce/secret``."""
+    """Return the default path of a user's secret, such as ``~/.config/rce/secret``."""
     return platformdirs.user_config_path("rce") / "secret"
 
 
@@ -170,7 +170,7 @@ def new_secret(file: Path) -> Secret:
     """Make a secret in a file that only its owner may read.
 
     Raises:
-        SecretError: There is such a file already, or it cannot be made.
+        SecretError: The file exists already, or cannot be made.
     """
     secret = Secret.generate()
     try:
@@ -203,7 +203,7 @@ def rotate_secret(file: Path) -> None:
     """Put a new secret before the one in a file, which stays accepted.
 
     Raises:
-        SecretError: The file cannot be read or written, or holds a former secret still.
+        SecretError: The file cannot be read or written, or still has a former secret.
     """
     texts = _read_lines(file)
     if len(texts) > 1:
@@ -247,7 +247,7 @@ def _read_lines(file: Path) -> list[str]:
 
 
 def _replace(file: Path, texts: list[str]) -> None:
-    """Write a file whole or not at all, with the owner and the rights that it has."""
+    """Replace a file atomically, with the same owner and permissions."""
     aside = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         was = file.stat()
@@ -266,10 +266,10 @@ def _replace(file: Path, texts: list[str]) -> None:
 
 
 def shared_dev_secret(folder: Path) -> Secret:
-    """Return the secret in ``folder``; whoever comes first makes it.
+    """Return the secret in ``folder``; the first program makes it.
 
-    The file appears whole or not at all (it is written aside and then linked), so programs that start at the
-    same moment agree.
+    The file is created atomically (it is written aside and then linked), so programs that start at the same
+    moment agree.
 
     Raises:
         SecretError: It cannot be made or read.

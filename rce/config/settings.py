@@ -15,10 +15,11 @@ from typing import Annotated
 
 from msgspec import Meta, field
 
-from rce.config.fields import Host, Memory, Section, Setting, choice
+from rce.config.fields import Hosts, Memory, Section, Setting, choice
 from rce.config.folders import default_state_dir
 from rce.config.master_settings import ANYWHERE, MasterSettings
 from rce.config.task_set_settings import ContainerSettings, RobotSettings, Runtime
+from rce.masters import split_addresses
 
 __all__ = [
     "ANYWHERE",
@@ -87,7 +88,7 @@ class TlsSettings(Section, frozen=True, kw_only=True):
 
 
 class EngineSettings(Section, frozen=True, kw_only=True):
-    """What all programs share."""
+    """Settings that all programs share."""
 
     dev: Annotated[
         bool,
@@ -113,9 +114,9 @@ class EngineSettings(Section, frozen=True, kw_only=True):
         ),
     ] = None
     master_host: Annotated[
-        Host,
+        Hosts,
         Setting(
-            "Where robot and container task sets find the master.",
+            "Where robot and container task sets find the master; several by commas, used in turn.",
             option="",
             unset="the argument MASTER_IP; 127.0.0.1 with `rce up`",
             example="10.0.0.1",
@@ -147,29 +148,29 @@ class EngineSettings(Section, frozen=True, kw_only=True):
 
     @property
     def master_state(self) -> Path:
-        """Where the master keeps its state."""
+        """The folder of the master's state."""
         return self.master.state_dir or self.state_dir / "master"
 
     @property
     def container_state(self) -> Path:
-        """Where a container task set keeps its state."""
+        """The folder of a container task set's state."""
         return self.container.state_dir or self.state_dir / "container"
 
     @property
     def certificates(self) -> Path:
-        """The folder with the authority and what it issued."""
+        """The folder with the authority and its certificates."""
         return self.tls.certificates or self.state_dir / "certificates"
 
     @property
     def control_url(self) -> str:
-        """Where task sets dial the master."""
-        host = self.master_host or LOOPBACK
+        """The URL at which task sets dial the master, the first of several."""
+        host = (*split_addresses(self.master_host), LOOPBACK)[0]
         scheme = "wss" if self.tls.enabled else "ws"
         return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.master.control_port}"
 
     @property
     def http_url(self) -> str:
-        """Where clients on this machine find the master."""
+        """The URL of the master for clients on this machine."""
         host = self.master.bind or LOOPBACK
         with contextlib.suppress(ValueError):
             if ipaddress.ip_address(host).is_unspecified:

@@ -16,7 +16,7 @@ class Runtime(Enum):
     """How containers are kept apart."""
 
     AUTO = "auto"
-    """The strongest that this machine can do."""
+    """The strongest isolation that this machine supports."""
     NAMESPACE = "namespace"
     PODMAN = "podman"
     """All containers are of images."""

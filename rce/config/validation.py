@@ -1,4 +1,4 @@
-"""Turns pydantic's complaints into faults with paths, in our words."""
+"""Turns pydantic's errors into faults with paths and this project's texts."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 
 
 class Strict(BaseModel):
-    """Base of what users write: nothing is converted, unknown keys are faults, instances do not change."""
+    """Base of the models of user input: no conversions, unknown keys are faults, instances do not change."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, populate_by_name=True)
 
 
 def faults_of(error: ValidationError, model: type[BaseModel]) -> list[Fault]:
-    """List every complaint with its path.
+    """Return a fault with its path for every error.
 
     Args:
-        error: What pydantic raised.
+        error: Pydantic's error.
         model: The model of the whole document, for suggestions.
     """
     faults = []
@@ -65,6 +65,8 @@ def _keys_beside(model: type[BaseModel], steps: tuple[int | str, ...]) -> list[s
 def _inner_model(model: type[BaseModel], key: str) -> type[BaseModel] | None:
     for name, field in model.model_fields.items():
         if key in (name, field.alias):
-            candidates = (field.annotation, *getattr(field.annotation, "__args__", ()))
+            candidates = [field.annotation, *getattr(field.annotation, "__args__", ())]
+            for one in candidates[:]:  # a model of its own may read what is annotated: rce.config.items
+                candidates += [getattr(mark, "model", None) for mark in getattr(one, "__metadata__", ())]
             return next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), None)
     return None

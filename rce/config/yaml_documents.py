@@ -15,7 +15,7 @@ _MAX_ALIASES = 100
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses keys that come twice, and files that blow up by aliases."""
+    """Refuses duplicate keys, and files that grow too large by aliases."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -54,7 +54,7 @@ def parse_yaml(text: str, source: str) -> Any:
         source: Its file's name, for errors.
 
     Raises:
-        ConfigError: It is no YAML, or has keys that come twice.
+        ConfigError: It is not YAML, or has duplicate keys.
     """
     try:
         loader = _Loader(text)

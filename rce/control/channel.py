@@ -1,8 +1,8 @@
-"""The task set's side of the control channel: dials the master for ever.
+"""The task set's side of the control channel: dials the master, again after each loss.
 
-One task, :meth:`TaskSetChannel.run`, owns everything. A connection starts with ``Hello``, which says all that
-is there, so nothing needs to be kept while there is none. Requests are kept until they are answered: they are
-idempotent, and are sent again on the next connection.
+One task, :meth:`TaskSetChannel.run`, owns everything. A connection starts with ``Hello``, which has the whole
+state of the task set, so the channel keeps no reports while it is not connected. It keeps requests until they
+are answered: they are idempotent, and are sent again on the next connection.
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
-import random
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, assert_never
 
 import msgspec
 from websockets.asyncio.client import connect
@@ -22,9 +21,18 @@ from rce.control.exceptions import MasterUnavailableError, UnsendableError
 from rce.control.messages import (
     ClientReply,
     ClientRequest,
+    Drop,
+    Execute,
     Login,
     LoginReply,
+    Notify,
+    PatchSpec,
+    Probe,
+    Put,
+    ReadLog,
     Refused,
+    StatusWanted,
+    Sync,
     Welcome,
     decode_to_task_set,
     encode,
@@ -32,6 +40,7 @@ from rce.control.messages import (
 from rce.control.tags import Unknown
 from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, MAX_TEXT, ControlTimeouts
 from rce.dialing import open_url_socket
+from rce.masters import Masters
 from rce.tls.exceptions import CertificateError
 from rce.tls.faults import explain_to_client
 from rce.tls.websocket import TlsClientConnection
@@ -43,6 +52,7 @@ if TYPE_CHECKING:
 
     from rce.config.secret import Secret
     from rce.control.messages import Hello, ToMaster, ToTaskSet
+    from rce.model.requests import Request
     from rce.tls.identity import Context
 
 _log = logging.getLogger(__name__)
@@ -54,7 +64,7 @@ Reply = TypeVar("Reply", LoginReply, ClientReply)
 
 
 class _RefusedError(Exception):
-    """The master said no."""
+    """The master refused the connection."""
 
 
 class _Pending:
@@ -69,19 +79,19 @@ class TaskSetChannel:
     """The way to the master.
 
     Args:
-        url: Where the master is, ``ws://host:8080`` (or ``wss://``).
+        url: Where the master is, ``ws://host:8080`` (or ``wss://``); several are dialed in turn.
         secret: Proves that this is a task set of the same engine.
-        hello: Makes the first message of every connection: all that is there now.
+        hello: Makes the first message of every connection: the current state of the task set.
         handler: Called with each message of the master but the answers to requests; one after the other, in
             order, and never cancelled by a lost connection. An exception from it is logged, and after a
-            while the master is dialed anew so that it says everything again.
+            while the master is dialed again so that it says everything again.
         timeouts: Times of this end.
         tls: Gives the TLS context for each connection to a ``wss://`` URL.
     """
 
     def __init__(
         self,
-        url: str,
+        url: str | Masters,
         secret: Secret,
         hello: Callable[[], Hello],
         handler: Callable[[ToTaskSet], Awaitable[None]],
@@ -89,7 +99,8 @@ class TaskSetChannel:
         timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
         tls: Context | None = None,
     ) -> None:
-        self._url = url
+        self._masters = url if isinstance(url, Masters) else Masters(url)
+        self._url = self._masters.current
         self._tls = tls
         self._secret = secret
         self._hello = hello
@@ -100,7 +111,7 @@ class TaskSetChannel:
         self._outbox: asyncio.Queue[str] | None = None  # there is one while there is a connection
         self._inbox: asyncio.Queue[ToTaskSet] = asyncio.Queue(MAX_QUEUED)
         self._socket: ClientConnection | None = None
-        self._failures = 0
+        self._pauses = timeouts.backoff.start()
         self._told = ""
         """Why there was no connection, as the log has it."""
         self._handler_failed = False
@@ -116,7 +127,7 @@ class TaskSetChannel:
         await self._welcomed.wait()
 
     def send(self, message: ToMaster) -> None:
-        """Send a message; it is dropped while there is no connection, as ``Hello`` will say it all again."""
+        """Send a message. Without a connection it is dropped: the next ``Hello`` has the whole state."""
         if self._outbox is None:
             return
         try:
@@ -158,19 +169,28 @@ class TaskSetChannel:
         )
         return await self._request(message, LoginReply)
 
-    async def client_request(self, id: str, type: str, data: Any) -> ClientReply:  # noqa: A002 - wire names
+    async def client_request(
+        self,
+        id: str,  # noqa: A002 - wire names
+        type: str,  # noqa: A002
+        data: Any = None,
+        *,
+        content: Request | None = None,
+    ) -> ClientReply:
         """Have a client's request carried out.
 
         Args:
             id: Endpoint id of the robot that asks.
-            type: ``CC``, ``DC``, ``CN`` or ``CX``.
-            data: As the client sent it.
+            type: ``CC``, ``RC``, ``DC``, ``CN`` or ``CX``.
+            data: As the client sent it; for a master that does not know
+                :data:`rce.control.messages.TYPED_REQUESTS`.
+            content: The request, for a master that does.
 
         Raises:
             MasterUnavailableError: No answer in time.
             UnsendableError: It is too long, or holds something that cannot be sent.
         """
-        message = ClientRequest(request=next(self._numbers), id=id, type=type, data=data)
+        message = ClientRequest(request=next(self._numbers), id=id, type=type, content=content, data=data)
         return await self._request(message, ClientReply)
 
     async def run(self) -> None:
@@ -197,6 +217,13 @@ class TaskSetChannel:
         return reply
 
     async def _connect_once(self) -> float:
+        """Run one connection to its end, and turn to the next master; return how long to wait, in seconds."""
+        self._url = self._masters.current
+        delay = await self._connect()
+        self._masters.failed(self._url)
+        return delay
+
+    async def _connect(self) -> float:
         """Run one connection to its end; return how long to wait before the next, in seconds."""
         shown = self._secret.reveal()
         try:
@@ -225,7 +252,7 @@ class TaskSetChannel:
             if status in (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN):
                 if self._secret.was_refused(shown):
                     _log.info("the master at %s refuses one of our secrets; showing the other", self._url)
-                    return self._next_delay()
+                    return self._pauses.next()
                 _log.error("the master at %s refuses our secret (HTTP %d)", self._url, status)
                 return self._timeouts.backoff_refused
             body = bytes(error.response.body or b"")[:_MOST_SAID].decode(errors="replace").strip()
@@ -238,10 +265,10 @@ class TaskSetChannel:
         if self._handler_failed:  # it may fail again, so not at once
             self._handler_failed = False
             return self._timeouts.backoff_refused
-        return self._next_delay()
+        return self._pauses.next()
 
     def _tell(self, error: Exception) -> None:
-        """Log why there is no connection: plainly at first, and whenever the reason is another one."""
+        """Log why the connection failed: as a warning at first, and whenever the reason changes."""
         why = explain_to_client(error)
         words = why or str(error) or "no answer in time"
         level = logging.INFO if why is None else logging.ERROR
@@ -249,12 +276,6 @@ class TaskSetChannel:
             level = logging.DEBUG
         self._told = words
         _log.log(level, "no connection to the master at %s: %s", self._url, words)
-
-    def _next_delay(self) -> float:
-        """Draw a wait below a bound that doubles (full jitter), so that task sets do not all dial at once."""
-        bound = min(self._timeouts.backoff_max, self._timeouts.backoff_min * 2 ** min(self._failures, 16))
-        self._failures += 1
-        return random.uniform(0.0, bound)  # noqa: S311 - spreads load, keeps no secret
 
     async def _talk(self, socket: ClientConnection) -> None:
         self._socket = socket
@@ -302,7 +323,7 @@ class TaskSetChannel:
                 _log.info("the master sent a %s, which this release does not know", name)
             case Welcome():
                 _log.info("connected to master %s at %s", message.master, self._url)
-                self._failures = 0
+                self._pauses.reset()
                 self._told = ""
                 self._welcomed.set()
                 await self._inbox.put(message)
@@ -312,8 +333,20 @@ class TaskSetChannel:
                 pending = self._pending.get(message.request)
                 if pending is not None and not pending.reply.done():
                     pending.reply.set_result(message)
-            case _:
+            case (
+                Sync()
+                | Put()
+                | PatchSpec()
+                | StatusWanted()
+                | Drop()
+                | Notify()
+                | Probe()
+                | ReadLog()
+                | Execute()
+            ):
                 await self._inbox.put(message)
+            case _:
+                assert_never(message)
 
     async def _handle_inbox(self) -> None:
         while True:
@@ -326,8 +359,8 @@ class TaskSetChannel:
                 self._abort("a message from the master failed")
 
     def _abort(self, reason: str) -> None:
-        """Cut the connection off; the next one starts with Hello."""
-        _log.warning("dialing the master anew: %s", reason)
+        """Abort the connection; the next one starts with Hello."""
+        _log.warning("dialing the master again: %s", reason)
         if self._socket is not None:
             self._socket.transport.abort()
 

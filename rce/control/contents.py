@@ -2,7 +2,7 @@
 
 ``GET /contents/SHA256`` with the secret of the task sets and ``Range: bytes=OFFSET-`` answers 206 with the
 next piece and, in ``Content-Range``, the size of the whole. A piece is small enough for a server that has
-nothing but the time of a handshake, and a fetch that broke goes on where it broke.
+nothing but the time of a handshake, and a fetch that broke continues where it broke.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import contextlib
 import re
 from http import HTTPStatus
 from typing import TYPE_CHECKING, NamedTuple
+from urllib.parse import urlsplit
 
 import h11
 from websockets.datastructures import Headers
@@ -29,14 +30,16 @@ if TYPE_CHECKING:
     from websockets.http11 import Request
 
     from rce.config.secret import Secret
+    from rce.masters import Masters
     from rce.tls.identity import Context
 
     ReadContent = Callable[[str, int, int], Awaitable[tuple[bytes, int] | None]]
-    """Gives a piece (hash, offset, bytes) and the size of the whole; None if there is no such content."""
+    """Returns a piece (hash, offset, bytes) and the size of the whole; None if the content does not exist."""
 
 PIECE = 512 << 10
 """Bytes."""
 _PREFIX = "/contents/"
+_DEFAULT_PORT = 80
 _PATH = re.compile(rf"{_PREFIX}([0-9a-f]{{64}})")
 _FROM = re.compile(r"bytes=([0-9]{1,15})-")
 _RANGE = re.compile(r"bytes [0-9]+-[0-9]+/([0-9]{1,15})")
@@ -44,12 +47,12 @@ _CHUNK = 1 << 16
 
 
 def is_for_contents(path: str) -> bool:
-    """Tell whether a request's path asks for contents."""
+    """Return whether a request's path asks for contents."""
     return path.startswith(_PREFIX)
 
 
 async def answer(request: Request, read: ReadContent) -> Response:
-    """Answer a request for a piece; whoever calls this has checked the secret."""
+    """Answer a request for a piece. The caller has checked the secret."""
     found = _PATH.fullmatch(request.path)
     start = _FROM.fullmatch(",".join(request.headers.get_all("Range")) or "bytes=0-")
     if found is None or start is None:
@@ -93,8 +96,7 @@ class ContentClient:
     """Fetches contents from a master.
 
     Args:
-        host: Where the master is.
-        port: Its port for task sets.
+        masters: Where the masters are, as for :class:`rce.control.channel.TaskSetChannel`.
         secret: Proves that this is a task set of the same engine.
         timeouts: Times of this end.
         tls: Gives the TLS context for each connection; none for a plain one.
@@ -102,15 +104,13 @@ class ContentClient:
 
     def __init__(
         self,
-        host: str,
-        port: int,
+        masters: Masters,
         secret: Secret,
         timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
         *,
         tls: Context | None = None,
     ) -> None:
-        self._host = host
-        self._port = port
+        self._masters = masters
         self._secret = secret
         self._timeouts = timeouts
         self._tls = tls
@@ -121,14 +121,13 @@ class ContentClient:
         Raises:
             ContentError: The master is away or does not have it.
         """
+        url = self._masters.current
         try:
             async with asyncio.timeout(self._timeouts.request):
-                status, headers, body = await self._get(f"{_PREFIX}{sha256}", offset)
+                status, headers, body = await self._get(url, f"{_PREFIX}{sha256}", offset)
         except (OSError, TimeoutError, h11.RemoteProtocolError, CertificateError) as error:
             why = explain_to_client(error) or str(error) or "no answer in time"
-            raise ContentError(
-                f"the master at {self._host}:{self._port} does not hand it out: {why}"
-            ) from error
+            raise ContentError(f"the master at {urlsplit(url).netloc} does not hand it out: {why}") from error
         found = _RANGE.fullmatch(headers.get("content-range", ""))
         if status != HTTPStatus.PARTIAL_CONTENT or found is None or not body:
             text = body[:200].decode(errors="replace").strip()
@@ -137,12 +136,14 @@ class ContentClient:
             )
         return Piece(body, int(found[1]))
 
-    async def _get(self, path: str, offset: int) -> tuple[int, dict[str, str], bytes]:
+    async def _get(self, url: str, path: str, offset: int) -> tuple[int, dict[str, str], bytes]:
+        parts = urlsplit(url)
+        host = parts.hostname or ""
         shown = self._secret.reveal()
         tls = None if self._tls is None else self._tls()
-        sock = await open_socket(self._host, self._port)
+        sock = await open_socket(host, parts.port or _DEFAULT_PORT)
         reader, writer = await asyncio.open_connection(
-            sock=sock, ssl=tls, server_hostname=None if tls is None else self._host
+            sock=sock, ssl=tls, server_hostname=None if tls is None else host
         )
         try:
             connection = h11.Connection(h11.CLIENT)
@@ -150,7 +151,7 @@ class ContentClient:
                 method="GET",
                 target=path,
                 headers=[
-                    ("Host", f"{self._host}:{self._port}"),
+                    ("Host", parts.netloc),
                     ("Authorization", f"Bearer {shown}"),
                     ("Range", f"bytes={offset}-"),
                 ],

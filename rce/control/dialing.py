@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from websockets.asyncio.client import ClientConnection
 
     from rce.config.secret import Secret
+    from rce.masters import Masters
     from rce.tls.identity import Context
 
 
@@ -26,7 +27,7 @@ class RunDialer:
     """Dials the master for runs.
 
     Args:
-        url: Where the master is, as for :class:`rce.control.channel.TaskSetChannel`.
+        masters: Where the masters are, as for :class:`rce.control.channel.TaskSetChannel`, whose master asks.
         secret: Proves that this is a task set of the same engine.
         timeouts: Times of this end.
         tls: Gives the TLS context for each connection to a ``wss://`` URL.
@@ -34,14 +35,14 @@ class RunDialer:
 
     def __init__(
         self,
-        url: str,
+        masters: Masters,
         secret: Secret,
         timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
         *,
         tls: Context | None = None,
     ) -> None:
         self._tls = tls
-        self._url = url.rstrip("/")
+        self._masters = masters
         self._secret = secret
         self._timeouts = timeouts
 
@@ -53,10 +54,11 @@ class RunDialer:
             OSError: The master cannot be reached; ``TimeoutError`` if it does not answer.
             WebSocketException: It does not take the connection.
         """
+        url = self._masters.current.rstrip("/")
         async with asyncio.timeout(self._timeouts.open):
-            sock = await open_url_socket(self._url)
+            sock = await open_url_socket(url)
         async with connect(
-            self._url + path_of(run),
+            url + path_of(run),
             sock=sock,
             additional_headers={"Authorization": f"Bearer {self._secret.reveal()}"},
             ssl=None if self._tls is None else self._tls(),

@@ -1,4 +1,4 @@
-"""What can go wrong on the control channel.
+"""Errors of the control channel.
 
 ::
 

@@ -18,7 +18,7 @@ import msgspec
 from msgspec import Struct
 
 FEATURE = "exec"
-"""What a task set or an environment says it knows if it can do this."""
+"""The feature that a task set or an environment names if it can run commands."""
 MAX_DATA = 32 << 10
 """Bytes of the contents of one frame."""
 MAX_ARGUMENTS = 1024
@@ -32,7 +32,7 @@ _SIZE = struct.Struct("!HH")
 
 
 class Part(Enum):
-    """What a frame holds."""
+    """The kind of a frame."""
 
     INPUT = b"i"
     """Bytes for the command's standard input."""
@@ -62,7 +62,7 @@ class Frame(NamedTuple):
 
 
 class Command(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What is to be run."""
+    """The command to run."""
 
     argv: tuple[str, ...] = ()
     """The program and its arguments; empty: a shell."""
@@ -89,7 +89,7 @@ def decode(frame: bytes) -> Frame:
     """Read a frame.
 
     Raises:
-        ValueError: It is none.
+        ValueError: The data is not a frame.
     """
     if len(frame) > MAX_DATA + 1:
         raise ValueError(f"a frame of {len(frame)} bytes; at most {MAX_DATA + 1} are allowed")
@@ -105,7 +105,7 @@ def read_size(data: bytes) -> tuple[int, int]:
     """Read rows and columns.
 
     Raises:
-        ValueError: It is no size.
+        ValueError: It is not a size.
     """
     if len(data) != _SIZE.size:
         raise ValueError(f"a terminal's size has {_SIZE.size} bytes, not {len(data)}")
@@ -122,16 +122,16 @@ def read_ended(data: bytes) -> Ended:
     """Read the last frame.
 
     Raises:
-        msgspec.ValidationError: It is none.
+        msgspec.ValidationError: The data is not a last frame.
     """
     return msgspec.json.decode(data, type=Ended)
 
 
 def read_command(text: str | bytes) -> Command:
-    """Read what a user wants to be run.
+    """Read the command that a user wants to run.
 
     Raises:
-        ValueError: It is no such thing, or too much; the text says what.
+        ValueError: The data is not a command, or it is too large; the text names the fault.
     """
     if len(text) > MAX_COMMAND:
         raise ValueError(f"the command has {len(text)} bytes; at most {MAX_COMMAND} are allowed")
@@ -147,11 +147,11 @@ def read_command(text: str | bytes) -> Command:
 
 
 def path_of(run: str) -> str:
-    """Where a task set dials for a run."""
+    """Return the path that a task set dials for a run."""
     return f"{PATH_PREFIX}{run}"
 
 
 def run_of(path: str) -> str | None:
-    """Tell for which run a path is; None if it is another path."""
+    """Return the run that a path belongs to; None for any other path."""
     found = _RUN.fullmatch(path)
     return found[1] if found else None

@@ -1,7 +1,9 @@
 """The messages on the control channel (JSON text frames, tagged by ``t``).
 
 A task set dials the master and sends :class:`Hello`. The master answers :class:`Welcome` and
-:class:`Sync` with all that it desires there, and from then on single :class:`Put` and :class:`Drop`.
+:class:`Sync` with the whole desired state of the task set; later it sends single :class:`Put`,
+:class:`PatchSpec` and :class:`Drop`. Reports work the same way: the whole state in ``Hello``, then
+:class:`Status` and :class:`PatchStatus`. A receiver whose state does not fit a patch asks for the whole.
 Messages with a ``request`` number are answered by the reply with the same number.
 
 Programs of two releases that follow each other talk to one another: the master takes task sets of this
@@ -16,21 +18,28 @@ from enum import Enum
 from typing import Any
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, field
 
 from rce.control.execution import Command
-from rce.control.logs import LogWish
+from rce.control.logs import LogQuery
 from rce.control.model import (
     EndpointSpec,
     EndpointStatus,
     EndpointUsage,
     LinkAddress,
+    SpecPatch,
+    StatusPatch,
 )
 from rce.control.tags import TaggedReader
+from rce.model.requests import Request
 
 CONTROL_VERSION = 2
 ACCEPTED_VERSIONS = (1, CONTROL_VERSION)
 """Of task sets: a new master works with those that are not upgraded yet."""
+
+
+TYPED_REQUESTS = "typed-requests"
+"""A feature of masters: they take :attr:`ClientRequest.content`."""
 
 
 class TaskSetKind(Enum):
@@ -51,11 +60,11 @@ class MachineInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_fie
     """The runtime in use; container task sets only."""
     labels: tuple[str, ...] = ()
     slots: int = 0
-    """How many slots its containers may take in all; 0 if nobody counts."""
+    """How many slots its containers may take in all; 0 if it is not counted."""
     limits: str = ""
     """How limits are enforced: ``cgroup2``, ``cgroup1``, ``rlimit``; container task sets only."""
     networks: tuple[str, ...] = ("none",)
-    """The values of :class:`rce.control.model.Network` that containers can have here."""
+    """The values of :class:`rce.model.specs.Network` that containers can have here."""
     runtimes: tuple[str, ...] = ()
     """All runtimes that work here."""
     draining: bool = False
@@ -63,7 +72,7 @@ class MachineInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_fie
     requirements: bool = False
     """Whether it installs what packages that users bring ask for in their ``requirements.txt``."""
     detail: str = ""
-    """What is missing on this machine, in words."""
+    """Text on what is missing on this machine."""
 
 
 class _Message(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field="t"):
@@ -86,7 +95,7 @@ class Hello(_Message, frozen=True, kw_only=True, omit_defaults=True):
     address: LinkAddress = LinkAddress()
     """Robot task sets: where links to any of its robots are accepted."""
     endpoints: tuple[EndpointStatus, ...] = ()
-    """All that is there now."""
+    """The current status of every endpoint."""
     bearer: bool = False
     """Robot task sets: whether robots may show their credential in the header ``Authorization``."""
     features: tuple[str, ...] = ()
@@ -100,15 +109,27 @@ class Status(_Message, frozen=True, kw_only=True, omit_defaults=True):
     status: EndpointStatus
 
 
+class PatchStatus(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """The changes of an endpoint. Only to masters with the feature :data:`rce.control.model.PATCHES`."""
+
+    patch: StatusPatch
+
+
+class SpecWanted(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """A patch did not fit what is desired here. Answered by :class:`Put`, if the endpoint is placed here."""
+
+    id: str
+
+
 class Gone(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """A dropped endpoint is gone with all that belonged to it."""
+    """A dropped endpoint and everything that belonged to it was removed."""
 
     id: str
     revision: int
 
 
 class Fault(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """Something failed that the endpoint's user must know of; becomes an ``ER`` and an event."""
+    """A failure that the endpoint's user must know of; becomes an ``ER`` and an event."""
 
     id: str
     text: str
@@ -127,7 +148,7 @@ class Usage(_Message, frozen=True, kw_only=True, omit_defaults=True):
     shed: int = 0
     """How often a user held too much, and lost the oldest of it."""
     turned_away: int = 0
-    """Connections that were closed because too many did not say who they are."""
+    """Connections that were closed because too many had not authenticated."""
 
 
 class Login(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -162,6 +183,9 @@ class ClientRequest(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Endpoint id of the robot that asks."""
     type: str
     data: Any
+    """As the client sent it, for masters of the release before; else None."""
+    content: Request | None = None
+    """The request; for masters whose ``features`` name :data:`TYPED_REQUESTS`."""
 
 
 class LogChunk(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -169,13 +193,13 @@ class LogChunk(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
     request: int
     offset: int
-    """Where the next read goes on."""
+    """Where the next read continues."""
     text: str = ""
     error: str = ""
-    life: str = ""
-    """The container's life (its incarnation) of which this is the log."""
+    incarnation: str = field(default="", name="life")
+    """The container's incarnation of which this is the log."""
     ended: float = 0.0
-    """When that life ended, in seconds since the epoch; 0 if it has not."""
+    """When that incarnation ended, in seconds since the epoch; 0 if it has not."""
     reason: str = ""
     """Why it ended."""
 
@@ -188,6 +212,8 @@ class Welcome(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
     version: int
     master: str
+    features: tuple[str, ...] = ()
+    """What this master can do that one of an earlier release could not."""
 
 
 class Refused(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -197,15 +223,30 @@ class Refused(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Sync(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """All that is desired at this task set; what else is there is to be removed."""
+    """The whole desired state of this task set; it removes everything else."""
 
     endpoints: tuple[EndpointSpec, ...]
 
 
 class Put(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """One endpoint is desired like this. An older revision than the one applied is ignored."""
+    """The desired state of one endpoint. A revision older than the applied one is ignored."""
 
     endpoint: EndpointSpec
+
+
+class PatchSpec(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """The changes of one endpoint's desired state.
+
+    Only to task sets with the feature :data:`rce.control.model.PATCHES`.
+    """
+
+    patch: SpecPatch
+
+
+class StatusWanted(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """A patch did not fit what was reported. Answered by :class:`Status`, if the endpoint is there."""
+
+    id: str
 
 
 class Drop(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -224,7 +265,7 @@ class Notify(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Probe(_Message, frozen=True, kw_only=True, omit_defaults=True):
-    """Find out whether a robot is still there: it logs in elsewhere. One that is not is :class:`Left`."""
+    """Check whether a robot is still connected: it logs in elsewhere. If not, the answer is :class:`Left`."""
 
     id: str
 
@@ -257,7 +298,7 @@ class ReadLog(_Message, frozen=True, kw_only=True, omit_defaults=True):
     offset: int = 0
     """Negative: that many bytes before the end."""
     limit: int = 65536
-    wish: LogWish = LogWish()
+    query: LogQuery = field(default=LogQuery(), name="wish")
 
 
 class Execute(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -270,9 +311,23 @@ class Execute(_Message, frozen=True, kw_only=True, omit_defaults=True):
     command: Command
 
 
-ToMaster = Hello | Status | Gone | Fault | Usage | Login | Left | ClientRequest | LogChunk
+ToMaster = (
+    Hello | Status | PatchStatus | SpecWanted | Gone | Fault | Usage | Login | Left | ClientRequest | LogChunk
+)
 ToTaskSet = (
-    Welcome | Refused | Sync | Put | Drop | Notify | Probe | LoginReply | ClientReply | ReadLog | Execute
+    Welcome
+    | Refused
+    | Sync
+    | Put
+    | PatchSpec
+    | StatusWanted
+    | Drop
+    | Notify
+    | Probe
+    | LoginReply
+    | ClientReply
+    | ReadLog
+    | Execute
 )
 
 _encoder = msgspec.json.Encoder()

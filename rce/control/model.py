@@ -1,100 +1,25 @@
-"""What the master desires of an endpoint and what a task set reports of it.
+"""The desired state of an endpoint, from the master, and its status, from a task set.
 
-An *endpoint* is a robot or a container. The master keeps one :class:`EndpointSpec` for each and sends it
-whole, with a growing revision, to the task set where the endpoint is placed; the task set compares it with
-what is there and makes up the difference. Applying the same spec twice changes nothing.
+An *endpoint* is a robot or a container. The master sends its :class:`EndpointSpec`, with a growing revision,
+to the task set where it is placed: whole at first, then what changed (:class:`SpecPatch`). The task set
+compares it with the actual state and reconciles the two. Applying the same spec twice changes nothing. The
+status goes the other way in the same forms: :class:`EndpointStatus`, then :class:`StatusPatch`.
 """
 
 from __future__ import annotations
 
 from enum import Enum
 
-from msgspec import Struct
+from msgspec import Struct, field
 
-ParameterValue = bool | int | float | str | list[bool | int | float | str]
-"""A parameter's value on the wire."""
+from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec, Resources
 
-
-class InterfaceSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """An interface of an endpoint."""
-
-    tag: str
-    type: str
-    """An interface type such as ``PublisherInterface`` (see :class:`rce.protocol.names.InterfaceType`)."""
-    cls: str
-    """Message or service class, ``package/Type``."""
-    addr: str = ""
-    """ROS name of the topic or service; container ends only."""
-
-
-class RestartPolicy(Enum):
-    """When a node that ended by itself is started again."""
-
-    NEVER = "never"
-    ON_FAILURE = "on-failure"
-    """After any end but exit code 0."""
-    ALWAYS = "always"
-
-
-class NodeSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A node of a container."""
-
-    tag: str
-    pkg: str
-    exe: str
-    args: str = ""
-    """Split as a POSIX shell splits, never given to one. May hold ``$(find PKG)`` and ``$(env VAR)``."""
-    name: str = ""
-    namespace: str = ""
-    restart: RestartPolicy = RestartPolicy.NEVER
-    max_restarts: int = 5
-    """How often in a row it is started again; one that ran well for a while counts anew. 0: no limit."""
-    after: tuple[str, ...] = ()
-    """Tags of nodes that must be ready before this one starts."""
-    heartbeat: str = ""
-    """A topic that the node publishes as long as it is well; empty for none."""
-    heartbeat_timeout: float = 5.0
-    """Seconds without a message on the heartbeat topic after which the node is taken for stuck."""
-
-
-class ParameterSpec(Struct, frozen=True, kw_only=True):
-    """A parameter of a container's ROS parameter server."""
-
-    name: str
-    value: ParameterValue
-
-
-class Network(Enum):
-    """What a container sees of the network, beside its own loopback and its links."""
-
-    NONE = "none"
-    GROUP = "group"
-    """The containers of the same user and group, on the same machine, at their ``group_ip``."""
-    HOST = "host"
-    """The machine's own network; for containers of administrators only."""
-
-
-class Resources(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a container asks for. Zero or empty means: no wish."""
-
-    group: str = ""
-    group_ip: str = ""
-    network: Network = Network.NONE
-    image: str = ""
-    """Root file system: an OCI image's name, or a folder of the machine; needs the runtime ``podman``."""
-    size: int = 1
-    """Slots of the machine that it takes; the limits it does not set itself are so many times a slot's."""
-    cpu: float = 0.0
-    """Cores."""
-    memory: int = 0
-    """Bytes."""
-    bandwidth: int = 0
-    """Bytes per second on the container's links."""
-    special_features: tuple[str, ...] = ()
+PATCHES = "patches"
+"""The feature of programs that take and send patches in place of whole specs and statuses."""
 
 
 class LinkAddress(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Where an endpoint accepts links. On the same machine the unix socket is used, else TCP."""
+    """The address of an endpoint for links. On the same machine the unix socket is used, else TCP."""
 
     machine: str = ""
     """Equal strings mean that the unix socket of one can be reached from the other."""
@@ -108,14 +33,14 @@ class LinkAddress(Struct, frozen=True, kw_only=True, omit_defaults=True):
 class LinkSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One end of a link to a peer endpoint. Exactly one of the two ends has ``dial`` set.
 
-    The link of an endpoint with itself is here once, and nobody dials it.
+    The link of an endpoint with itself is listed once, and neither end dials it.
     """
 
     id: str
     peer: str
     """The peer's endpoint id, ``user/tag``."""
     token: str
-    """A secret that the master gave both ends; the dialing end proves with it who it is."""
+    """A secret that the master gave both ends; the dialing end authenticates with it."""
     dial: bool
     address: LinkAddress = LinkAddress()
     """Where to dial; empty while the peer is not up (yet)."""
@@ -130,7 +55,7 @@ class ConnectionSpec(Struct, frozen=True, kw_only=True):
     peer_interface: str
 
 
-class BundleSpec(Struct, frozen=True, kw_only=True):
+class PackageSpec(Struct, frozen=True, kw_only=True):
     """A version of a package that a user brought to the engine; mounted read-only on the package path."""
 
     name: str
@@ -138,20 +63,20 @@ class BundleSpec(Struct, frozen=True, kw_only=True):
     sha256: str
     """Of the archive, in hex; names its content everywhere."""
     signature: str
-    """Ed25519, in hex, over what :mod:`rce.bundles` says."""
+    """Ed25519, in hex, over what :mod:`rce.packages` says."""
     key: str
     """The public key that made the signature, in hex."""
 
 
 class EndpointKind(Enum):
-    """What an endpoint is."""
+    """The kind of an endpoint."""
 
     ROBOT = "robot"
     CONTAINER = "container"
 
 
 class EndpointSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """All that the master desires of one endpoint."""
+    """The whole desired state of one endpoint."""
 
     id: str
     kind: EndpointKind
@@ -162,20 +87,52 @@ class EndpointSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     resources: Resources = Resources()
     nodes: tuple[NodeSpec, ...] = ()
     parameters: tuple[ParameterSpec, ...] = ()
-    bundles: tuple[BundleSpec, ...] = ()
+    packages: tuple[PackageSpec, ...] = field(default=(), name="bundles")
+
+
+class EndpointContents(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """The contents of an endpoint's spec beside interfaces, links and connections."""
+
+    resources: Resources = Resources()
+    nodes: tuple[NodeSpec, ...] = ()
+    parameters: tuple[ParameterSpec, ...] = ()
+    packages: tuple[PackageSpec, ...] = ()
+
+
+class SpecPatch(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """The changes in the spec of an endpoint. It applies only to the revision ``base``."""
+
+    id: str
+    base: int
+    revision: int
+    """Of the spec when the patch is applied."""
+    interfaces: tuple[InterfaceSpec, ...] = ()
+    """New, or changed; so are links and connections."""
+    links: tuple[LinkSpec, ...] = ()
+    connections: tuple[ConnectionSpec, ...] = ()
+    removed_interfaces: tuple[str, ...] = ()
+    """By tag."""
+    removed_links: tuple[str, ...] = ()
+    """By id."""
+    removed_connections: tuple[int, ...] = ()
+    """By id."""
+    contents: EndpointContents | None = None
+    """None: as before."""
 
 
 class NodeState(Enum):
-    """Where a node is in its life."""
+    """The state of a node in its life cycle."""
 
     WAITING = "waiting"
     """Not started (again) yet: nodes that it comes after are not ready, or it ended and pauses."""
     STARTING = "starting"
     """The process was started and has not registered with the container's ROS core yet."""
     RUNNING = "running"
+    """Registered with the container's ROS core."""
     STUCK = "stuck"
-    """Runs, but its heartbeat stays away."""
+    """Runs, but sends no heartbeat."""
     STOPPING = "stopping"
+    """Told to end."""
     EXITED = "exited"
     """Ended by itself with exit code 0."""
     FAILED = "failed"
@@ -183,7 +140,7 @@ class NodeState(Enum):
 
 
 class NodeStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a container reports of one node."""
+    """The status of one node, as its container reports it."""
 
     tag: str
     state: NodeState
@@ -196,7 +153,7 @@ class NodeStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class EndpointState(Enum):
-    """Where an endpoint is in its life, as its task set sees it."""
+    """The state of an endpoint in its life cycle, as its task set sees it."""
 
     STARTING = "starting"
     RUNNING = "running"
@@ -210,7 +167,7 @@ class EndpointState(Enum):
 
 
 class EndpointStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """All that a task set reports of one endpoint; sent whole whenever something in it changed."""
+    """The whole status of one endpoint, as a task set reports it."""
 
     id: str
     revision: int
@@ -226,7 +183,20 @@ class EndpointStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Ids of the established connections."""
     address: LinkAddress = LinkAddress()
     client: str = ""
-    """From where a robot is connected, and since when, in words for its user; robots only."""
+    """From where and since when a robot is connected, as a text for its user; robots only."""
+    number: int = 0
+    """Counts the reports of this endpoint; a patch has the number after that of the status it fits."""
+
+
+class StatusPatch(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """The changes in the status of an endpoint. It applies only to the status with the number before it."""
+
+    status: EndpointStatus
+    """As it is now; but of interfaces only those that are new or changed, and of connections only those that
+    were established since."""
+    removed_interfaces: tuple[str, ...] = ()
+    lost_connections: tuple[int, ...] = ()
+    """No longer established, or removed."""
 
 
 class InterfaceUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -243,7 +213,7 @@ class InterfaceUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class NodeUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a node consumes, with all processes that it started."""
+    """The resources that a node uses, with all processes that it started."""
 
     cpu_s: float = 0.0
     memory: int = 0
@@ -252,7 +222,7 @@ class NodeUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class EndpointUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What an endpoint consumes. All but the interfaces: containers only."""
+    """The resources that an endpoint uses. All but the interfaces: containers only."""
 
     interfaces: dict[str, InterfaceUsage] = {}
     nodes: dict[str, NodeUsage] = {}
@@ -263,11 +233,11 @@ class EndpointUsage(Struct, frozen=True, kw_only=True, omit_defaults=True):
     memory: int = 0
     """Bytes in use."""
     memory_peak: int = 0
-    """Bytes, the most since the start; 0 if nobody counts."""
+    """Bytes, the most since the start; 0 if it is not measured."""
     memory_limit: int = 0
-    """Bytes; 0 if there is no limit."""
+    """Bytes; 0 without a limit."""
     cpu_limit: float = 0.0
-    """Cores; 0 if there is no limit."""
+    """Cores; 0 without a limit."""
     oom_kills: int = 0
     """Processes that were killed because memory ran out."""
     io_read: int = 0

@@ -1,4 +1,4 @@
-"""One task set, seen from the master."""
+"""The master's view of one task set."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from rce.control.exceptions import PeerGoneError, PeerTimeoutError
-from rce.control.logs import LogWish
+from rce.control.logs import LogQuery
 from rce.control.messages import ReadLog, encode
 from rce.control.timeouts import MAX_QUEUED, ControlTimeouts
 
@@ -32,7 +32,7 @@ class Peer:
         self._reads: dict[int, asyncio.Future[LogChunk]] = {}
         self._left = False
         self.finished = asyncio.Event()
-        """Set by the server when it has done with this peer."""
+        """Set by the server when it is done with this peer."""
 
     def __repr__(self) -> str:
         return f"<Peer {self.kind.value} {self.process}>"
@@ -49,11 +49,11 @@ class Peer:
 
     @property
     def features(self) -> frozenset[str]:
-        """What it can do that a task set of an earlier release could not."""
+        """The features of this task set that one of an earlier release did not have."""
         return frozenset(self.hello.features)
 
     def send(self, message: ToTaskSet) -> None:
-        """Send a message; never blocks. A peer that is too far behind is cut off and will say Hello again."""
+        """Send a message; never blocks. A peer that is too far behind is disconnected, and dials again."""
         if self._left:
             return
         try:
@@ -64,7 +64,7 @@ class Peer:
             self.leave()
 
     def abort(self) -> None:
-        """Cut the connection off."""
+        """Abort the connection."""
         self._socket.transport.abort()
 
     async def read_log(
@@ -73,7 +73,7 @@ class Peer:
         node: str,
         offset: int = 0,
         limit: int = 65536,
-        wish: LogWish = LogWish(),  # noqa: B008 - it is frozen
+        query: LogQuery = LogQuery(),  # noqa: B008 - it is frozen
     ) -> LogChunk:
         """Read a piece of a node's log.
 
@@ -82,7 +82,7 @@ class Peer:
             node: Node tag; empty for the environment's own log.
             offset: Where to start, in bytes; negative: that many before the end.
             limit: At most so many bytes.
-            wish: Of which life of the container, and what of it.
+            query: Of which incarnation of the container, and what of it.
 
         Raises:
             PeerGoneError: The task set left.
@@ -93,7 +93,7 @@ class Peer:
         number = next(self._numbers)
         reply: asyncio.Future[LogChunk] = asyncio.get_running_loop().create_future()
         self._reads[number] = reply
-        self.send(ReadLog(request=number, id=id, node=node, offset=offset, limit=limit, wish=wish))
+        self.send(ReadLog(request=number, id=id, node=node, offset=offset, limit=limit, query=query))
         try:
             async with asyncio.timeout(self._timeouts.log):
                 return await reply
@@ -118,7 +118,7 @@ class Peer:
             reply.set_result(chunk)
 
     def leave(self) -> None:
-        """Note that the peer is gone; who waits for it is told (for the server)."""
+        """Note that the peer is gone, and fail the calls that wait for it (for the server)."""
         self._left = True
         for reply in self._reads.values():
             if not reply.done():

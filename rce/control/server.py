@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from http import HTTPStatus
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 from weakref import WeakKeyDictionary
 
 import msgspec
@@ -18,9 +18,18 @@ from rce.control.execution import run_of
 from rce.control.messages import (
     ACCEPTED_VERSIONS,
     CONTROL_VERSION,
+    ClientRequest,
+    Fault,
+    Gone,
     Hello,
+    Left,
     LogChunk,
+    Login,
+    PatchStatus,
     Refused,
+    SpecWanted,
+    Status,
+    Usage,
     Welcome,
     decode_to_master,
     encode,
@@ -52,21 +61,21 @@ STRANGERS_PER_ADDRESS = PER_ADDRESS
 """Connections from one address that have not shown the secret yet."""
 
 PROOF_CHECK_S = 1.0
-"""How often it is looked whether the secrets and certificates that were shown are still accepted."""
+"""Seconds between checks whether the secrets and certificates of connected task sets are still accepted."""
 
 _GARBAGE, _POLICY, _INTERNAL, _GOING_AWAY = 1007, 1008, 1011, 1001
 _MAX_REASON = 123  # bytes of a WebSocket close frame's reason
 
 
 class ControlServer:
-    """Takes task sets in. An async context manager: listens inside.
+    """Accepts task sets. An async context manager: listens inside.
 
-    Callbacks are awaited one after the other for each peer, so a slow one slows that peer only. What they
-    raise is logged and ends that peer's connection, nothing else.
+    Callbacks are awaited one after the other for each peer, so a slow one slows that peer only. An exception
+    from a callback is logged and ends only that peer's connection.
 
     Args:
         secret: What task sets must prove to have.
-        on_hello: A task set came. What it sends to the peer follows ``Welcome``. May raise
+        on_hello: A task set connected. Messages that it sends to the peer follow ``Welcome``. May raise
             :class:`PeerRefusedError`; then no other callback is called for that peer.
         on_message: A task set sent something (answers to :meth:`Peer.read_log` are not passed on).
         on_gone: A task set that ``on_hello`` took has left, however it ended.
@@ -97,7 +106,9 @@ class ControlServer:
         tls: Context | None = None,
         is_revoked: Callable[[int], bool] | None = None,
         on_execution: Callable[[str, ServerConnection], Awaitable[None]] | None = None,
+        features: tuple[str, ...] = (),
     ) -> None:
+        self._features = features
         self._secret = secret
         self._tls = tls
         self._is_revoked = is_revoked
@@ -113,7 +124,7 @@ class ControlServer:
         self._timeouts = timeouts
         self._peers: dict[str, Peer] = {}
         self._shown: WeakKeyDictionary[ServerConnection, str] = WeakKeyDictionary()
-        """What each task set that is connected proved itself by."""
+        """The credential of each connected task set."""
         self._watcher: asyncio.Task[None] | None = None
         self._server: Server | None = None
 
@@ -141,7 +152,7 @@ class ControlServer:
             self._port,
             process_request=self._admit,
             create_connection=behind_gate(connection, self._gate),
-            origins=[None],  # no browser's page has any business here
+            origins=[None],  # pages in browsers must not connect here
             compression=None,
             open_timeout=self._timeouts.open,
             ping_interval=self._timeouts.ping_interval,
@@ -248,7 +259,7 @@ class ControlServer:
 
     async def _serve_peer(self, peer: Peer, socket: ServerConnection) -> None:
         while (older := self._peers.get(peer.process)) is not None:
-            _log.info("%r dialed anew", peer)
+            _log.info("%r dialed again", peer)
             older.abort()
             await older.finished.wait()
         self._peers[peer.process] = peer
@@ -260,7 +271,7 @@ class ControlServer:
             peer.finished.set()
 
     async def _introduce(self, peer: Peer, socket: ServerConnection) -> None:
-        peer.send(Welcome(version=CONTROL_VERSION, master=self._master))
+        peer.send(Welcome(version=CONTROL_VERSION, master=self._master, features=self._features))
         try:
             await self._on_hello(peer, peer.hello)
         except PeerRefusedError as error:
@@ -298,8 +309,20 @@ class ControlServer:
                     return
                 case Unknown(name=name):
                     _log.info("%r sent a %s, which this release does not know", peer, name)
-                case _:
+                case (
+                    Status()
+                    | PatchStatus()
+                    | SpecWanted()
+                    | Gone()
+                    | Fault()
+                    | Usage()
+                    | Login()
+                    | Left()
+                    | ClientRequest()
+                ):
                     await self._on_message(peer, message)
+                case _:
+                    assert_never(message)
 
 
 def _serial_of(socket: ServerConnection) -> int:

@@ -25,7 +25,7 @@ _tag_of = msgspec.json.Decoder(_Tagged).decode
 
 
 class TaggedReader(Generic[T]):
-    """Reads the messages of a union, and tells those of a later release.
+    """Reads the messages of a union, and recognizes those of a later release.
 
     Args:
         union: The union of :class:`msgspec.Struct` types, each tagged by its name.
@@ -39,7 +39,7 @@ class TaggedReader(Generic[T]):
         """Read a message.
 
         Raises:
-            msgspec.DecodeError: It is none; the text names the place.
+            msgspec.DecodeError: The data is not a message; the text names the place.
         """
         try:
             return self._decode(text)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from rce.aio.backoff import Backoff
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlTimeouts:
@@ -19,19 +21,18 @@ class ControlTimeouts:
     """An answer of the master; long enough for a master that is being restarted."""
     log: float = 5.0
     """A piece of a node's log."""
-    backoff_min: float = 0.05
-    backoff_max: float = 2.0
-    """The longest wait before the next dial; waits are spread at random between zero and a growing bound."""
+    backoff: Backoff = Backoff(first=0.05, longest=2.0, jitter=1.0)
+    """Waits before the next dial."""
     backoff_refused: float = 5.0
-    """The wait after the master refused this task set or its secret, which will hardly help itself."""
+    """The wait after the master refused this task set or its secret; dialing sooner would hardly help."""
 
 
 DEFAULT_TIMEOUTS = ControlTimeouts()
 
 MAX_FRAME = 256 * 2**20
-"""Longest message, in bytes: ``Sync`` says all that a task set is to do, in one. Both ends have proven who
-they are; how much a user may ask for is limited by the master."""
+"""Longest message, in bytes: ``Sync`` has the whole desired state of a task set. Both ends have
+authenticated; the master limits how much a user may ask for."""
 MAX_TEXT = MAX_FRAME // 4
 """Most characters that surely fit."""
 MAX_QUEUED = 8192
-"""How many messages may wait for a peer; one that is further behind is cut off and starts anew."""
+"""How many messages may wait for a peer; one that is further behind is disconnected and starts anew."""

@@ -1,1 +1,1 @@
-"""Bounds for what strangers and users may take of a process: connections, memory, file descriptors."""
+"""Limits on a process's resources for strangers and users: connections, memory, file descriptors."""

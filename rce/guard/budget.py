@@ -1,7 +1,8 @@
-"""How many bytes a user's connections may make this process hold, and all users together (sans-I/O).
+"""Limits on the bytes that this process holds for the connections of each user and of all (sans-I/O).
 
-Holders tell when they hold more, not when they hold less; so before anybody must give something up, all who
-matter are asked again. Then the holder with the most gives up its oldest, and one that cannot is ended.
+Holders report when they hold more, not when they hold less. So before a holder must drop anything, the
+relevant holders are asked again. Then the holder with the most drops its oldest data; one that cannot is
+ended.
 """
 
 from __future__ import annotations
@@ -14,21 +15,21 @@ _MIB = 1 << 20
 
 
 class Holder(Protocol):
-    """Something that keeps bytes for a user: a robot."""
+    """An object that keeps bytes for a user: a robot."""
 
     @property
     def held(self) -> int:
         """Bytes that it holds now."""
 
     def shed(self, size: int) -> None:
-        """Throw away the oldest that may be thrown away, ``size`` bytes if there are so many."""
+        """Drop the oldest droppable data, ``size`` bytes if there are so many."""
 
     def fail(self, reason: str) -> None:
-        """End, because what it holds may not be thrown away; the reason is for its user."""
+        """End, because its data may not be dropped; the reason is for its user."""
 
 
 class Account:
-    """What one holder holds, as far as the ledger knows."""
+    """The bytes of one holder, as far as the ledger knows."""
 
     __slots__ = ("_ledger", "held", "holder", "user")
 
@@ -40,11 +41,11 @@ class Account:
 
     def note(self) -> None:
         """Take note that the holder holds more. May make it, or another one, shed or fail."""
-        self._ledger._note(self)  # noqa: SLF001 - two halves of one thing
+        self._ledger._note(self)  # noqa: SLF001 - same module
 
     def close(self) -> None:
         """Take note that the holder is gone."""
-        self._ledger._close(self)  # noqa: SLF001 - two halves of one thing
+        self._ledger._close(self)  # noqa: SLF001 - same module
 
 
 class Ledger:
@@ -58,9 +59,9 @@ class Ledger:
 
     Attributes:
         total: Bytes held.
-        shed: How often somebody had to give something up.
+        shed: How often a holder had to drop data.
         failed: How many holders were ended.
-        growths: How often a holder told that it holds more.
+        growths: How often a holder reported that it holds more.
     """
 
     def __init__(self, *, per_user: int, in_all: int) -> None:
@@ -70,7 +71,7 @@ class Ledger:
         self._sums: dict[str, int] = {}
         self._settling = False
         self._complained: set[str] = set()
-        """Users the log has been told of, for as long as they have an account."""
+        """Users that were logged, for as long as they have an account."""
         self.total = 0
         self.shed = 0
         self.failed = 0
@@ -84,7 +85,7 @@ class Ledger:
         return account
 
     def refresh(self) -> None:
-        """Ask all holders anew what they hold, so that the sums tell the truth, also where it became less."""
+        """Ask all holders for their bytes, so that the sums are right also where they became less."""
         for user in self._accounts:
             self._refresh(user)
 

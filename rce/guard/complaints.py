@@ -1,24 +1,24 @@
-"""Keeps strangers from filling the log: one complaint for each address now and then (sans-I/O)."""
+"""Limits log lines about strangers: one complaint for each address per interval (sans-I/O)."""
 
 from __future__ import annotations
 
 EVERY_S = 10.0
-"""The log is told of an address at most so often."""
+"""Seconds between two complaints about an address."""
 _MOST = 1024
 """Addresses that are remembered."""
 
 
 class Complaints:
-    """Says which complaints the log is to be told."""
+    """Decides which complaints are logged."""
 
     def __init__(self) -> None:
         self._last: dict[str, float] = {}
 
     def is_due(self, address: str, now: float) -> bool:
-        """Tell whether to complain of an address; counts as a complaint if so.
+        """Return whether to log a complaint about an address; if so, it counts as logged.
 
         Args:
-            address: Whom it is about.
+            address: The peer's address.
             now: Seconds that never go back.
         """
         if now - self._last.get(address, -EVERY_S) < EVERY_S:

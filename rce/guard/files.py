@@ -1,4 +1,4 @@
-"""How many files and sockets this process may have open."""
+"""The limit of open files and sockets of this process."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ _log = logging.getLogger(__name__)
 
 
 def raise_file_limit() -> int:
-    """Let this process, and those that it starts, open as many files as the system lets it.
+    """Raise the limit of open files to the most that the system allows, also for child processes.
 
     The usual soft limit of 1024 is there for old programs; a server needs a socket for each of its clients.
 
     Returns:
-        How many that are.
+        The new limit.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _ENOUGH if hard == resource.RLIM_INFINITY else min(hard, _ENOUGH)

@@ -1,7 +1,7 @@
-"""What one holder of an account holds outside its queues, and how each thing can be given up (sans-I/O).
+"""The data that the holder of an account holds outside its queues, and how to drop each item (sans-I/O).
 
-Queues know what they hold. Everything else that keeps a message alive, such as a call that waits for its
-answer, a latched message or a conversion under way, is entered here for as long as it does.
+Queues count their own bytes. Everything else that keeps a message in memory, such as a call that waits for
+its answer, a latched message or a running conversion, has an entry here for as long as it does.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Holding:
-    """A thing that is held. Use :meth:`release` when it is not held any more, any number of times."""
+    """One entry. Call :meth:`release` when it is not held any more; further calls have no effect."""
 
     __slots__ = ("_give_up", "_holdings", "size")
 
@@ -24,11 +24,11 @@ class Holding:
 
     def release(self) -> None:
         """Take note that it is not held any more."""
-        self._holdings._release(self)  # noqa: SLF001 - two halves of one thing
+        self._holdings._release(self)  # noqa: SLF001 - same module
 
 
 class Holdings:
-    """All such things of one holder, oldest first.
+    """All entries of one holder, oldest first.
 
     Args:
         on_growth: Called after something was added; may call :meth:`shed`.
@@ -46,12 +46,12 @@ class Holdings:
         return len(self._held)
 
     def hold(self, size: int, give_up: Callable[[], object] | None = None) -> Holding:
-        """Enter something.
+        """Add an entry.
 
         Args:
             size: Bytes.
-            give_up: Called when memory is short, after the thing was taken from the books: throws it away.
-                May be called before this returns. None if it cannot be thrown away.
+            give_up: Drops the data; called when memory is short, after the entry was removed. May be called
+                before this returns. None if the data cannot be dropped.
         """
         holding = Holding(self, size, give_up)
         self._held[holding] = None
@@ -60,14 +60,14 @@ class Holdings:
         return holding
 
     def shed(self, size: int) -> None:
-        """Have the oldest thrown away that can be, until ``size`` bytes are free."""
+        """Drop the oldest droppable entries, until ``size`` bytes are free."""
         goal = self.bytes - size
         for holding in list(self._held):
             if self.bytes <= goal:
                 return
-            if holding in self._held and holding._give_up is not None:  # noqa: SLF001 - two halves of one thing
+            if holding in self._held and holding._give_up is not None:  # noqa: SLF001 - same module
                 self._release(holding)
-                holding._give_up()  # noqa: SLF001 - two halves of one thing
+                holding._give_up()  # noqa: SLF001 - same module
 
     def _release(self, holding: Holding) -> None:
         if holding in self._held:

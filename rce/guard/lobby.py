@@ -1,8 +1,9 @@
-"""Counts connections that have not shown yet who they are, for each address and in all (sans-I/O).
+"""Counts connections that have not authenticated yet, for each address and in all (sans-I/O).
 
-Whoever is known is not counted, so many robots may share the address of a proxy. Of those who are not, the
-*silent* ones (nothing useful came from them yet) give way first: a handshake that a real client begins takes
-one round trip, one that is held open on purpose stays. So who fills the lobby turns out their own.
+Authenticated connections are not counted, so many robots may share the address of a proxy. Of the others, the
+*silent* ones (which have sent nothing useful yet) are closed first: the handshake of a real client takes one
+round trip, while a connection that is held open on purpose stays. So a client that fills the lobby causes
+its own connections to be closed.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ IN_ALL = 1024
 
 _log = logging.getLogger(__name__)
 _V6_SITE = 64
-"""Bits of an IPv6 address that tell sites apart; the rest anybody may choose."""
+"""Bits of an IPv6 address that identify a site; the site chooses the rest."""
 
 
 class Guest:
@@ -32,29 +33,29 @@ class Guest:
         self.turn_out = turn_out
 
     def speak(self) -> None:
-        """Take note that it began as it should: it stays until it leaves."""
-        self._lobby._silent_at(self.address).pop(self, None)  # noqa: SLF001 - two halves of one thing
+        """Take note that it began a valid handshake: it stays until it leaves."""
+        self._lobby._silent_at(self.address).pop(self, None)  # noqa: SLF001 - same module
 
     def rest(self) -> None:
         """Take :meth:`speak` back: it is idle, and may be asked to make room."""
-        self._lobby._rest(self)  # noqa: SLF001 - two halves of one thing
+        self._lobby._rest(self)  # noqa: SLF001 - same module
 
     def leave(self) -> None:
         """Take note that it is known now, or gone."""
-        self._lobby._leave(self)  # noqa: SLF001 - two halves of one thing
+        self._lobby._leave(self)  # noqa: SLF001 - same module
 
 
 class Lobby:
-    """The connections of one kind that nobody knows yet.
+    """The connections of one kind that have not authenticated yet.
 
     Args:
-        name: What comes in here, for the log.
+        name: The kind of connections, for the log.
         per_address: Most from one address (for IPv6: one network of 64 bits).
         in_all: Most from everywhere.
 
     Attributes:
         name: What comes in here.
-        turned_away: How many were not let in, or had to go for others.
+        turned_away: How many were refused, or closed to make room for others.
     """
 
     def __init__(self, name: str, *, per_address: int = PER_ADDRESS, in_all: int = IN_ALL) -> None:
@@ -66,14 +67,14 @@ class Lobby:
         """Those of them that are silent, oldest first."""
         self._count = 0
         self._complained: set[str] = set()
-        """Addresses the log has been told of, for as long as they have a guest."""
+        """Addresses that were logged, for as long as they have a guest."""
         self.turned_away = 0
 
     def __len__(self) -> int:
         return self._count
 
     def enter(self, address: str, turn_out: Callable[[], object]) -> Guest | None:
-        """Let a connection in; None if it must go at once.
+        """Add a connection; return None if it must be closed at once.
 
         Args:
             address: As :func:`address_of` says it.
@@ -128,7 +129,7 @@ class Lobby:
 
 
 def address_of(peer: object) -> str:
-    """Return whom a peer is counted as: its IPv4 address or IPv6 network; empty for unix sockets.
+    """Return the address that a peer counts for: its IPv4 address or IPv6 network; empty for unix sockets.
 
     Args:
         peer: As :meth:`socket.socket.getpeername` says it.

@@ -1,7 +1,7 @@
-"""Shares an event loop among users, so that one who sends much does not keep the others waiting.
+"""Shares an event loop among users, so that a user who sends much does not delay the others.
 
-What comes in is handled at once, as long as its user has used little of the loop's time of late. Then the
-rest waits until the others have had their turn. No user is slowed down while no other has anything to do.
+Input is handled at once as long as its user has used little of the loop's time recently. Beyond that, it
+waits until the others have had their turn. A user is not slowed down while the others are idle.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 SLICE_S = 0.002
-"""What a user may use before others have their turn."""
+"""Seconds that a user may use before others have their turn."""
 _RECOVERY = 0.5
 """Seconds of use that are forgotten in a second."""
 
 
 class Workload(Protocol):
-    """Something of a user that has work to do."""
+    """A user's object that has work to do."""
 
     def go_on(self) -> bool:
         """Do a small part of it; return whether there is more."""
@@ -41,7 +41,7 @@ class LoopShare:
         self._slice = slice_s
         self._clock = clock
         self._used: dict[str, tuple[float, float]] = {}
-        """User to the seconds that they used, and when that was so."""
+        """User to the seconds that they used, and the time of that count."""
         self._waiting: OrderedDict[str, deque[Workload]] = OrderedDict()
         self._round: asyncio.Handle | None = None
 
@@ -69,7 +69,7 @@ class LoopShare:
                 del self._waiting[user]
 
     def leave(self, user: str) -> None:
-        """Forget a user who has nothing here any more."""
+        """Forget a user without workloads."""
         if user not in self._waiting:
             self._used.pop(user, None)
 
@@ -85,12 +85,12 @@ class LoopShare:
         return not more
 
     def _plan(self) -> None:
-        """Have a round after the loop has looked at its sockets, so that who has anything to say is heard."""
+        """Schedule a round after the loop has polled its sockets, so that new input is received first."""
         if self._round is None and self._waiting:
             self._round = asyncio.get_running_loop().call_soon(self._next_round)
 
     def _next_round(self) -> None:
-        """Give users who wait a turn each, all of them together no more than two slices."""
+        """Give each waiting user a turn, all together no more than two slices."""
         self._round = None
         end = self._clock() + 2 * self._slice
         for user in list(self._waiting):

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _HANDSHAKE_RECORD = 0x16
-"""First byte of a TLS client, and of no HTTP request."""
+"""First byte that a TLS client sends; an HTTP request never begins with it."""
 _TEXT = b"This port does not speak TLS: use http:// or ws://\n"
 _ANSWER = (
     b"HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain\r\nConnection: close\r\n"
@@ -26,7 +26,7 @@ class PlainPort:
     """Refuses TLS clients of a server without TLS.
 
     Args:
-        name: What is served, for the log.
+        name: The service on the port, for the log.
     """
 
     def __init__(self, name: str) -> None:
@@ -34,7 +34,7 @@ class PlainPort:
         self._complaints = Complaints()
 
     def refuses(self, transport: asyncio.Transport, data: bytes, now: float) -> bool:
-        """Tell whether a connection is refused for its first bytes; if so, it is answered and closed.
+        """Return whether a connection is refused for its first bytes; if so, it is answered and closed.
 
         Args:
             transport: Of the connection.

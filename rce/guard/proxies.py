@@ -1,4 +1,4 @@
-"""Whose address a request counts for, where proxies stand in front (pure)."""
+"""The client address of a request that came through proxies (pure)."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ class TrustedProxies:
     """Reads ``X-Forwarded-For``, which only a proxy that is trusted may write.
 
     Each proxy adds, at the end, the address that it was reached from. So the last address that is not a
-    trusted proxy's is the client; what stands before it is whatever the client likes to claim.
+    trusted proxy's is the client; addresses before it are claims of the client and are ignored.
 
     Args:
         networks: The proxies, as addresses or networks (``10.0.0.0/8``).
 
     Raises:
-        ValueError: One is neither.
+        ValueError: A value is neither.
     """
 
     def __init__(self, networks: Iterable[str] = ()) -> None:
         self._networks: list[Network] = [ipaddress.ip_network(text, strict=False) for text in networks]
 
     def origin(self, peer: object, forwarded: Iterable[str] = ()) -> str:
-        """Tell whom a request counts for.
+        """Return the address that a request counts for.
 
         Args:
-            peer: Who is connected, as :meth:`socket.socket.getpeername` says it.
+            peer: The connected peer, as :meth:`socket.socket.getpeername` returns it.
             forwarded: The values of all ``X-Forwarded-For``, in their order.
 
         Returns:

@@ -1,4 +1,4 @@
-"""How often somebody may do something: a token bucket for each key (pure: the time is an argument)."""
+"""Rate limits: a token bucket for each key (pure: the time is an argument)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Rates:
         """
         tokens = self._tokens(key, now)
         lacking = min(cost, self.burst) - tokens
-        if lacking > 1e-9:  # noqa: PLR2004 - what adding up seconds leaves
+        if lacking > 1e-9:  # noqa: PLR2004 - rounding error of added seconds
             self._put(key, tokens, now)
             return lacking / self.per_second
         self._put(key, tokens - cost, now)

@@ -1,9 +1,9 @@
-"""Turns at something scarce, such as worker threads: shared fairly between crowds, and between their members.
+"""Turns at a scarce resource, such as worker threads, shared fairly between crowds and their members.
 
-A crowd is what may act as one: an address, or a user. Each crowd that waits gets a turn before any gets
-another one; within a crowd the same holds for its members. When too many wait, the newest of the largest
-crowd's largest member must go. So whoever asks a thousand times waits for their own turns, and others, also
-those of the same crowd, wait for one of them.
+A crowd is a source that may act as one: an address, or a user. Each waiting crowd gets a turn before any
+gets another one; within a crowd the same holds for its members. When too many wait, the newest request of
+the largest member of the largest crowd is refused. So a member that asks a thousand times waits for its own
+turns, and others, also those of the same crowd, wait for one of them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class CrowdedError(Exception):
 
 
 class Turns:
-    """Lets a number work at once; the others wait for their turns.
+    """Allows a number of users at a time; the others wait for their turns.
 
     Args:
         at_once: How many may work at the same time.
@@ -59,11 +59,11 @@ class Turns:
         """Wait for a turn, and have it until the context ends.
 
         Args:
-            crowd: Whom it counts for.
+            crowd: The crowd that it counts for.
             member: The same within the crowd.
 
         Raises:
-            CrowdedError: Too many wait, this crowd is the largest, and this member has the most of it.
+            CrowdedError: Too many wait, this crowd is the largest, and this member waits most often in it.
         """
         if self._has_room(crowd):
             self._working[crowd] += 1
@@ -92,7 +92,7 @@ class Turns:
             raise
 
     def _make_room(self, crowd: str, member: str) -> None:
-        """Send the newest of the largest crowd's largest member away, unless that is who asks."""
+        """Refuse the newest request of the largest crowd's largest member; raise if that is the caller."""
         largest = max(self._crowds, key=lambda name: _size(self._crowds[name]))
         own = self._crowds.get(crowd, OrderedDict())
         if _size(own) >= _size(self._crowds[largest]):
@@ -108,7 +108,7 @@ class Turns:
     def _forget(self, crowd: str, member: str, turn: asyncio.Future[None]) -> None:
         members = self._crowds.get(crowd, OrderedDict())
         waiting = members.get(member, deque())
-        with contextlib.suppress(ValueError):  # it was sent away just before it was cancelled
+        with contextlib.suppress(ValueError):  # it was refused just before it was cancelled
             waiting.remove(turn)
         self._tidy(crowd, member)
 

@@ -30,12 +30,12 @@ class GuardedConnection(ServerConnection):
             self._guest.speak()
 
     def become_known(self) -> None:
-        """Count it among strangers no longer."""
+        """Leave the lobby: the peer has authenticated."""
         if self._guest is not None:
             self._guest.leave()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Come into the lobby, or be dropped."""
+        """Enter the lobby, or drop the connection."""
         super().connection_made(transport)
         address = address_of(transport.get_extra_info("peername"))
         self._guest = self.lobby.enter(address, self.transport.abort)
@@ -43,7 +43,7 @@ class GuardedConnection(ServerConnection):
             self.transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        """Drop who sends garbage, or their end, before the handshake was answered.
+        """Drop a client that sends garbage, or closes its side, before the handshake was answered.
 
         The library has given such a connection up then, and could not send its answer. TLS clients of a plain
         port are told what they are.
@@ -58,7 +58,7 @@ class GuardedConnection(ServerConnection):
             self._give_up()
 
     def eof_received(self) -> None:
-        """Drop who ends their side before the handshake was answered."""
+        """Drop a client that closes its side before the handshake was answered."""
         if self.protocol.state is State.CONNECTING:
             self._give_up()
         else:

@@ -1,4 +1,4 @@
-"""Which address a program that accepts links, or robots, is known by to others."""
+"""The address by which others reach a program that accepts links or robots."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine
 
 _SOMEWHERE = "192.0.2.1"
-"""An address that nobody has (RFC 5737); the way to it is the way to everybody outside."""
+"""An address for documentation (RFC 5737), never assigned: the route to it is the route to the Internet."""
 
 
 async def own_address(master: str, port: int, hurry: asyncio.Event | None = None) -> str:
     """Return the address of this machine on the way to the master, or outside if the master is here.
 
-    Nothing is sent for it but a question to the name server, if the master is given by name.
+    This sends nothing, except a query to the name server if the master is given by name.
 
     Args:
         master: Host of the master.
         port: Its port.
-        hurry: Once this is set, the answer to that question is not waited for.
+        hurry: Once this is set, the answer to that query is not waited for.
     """
     found = await _unless(hurry or asyncio.Event(), _address_towards(master, port))
     if found is None or ipaddress.ip_address(found).is_loopback:
@@ -34,7 +34,7 @@ async def own_address(master: str, port: int, hurry: asyncio.Event | None = None
 
 
 def is_any(host: str) -> bool:
-    """Tell whether binding ``host`` binds every address of the machine."""
+    """Return whether binding ``host`` binds every address of the machine."""
     return host in ("", "0.0.0.0", "::")  # noqa: S104 - compared, not bound
 
 

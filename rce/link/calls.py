@@ -1,4 +1,4 @@
-"""Service calls: who waits for an answer, and who works on one."""
+"""Service calls: those that wait for an answer, and those that are being served."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import logging
 from collections import deque
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import BackgroundTasks
 from rce.guard.holdings import Holdings
-from rce.link.exceptions import NotConnected, Overloaded
+from rce.link.exceptions import NotConnectedError, OverloadedError
 from rce.link.frames import MAX_ID
-from rce.link.tasks import TaskScope
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rce.link.interface import Buffer
     from rce.link.settings import LinkLimits
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class PendingCalls:
@@ -41,10 +41,10 @@ class PendingCalls:
             Its id and its answer.
 
         Raises:
-            Overloaded: Too many calls have no answer.
+            OverloadedError: Too many calls have no answer.
         """
         if len(self._answers) >= self._max_calls:
-            raise Overloaded(f"{len(self._answers)} calls have no answer yet")
+            raise OverloadedError(f"{len(self._answers)} calls have no answer yet")
         self._last = self._last % MAX_ID + 1
         while self._last in self._answers:
             self._last = self._last % MAX_ID + 1
@@ -57,19 +57,19 @@ class PendingCalls:
         return self._answers.pop(call_id, None) is not None
 
     def answer(self, call_id: int, payload: bytes) -> None:
-        """Hand an answer to who waits for it, if somebody still does."""
+        """Hand an answer to its caller, if the caller still waits."""
         answer = self._answers.pop(call_id, None)
         if answer is not None and not answer.done():
             answer.set_result(payload)
 
     def fail(self, call_id: int, error: Exception) -> None:
-        """Hand an error to who waits for the answer, if somebody still does."""
+        """Fail a call with an error, if its caller still waits."""
         answer = self._answers.pop(call_id, None)
         if answer is not None and not answer.done():
             answer.set_exception(error)
 
     def fail_all(self, make_error: Callable[[], Exception]) -> None:
-        """Hand an error to everybody who waits."""
+        """Fail every waiting call with an error."""
         for call_id in list(self._answers):
             self.fail(call_id, make_error())
 
@@ -80,7 +80,7 @@ class CallServer:
     A request is held until it has been answered. When memory is short, the oldest is answered with a fault.
 
     At most :attr:`LinkLimits.serving` requests are served at a time; :attr:`LinkLimits.waiting` more wait in
-    order, and what comes then is answered with a fault at once.
+    order, and later ones are answered with a fault at once.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class CallServer:
         self._serve = serve
         self._limits = limits
         self._name = name
-        self._scope = TaskScope()
+        self._scope = BackgroundTasks()
         self._serving: dict[tuple[Channel, int], asyncio.Task[None]] = {}
         self._waiting: deque[tuple[Channel, int, bytes]] = deque()
         self._holdings = Holdings() if holdings is None else holdings
@@ -104,17 +104,17 @@ class CallServer:
         """Serve a request, now or when its turn comes.
 
         Raises:
-            NotConnected: The interface is closed.
-            Overloaded: Too many requests wait.
+            NotConnectedError: The interface is closed.
+            OverloadedError: Too many requests wait.
         """
         if self._closed:
-            raise NotConnected
+            raise NotConnectedError
         if len(self._scope) < self._limits.serving:
             self._begin(channel, call_id, payload)
         elif len(self._waiting) < self._limits.waiting:
             self._waiting.append((channel, call_id, payload))
         else:
-            raise Overloaded(f"{len(self._waiting)} requests wait to be served")
+            raise OverloadedError(f"{len(self._waiting)} requests wait to be served")
         key = channel, call_id
         holding = self._holdings.hold(len(payload), lambda: self._give_up(*key))
         if self.has(*key):
@@ -123,7 +123,7 @@ class CallServer:
             holding.release()
 
     def has(self, channel: Channel, call_id: int) -> bool:
-        """Tell whether a request is being served or waits."""
+        """Return whether a request is being served or waits."""
         return (channel, call_id) in self._serving or any(
             waiting[:2] == (channel, call_id) for waiting in self._waiting
         )
@@ -151,15 +151,15 @@ class CallServer:
         await self._scope.close()
 
     def _begin(self, channel: Channel, call_id: int, payload: bytes) -> None:
-        task = self._scope.spawn(self._run(channel, call_id, payload), f"{self._name} request {call_id}")
+        task = self._scope.spawn(self._run(channel, call_id, payload), name=f"{self._name} request {call_id}")
         self._serving[channel, call_id] = task
         task.add_done_callback(self._next)
 
     async def _run(self, channel: Channel, call_id: int, payload: bytes) -> None:
         try:
             answer = await self._serve(payload)
-        except Exception as error:
-            log.debug("%s: request failed", self._name, exc_info=True)
+        except Exception as error:  # noqa: BLE001 - logged
+            _log.debug("%s: request failed", self._name, exc_info=True)
             if self._finish(channel, call_id):
                 channel.fault(call_id, error)
         else:
@@ -167,7 +167,7 @@ class CallServer:
                 channel.reply(call_id, answer)
 
     def _finish(self, channel: Channel, call_id: int) -> bool:
-        """Take note that a request was served; false if nobody waits for its answer any more."""
+        """Take note that a request was served; return false if its caller no longer waits."""
         if self._serving.get((channel, call_id)) is not asyncio.current_task():
             return False
         del self._serving[channel, call_id]
@@ -180,7 +180,7 @@ class CallServer:
         """Answer a request with a fault, because memory is short."""
         if self.has(channel, call_id):
             self.cancel(channel, call_id)
-            channel.fault(call_id, Overloaded("memory is short; the request was given up"))
+            channel.fault(call_id, OverloadedError("memory is short; the request was given up"))
 
     def _next(self, _ended: asyncio.Task[None]) -> None:
         while self._waiting and len(self._scope) < self._limits.serving and not self._closed:

@@ -1,4 +1,4 @@
-"""What carries the frames of a link: a socket, or a pair of objects in one process."""
+"""Carriers of a link's frames: a socket, or a pair of objects in one process."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
-from rce.link.exceptions import LinkLost, ProtocolError
+from rce.link.exceptions import LinkLostError, ProtocolError
 from rce.link.handshake import FEATURES
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ _TURN = 1 << 20
 
 
 class CarrierHandler(Protocol):
-    """Who takes what a carrier brings."""
+    """Receives the frames and the end of a carrier."""
 
     def frame_received(self, frame: Frame) -> None:
         """Take a frame of the peer.
@@ -60,7 +60,7 @@ class Carrier(ABC):
 
     @abstractmethod
     def pace(self, pacer: Pacer | None) -> None:
-        """Limit what passes; none for no limit. A link within a process is no traffic and has no limit."""
+        """Limit what passes; none for no limit. A link within a process is not traffic and has no limit."""
 
     @property
     @abstractmethod
@@ -85,7 +85,7 @@ class Carrier(ABC):
         """Send a message of a channel, after those that wait in its queue. Ignored when the carrier ended.
 
         Raises:
-            Overloaded: The queue is full and its policy is to refuse.
+            OverloadedError: The queue is full and its policy is to refuse.
         """
 
     @abstractmethod
@@ -98,7 +98,7 @@ class Carrier(ABC):
 
     @abstractmethod
     def abort(self, reason: Exception) -> None:
-        """End the carrier at once; who handles the frames is told the reason in a later step."""
+        """End the carrier at once; its handler is told the reason in a later step of the event loop."""
 
     @abstractmethod
     def close(self) -> None:
@@ -106,15 +106,15 @@ class Carrier(ABC):
 
     @abstractmethod
     async def wait_closed(self) -> None:
-        """Wait until the carrier has ended and holds nothing any more."""
+        """Wait until the carrier has ended and has released everything."""
 
 
 class LocalCarrier(Carrier):
     """One half of a link between two endpoints of one process.
 
     Payloads are handed over as they are. Delivery is a later step of the event loop, so that interfaces which
-    answer at once cannot recurse. A step takes what lay there when it began, up to 1 MB or one larger
-    message, so that two of them cannot hold the loop.
+    answer at once cannot recurse. A step delivers the messages that were there when it began, up to 1 MB or
+    one larger message, so that two halves cannot block the loop.
     """
 
     kind = "local"
@@ -141,7 +141,7 @@ class LocalCarrier(Carrier):
         self._schedule()
 
     def pace(self, pacer: Pacer | None) -> None:
-        """Do nothing: this is no traffic."""
+        """Do nothing: this is not traffic."""
 
     @property
     def traffic(self) -> tuple[int, int]:
@@ -166,7 +166,7 @@ class LocalCarrier(Carrier):
     def control(self, frame: Frame) -> None:
         """Send a frame."""
         if self._peer is not None:
-            self._peer._take(frame)  # noqa: SLF001 - two halves of one thing
+            self._peer._take(frame)  # noqa: SLF001 - same module
 
     def send(self, queue: OutgoingQueue, frame: Frame) -> None:
         """Send a message; nothing ever waits here."""
@@ -186,7 +186,7 @@ class LocalCarrier(Carrier):
         """End both halves; the peer's handler learns it in a later step of the event loop."""
         peer = self._end()
         if peer is not None:
-            self._loop.call_soon(peer._lose)  # noqa: SLF001 - two halves of one thing
+            self._loop.call_soon(peer._lose)  # noqa: SLF001 - same module
 
     async def wait_closed(self) -> None:
         """Wait until this half has ended."""
@@ -203,7 +203,7 @@ class LocalCarrier(Carrier):
 
     def _lose(self) -> None:
         if self._end() is not None and self._handler is not None:
-            self._handler.carrier_lost(self, LinkLost("the peer ended the link"))
+            self._handler.carrier_lost(self, LinkLostError("the peer ended the link"))
 
     def _take(self, frame: Frame) -> None:
         if not self._closed.done():

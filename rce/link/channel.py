@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
+from rce.aio.queues import OverflowPolicy
 from rce.link.calls import PendingCalls
 from rce.link.exceptions import (
-    CallTimeout,
-    MessageTooLarge,
-    NotConnected,
-    Overloaded,
-    PeerFault,
-    PeerLost,
+    CallTimeoutError,
+    MessageTooLargeError,
+    NotConnectedError,
+    OverloadedError,
+    PeerFaultError,
+    PeerLostError,
     ProtocolError,
 )
 from rce.link.frames import LATCHED, OVERLOADED, Frame, FrameType, encode_sources, parse_sources
 from rce.link.handshake import LATCH
-from rce.link.queues import OutgoingQueue, OverflowPolicy
+from rce.link.queues import OutgoingQueue
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from rce.link.queues import Backlog
     from rce.link.slot import InterfaceSlot
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _MAX_FAULT = 4096
 """Longest fault text that is sent, in bytes."""
@@ -104,7 +105,7 @@ class Channel:
                 self.link.carrier.clear(self._queue)
             self._queue.clear()
             self._queue = self._new_queue()
-            self._calls.fail_all(lambda: PeerLost("the connection was lost"))
+            self._calls.fail_all(lambda: PeerLostError("the connection was lost"))
         self.slot.channel_changed(self)
 
     def _new_queue(self) -> OutgoingQueue:
@@ -134,7 +135,7 @@ class Channel:
             carrier.send(self._queue, Frame(FrameType.DATA, self.number, source, flags, payload))
 
     def send_sources(self, sources: Collection[int]) -> None:
-        """Tell the peer which sources' latched messages are in force, after all that was sent before."""
+        """Tell the peer which sources' latched messages are in force, after everything sent before."""
         carrier = self.link.carrier
         if self.established and carrier is not None and LATCH in carrier.features:
             carrier.send(self._queue, encode_sources(self.number, sources))
@@ -143,19 +144,19 @@ class Channel:
         """Send a request and wait ``deadline`` seconds for its answer. Raises as :meth:`Port.call`."""
         carrier = self.link.carrier
         if not self.established or carrier is None:
-            raise NotConnected
+            raise NotConnectedError
         call_id, answer = self._calls.add()
         queue = self._queue
         try:
             carrier.send(queue, Frame(FrameType.CALL, self.number, call_id, 0, payload))
-        except Overloaded:
+        except OverloadedError:
             self._calls.drop(call_id)
             raise
         try:
             async with asyncio.timeout(deadline):
                 return await answer
         except TimeoutError as error:
-            raise CallTimeout(f"no answer in {deadline:g} s") from error
+            raise CallTimeoutError(f"no answer in {deadline:g} s") from error
         finally:
             if self._calls.drop(call_id) and not carrier.withdraw(queue, call_id):
                 carrier.control(Frame(FrameType.CANCEL, self.number, call_id))
@@ -169,15 +170,15 @@ class Channel:
         try:
             payload = as_payload(answer, self._limits.max_message)
             carrier.send(self._queue, Frame(FrameType.REPLY, self.number, call_id, 0, payload))
-        except (TypeError, MessageTooLarge, Overloaded) as error:
+        except (TypeError, MessageTooLargeError, OverloadedError) as error:
             self.fault(call_id, error)
 
     def fault(self, call_id: int, error: Exception) -> None:
-        """Answer a request with what went wrong."""
+        """Answer a request with a fault."""
         carrier = self.link.carrier
         if carrier is not None:
             text = (str(error) or type(error).__name__).encode(errors="replace")[:_MAX_FAULT]
-            flags = OVERLOADED if isinstance(error, Overloaded) else 0
+            flags = OVERLOADED if isinstance(error, OverloadedError) else 0
             carrier.control(Frame(FrameType.FAULT, self.number, call_id, flags, text))
 
     # Receiving
@@ -204,12 +205,26 @@ class Channel:
             case FrameType.FAULT:
                 text = payload.decode(errors="replace")
                 overloaded = frame.flags & OVERLOADED
-                self._calls.fail(frame.id, Overloaded(text) if overloaded else PeerFault(text))
+                self._calls.fail(frame.id, OverloadedError(text) if overloaded else PeerFaultError(text))
             case FrameType.CANCEL:
                 if self.slot.server is not None:
                     self.slot.server.cancel(self, frame.id)
-            case _:
+            case (
+                FrameType.HELLO
+                | FrameType.WELCOME
+                | FrameType.REFUSE
+                | FrameType.PING
+                | FrameType.PONG
+                | FrameType.SECURE
+                | FrameType.GRANT
+                | FrameType.OPEN
+                | FrameType.CLOSE
+                | FrameType.FRAGMENT
+                | FrameType.ABORT
+            ):
                 raise ProtocolError(f"{frame.type.name} on a channel")
+            case _:
+                assert_never(frame.type)
 
     def frame_dropped(self, frame: Frame) -> None:
         """Take note that a message of the peer was dropped while it came in, because memory is short.
@@ -221,9 +236,11 @@ class Channel:
             case FrameType.DATA:
                 self.slot.message_dropped(self, frame.id if frame.flags & LATCHED else None)
             case FrameType.CALL:
-                self.fault(frame.id, Overloaded("the request was dropped: memory is short"))
+                self.fault(frame.id, OverloadedError("the request was dropped: memory is short"))
             case FrameType.REPLY:
-                self._calls.fail(frame.id, Overloaded("the answer was dropped: memory is short"))
+                self._calls.fail(frame.id, OverloadedError("the answer was dropped: memory is short"))
+            case _:
+                raise AssertionError(f"{frame.type.name} never comes in parts")
 
     def _request_received(self, call_id: int, payload: bytes) -> None:
         server = self.slot.server
@@ -235,7 +252,7 @@ class Channel:
         self.slot.counters.count_in(len(payload))
         try:
             server.accept(self, call_id, payload)
-        except (Overloaded, NotConnected) as error:
+        except (OverloadedError, NotConnectedError) as error:
             self.fault(call_id, error)
 
 
@@ -243,10 +260,10 @@ def as_payload(buffer: Buffer, limit: int) -> bytes | memoryview:
     """Return a payload as the frames need it: its length in bytes, and small enough.
 
     Raises:
-        MessageTooLarge: It is larger than ``limit`` bytes.
-        TypeError: It is no buffer.
+        MessageTooLargeError: It is larger than ``limit`` bytes.
+        TypeError: It is not a buffer.
     """
     payload = buffer if isinstance(buffer, bytes) else memoryview(buffer).cast("B")
     if len(payload) > limit:
-        raise MessageTooLarge(len(payload), limit)
+        raise MessageTooLargeError(len(payload), limit)
     return payload

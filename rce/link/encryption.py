@@ -25,14 +25,14 @@ _ROLES = {True: "rce link dialing end", False: "rce link accepting end"}
 def dialing_context(token: str) -> ssl.SSLContext:
     """Return the context of a link's dialing end. Blocks for milliseconds, the first time longer."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname = False  # the key tells who the peer is
+    context.check_hostname = False  # the key identifies the peer
     return _prepare(context, token, dialing=True)
 
 
 def accepting_context(token: str) -> ssl.SSLContext:
     """Return the context of a link's accepting end. Blocks for milliseconds, the first time longer."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.num_tickets = 0  # a link is dialed anew with a whole handshake
+    context.num_tickets = 0  # a link is dialed again with a whole handshake
     return _prepare(context, token, dialing=False)
 
 

@@ -1,13 +1,17 @@
-"""A robot or a container: makes what its spec says, and keeps it so."""
+"""A robot or a container: reconciles its interfaces, links and connections with its spec."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
+from functools import partial
 from typing import TYPE_CHECKING
 
 import msgspec
 
+from rce.aio.tasks import BackgroundTasks
+from rce.control.desired import DesiredState, Difference
+from rce.control.model import EndpointKind, EndpointSpec
 from rce.guard.holdings import Holdings
 from rce.link.carrier import LocalCarrier
 from rce.link.channel import Channel
@@ -16,18 +20,19 @@ from rce.link.link import Link, add_traffic
 from rce.link.pacing import Pacer
 from rce.link.queues import Backlog
 from rce.link.slot import InterfaceSlot
-from rce.link.tasks import TaskScope
+from rce.link.wiring import ChannelTable, Refusals, WiringNews
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Mapping
 
-    from rce.control.model import ConnectionSpec, EndpointSpec, InterfaceSpec, InterfaceUsage, LinkSpec
+    from rce.control.model import ConnectionSpec, InterfaceUsage, LinkSpec, SpecPatch
     from rce.link.carrier import Carrier
     from rce.link.hub import LinkHub
     from rce.link.interface import InterfaceFactory
-    from rce.protocol.names import EndpointId
+    from rce.model.names import EndpointId
+    from rce.model.specs import InterfaceSpec
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class Endpoint:
@@ -45,7 +50,7 @@ class Endpoint:
 
     def __init__(
         self,
-        id: EndpointId,  # noqa: A002 - what it is
+        id: EndpointId,  # noqa: A002 - the word of the wire format
         factory: InterfaceFactory,
         hub: LinkHub,
         *,
@@ -62,17 +67,20 @@ class Endpoint:
         self._links: dict[str, Link] = {}
         self._far_ends: dict[str, Link] = {}
         """The other ends of links of this endpoint with itself."""
-        self._channels: dict[tuple[int, str], Channel] = {}
-        """By number and interface: both ends of a connection may be here."""
+        self._channels = ChannelTable()
+        self._desired = DesiredState(EndpointSpec(id=str(id), kind=EndpointKind.ROBOT, revision=-1))
+        self._due = Difference()
+        """The parts that may not be made yet."""
+        self._news = WiringNews()
         self._backlog = Backlog(on_growth)
         self._holdings = Holdings(on_growth)
         self._on_growth = on_growth
         self._pacer: Pacer | None = None
         self._former_traffic = (0, 0)
-        self._refused: set[InterfaceSpec | ConnectionSpec] = set()
+        self._refused = Refusals()
         self._starts: dict[InterfaceSlot, asyncio.Task[None]] = {}
         self._dials: dict[Link, asyncio.Task[None]] = {}
-        self._tasks = TaskScope()
+        self._tasks = BackgroundTasks()
         self._lock = asyncio.Lock()
         self._notice: asyncio.Handle | None = None
         self._closed = False
@@ -85,8 +93,26 @@ class Endpoint:
     @property
     def connections(self) -> tuple[int, ...]:
         """Ids of the established connections, in order."""
-        half = {number for (number, _), channel in self._channels.items() if not channel.established}
-        return tuple(sorted({number for number, _ in self._channels} - half))
+        return self._channels.established
+
+    def take_news(self) -> WiringNews:
+        """Return the changes of interfaces and connections since the last call."""
+        news, self._news = self._news, WiringNews()
+        for tag in news.changed_interfaces:
+            slot = self._slots.get(tag)
+            if slot is None:
+                news.removed_interfaces.append(tag)
+            else:
+                news.interfaces[tag] = slot.active
+        for number in news.changed_connections:
+            found = news.connections if self._channels.is_established(number) else news.lost_connections
+            found.append(number)
+        return news
+
+    @property
+    def desired_interfaces(self) -> frozenset[InterfaceSpec]:
+        """The interfaces that were desired last."""
+        return frozenset(self._desired.interfaces.values())
 
     def usage(self) -> dict[str, InterfaceUsage]:
         """Return the counters of every interface by tag, since it was made."""
@@ -107,12 +133,12 @@ class Endpoint:
         return self._backlog.bytes + self._holdings.bytes + unfinished
 
     def shed(self, size: int) -> None:
-        """Throw away what is held until ``size`` bytes are free, as far as there is anything to throw away.
+        """Drop held payloads until ``size`` bytes are free, or nothing is left to drop.
 
         First the oldest messages of topics, where most waits; then the oldest requests and latched messages.
         """
         goal = self.waiting_bytes - size
-        for channel in sorted(self._channels.values(), key=lambda channel: -channel.waiting_bytes):
+        for channel in sorted(self._channels, key=lambda channel: -channel.waiting_bytes):
             if self.waiting_bytes <= goal:
                 return
             channel.shed(self.waiting_bytes - goal)
@@ -129,12 +155,12 @@ class Endpoint:
                 link.drop_unfinished(self.waiting_bytes - goal)
 
     async def apply(self, spec: EndpointSpec) -> None:
-        """Make up the difference between ``spec`` and what is there.
+        """Reconcile the actual state with ``spec``.
 
-        What is equal in both is not touched. Returns when what is no longer desired is gone, and what is new
-        has begun to be made: interfaces start and links are dialed in the background. An interface that
-        cannot be made or started is reported to ``on_fault`` and does not hinder the others; it is not tried
-        again before its spec changes.
+        Parts that are equal in both are not touched. Returns when the parts that are no longer desired are
+        gone and the creation of new ones has begun: interfaces start and links are dialed in the background.
+        An interface that cannot be made or started is reported to ``on_fault`` and does not affect the
+        others; it is not tried again before its spec changes.
 
         Raises:
             RuntimeError: The endpoint is closed.
@@ -142,15 +168,26 @@ class Endpoint:
         async with self._lock:
             if self._closed:
                 raise RuntimeError(f"endpoint {self.id} is closed")
-            self._limit(spec.resources.bandwidth)
-            await self._remove(spec)
-            self._add(spec)
+            self._due.include(self._desired.replace(spec))
+            await self._make_up()
+
+    async def patch(self, patch: SpecPatch) -> None:
+        """Do what :meth:`apply` does, with what changed since the spec or patch before.
+
+        Raises:
+            RuntimeError: The endpoint is closed.
+        """
+        async with self._lock:
+            if self._closed:
+                raise RuntimeError(f"endpoint {self.id} is closed")
+            self._due.include(self._desired.patch(patch))
+            await self._make_up()
 
     async def close(self) -> None:
         """End everything; returns when nothing is left."""
         async with self._lock:
             self._closed = True
-            self._drop_channels(list(self._channels.values()))
+            self._drop_channels(list(self._channels))
             carriers = self._drop_links(list(self._links.values()))
             await self._close_slots(list(self._slots.values()))
             await self._tasks.close()
@@ -173,34 +210,57 @@ class Endpoint:
             if former is not None:
                 former.close()
 
-    # Taking away
+    # What is due
 
-    async def _remove(self, spec: EndpointSpec) -> None:
-        interfaces = {interface.tag: interface for interface in spec.interfaces}
-        links = {link.id: link for link in spec.links}
-        connections = {
-            _key(end): end for connection in spec.connections for end in self._ends(connection, links)
-        }
-        self._refused &= {*spec.interfaces, *spec.connections}
-        slots = [slot for tag, slot in self._slots.items() if interfaces.get(tag) != slot.spec]
-        gone = [
-            link for link_id, link in self._links.items() if not _is_same_link(link.spec, links.get(link_id))
+    async def _make_up(self) -> None:
+        """Do what is due. If this is cancelled, it is due again the next time."""
+        due, desired = self._due, self._desired
+        if due.contents:
+            self._limit(desired.contents.resources.bandwidth)
+        self._refused.review(due.interfaces, due.connections, desired)
+        slots = [
+            slot
+            for tag in due.interfaces
+            if (slot := self._slots.get(tag)) is not None and desired.interfaces.get(tag) != slot.spec
         ]
-        self._drop_channels(
-            channel
-            for channel in list(self._channels.values())
-            if connections.get(_key(channel.spec)) != channel.spec
-            or channel.slot in slots
-            or channel.link in gone
-        )
+        gone = [
+            link
+            for link_id in due.links
+            if (link := self._links.get(link_id)) is not None
+            and not _is_same_link(link.spec, desired.links.get(link_id))
+        ]
+        for tag in due.interfaces:
+            due.connections.update(dict.fromkeys(desired.connections_at(tag)))
+        for link_id in due.links:
+            due.connections.update(dict.fromkeys(desired.connections_on(link_id)))
+        self._drop_channels(self._stale_channels(due, slots, gone))
         self._drop_links(gone)
         await self._close_slots(slots)
+        self._add(due)
+        self._due = Difference()
 
-    def _drop_channels(self, channels: Iterable[Channel]) -> None:
-        for channel in list(channels):
+    # Taking away
+
+    def _stale_channels(self, due: Difference, slots: list[InterfaceSlot], gone: list[Link]) -> list[Channel]:
+        """Return the channels that are not desired any more, or whose interface or link ends."""
+        stale: list[Channel] = []
+        ended = {link.spec.id for link in gone}
+        for number in due.connections:
+            connection = self._desired.connections.get(number)
+            ends = () if connection is None else self._ends(connection)
+            stale += [
+                channel
+                for channel in self._channels.of(number)
+                if channel.spec not in ends or channel.slot in slots or channel.spec.link in ended
+            ]
+        return stale
+
+    def _drop_channels(self, channels: list[Channel]) -> None:
+        for channel in channels:
             channel.link.remove(channel)
             channel.slot.remove(channel)
-            del self._channels[_key(channel.spec)]
+            self._channels.remove(channel)
+            self._news.changed_connections[channel.number] = None
 
     def _drop_links(self, links: list[Link]) -> list[Carrier]:
         """Forget links; return the carriers that are still closing."""
@@ -215,13 +275,14 @@ class Endpoint:
         return carriers
 
     async def _close_slots(self, slots: list[InterfaceSlot]) -> None:
-        """Close interfaces, all at the same time; they are closed also if nobody waits for it any more."""
+        """Close interfaces, all at the same time; cancelling this does not stop the closing."""
         for slot in slots:
             del self._slots[slot.spec.tag]
+            self._news.changed_interfaces[slot.spec.tag] = None
         if slots:
             self._changed()
             name = f"{self.id} closes an interface"
-            await asyncio.wait([self._tasks.spawn(self._close_slot(slot), name) for slot in slots])
+            await asyncio.wait([self._tasks.spawn(self._close_slot(slot), name=name) for slot in slots])
 
     async def _close_slot(self, slot: InterfaceSlot) -> None:
         start = self._starts.pop(slot, None)
@@ -233,22 +294,27 @@ class Endpoint:
                 await slot.close()
         except TimeoutError:
             slot.fail(TimeoutError("takes too long to close"))
-        except Exception as error:
-            log.debug("endpoint %s: interface %s did not close well", self.id, slot.spec.tag, exc_info=True)
+        except Exception as error:  # noqa: BLE001 - logged
+            _log.debug("endpoint %s: interface %s did not close well", self.id, slot.spec.tag, exc_info=True)
             slot.fail(error)
 
     # Adding
 
-    def _add(self, spec: EndpointSpec) -> None:
-        links = {link.id: link for link in spec.links}
-        for link in spec.links:
-            self._put_link(link)
-        for interface in spec.interfaces:
-            if interface.tag not in self._slots and interface not in self._refused:
+    def _add(self, due: Difference) -> None:
+        desired = self._desired
+        for link_id in due.links:
+            if (link := desired.links.get(link_id)) is not None:
+                self._put_link(link)
+        for tag in due.interfaces:
+            interface = desired.interfaces.get(tag)
+            if interface is not None and tag not in self._slots and not self._refused.has_interface(tag):
                 self._add_slot(interface)
-        for connection in spec.connections:
-            for end in self._ends(connection, links):
-                if _key(end) not in self._channels and connection not in self._refused:
+        for number in due.connections:
+            connection = desired.connections.get(number)
+            if connection is None:
+                continue
+            for end in self._ends(connection):
+                if not self._channels.has(end) and not self._refused.has_connection(number):
                     self._add_channel(connection, end)
 
     def _put_link(self, spec: LinkSpec) -> None:
@@ -271,7 +337,7 @@ class Endpoint:
                 self._dial(link)
 
     def _dial(self, link: Link) -> None:
-        task = self._tasks.spawn(keep_dialed(link, self._hub), f"{self.id} dials {link.spec.peer}")
+        task = self._tasks.spawn(keep_dialed(link, self._hub), name=f"{self.id} dials {link.spec.peer}")
         self._dials[link] = task
 
     def _stop_dialing(self, link: Link) -> None:
@@ -285,26 +351,28 @@ class Endpoint:
                 spec,
                 limits=self._hub.limits,
                 timeouts=self._hub.timeouts,
-                on_change=self._changed,
+                on_change=partial(self._channel_changed, spec.tag),
                 on_fault=self._on_fault,
                 holdings=self._holdings,
             )
             slot.make(self._factory)
-        except Exception as error:
-            log.debug("endpoint %s: interface %s cannot be made", self.id, spec.tag, exc_info=True)
-            self._refuse(spec, f"interface {spec.tag}: {error}")
+        except Exception as error:  # noqa: BLE001 - logged
+            _log.debug("endpoint %s: interface %s cannot be made", self.id, spec.tag, exc_info=True)
+            self._refused.add_interface(spec)
+            self._on_fault(f"interface {spec.tag}: {error}")
             return
         self._slots[spec.tag] = slot
-        self._starts[slot] = self._tasks.spawn(self._start(slot), f"{self.id} starts {spec.tag}")
+        self._news.changed_interfaces[spec.tag] = None
+        self._starts[slot] = self._tasks.spawn(self._start(slot), name=f"{self.id} starts {spec.tag}")
         self._changed()
 
     async def _start(self, slot: InterfaceSlot) -> None:
         await slot.start()
         self._starts.pop(slot, None)
 
-    def _ends(self, connection: ConnectionSpec, links: Mapping[str, LinkSpec]) -> tuple[ConnectionSpec, ...]:
+    def _ends(self, connection: ConnectionSpec) -> tuple[ConnectionSpec, ...]:
         """Return the ends of a connection that are here: both, if it joins interfaces of this endpoint."""
-        link = links.get(connection.link)
+        link = self._desired.links.get(connection.link)
         if link is None or link.peer != str(self.id):
             return (connection,)
         there, here = connection.interface, connection.peer_interface
@@ -315,30 +383,30 @@ class Endpoint:
         link = self._links.get(end.link)
         if slot is None or link is None:
             missing = f"interface {end.interface}" if slot is None else f"link {end.link}"
-            self._refuse(connection, f"connection {end.id}: there is no {missing}")
+            self._refused.add_connection(connection)
+            self._on_fault(f"connection {end.id}: there is no {missing}")
             return
         if end is not connection:
             link = self._far_ends[end.link]
-        channel = self._channels[_key(end)] = Channel(end, slot, link, self._backlog)
+        channel = Channel(end, slot, link, self._backlog)
+        self._channels.add(channel)
         slot.add(channel)
         link.add(channel)
 
-    def _refuse(self, spec: InterfaceSpec | ConnectionSpec, text: str) -> None:
-        self._refused.add(spec)
-        self._on_fault(text)
+    def _channel_changed(self, tag: str, number: int) -> None:
+        """Take note that a channel of an interface was established or lost."""
+        self._news.changed_interfaces[tag] = None
+        self._news.changed_connections[number] = None
+        self._changed()
 
     def _changed(self) -> None:
-        """Call ``on_change`` soon, once for all that changes until then."""
+        """Call ``on_change`` soon, once for all changes until then."""
         if self._notice is None and not self._closed:
             self._notice = asyncio.get_running_loop().call_soon(self._tell)
 
     def _tell(self) -> None:
         self._notice = None
         self._on_change()
-
-
-def _key(end: ConnectionSpec) -> tuple[int, str]:
-    return end.id, end.interface
 
 
 def _bend_back(link: Link) -> Link:
@@ -351,5 +419,5 @@ def _bend_back(link: Link) -> Link:
 
 
 def _is_same_link(old: LinkSpec, new: LinkSpec | None) -> bool:
-    """Whether a link can go on under a new spec: another address or token does not end it."""
+    """Whether a link can continue under a new spec: another address or token does not end it."""
     return new is not None and (old.peer, old.dial) == (new.peer, new.dial)

@@ -1,37 +1,37 @@
-"""What may go wrong on links.
+"""Errors of links.
 
 ::
 
     LinkError
-    +-- ProtocolError        the peer broke the rules of the frames; the connection is dropped
-    +-- LinkRefused          the accepting end turned the dialing end away
-    +-- LinkLost             the connection of a link ended
-    +-- InterfaceError       an interface cannot be made or started as its spec says
-    +-- CallError            a service call got no answer
-        +-- NotConnected     there is no peer to ask
-        +-- PeerFault        the peer answered with a fault
-        +-- PeerLost         the peer went away before it answered
-        +-- CallTimeout      no answer in time
-        +-- Overloaded       too many calls wait already, here or at the peer
-        +-- MessageTooLarge  the message is larger than a link carries
+    +-- ProtocolError             the peer broke the rules of the frames; the connection is dropped
+    +-- LinkRefusedError          the accepting end refused the dialing end
+    +-- LinkLostError             the connection of a link ended
+    +-- InterfaceError            an interface cannot be made or started as its spec says
+    +-- CallError                 a service call got no answer
+        +-- NotConnectedError     no peer is connected
+        +-- PeerFaultError        the peer answered with a fault
+        +-- PeerLostError         the peer went away before it answered
+        +-- CallTimeoutError      no answer in time
+        +-- OverloadedError       too many calls wait already, here or at the peer
+        +-- MessageTooLargeError  the message is larger than a link carries
 """
 
 from __future__ import annotations
 
 
 class LinkError(Exception):
-    """Base of all that this package raises."""
+    """Base of all errors of this package."""
 
 
 class ProtocolError(LinkError):
     """The peer broke the rules of the frames."""
 
 
-class LinkRefused(LinkError):  # noqa: N818
-    """The accepting end turned the dialing end away; the text is its reason."""
+class LinkRefusedError(LinkError):
+    """The accepting end refused the dialing end; the text is its reason."""
 
 
-class LinkLost(LinkError):  # noqa: N818
+class LinkLostError(LinkError):
     """The connection of a link ended."""
 
 
@@ -46,14 +46,14 @@ class CallError(LinkError):
     """A service call got no answer."""
 
 
-class NotConnected(CallError):  # noqa: N818
-    """There is no peer to ask."""
+class NotConnectedError(CallError):
+    """No peer is connected."""
 
     def __str__(self) -> str:
         return super().__str__() or "not connected"
 
 
-class PeerFault(CallError):  # noqa: N818
+class PeerFaultError(CallError):
     """The peer answered with a fault.
 
     Attributes:
@@ -65,19 +65,19 @@ class PeerFault(CallError):  # noqa: N818
         self.text = text
 
 
-class PeerLost(CallError):  # noqa: N818
+class PeerLostError(CallError):
     """The peer went away before it answered."""
 
 
-class CallTimeout(CallError):  # noqa: N818
+class CallTimeoutError(CallError):
     """No answer came in time."""
 
 
-class Overloaded(CallError):  # noqa: N818
+class OverloadedError(CallError):
     """Too many calls wait already, here or at the peer."""
 
 
-class MessageTooLarge(CallError):  # noqa: N818
+class MessageTooLargeError(CallError):
     """The message is larger than a link carries.
 
     Attributes:

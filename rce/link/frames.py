@@ -11,7 +11,7 @@ Every frame starts with 24 bytes in network order::
         16     4  length   bytes of payload in this frame
         20     4  total    bytes of payload in the whole message
 
-A message with ``total`` above ``length`` goes on in FRAGMENT frames of the same channel. A channel has at
+A message with ``total`` above ``length`` continues in FRAGMENT frames of the same channel. A channel has at
 most one unfinished message at a time; frames of other channels, and frames that carry a whole message, may
 come in between. ABORT says that the rest of the channel's unfinished message will not come.
 
@@ -41,9 +41,9 @@ HEADER_SIZE = HEADER.size
 FRAGMENT_SIZE = 128 * KIB
 """Most bytes of payload that a sender puts in one frame: an urgent frame waits for it 1 ms at 1 Gbit/s."""
 HANDSHAKE_SIZE = 4 * KIB
-"""Most bytes of payload before the peer has shown who it is."""
+"""Most bytes of payload before the peer has authenticated."""
 LATCHED = 1
-"""Flag of DATA: the topic's last message, kept for those who come late."""
+"""Flag of DATA: the topic's last message, kept for peers that connect later."""
 OVERLOADED = 2
 """Flag of FAULT: the peer has too many requests already."""
 MAX_CHANNEL = 2**64 - 1
@@ -55,10 +55,10 @@ _DIRECT_SIZE = 16 * KIB
 
 
 class FrameType(IntEnum):
-    """What a frame is for."""
+    """The type of a frame."""
 
     HELLO = 1
-    """Dialing end's first frame: who it is."""
+    """Dialing end's first frame: names the link and has its token."""
     WELCOME = 2
     """Accepting end's answer; the link is up."""
     REFUSE = 3
@@ -68,11 +68,11 @@ class FrameType(IntEnum):
     SECURE = 7
     """Dialing end's first frame on TCP, where the peer's address wants TLS: the link; TLS begins after it."""
     GRANT = 6
-    """How far the peer may send bulk: an offset of 8 bytes in the stream; see :mod:`rce.link.valve`."""
+    """How far the peer may send bulk: an offset of 8 bytes in the stream (:mod:`rce.link.flow_control`)."""
     OPEN = 8
     """The sender's interface is ready on this channel."""
     CLOSE = 9
-    """It is no more."""
+    """The sender's interface is gone from this channel."""
     DATA = 16
     """A message of a topic."""
     CALL = 17
@@ -127,7 +127,7 @@ def parse_sources(payload: bytes) -> frozenset[int]:
     """Read :func:`encode_sources`.
 
     Raises:
-        ProtocolError: It is none.
+        ProtocolError: The frame is not a valid SOURCES frame.
     """
     if len(payload) % 4:
         raise ProtocolError(f"SOURCES of {len(payload)} bytes")
@@ -162,7 +162,7 @@ class _Message:
         return self.first._replace(payload=self._buffer.getvalue())
 
     def discard(self) -> None:
-        """Let go of the buffer, which complains if it is freed while it is looked into."""
+        """Release the buffer; it must not be freed while a view of it exists."""
         self.dropped = True
         self.view.release()
         self._buffer = _NOTHING
@@ -193,8 +193,8 @@ class FrameReader:
     def get_buffer(self) -> memoryview:
         """Return where the next bytes go; never empty."""
         message = self._current
-        # The last byte of a frame goes through the scratch: as long as whoever fills a buffer holds on to it,
-        # which event loops do until `advance` returns, the message could not be taken without a copy.
+        # The last byte of a frame goes through the scratch: an event loop holds the buffer that it fills
+        # until `advance` returns, and until then the message could not be taken without a copy.
         if message is not None and self._missing > 1 and not message.dropped:
             return message.view[message.filled : message.filled + self._missing - 1]
         return self._scratch[self._end :]
@@ -206,7 +206,7 @@ class FrameReader:
             The messages that these bytes completed, in order.
 
         Raises:
-            ProtocolError: The bytes are no frames. The reader cannot be used any more.
+            ProtocolError: The bytes are not frames. The reader cannot be used any more.
         """
         if self._current is not None and self._missing > 1 and not self._current.dropped:
             self._current.filled += count
@@ -217,7 +217,7 @@ class FrameReader:
 
     @property
     def missing(self) -> int:
-        """Bytes that are needed at least to go on: of a header, or of the frame whose header is known."""
+        """Bytes that are needed at least to continue: of a header, or of the frame whose header is known."""
         if self._current is not None:
             return self._missing
         known = self._end - self._start
@@ -240,7 +240,7 @@ class FrameReader:
         return frames
 
     def drop_unfinished(self, size: int) -> list[Frame]:
-        """Forget the oldest messages that have not come as a whole yet; what comes of them is passed over.
+        """Forget the oldest messages that have not come as a whole yet; their remaining bytes are skipped.
 
         Not to be called between :meth:`get_buffer` and :meth:`advance`.
 
@@ -305,7 +305,7 @@ class FrameReader:
         number, flags, zero, call_id, channel, length, total = HEADER.unpack_from(self._scratch, self._start)
         frame_type = _TYPES.get(number)
         if frame_type is None or zero:
-            raise ProtocolError("these bytes are no frame")
+            raise ProtocolError("these bytes are not a frame")
         if length > total or total > self.max_message:
             raise ProtocolError(f"message of {total} bytes (limit {self.max_message}), {length} in one frame")
         body = self._start + HEADER_SIZE

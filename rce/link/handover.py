@@ -4,7 +4,7 @@ One process of a machine accepts links for all its containers. It reads the HELL
 names the link, and passes the socket with those bytes to the container's process, over a unix socket with
 ``SCM_RIGHTS``. From then on data goes straight to that process::
 
-    peer --TCP--> Doorman --(socket, HELLO)--> HandoverSender ==unix==> HandoverReceiver --> LinkHub.adopt
+    peer --TCP--> LinkAcceptor --(socket, HELLO)--> HandoverSender =unix=> HandoverReceiver --> LinkHub.adopt
 
 The unix socket must keep message boundaries (``SOCK_SEQPACKET`` or ``SOCK_DGRAM``).
 """
@@ -19,20 +19,20 @@ import os
 import socket
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import BackgroundTasks
 from rce.guard.lobby import Lobby, address_of
-from rce.link.exceptions import LinkError, LinkRefused
+from rce.link.exceptions import LinkError, LinkRefusedError
 from rce.link.frames import HANDSHAKE_SIZE, HEADER_SIZE, Frame, FrameType, encode
-from rce.link.opening import LinkSender, PlainLinkRefused, read_hello
+from rce.link.opening import LinkSender, PlainLinkRefusedError, read_hello
 from rce.link.settings import LinkLimits, LinkTimeouts
-from rce.link.tasks import TaskScope
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _BUSY_PAUSE = 0.1
-"""Seconds to wait after the system refused to accept, for want of file descriptors for example."""
+"""Seconds to wait after the system refused to accept, for example because file descriptors ran out."""
 _FD = array.array("i")
 
 
@@ -98,7 +98,7 @@ class HandoverReceiver:
         self._sock = sock
         self._adopt = adopt
         self._on_end = on_end
-        self._scope = TaskScope()
+        self._scope = BackgroundTasks()
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(sock, self._read)
         self._open = True
@@ -115,27 +115,27 @@ class HandoverReceiver:
             self._sock.close()
 
     def _read(self) -> None:
-        """Take all that has come."""
+        """Take every waiting connection."""
         while self._open:
             try:
                 received, descriptors = _receive(self._sock)
             except BlockingIOError:
                 return
             except OSError as error:
-                log.debug("handover ended: %s", error)
+                _log.debug("handover ended: %s", error)
                 received, descriptors = b"", []
             if not received:
                 self._stop()
                 if self._on_end is not None:
                     self._on_end()
             for descriptor in descriptors:
-                self._scope.spawn(self._take(descriptor, received), "handed-over connection")
+                self._scope.spawn(self._take(descriptor, received), name="handed-over connection")
 
     async def _take(self, descriptor: int, received: bytes) -> None:
         try:
             await self._adopt(socket.socket(fileno=descriptor), received)
         except (OSError, ValueError) as error:
-            log.info("a handed-over connection is of no use: %s", error)
+            _log.info("a handed-over connection is of no use: %s", error)
 
 
 def _resolve(ready: asyncio.Future[None]) -> None:
@@ -158,14 +158,14 @@ def _receive(sock: socket.socket) -> tuple[bytes, list[int]]:
     return received, list(descriptors)
 
 
-class Doorman:
+class LinkAcceptor:
     """Accepts TCP links for the endpoints of other processes and hands each to the right one.
 
     Args:
         timeouts: Of links.
         limits: Of links.
         tls: Refuse links without TLS.
-        everything: Takes the links that nobody was assigned to, in place of refusing them.
+        everything: Takes the links that are not assigned to a sender; if None, they are refused.
 
     Attributes:
         lobby: Accepted connections that have not been handed over yet.
@@ -191,7 +191,7 @@ class Doorman:
         self._routes: dict[str, HandoverSender] = {}
         self._assigned = asyncio.Condition()
         self._sockets: list[socket.socket] = []
-        self._scope = TaskScope()
+        self._scope = BackgroundTasks()
 
     async def listen(self, host: str, port: int) -> int:
         """Accept links.
@@ -206,7 +206,7 @@ class Doorman:
         sock = socket.create_server((host, port), backlog=512)
         sock.setblocking(False)
         self._sockets.append(sock)
-        self._scope.spawn(self._accept(sock), f"doorman on port {port}")
+        self._scope.spawn(self._accept(sock), name=f"link acceptor on port {port}")
         taken: int = sock.getsockname()[1]
         return taken
 
@@ -215,6 +215,15 @@ class Doorman:
         self._forget(sender)
         async with self._assigned:
             self._routes.update(dict.fromkeys(links, sender))
+            self._assigned.notify_all()
+
+    async def reassign(self, sender: HandoverSender, added: Iterable[str], removed: Iterable[str]) -> None:
+        """Send some more links to ``sender``, and some no longer."""
+        for link in removed:
+            if self._routes.get(link) is sender:
+                del self._routes[link]
+        async with self._assigned:
+            self._routes.update(dict.fromkeys(added, sender))
             self._assigned.notify_all()
 
     def forget(self, sender: HandoverSender) -> None:
@@ -238,10 +247,10 @@ class Doorman:
             try:
                 connection, peer = await loop.sock_accept(sock)
             except OSError as error:
-                log.warning("cannot accept a link: %s", error)
+                _log.warning("cannot accept a link: %s", error)
                 await asyncio.sleep(_BUSY_PAUSE)
                 continue
-            self._scope.spawn(self._receive(connection, address_of(peer)), "link to hand over")
+            self._scope.spawn(self._receive(connection, address_of(peer)), name="link to hand over")
 
     async def _receive(self, connection: socket.socket, address: str) -> None:
         """Pass a connection on, if there is room for it; one that must make room is cancelled."""
@@ -260,19 +269,21 @@ class Doorman:
             async with asyncio.timeout(self._timeouts.handshake):
                 received = await read_hello(connection, self._limits)
                 if self._tls and not received.secure:
-                    raise PlainLinkRefused(received.link)
+                    raise PlainLinkRefusedError(received.link)
                 sender = await self._find(received.link)
                 await sender.send(connection, received.data)
-        except LinkRefused as error:
-            log.warning("link refused: %s", error)
-            why = error.for_peer if isinstance(error, PlainLinkRefused) else b"unknown link or wrong token"
+        except LinkRefusedError as error:
+            _log.warning("link refused: %s", error)
+            why = (
+                error.for_peer if isinstance(error, PlainLinkRefusedError) else b"unknown link or wrong token"
+            )
             with contextlib.suppress(OSError):
                 connection.send(encode(Frame(FrameType.REFUSE, payload=why)))
         except (LinkError, OSError) as error:
-            log.info("a link was not handed over: %s", str(error) or type(error).__name__)
+            _log.info("a link was not handed over: %s", str(error) or type(error).__name__)
 
     async def _find(self, link: str) -> LinkSender:
-        """Return who takes a link; the news of it may still be on its way."""
+        """Return the sender of a link; its assignment may still be on its way."""
         if self._everything is not None:
             return self._everything
         try:
@@ -280,4 +291,4 @@ class Doorman:
                 await self._assigned.wait_for(lambda: link in self._routes)
                 return self._routes[link]
         except TimeoutError as error:
-            raise LinkRefused(f"unknown link {link!r}") from error
+            raise LinkRefusedError(f"unknown link {link!r}") from error

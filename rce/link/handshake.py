@@ -1,10 +1,10 @@
-"""How a link begins: HELLO, its answer, and what each end knows beyond the first version (sans-I/O)."""
+"""The handshake of a link: HELLO, its answer, and the features of each end (sans-I/O)."""
 
 from __future__ import annotations
 
 import msgspec
 
-from rce.link.exceptions import LinkRefused, ProtocolError
+from rce.link.exceptions import LinkRefusedError, ProtocolError
 from rce.link.frames import VERSION, Frame, FrameType, encode
 
 
@@ -15,7 +15,7 @@ class Hello(msgspec.Struct, frozen=True, kw_only=True):
     link: str
     token: str
     features: tuple[str, ...] = ()
-    """What the dialing end knows beyond the first version; unknown words mean nothing."""
+    """The dialing end's features beyond the first version; unknown words are ignored."""
 
 
 class Welcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -27,7 +27,7 @@ class Welcome(msgspec.Struct, frozen=True, kw_only=True):
 LATCH = "latch"
 """Feature: latched messages name their source, and SOURCES takes back those of sources that ended."""
 FEATURES = (LATCH,)
-"""What is known here beyond the first version of links."""
+"""This end's features beyond the first version of links."""
 
 _hello_decoder = msgspec.json.Decoder(Hello)
 _welcome_decoder = msgspec.json.Decoder(Welcome)
@@ -48,7 +48,7 @@ def parse_hello(frame: Frame) -> Hello:
     """Read the first frame of a link's dialing end.
 
     Raises:
-        ProtocolError: It is no HELLO, or one of a version that is not spoken here.
+        ProtocolError: It is not a HELLO, or one of a version that is not spoken here.
     """
     if frame.type is not FrameType.HELLO:
         raise ProtocolError(f"first frame is {frame.type.name}, not HELLO")
@@ -73,7 +73,7 @@ def parse_opening(frame: Frame) -> tuple[str, bool]:
         The link, and whether TLS follows.
 
     Raises:
-        ProtocolError: It begins no link.
+        ProtocolError: The frame does not begin a link.
     """
     if frame.type is not FrameType.SECURE:
         return parse_hello(frame).link, False
@@ -87,14 +87,14 @@ def check_answer(frame: Frame) -> frozenset[str]:
     """Read the accepting end's answer to HELLO.
 
     Returns:
-        The features that it knows.
+        The features that the peer knows.
 
     Raises:
-        LinkRefused: It does not want the link.
-        ProtocolError: It is no answer.
+        LinkRefusedError: The peer refuses the link.
+        ProtocolError: The frame is not an answer to HELLO.
     """
     if frame.type is FrameType.REFUSE:
-        raise LinkRefused(bytes(frame.payload).decode(errors="replace"))
+        raise LinkRefusedError(bytes(frame.payload).decode(errors="replace"))
     if frame.type is not FrameType.WELCOME:
         raise ProtocolError(f"HELLO was answered by {frame.type.name}")
     if not frame.payload:

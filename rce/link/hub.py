@@ -1,4 +1,4 @@
-"""One process's place in the web of links: it listens, dials, and joins endpoints of the same process."""
+"""The links of one process: listens, dials, and joins endpoints of the same process."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import socket
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import BackgroundTasks
 from rce.dialing import open_socket
 from rce.guard.lobby import Lobby, address_of
 from rce.link.carrier import Carrier, LocalCarrier
-from rce.link.exceptions import LinkError, LinkLost, LinkRefused
+from rce.link.exceptions import LinkError, LinkLostError, LinkRefusedError
 from rce.link.frames import Frame, FrameType, encode
-from rce.link.handover import Doorman
+from rce.link.handover import LinkAcceptor
 from rce.link.handshake import check_answer, encode_hello, encode_welcome, parse_hello
 from rce.link.opening import secured_link
 from rce.link.secure import Adopter, accept_secure, dial_secure
 from rce.link.settings import LinkLimits, LinkTimeouts
 from rce.link.socket_carrier import SocketCarrier
-from rce.link.tasks import TaskScope
 from rce.link.unix import bind_private, unlink_own
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rce.link.handshake import Hello
     from rce.link.link import Link
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class LinkHub:
@@ -63,7 +63,7 @@ class LinkHub:
         tls: bool = False,
     ) -> None:
         self._tls = tls
-        self._doormen: list[Doorman] = []
+        self._doormen: list[LinkAcceptor] = []
         self.machine = machine
         self.timeouts = timeouts or LinkTimeouts()
         self.limits = limits or LinkLimits()
@@ -74,7 +74,7 @@ class LinkHub:
         self._accepting: dict[str, Link] = {}
         self._waiters: dict[str, set[asyncio.Future[None]]] = {}
         self._carriers: set[SocketCarrier] = set()
-        self._greetings = TaskScope()
+        self._greetings = BackgroundTasks()
         self._servers: list[asyncio.Server] = []
         self._unix_sockets: dict[Path, int] = {}
         self._closed = False
@@ -92,7 +92,7 @@ class LinkHub:
         A socket file that a dead process left behind is replaced.
 
         Raises:
-            OSError: The path is too long (107 bytes at most), is no socket, or another process listens there.
+            OSError: The path is over 107 bytes long or not a socket, or another process listens there.
         """
         sock, inode = bind_private(path)
         await self.listen_socket(sock)
@@ -131,9 +131,9 @@ class LinkHub:
 
     async def listen_secure(self, host: str, port: int) -> int:
         """Accept links on TCP, in TLS only. Arguments and result are those of :meth:`listen_tcp`."""
-        doorman = Doorman(self.timeouts, self.limits, tls=True, everything=Adopter(self.adopt))
-        self._doormen.append(doorman)
-        return await doorman.listen(host, port)
+        acceptor = LinkAcceptor(self.timeouts, self.limits, tls=True, everything=Adopter(self.adopt))
+        self._doormen.append(acceptor)
+        return await acceptor.listen(host, port)
 
     async def adopt(self, sock: socket.socket, received: bytes) -> None:
         """Take over a connection that was accepted elsewhere, with what was read from it.
@@ -160,13 +160,13 @@ class LinkHub:
             server.close()
         for path, inode in self._unix_sockets.items():
             unlink_own(path, inode)
-        for doorman in self._doormen:
-            await doorman.close()
+        for acceptor in self._doormen:
+            await acceptor.close()
         await self._greetings.close()
-        await asyncio.sleep(0)  # connections that were just being accepted come into view
+        await asyncio.sleep(0)  # connections that were just being accepted are registered
         carriers = list(self._carriers)
         for carrier in carriers:
-            carrier.abort(LinkLost("the hub is closed"))
+            carrier.abort(LinkLostError("the hub is closed"))
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self.timeouts.flush):
                 for carrier in carriers:
@@ -179,7 +179,7 @@ class LinkHub:
     # Endpoints of this process
 
     def register(self, link: Link) -> None:
-        """Let a link be found by its id: its peer dials."""
+        """Register a link under its id: its peer dials."""
         self._accepting[link.spec.id] = link
         for waiter in self._waiters.get(link.spec.id, ()):
             if not waiter.done():
@@ -191,7 +191,7 @@ class LinkHub:
             del self._accepting[link.spec.id]
 
     async def wait_registered(self, link_id: str, timeout: float | None) -> None:
-        """Wait until the accepting end of a link is registered anew, or ``timeout`` seconds (none: ever)."""
+        """Wait until a link's accepting end is registered anew, or ``timeout`` seconds (None: no limit)."""
         waiter = self.loop.create_future()
         self._waiters.setdefault(link_id, set()).add(waiter)
         try:
@@ -205,7 +205,7 @@ class LinkHub:
     # Dialing
 
     def can_reach(self, spec: LinkSpec) -> bool:
-        """Tell whether :meth:`connect` has anywhere to go; else only a registration can help."""
+        """Return whether :meth:`connect` can reach the link; if not, it must be registered here first."""
         if spec.id in self._accepting:
             return True
         address = spec.address
@@ -220,7 +220,7 @@ class LinkHub:
 
         Raises:
             OSError: It cannot be reached, or not in time.
-            LinkError: It does not want the link, or does not speak as it should.
+            LinkError: The peer refuses the link, or breaks the protocol.
         """
         local = self._accepting.get(spec.id)
         if local is not None:
@@ -237,7 +237,7 @@ class LinkHub:
             except OSError as error:
                 if not address.port:
                     raise
-                log.debug("link %s: %s does not answer (%s), trying TCP", spec.id, address.unix, error)
+                _log.debug("link %s: %s does not answer (%s), trying TCP", spec.id, address.unix, error)
         return await self._dial_tcp(spec)
 
     def _is_near(self, address: LinkAddress) -> bool:
@@ -275,7 +275,7 @@ class LinkHub:
             async with asyncio.timeout(self.timeouts.handshake):
                 carrier.features = check_answer(await carrier.handshake_frame())
         except BaseException as error:
-            carrier.abort(LinkLost(f"no handshake: {error}"))
+            carrier.abort(LinkLostError(f"no handshake: {error}"))
             raise
         return carrier
 
@@ -301,12 +301,12 @@ class LinkHub:
 
     def _let_in(self, carrier: SocketCarrier) -> None:
         """Wait for the HELLO of an accepted connection, if there is room."""
-        crowded = LinkLost("too many connections come at once")
+        crowded = LinkLostError("too many connections come at once")
         guest = self.lobby.enter(address_of(carrier.peer), lambda: carrier.abort(crowded))
         if self._closed or guest is None:
             carrier.abort(crowded)
         else:
-            self._greetings.spawn(self._greet(carrier, guest), "link greeting")
+            self._greetings.spawn(self._greet(carrier, guest), name="link greeting")
 
     async def _greet(self, carrier: SocketCarrier, guest: Guest) -> None:
         """Shake hands as the accepting end."""
@@ -314,15 +314,15 @@ class LinkHub:
             async with asyncio.timeout(self.timeouts.handshake):
                 hello = parse_hello(await carrier.handshake_frame())
                 link = await self._find(hello)
-        except LinkRefused as error:
-            log.warning("link refused: %s", error)
+        except LinkRefusedError as error:
+            _log.warning("link refused: %s", error)
             carrier.greet(encode(Frame(FrameType.REFUSE, payload=b"unknown link or wrong token")))
             carrier.close()
         except (LinkError, TimeoutError) as error:
-            log.info("no handshake: %s", str(error) or "it took too long")
-            carrier.abort(LinkLost("no handshake"))
+            _log.info("no handshake: %s", str(error) or "it took too long")
+            carrier.abort(LinkLostError("no handshake"))
         except BaseException:
-            carrier.abort(LinkLost("the hub is closed"))
+            carrier.abort(LinkLostError("the hub is closed"))
             raise
         else:
             carrier.features = frozenset(hello.features)
@@ -332,13 +332,13 @@ class LinkHub:
             guest.leave()
 
     async def _adopt_secure(self, sock: socket.socket, link_id: str) -> None:
-        """Begin TLS as the accepting end; what comes then is a connection like others."""
+        """Begin TLS as the accepting end; then continue as with any other connection."""
         try:
             async with asyncio.timeout(self.timeouts.handshake):
                 await accept_secure(sock, (await self._wait_for(link_id)).spec, self._accept)
-        except (LinkRefused, OSError) as error:
+        except (LinkRefusedError, OSError) as error:
             sock.close()
-            log.warning("link refused: no TLS with the peer: %s", str(error) or "it took too long")
+            _log.warning("link refused: no TLS with the peer: %s", str(error) or "it took too long")
 
     async def _find(self, hello: Hello) -> Link:
         """Return the link that a peer asks for."""
@@ -352,10 +352,10 @@ class LinkHub:
             await self.wait_registered(link_id, self.timeouts.unknown_link)
         link = self._accepting.get(link_id)
         if link is None:
-            raise LinkRefused(f"unknown link {link_id!r}")
+            raise LinkRefusedError(f"unknown link {link_id!r}")
         return link
 
 
 def _check_token(link: Link, token: str) -> None:
     if not hmac.compare_digest(link.spec.token.encode(), token.encode()):
-        raise LinkRefused(f"wrong token for link {link.spec.id!r}")
+        raise LinkRefusedError(f"wrong token for link {link.spec.id!r}")

@@ -1,4 +1,4 @@
-"""What ends a connection: interfaces, and the ports they send through."""
+"""Interfaces, the ends of connections, and the ports they send through."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 if TYPE_CHECKING:
-    from rce.control.model import InterfaceSpec
+    from rce.model.specs import InterfaceSpec
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
 """A payload to send. It is not copied where that can be avoided: do not change it afterwards."""
 
 
 class Port(Protocol):
-    """What an interface may do with its peers."""
+    """An interface's access to its peers."""
 
     @property
     def spec(self) -> InterfaceSpec:
-        """What the interface was made for."""
+        """The interface's spec."""
         ...
 
     def send(self, payload: Buffer, *, latched: bool = False, source: str = "") -> None:
@@ -53,12 +53,12 @@ class Port(Protocol):
 
         Raises:
             TypeError: The interface is not a service provider.
-            NotConnected: There is no peer.
-            PeerFault: The peer answered with a fault.
-            PeerLost: The connection ended before the answer came.
-            CallTimeout: No answer in time.
-            Overloaded: Too many calls wait, here or at the peer.
-            MessageTooLarge: The request is larger than a link carries.
+            NotConnectedError: No peer is connected.
+            PeerFaultError: The peer answered with a fault.
+            PeerLostError: The connection ended before the answer came.
+            CallTimeoutError: No answer in time.
+            OverloadedError: Too many calls wait, here or at the peer.
+            MessageTooLargeError: The request is larger than a link carries.
         """
         ...
 
@@ -83,7 +83,7 @@ class Interface(ABC):
 
     @abstractmethod
     async def close(self) -> None:
-        """Give up all that the interface holds."""
+        """Release everything that the interface holds."""
 
     def receive(self, payload: bytes, *, latched: bool) -> None:
         """Take a peer's message. For publisher interfaces; must not block."""
@@ -105,7 +105,7 @@ class Interface(ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} serves no requests")
 
-    def on_active(self, active: bool) -> None:  # noqa: B027 - not everybody wants to know
+    def on_active(self, active: bool) -> None:  # noqa: B027 - not every interface needs it
         """Notice that the first connection was established or the last one lost. Must not block."""
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from rce.link.exceptions import ProtocolError
 from rce.link.frames import FRAGMENT_SIZE, Frame, FrameType, encode, pack_fragment, pack_header
-from rce.link.queues import Lane, OutgoingQueue
+from rce.link.queues import SMALL_MESSAGE, Lane, OutgoingQueue
 
 if TYPE_CHECKING:
     from rce.link.settings import LinkLimits
@@ -36,7 +36,7 @@ Chunk = tuple[bytes | memoryview, ...]
 
 
 class Lanes:
-    """All that waits on one link."""
+    """The frames that wait on one link."""
 
     def __init__(self, limits: LinkLimits) -> None:
         self._max_begun = limits.unfinished_bytes
@@ -73,7 +73,7 @@ class Lanes:
         """Append a message of a channel.
 
         Raises:
-            Overloaded: As :meth:`OutgoingQueue.push`.
+            OverloadedError: As :meth:`OutgoingQueue.push`.
         """
         queue.push(frame)
         if queue.lane is Lane.NONE:
@@ -100,26 +100,28 @@ class Lanes:
             return (self._control.popleft(),)
         while self._urgent and not (self._bulk and self._burst >= URGENT_BURST):
             queue = self._leave(self._urgent)
-            if len(queue) and queue.urgent:
+            head = queue.head
+            if head is not None and len(head.payload) <= SMALL_MESSAGE:
                 return self._whole(queue)
             self._enlist(queue)
         while self._bulk:
             queue = self._leave(self._bulk)
-            if not len(queue):
+            head = queue.head
+            if head is None:
                 continue
-            if not self._may_begin(queue):
+            if not self._may_begin(queue, head):
                 self._enlist(queue)
                 continue
             self._burst = 0
             return self._part(queue, limit)
         return self.next(limit) if self._urgent else None
 
-    def _may_begin(self, queue: OutgoingQueue) -> bool:
+    def _may_begin(self, queue: OutgoingQueue, head: Frame) -> bool:
         """Whether the peer accepts the next part of the queue; true for one queue of the lane at least."""
         return (
             bool(queue.sent)
             or not self._begun_bytes
-            or self._begun_bytes + len(queue.head.payload) <= self._max_begun
+            or self._begun_bytes + len(head.payload) <= self._max_begun
         )
 
     def _whole(self, queue: OutgoingQueue) -> Chunk:
@@ -147,9 +149,10 @@ class Lanes:
         return chunk
 
     def _enlist(self, queue: OutgoingQueue) -> None:
-        if not len(queue):
+        head = queue.head
+        if head is None:
             queue.lane = Lane.NONE
-        elif queue.urgent:
+        elif len(head.payload) <= SMALL_MESSAGE:
             queue.lane = Lane.URGENT
             self._urgent.append(queue)
         else:

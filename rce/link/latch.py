@@ -1,10 +1,10 @@
-"""What an interface keeps of latched topics: the last message of each source, at both ends of a connection.
+"""Latched messages of an interface: the last one of each source, at both ends of a connection.
 
-The sending end keeps the payloads, and sends them to each peer that comes later. The receiving end keeps
-nothing but which sources it has heard of on which channel, so that it can tell its interface when one ended.
+The sending end keeps the payloads, and sends them to each peer that connects later. The receiving end keeps
+only which sources it has heard of on which channel, so that it can tell its interface when one ended.
 
-Sources survive the loss of a connection: what they said stays in force until the peer is back and says what
-is in force now (SOURCES), or until the connection is removed.
+Sources survive the loss of a connection: their messages stay in force until the peer is back and lists the
+sources that are in force now (SOURCES), or until the connection is removed.
 """
 
 from __future__ import annotations
@@ -65,12 +65,12 @@ class LatchedMessages:
             kept.holding.release()
         kept.payload = payload
         holding = self._holdings.hold(len(payload), lambda: self._give_up(source, kept))
-        if self._kept.get(source) is kept:  # else it was given up at once
+        if self._kept.get(source) is kept:  # otherwise it was dropped at once
             kept.holding = holding
         return kept.number
 
     def retain(self, sources: Collection[str]) -> bool:
-        """Forget all but these sources; tell whether there were others."""
+        """Forget all but these sources; return whether there were others."""
         ended = [source for source in self._kept if source not in sources]
         for source in ended:
             self._forget(source)

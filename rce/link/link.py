@@ -1,4 +1,4 @@
-"""One endpoint's end of a link: its channels, over whatever carries them at present."""
+"""One endpoint's end of a link: its channels, over the present carrier."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rce.link.pacing import Pacer
     from rce.link.settings import LinkLimits
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class Link:
@@ -61,7 +61,7 @@ class Link:
     def drop_unfinished(self, size: int) -> None:
         """Drop the oldest messages that have not come as a whole yet, until ``size`` bytes are free.
 
-        The link goes on. Who waits for one of them is told; the log and the counters tell of the others.
+        The link continues. Calls that wait for one of them fail; the log and the counters record the others.
         """
         dropped = [] if self.carrier is None else self.carrier.drop_unfinished(size)
         for frame in dropped:
@@ -86,9 +86,9 @@ class Link:
         del self._channels[channel.number]
 
     def attach(self, carrier: Carrier) -> None:
-        """Go on over a new carrier; a former one is closed, as its peer has given it up."""
+        """Continue over a new carrier; a former one is closed, as its peer has given it up."""
         self.detach()
-        log.debug("link %s to %s is up (%s)", self.spec.id, self.spec.peer, carrier.kind)
+        _log.debug("link %s to %s is up (%s)", self.spec.id, self.spec.peer, carrier.kind)
         self.carrier = carrier
         carrier.pace(self._pacer)
         for channel in list(self._channels.values()):
@@ -129,7 +129,7 @@ class Link:
     def carrier_lost(self, carrier: Carrier, reason: Exception) -> None:
         """Close all channels."""
         if carrier is self.carrier:
-            log.debug("link %s to %s is down: %s", self.spec.id, self.spec.peer, reason)
+            _log.debug("link %s to %s is down: %s", self.spec.id, self.spec.peer, reason)
             self._lose()
 
     def _lose(self) -> None:

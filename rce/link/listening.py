@@ -1,4 +1,4 @@
-"""Which port a program accepts links on."""
+"""The port on which a program accepts links."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _log = logging.getLogger(__name__)
 
 
 async def listen_on(listen: Callable[[str, int], Awaitable[int]], host: str, port: int | None) -> int:
-    """Accept links: where it is said, else on :data:`DEFAULT_PORT`, or a free one where that is taken.
+    """Accept links on the given port, else on :data:`DEFAULT_PORT`, or on a free one if that is taken.
 
     Peers learn the port from the master.
 
@@ -27,7 +27,7 @@ async def listen_on(listen: Callable[[str, int], Awaitable[int]], host: str, por
         The port taken.
 
     Raises:
-        OSError: It cannot be taken.
+        OSError: The port cannot be bound.
     """
     if port is not None:
         return await listen(host, port)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Protocol
 
-from rce.link.exceptions import LinkLost, LinkRefused, ProtocolError
+from rce.link.exceptions import LinkLostError, LinkRefusedError, ProtocolError
 from rce.link.frames import HANDSHAKE_SIZE, HEADER_SIZE, FrameReader, FrameType
 from rce.link.handshake import parse_opening
 
@@ -22,12 +22,12 @@ class LinkSender(Protocol):
         """Pass a connection and what was read from it; the caller closes its own copy afterwards.
 
         Raises:
-            OSError: It is not taken.
+            OSError: The connection is refused.
         """
 
 
-class PlainLinkRefused(LinkRefused):
-    """A link came without TLS where it is demanded."""
+class PlainLinkRefusedError(LinkRefusedError):
+    """A peer dialed without TLS, and TLS is required."""
 
     for_peer = b"links are taken in TLS only here; start the peer's program with --tls too"
 
@@ -41,7 +41,7 @@ class ReceivedHello:
     Attributes:
         link: Id of the link that the peer asks for.
         secure: Whether TLS follows.
-        data: All that was read.
+        data: The bytes that were read.
     """
 
     def __init__(self, link: str, secure: bool, data: bytes) -> None:
@@ -55,7 +55,7 @@ async def read_hello(connection: socket.socket, limits: LinkLimits) -> ReceivedH
 
     Raises:
         ProtocolError: It begins no link.
-        LinkLost: The connection ended.
+        LinkLostError: The connection ended.
         OSError: The connection failed.
     """
     loop = asyncio.get_running_loop()
@@ -66,7 +66,7 @@ async def read_hello(connection: socket.socket, limits: LinkLimits) -> ReceivedH
     while True:
         part = await loop.sock_recv(connection, missing)
         if not part:
-            raise LinkLost("the peer hung up")
+            raise LinkLostError("the peer hung up")
         data += part
         frames = reader.feed(part)
         if frames:
@@ -77,7 +77,7 @@ async def read_hello(connection: socket.socket, limits: LinkLimits) -> ReceivedH
 
 
 def secured_link(received: bytes, limits: LinkLimits) -> str:
-    """Return the link for which TLS follows; empty if this is no announcement of TLS.
+    """Return the link for which TLS follows; empty if this is not an announcement of TLS.
 
     Args:
         received: What was read of a connection.

@@ -1,12 +1,12 @@
 """A limit in bytes per second for all links of one endpoint, both directions together.
 
-:class:`Bucket` is the rule (sans-I/O), :class:`Pacer` the thin shell that wakes those who wait. What is moved
-may overdraw the bucket by one part; the next part waits until the debt is paid. So a message of any size
+:class:`Bucket` is the rule (sans-I/O); :class:`Pacer` is the thin shell that wakes waiting senders. One part
+of a message may overdraw the bucket; the next part waits until the debt is paid. So a message of any size
 passes, and the mean rate holds.
 
-Small messages need not stand behind large ones: they may go ahead with up to half the rate, which is lent to
-them by a second bucket. What they use is taken from the first one too, so that the sum stays within the limit
-and bulk keeps at least the other half.
+Small messages need not wait behind large ones: they may use up to half the rate, from a second bucket. Their
+bytes are taken from the first bucket too, so that the sum stays within the limit and bulk keeps at least the
+other half.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 MIN_RATE = 4 * KIB
-"""Bytes per second. A lower limit counts as this one: a link could not say that it lives."""
+"""Bytes per second. A lower limit counts as this one: heartbeats of a link would not pass."""
 
 _BURST_S = 0.05
 """After a rest so many seconds' worth passes at once, within the bounds that follow."""
@@ -60,7 +60,7 @@ class Bucket:
 
 
 class Pacer:
-    """Lets the bytes of one endpoint pass in turn, at the rate that is set.
+    """Passes the bytes of one endpoint in turn, at the rate that is set.
 
     Args:
         rate: Bytes per second; above 0.
@@ -74,7 +74,7 @@ class Pacer:
     def __init__(self, rate: int, *, loop: asyncio.AbstractEventLoop | None = None) -> None:
         self._loop = loop or asyncio.get_running_loop()
         self._waiting: dict[Callable[[], None], bool] = {}
-        """Whom to call, in turn; and whether it is for something urgent."""
+        """The callbacks to call, in turn, and whether each is for urgent messages."""
         self._serving = False
         self._timer: asyncio.TimerHandle | None = None
         self.change(rate)
@@ -90,7 +90,7 @@ class Pacer:
         self._arm()
 
     def ask(self, go: Callable[[], None], *, urgent: bool) -> bool:
-        """Tell whether a part may pass now; if not, ``go`` is called when it is its turn to ask again."""
+        """Return whether a part may pass now; if not, ``go`` is called when it is its turn to ask again."""
         if self._pause(urgent=urgent) <= 0 and (urgent or self._serving or not self._waiting):
             return True
         self._waiting[go] = urgent or self._waiting.get(go, False)
@@ -105,11 +105,11 @@ class Pacer:
             self._ahead.spend(size, now)
 
     def forget(self, go: Callable[[], None]) -> None:
-        """Call it no more."""
+        """Cancel a callback."""
         self._waiting.pop(go, None)
 
     def close(self) -> None:
-        """Call nobody any more."""
+        """Cancel all callbacks."""
         self._waiting.clear()
         self._arm()
 
@@ -119,7 +119,7 @@ class Pacer:
         return min(pause, self._ahead.pause(now)) if urgent else pause
 
     def _arm(self) -> None:
-        """Wake up when the first of those who wait may ask again."""
+        """Set the timer for when the first waiting callback may ask again."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

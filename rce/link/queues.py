@@ -1,14 +1,14 @@
-"""What waits to be sent on one channel: a bounded queue with a documented policy, and its counters."""
+"""The outgoing queue of one channel, and its counters."""
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING
 
+from rce.aio.queues import BoundedQueue, OverflowPolicy
 from rce.control.model import InterfaceUsage
-from rce.link.exceptions import Overloaded
+from rce.link.exceptions import OverloadedError
 from rce.link.frames import FRAGMENT_SIZE, LATCHED, FrameType
 from rce.link.settings import KIB
 
@@ -21,22 +21,13 @@ SMALL_MESSAGE = 4 * KIB
 """Messages up to this size are urgent.
 
 Poses, goals, cancellations, states and most service calls fit; images, maps and long scans do not. A whole
-one adds no more to anybody's waiting than a thirtieth of a fragment.
+one delays any other message by no more than a thirtieth of a fragment.
 """
-
-
-class OverflowPolicy(Enum):
-    """What happens when a queue is full."""
-
-    DROP_OLDEST = "drop oldest"
-    """The oldest waiting messages are thrown away and counted: topics, where the newest is worth most."""
-    REFUSE = "refuse"
-    """The new message is refused with ``Overloaded``: services, where none may be lost."""
 
 
 @dataclass(slots=True)
 class Counters:
-    """What one interface moved; see :class:`~rce.control.model.InterfaceUsage`."""
+    """The traffic of one interface; see :class:`~rce.control.model.InterfaceUsage`."""
 
     messages_in: int = 0
     messages_out: int = 0
@@ -67,7 +58,7 @@ class Counters:
 
 
 class Backlog:
-    """What waits on all channels of one endpoint.
+    """The payload that waits on all channels of one endpoint.
 
     Args:
         on_growth: Called after something was added.
@@ -82,7 +73,7 @@ class Backlog:
 
 
 class Lane(Enum):
-    """Where a channel's queue stands in line."""
+    """The lane of a channel's queue."""
 
     NONE = "none"
     URGENT = "urgent"
@@ -92,7 +83,8 @@ class Lane(Enum):
 class OutgoingQueue:
     """Messages of one channel that wait to be sent, oldest first.
 
-    A message whose first part is on its way is neither dropped nor counted against the limits.
+    A message whose first part is on its way is neither dropped nor counted against the limits. The newest
+    latched message of each source, and the newest SOURCES, are kept.
 
     Attributes:
         channel: The channel's number.
@@ -115,17 +107,14 @@ class OutgoingQueue:
         self.counters = counters
         self.lane = Lane.NONE
         self.sent = 0
-        self._policy = policy
-        self._max_messages = max_messages
-        self._max_bytes = max_bytes
-        self._frames: deque[Frame] = deque()
-        self._kept: dict[int, Frame] = {}
-        """The newest latched message of each source, and SOURCES (0), which a full queue does not drop."""
+        self._begun: Frame | None = None
+        """The message of which a part is on its way."""
+        self._waiting: BoundedQueue[Frame] = BoundedQueue(max_messages, max_bytes, policy, self._on_drop)
         self._bytes = 0
         self._backlog = backlog or Backlog()
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self._waiting) + (self._begun is not None)
 
     @property
     def waiting_bytes(self) -> int:
@@ -133,32 +122,24 @@ class OutgoingQueue:
         return self._bytes
 
     @property
-    def head(self) -> Frame:
-        """The oldest message."""
-        return self._frames[0]
-
-    @property
-    def urgent(self) -> bool:
-        """Whether the oldest message is small."""
-        return len(self._frames[0].payload) <= SMALL_MESSAGE
+    def head(self) -> Frame | None:
+        """The oldest message; None if nothing waits."""
+        return self._begun or self._waiting.peek()
 
     def push(self, frame: Frame) -> None:
         """Append a message.
 
         Raises:
-            Overloaded: The queue is full and its policy is to refuse.
+            OverloadedError: The queue is full and its policy is to refuse.
         """
-        size = len(frame.payload)
-        while self._is_full(size):
-            if self._policy is OverflowPolicy.REFUSE:
-                raise Overloaded(f"{len(self._frames)} messages wait to be sent")
-            if not self._drop_oldest():
-                break
-        self._frames.append(frame)
-        if _is_kept(frame):
-            self._kept[frame.id] = frame
-        self._count(size)
-        self._backlog.on_growth()
+        waiting, backlog = self._waiting, self._backlog
+        before = waiting.bytes
+        if not waiting.put(frame, len(frame.payload), _key(frame)):
+            raise OverloadedError(f"{len(self)} messages wait to be sent")
+        change = waiting.bytes - before
+        self._bytes += change
+        backlog.bytes += change
+        backlog.on_growth()
 
     def take(self, limit: int = FRAGMENT_SIZE) -> tuple[Frame, int, int]:
         """Take the next part of the oldest message.
@@ -169,35 +150,31 @@ class OutgoingQueue:
         Returns:
             The message, where the part begins and where it ends in its payload.
         """
-        frame = self._frames[0]
+        frame = self._begun or self._waiting.take()
         size = len(frame.payload)
         start = self.sent
         end = min(size, start + limit)
-        self.sent = end
-        if end == size:
-            self._remove_head()
+        if end < size:
+            self._begun, self.sent = frame, end
+        else:
+            self._begun, self.sent = None, 0
+            self._count(-size)
             self.counters.count_frame(frame)
         return frame, start, end
 
     def withdraw(self, call_id: int) -> bool:
         """Take a call back that has not begun; false if there is none."""
-        for index, frame in enumerate(self._frames):
-            if frame.id == call_id and not (index == 0 and self.sent):
-                del self._frames[index]
-                self._count(-len(frame.payload))
-                return True
-        return False
+        before = self._waiting.bytes
+        found = self._waiting.remove(lambda frame: frame.id == call_id)
+        self._count(self._waiting.bytes - before)
+        return found
 
     def shed(self, size: int) -> None:
         """Drop the oldest messages of a topic that have not begun, until ``size`` bytes are free."""
-        goal = self._bytes - size
-        while (
-            self._policy is OverflowPolicy.DROP_OLDEST
-            and len(self._frames) > (1 if self.sent else 0)
-            and self._bytes > goal
-        ):
-            if not self._drop_oldest():
-                self._kept.clear()
+        if self._waiting.policy is OverflowPolicy.DROP_OLDEST:
+            before = self._waiting.bytes
+            self._waiting.shed(size)
+            self._count(self._waiting.bytes - before)
 
     def clear(self) -> int:
         """Throw everything away.
@@ -205,44 +182,27 @@ class OutgoingQueue:
         Returns:
             Size of the message that had begun and must be aborted; 0 if none had.
         """
-        begun = len(self._frames[0].payload) if self.sent else 0
-        self.counters.dropped += sum(frame.type is not FrameType.SOURCES for frame in self._frames)
-        self._frames.clear()
-        self._kept.clear()
+        begun = 0
+        if self._begun is not None:
+            begun = len(self._begun.payload)
+            self._on_drop(self._begun)
+        for frame in self._waiting:
+            self._on_drop(frame)
+        self._waiting.clear()
         self._count(-self._bytes)
-        self.sent = 0
+        self._begun, self.sent = None, 0
         return begun
 
-    def _is_full(self, size: int) -> bool:
-        begun = len(self._frames[0].payload) if self.sent else 0
-        waiting = len(self._frames) - (1 if self.sent else 0)
-        if waiting == 0:
-            return False
-        return waiting >= self._max_messages or self._bytes - begun + size > self._max_bytes
-
-    def _drop_oldest(self) -> bool:
-        """Drop the oldest message that may be dropped; false if there is none."""
-        for index in range(1 if self.sent else 0, len(self._frames)):
-            frame = self._frames[index]
-            if self._kept.get(frame.id) is not frame:
-                self._count(-len(frame.payload))
-                del self._frames[index]
-                self.counters.dropped += 1
-                return True
-        return False
-
-    def _remove_head(self) -> None:
-        frame = self._frames.popleft()
-        if self._kept.get(frame.id) is frame:
-            del self._kept[frame.id]
-        self._count(-len(frame.payload))
-        self.sent = 0
+    def _on_drop(self, frame: Frame) -> None:
+        self.counters.dropped += frame.type is not FrameType.SOURCES
 
     def _count(self, change: int) -> None:
         self._bytes += change
         self._backlog.bytes += change
 
 
-def _is_kept(frame: Frame) -> bool:
-    """Tell whether a message stays in a full queue until a newer one of its source comes."""
-    return frame.type is FrameType.SOURCES or (frame.type is FrameType.DATA and bool(frame.flags & LATCHED))
+def _key(frame: Frame) -> int | None:
+    """Return the key under which a message is kept until a newer one comes; None if it may be dropped."""
+    if frame.type is FrameType.SOURCES:
+        return 0
+    return frame.id if frame.type is FrameType.DATA and frame.flags & LATCHED else None

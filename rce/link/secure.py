@@ -1,4 +1,4 @@
-"""Begin TLS on a link's connection; see :mod:`rce.link.encryption` for what it proves."""
+"""Begin TLS on a link's connection; :mod:`rce.link.encryption` describes what the handshake proves."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import socket
 from typing import TYPE_CHECKING
 
 from rce.link.encryption import accepting_context, dialing_context
-from rce.link.exceptions import LinkRefused
+from rce.link.exceptions import LinkRefusedError
 from rce.link.handshake import encode_secure
 
 if TYPE_CHECKING:
@@ -29,11 +29,11 @@ async def dial_secure(
         make: Makes the carrier.
 
     Raises:
-        LinkRefused: The peer takes no TLS.
+        LinkRefusedError: The peer does not accept TLS.
         OSError: The handshake failed (:class:`ssl.SSLError`).
     """
     if not spec.address.tls:
-        raise LinkRefused(f"{spec.peer} takes links without TLS only; start its program with --tls")
+        raise LinkRefusedError(f"{spec.peer} takes links without TLS only; start its program with --tls")
     context = await asyncio.to_thread(dialing_context, spec.token)
     loop = asyncio.get_running_loop()
     await loop.sock_sendall(sock, encode_secure(spec.id))
@@ -64,7 +64,7 @@ def _handed_on(sock: socket.socket) -> socket.socket:
 
 
 class Adopter:
-    """Takes connections that a doorman accepted for a hub of its own process.
+    """Takes connections that a link acceptor accepted for a hub of its own process.
 
     Args:
         adopt: As :meth:`rce.link.hub.LinkHub.adopt`.

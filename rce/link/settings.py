@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from rce.aio.backoff import Backoff
+
 KIB = 1024
 MIB = 1024 * KIB
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkTimeouts:
-    """How long links wait for what. All in seconds."""
+    """Timeouts of links. All in seconds."""
 
     connect: float = 5.0
     """To reach a peer's socket."""
@@ -18,18 +20,16 @@ class LinkTimeouts:
     """From an accepted connection to its HELLO, and from HELLO to the answer; more than ``unknown_link``."""
     unknown_link: float = 5.0
     """An accepted link that no endpoint knows yet: its spec may be on its way."""
-    redial_first: float = 0.02
-    """First pause before dialing again; it doubles every time."""
-    redial_last: float = 1.0
-    """Longest pause before dialing again."""
+    redial: Backoff = Backoff(first=0.02, longest=1.0, jitter=0.5)
+    """Pauses before dialing again."""
     heartbeat: float = 2.0
-    """A TCP link that was silent for so long is asked whether it lives."""
+    """A TCP link that was silent for so long is sent a PING."""
     silence: float = 8.0
     """A TCP link that was silent for so long is dead."""
     flush: float = 1.0
-    """A closing connection may send for so long what waits in its socket's buffer."""
+    """A closing connection may take so long to send the rest of its socket's buffer."""
     call: float = 30.0
-    """A service call that names no timeout."""
+    """A service call without a timeout of its own."""
     close: float = 10.0
     """An interface may take so long to close."""
 
@@ -55,6 +55,6 @@ class LinkLimits:
     waiting: int = 1024
     """Requests that wait until one interface can serve them."""
     strangers: int = 1024
-    """Accepted connections that have not shown yet which link they are for."""
+    """Accepted connections that have not named their link yet."""
     strangers_per_address: int = 256
     """The same from one address."""

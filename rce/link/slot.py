@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING
 from rce.guard.holdings import Holdings
 from rce.link.calls import CallServer
 from rce.link.channel import as_payload
-from rce.link.exceptions import MessageTooLarge, NotConnected
+from rce.link.exceptions import MessageTooLargeError, NotConnectedError
 from rce.link.latch import HeardSources, LatchedMessages
 from rce.link.queues import Counters
-from rce.protocol.names import InterfaceType, Role
+from rce.model.names import InterfaceType, Role
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from rce.control.model import InterfaceSpec
     from rce.link.channel import Channel
     from rce.link.interface import Buffer, Interface, InterfaceFactory
     from rce.link.settings import LinkLimits, LinkTimeouts
+    from rce.model.specs import InterfaceSpec
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class InterfaceSlot:
@@ -31,7 +31,7 @@ class InterfaceSlot:
         role: What the interface does.
         started: Whether it can be used.
         active: Whether it has an established connection.
-        counters: What it moved.
+        counters: Its traffic.
         server: Serves the peers' requests; service clients only.
     """
 
@@ -41,7 +41,7 @@ class InterfaceSlot:
         *,
         limits: LinkLimits,
         timeouts: LinkTimeouts,
-        on_change: Callable[[], None],
+        on_change: Callable[[int], None],
         on_fault: Callable[[str], None],
         holdings: Holdings | None = None,
     ) -> None:
@@ -66,7 +66,7 @@ class InterfaceSlot:
 
     @property
     def spec(self) -> InterfaceSpec:
-        """What the interface was made for."""
+        """The interface's spec."""
         return self._spec
 
     def send(self, payload: Buffer, *, latched: bool = False, source: str = "") -> None:
@@ -75,7 +75,7 @@ class InterfaceSlot:
             raise TypeError(f"{self._spec.tag} is a {self._spec.type}: only a subscriber sends messages")
         try:
             data = as_payload(payload, self._limits.max_message)
-        except MessageTooLarge as error:
+        except MessageTooLargeError as error:
             self.counters.dropped += 1
             self._fault_once(str(error))
             return
@@ -96,12 +96,12 @@ class InterfaceSlot:
         for channel in self._channels.values():
             if channel.established:
                 return await channel.call(data, self._timeouts.call if timeout is None else timeout)
-        raise NotConnected
+        raise NotConnectedError
 
     # The life of the interface
 
     def make(self, factory: InterfaceFactory) -> None:
-        """Make the interface. Raises whatever the factory raises."""
+        """Make the interface. Exceptions of the factory are passed on."""
         self._interface = interface = factory(self)
         if self.role is Role.SERVICE_CLIENT:
             self.server = CallServer(interface.serve, self._limits, self._spec.tag, self._holdings)
@@ -111,8 +111,8 @@ class InterfaceSlot:
         assert self._interface is not None
         try:
             await self._interface.start()
-        except Exception as error:
-            log.debug("interface %s did not start", self._spec.tag, exc_info=True)
+        except Exception as error:  # noqa: BLE001 - logged
+            _log.debug("interface %s did not start", self._spec.tag, exc_info=True)
             self._fault(str(error) or type(error).__name__)
             return
         self.started = True
@@ -138,7 +138,7 @@ class InterfaceSlot:
         self._channels[channel.number] = channel
 
     def remove(self, channel: Channel) -> None:
-        """Let a connection go; it was closed before."""
+        """Remove a connection; it was closed before."""
         del self._channels[channel.number]
         self._unlatch(self._heard.retain(channel.number))
 
@@ -154,7 +154,7 @@ class InterfaceSlot:
         if active != self.active:
             self.active = active
             self._tell_interface(active)
-        self._on_change()
+        self._on_change(channel.number)
 
     def receive(self, channel: Channel, payload: bytes, source: int | None) -> None:
         """Hand a peer's message to the interface; a latched one has a source."""
@@ -167,12 +167,12 @@ class InterfaceSlot:
                 name, ended = self._heard.hear(channel.number, source)
                 self._unlatch(ended)
                 self._interface.receive_latched(payload, name)
-        except Exception as error:
-            log.debug("interface %s refused a message", self._spec.tag, exc_info=True)
+        except Exception as error:  # noqa: BLE001 - logged
+            _log.debug("interface %s refused a message", self._spec.tag, exc_info=True)
             self._fault_once(str(error) or type(error).__name__)
 
     def message_dropped(self, channel: Channel, source: int | None) -> None:
-        """Take note that a peer's message was dropped while it came in: what its source latched is old."""
+        """Take note that a peer's message was dropped on arrival: what its source latched is outdated."""
         self.counters.dropped += 1
         self._fault_once("memory is short; a message was dropped while it came in")
         if source is not None:
@@ -187,8 +187,8 @@ class InterfaceSlot:
         if sources and self._interface is not None:
             try:
                 self._interface.unlatch(sources)
-            except Exception as error:
-                log.debug("interface %s: unlatch failed", self._spec.tag, exc_info=True)
+            except Exception as error:  # noqa: BLE001 - logged
+                _log.debug("interface %s: unlatch failed", self._spec.tag, exc_info=True)
                 self._fault_once(str(error) or type(error).__name__)
 
     def _send_sources(self) -> None:
@@ -204,8 +204,8 @@ class InterfaceSlot:
         assert self._interface is not None
         try:
             self._interface.on_active(active)
-        except Exception as error:
-            log.debug("interface %s: on_active failed", self._spec.tag, exc_info=True)
+        except Exception as error:  # noqa: BLE001 - logged
+            _log.debug("interface %s: on_active failed", self._spec.tag, exc_info=True)
             self._fault_once(str(error) or type(error).__name__)
 
     def _fault_once(self, text: str) -> None:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 from rce.buffers import write_together
 from rce.link.carrier import Carrier, CarrierHandler
-from rce.link.exceptions import LinkLost, ProtocolError
+from rce.link.exceptions import LinkLostError, ProtocolError
+from rce.link.flow_control import FlowControl
 from rce.link.frames import (
     FRAGMENT_SIZE,
     HANDSHAKE_SIZE,
@@ -20,7 +21,6 @@ from rce.link.frames import (
 )
 from rce.link.lanes import Lanes, frame_chunk
 from rce.link.settings import KIB, MIB
-from rce.link.valve import Valve
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,15 +31,15 @@ if TYPE_CHECKING:
     from rce.link.settings import LinkLimits, LinkTimeouts
 
 T = TypeVar("T")
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _HIGH_WATER = 64 * KIB
 _LOW_WATER = 16 * KIB
 """So little lies in the transport's buffer that urgent frames wait for a fragment or two only."""
 _NOT_SENT = 128 * KIB
-"""What the kernel may hold unsent of a TCP link, for the same reason."""
+"""Most unsent bytes of a TCP link in the kernel, for the same reason."""
 _TURN = 1 * MIB
-"""Bytes after which a link that could go on writing lets the event loop do something else."""
+"""Bytes after which a link that could continue writing lets the event loop do something else."""
 
 
 class SocketCarrier(asyncio.BufferedProtocol, Carrier):
@@ -74,8 +74,8 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         self._kind = ""
         self._writable = False
         self._straight = False
-        """Writable, and without a limit: what finds nothing waiting needs not to ask anybody."""
-        self._valve: Valve | None = None
+        """Writable, and without a limit: a message is sent at once if none waits before it."""
+        self._flow: FlowControl | None = None
         self.sent = 0
         self.received = 0
         self._handler: CarrierHandler | None = None
@@ -95,12 +95,12 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         """Wait for the peer's first frame.
 
         Raises:
-            ProtocolError: The peer sent something else than frames.
-            LinkLost: The connection ended first.
+            ProtocolError: The peer sent something other than frames.
+            LinkLostError: The connection ended first.
         """
         await asyncio.shield(self._first)
         if not self._early:
-            raise self._reason or LinkLost("the connection ended before the handshake")
+            raise self._reason or LinkLostError("the connection ended before the handshake")
         return self._early.pop(0)
 
     @property
@@ -128,16 +128,16 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
             self._heartbeat()
         early, self._early = self._early, []
         if self._ending:
-            reason = self._reason or LinkLost("the connection ended")
+            reason = self._reason or LinkLostError("the connection ended")
             self._loop.call_soon(handler.carrier_lost, self, reason)
         else:
             self._dispatch(early)
 
     def pace(self, pacer: Pacer | None) -> None:
         """Limit what passes."""
-        if not self._ending and (pacer is not None or self._valve is not None):
-            self._use_valve().pace(pacer)
-            self._look_at_valve()
+        if not self._ending and (pacer is not None or self._flow is not None):
+            self._use_flow_control().pace(pacer)
+            self._look_at_flow()
 
     @property
     def traffic(self) -> tuple[int, int]:
@@ -150,7 +150,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         return 0 if self._ending else self._reader.held_bytes
 
     def drop_unfinished(self, size: int) -> list[Frame]:
-        """Forget the oldest messages that have not come as a whole yet; the connection goes on."""
+        """Forget the oldest messages that have not come as a whole yet; the connection continues."""
         return [] if self._ending else self._reader.drop_unfinished(size)
 
     def control(self, frame: Frame) -> None:
@@ -192,12 +192,12 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
     def close(self) -> None:
         """Hang up after what lies in the socket's buffer was sent, or after the flush time."""
         self._handler = None
-        self._end(LinkLost("closed"), flush=True)
+        self._end(LinkLostError("closed"), flush=True)
 
     def abort(self, reason: Exception) -> None:
-        """End at once; whoever handles the frames is told the reason."""
+        """End at once; the handler is told the reason."""
         if isinstance(reason, ProtocolError):
-            log.warning("link dropped: %s", reason)
+            _log.warning("link dropped: %s", reason)
         self._end(reason, flush=False)
 
     async def wait_closed(self) -> None:
@@ -229,28 +229,28 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
     def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002 - the reader knows better
         """Return where the socket's next bytes go."""
         buffer = self._reader.get_buffer()
-        return buffer if self._valve is None else buffer[: self._valve.read_size]
+        return buffer if self._flow is None else buffer[: self._flow.read_size]
 
     def buffer_updated(self, nbytes: int) -> None:
         """Take bytes of the socket."""
         self.received += nbytes
         self._take(self._reader.advance, nbytes)
-        if self._valve is not None and not self._ending:
-            self._valve.count_received()
+        if self._flow is not None and not self._ending:
+            self._flow.count_received()
 
     def pause_writing(self) -> None:
         """Stop handing bytes to the transport."""
         self._writable = self._straight = False
 
     def resume_writing(self) -> None:
-        """Go on handing bytes to the transport."""
+        """Continue handing bytes to the transport."""
         self._writable = True
-        self._straight = self._valve is None
+        self._straight = self._flow is None
         self.go_on()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Give everything up."""
-        self._end(exc or LinkLost("the peer hung up"), flush=False)
+        self._end(exc or LinkLostError("the peer hung up"), flush=False)
         if self._timer is not None:
             self._timer.cancel()
         self._transport = None
@@ -258,15 +258,15 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         self._closed.set_result(None)
         self._on_closed(self)
 
-    # rce.link.valve.Stream
+    # rce.link.flow_control.Stream
 
     def go_on(self) -> None:
-        """Send what waits, as far as the socket takes it and the limits let it pass."""
+        """Send waiting frames, as far as the socket and the limits allow."""
         if self._writable and self._turn is None:
             self._pump()
 
     def pause_reading(self) -> None:
-        """Leave what comes in the kernel's buffers."""
+        """Leave incoming bytes in the kernel's buffers."""
         if self._transport is not None and not self._transport.is_closing():
             self._transport.pause_reading()
 
@@ -277,16 +277,16 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
 
     # Inside
 
-    def _use_valve(self) -> Valve:
-        if self._valve is None:
-            self._valve = Valve(self)
+    def _use_flow_control(self) -> FlowControl:
+        if self._flow is None:
+            self._flow = FlowControl(self)
             self._straight = False
-        return self._valve
+        return self._flow
 
-    def _look_at_valve(self) -> None:
-        """Do without the valve once nobody has a limit any more."""
-        if self._valve is not None and self._valve.open:
-            self._valve = None
+    def _look_at_flow(self) -> None:
+        """Remove the flow control when neither end has a limit any more."""
+        if self._flow is not None and self._flow.open:
+            self._flow = None
             self._straight = self._writable
 
     def _take(self, read: Callable[[T], list[Frame]], argument: T) -> None:
@@ -320,11 +320,11 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
 
     def _take_grant(self, frame: Frame) -> None:
         try:
-            self._use_valve().allow(frame.payload)
+            self._use_flow_control().allow(frame.payload)
         except ProtocolError as error:
             self.abort(error)
         else:
-            self._look_at_valve()
+            self._look_at_flow()
 
     def _keep(self, frame: Frame) -> None:
         if len(self._early) > self._limits.max_channels:
@@ -339,7 +339,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         self._turn = None
         budget = _TURN
         while self._lanes and self._writable and not self._ending:
-            chunk = self._lanes.next() if self._valve is None else self._next_through(self._valve)
+            chunk = self._lanes.next() if self._flow is None else self._next_through(self._flow)
             if chunk is None:
                 return
             budget -= self._write(chunk)
@@ -347,13 +347,13 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
                 self._turn = self._loop.call_soon(self._pump)
                 return
 
-    def _next_through(self, valve: Valve) -> Chunk | None:
-        """Return what may be sent next, paid for. Frames of the link itself never wait: it lives by them."""
+    def _next_through(self, flow: FlowControl) -> Chunk | None:
+        """Return the next frame that may be sent, paid for. Frames of the link itself never wait."""
         urgent = self._lanes.control or self._lanes.urgent
-        limit = FRAGMENT_SIZE if self._lanes.control else valve.room(urgent=urgent)
+        limit = FRAGMENT_SIZE if self._lanes.control else flow.room(urgent=urgent)
         chunk = self._lanes.next(limit) if limit else None
         if chunk is not None:
-            valve.count_sent(sum(map(len, chunk)), urgent=urgent)
+            flow.count_sent(sum(map(len, chunk)), urgent=urgent)
         return chunk
 
     def _write(self, chunk: Chunk) -> int:
@@ -367,16 +367,16 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         return size
 
     def _heartbeat(self) -> None:
-        """Ask a silent peer whether it lives; give a peer up that was silent for too long."""
+        """Send a PING to a silent peer; end the carrier if the peer was silent for too long."""
         now = self._loop.time()
         stood_still = now - self._beat > 2 * self._timeouts.heartbeat  # or this is the first beat
-        paused = self._valve is not None and self._valve.paused
+        paused = self._flow is not None and self._flow.paused
         if stood_still or paused:
-            self._heard = now  # nothing was read: that is not the peer's silence
+            self._heard = now  # this end read nothing: the peer may have sent something
         self._beat = now
         silent = now - self._heard
         if silent >= self._timeouts.silence:
-            self.abort(LinkLost(f"the peer was silent for {silent:.1f} s"))
+            self.abort(LinkLostError(f"the peer was silent for {silent:.1f} s"))
             return
         if silent >= self._timeouts.heartbeat / 2 or paused:
             self.control(Frame(FrameType.PING))
@@ -387,8 +387,8 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         if not self._ending:
             self._ending = True
             self._writable = self._straight = False
-            if self._valve is not None:
-                self._valve.close()
+            if self._flow is not None:
+                self._flow.close()
             self._reason = reason
             if self._turn is not None:
                 self._turn.cancel()

@@ -24,7 +24,7 @@ def bind_private(path: Path) -> tuple[socket.socket, int]:
     try:
         sock.setblocking(False)
         sock.bind(str(path))
-        path.chmod(stat.S_IRUSR | stat.S_IWUSR)  # before it listens: nobody can connect earlier
+        path.chmod(stat.S_IRUSR | stat.S_IWUSR)  # before it listens, so no process can connect earlier
     except BaseException:
         sock.close()
         raise
@@ -42,14 +42,14 @@ def _remove_stale_socket(path: Path) -> None:
     """Remove the socket file of a process that is gone.
 
     Raises:
-        OSError: The path is no socket, or somebody listens there.
+        OSError: The path is not a socket, or another process listens there.
     """
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
         return
     if not stat.S_ISSOCK(mode):
-        raise FileExistsError(errno.EEXIST, "exists and is no socket", str(path))
+        raise FileExistsError(errno.EEXIST, "exists and is not a socket", str(path))
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -73,7 +73,7 @@ def remove_stale_sockets(folder: Path, pattern: str) -> None:
     Young ones may just be about to listen, unless their names say that their process has ended.
     """
     for path in folder.glob(pattern):
-        with contextlib.suppress(OSError):  # somebody listens, or another one was quicker
+        with contextlib.suppress(OSError):  # a process listens there, or another one removed it first
             if _owner_ended(path) or time.time() - path.stat().st_mtime > _YOUNG_S:
                 _remove_stale_socket(path)
 

@@ -31,7 +31,7 @@ Binary: TypeAlias = bytes | bytearray | memoryview
 
 
 class Dropped(NamedTuple):
-    """Something that will not become a message."""
+    """An incomplete message or a binary value that was dropped."""
 
     text: str
     """Why."""
@@ -70,7 +70,7 @@ class Assembler:
         self._awaited: dict[str, _Partial] = {}
         self._unclaimed: dict[str, _Unclaimed] = {}
         self.pending_bytes = 0
-        """Bytes that are kept for what is not complete."""
+        """Bytes of incomplete messages and unclaimed values."""
 
     def __len__(self) -> int:
         """Count the incomplete messages and unclaimed values."""
@@ -78,7 +78,7 @@ class Assembler:
 
     @property
     def next_deadline(self) -> float | None:
-        """When :meth:`expire` has something to do next, if ever."""
+        """When :meth:`expire` must be called next; None if nothing waits."""
         oldest = next(iter(self._entries.values()), None)
         return None if oldest is None else oldest.deadline
 
@@ -87,7 +87,7 @@ class Assembler:
 
         Args:
             value: The JSON value; starred keys in it are replaced in place.
-            size: Length of the text, what it counts in memory.
+            size: Length of the text, which counts as its memory.
             now: Seconds on the caller's clock.
 
         Returns:
@@ -101,7 +101,7 @@ class Assembler:
     def add_single(
         self, value: Any, id_: str, holder: list[Any], size: int, now: float
     ) -> tuple[bool, list[Dropped]]:
-        """Take a message of which it is known already that it refers to one binary value only.
+        """Take a message that is known to refer to one binary value only.
 
         Args:
             value: What :meth:`add_binary` returns when it is complete.
@@ -123,11 +123,11 @@ class Assembler:
     def add_references(
         self, value: Any, ids: Collection[str], holder: dict[str, Any], size: int, now: float
     ) -> tuple[bool, list[Dropped]]:
-        """Take a message of which it is known already which binary values it refers to.
+        """Take a message whose references to binary values are known.
 
         Args:
             value: What :meth:`add_binary` returns when it is complete.
-            ids: What it refers to, each 32 hexadecimal characters.
+            ids: The ids of these values, each 32 hexadecimal characters.
             holder: Where the binary values are put, by id.
             size: As for :meth:`add_message`.
             now: Seconds on the caller's clock.
@@ -151,7 +151,7 @@ class Assembler:
     def _await(
         self, value: Any, places: dict[str, tuple[Any, Any]], size: int, now: float
     ) -> tuple[bool, list[Dropped]]:
-        """Put in place what is there already, and wait for the rest."""
+        """Insert the values that have come already, and wait for the rest."""
         found = [self._unclaimed[id_] for id_ in places if id_ in self._unclaimed]
         for unclaimed in found:
             self._forget(unclaimed)
@@ -203,7 +203,7 @@ class Assembler:
         return partial.value, []
 
     def expire(self, now: float) -> list[Dropped]:
-        """Drop what is older than the limit; return each with why."""
+        """Drop everything that is older than the limit; return each with the reason."""
         dropped: list[Dropped] = []
         while self._entries:
             oldest = next(iter(self._entries.values()))
@@ -214,7 +214,7 @@ class Assembler:
         return dropped
 
     def drop_oldest(self, size: int) -> list[Dropped]:
-        """Drop what is incomplete, oldest first, until ``size`` bytes are free; return each with why."""
+        """Drop incomplete items, oldest first, until ``size`` bytes are free; return each with the reason."""
         goal = self.pending_bytes - size
         dropped: list[Dropped] = []
         while self._entries and self.pending_bytes > goal:
@@ -259,7 +259,7 @@ class Assembler:
         return self._shrink()
 
     def _shrink(self) -> list[Dropped]:
-        """Drop the oldest until the rest is within the limits."""
+        """Drop the oldest items until the rest is within the limits."""
         dropped: list[Dropped] = []
         limits = self._limits
         while self.pending_bytes > limits.max_pending_bytes or len(self._entries) > limits.max_pending:

@@ -1,26 +1,16 @@
-"""Which service call a message is of, also where the message as a whole is refused.
+"""The service call that a message belongs to, also if the message is refused.
 
-A caller must hear of the end of its call. So what is refused is told with the interface and the ``msgID``
-that it names, as far as these can be read.
+A caller must learn of the end of its call. So a refusal names the interface and the ``msgID`` of the message,
+as far as these can be read.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
+from rce.model.names import is_name
 from rce.protocol.limits import MAX_MESSAGE_ID_LENGTH
-from rce.protocol.messages import NO_ID
-from rce.protocol.names import is_name
-
-
-class CallId(NamedTuple):
-    """A service call at an interface of a robot."""
-
-    i_tag: str
-    msg_id: str
-
-    def __str__(self) -> str:
-        return f"{self.i_tag}, msgID {self.msg_id}"
+from rce.protocol.messages import NO_ID, CallId
 
 
 def call_of(value: Any) -> CallId | None:
@@ -39,7 +29,7 @@ def call_of(value: Any) -> CallId | None:
 
 
 def call_at(i_tag: Any, msg_id: Any) -> CallId | None:
-    """Return a service call of an interface tag and a ``msgID``, ``None`` if they are none or no call's."""
+    """Return the service call of an interface tag and a ``msgID``; ``None`` if they do not name one."""
     if not isinstance(i_tag, str) or not is_name(i_tag) or not isinstance(msg_id, str):
         return None
     if msg_id == NO_ID or len(msg_id) > MAX_MESSAGE_ID_LENGTH:
@@ -58,4 +48,4 @@ def text_id(msg_id: Any) -> Any:
 
 
 _MOST_BITS = 256
-"""Of a number that is taken for an id; the writing of longer ones takes time."""
+"""Most bits of a number that is accepted as an id; converting longer ones to text takes time."""

@@ -1,9 +1,8 @@
 """Writes messages as frames: a text frame, then a binary frame for each binary value in it.
 
-A binary frame is made as one ``bytes`` by a single ``join``. The other way, to give a WebSocket library the
-id and the payload as two fragments, saves that copy but costs a second frame header, a second write and a
-drain, and there are clients that do not put fragments together; copying 10 MB takes a small part of the time
-that sending it takes.
+A binary frame is made as one ``bytes`` by a single ``join``. Passing the id and the payload as two fragments
+to a WebSocket library would save that copy, but cost a second frame header, a second write and a drain, and
+some clients do not join fragments. Copying 10 MB takes a small part of the time that sending it takes.
 """
 
 from __future__ import annotations
@@ -20,8 +19,12 @@ from rce.protocol.messages import (
     ClientMessage,
     DataMessage,
     ErrorReport,
+    InterfaceStatus,
+    LatchedSources,
     type_of,
 )
+from rce.protocol.reports import write_report
+from rce.protocol.requests import write_request
 from rce.protocol.single import MAX_PAYLOAD, encode_single
 
 if TYPE_CHECKING:
@@ -39,7 +42,7 @@ _encode = msgspec.json.Encoder().encode
 
 
 def _ids() -> Iterator[str]:
-    """Yield ids that no other process yields: 64 random bits and a count."""
+    """Yield ids that are unique among processes: 64 random bits and a count."""
     prefix = os.urandom(8).hex()
     return (f"{prefix}{number:016x}" for number in itertools.count(1))
 
@@ -52,38 +55,42 @@ def encode(message: ClientMessage) -> list[Frame]:
     """Write a message.
 
     Raises:
-        TypeError: It holds something that JSON cannot express.
+        TypeError: It holds a value that JSON cannot express.
     """
     if isinstance(message, DataMessage):
-        return encode_data(message.i_tag, message.type, message.msg, message.msg_id, message.latch)
+        return encode_data(message.i_tag, message.message_type, message.msg, message.msg_id, message.latch)
     if isinstance(message, ErrorReport):
-        return encode_message("ER", message.text)
-    return encode_message(type_of(message), msgspec.to_builtins(message))
+        return [_encode(write_report(message)).decode()]
+    if isinstance(message, LatchedSources | InterfaceStatus):
+        return encode_message(type_of(message), msgspec.to_builtins(message))
+    return encode_message(type_of(message), write_request(message))
 
 
 def encode_data(
-    i_tag: str, type_: str, msg: Any, msg_id: str = NO_ID, latch: str = "", *, single: bool = False
+    i_tag: str, message_type: str, msg: Any, msg_id: str = NO_ID, latch: str = "", *, single: bool = False
 ) -> list[Frame]:
     """Write a data message.
 
     Args:
         i_tag: Interface tag; a name, so it needs no escapes.
-        type_: Message or service class.
+        message_type: Message or service type.
         msg: The message as a JSON object that may hold binary values, or as binary as a whole.
         msg_id: Echoed in the answer to a service request.
-        latch: The source whose latched message it is; for peers that know of such only.
-        single: Write a message that is binary as a whole as one frame; for peers that agreed on it only.
+        latch: The source whose latched message it is; only for peers with that feature.
+        single: Write a message that is binary as a whole as one frame; only for peers with that feature.
 
     Raises:
-        TypeError: ``msg`` holds something that JSON cannot express.
+        TypeError: ``msg`` holds a value that JSON cannot express.
     """
     if isinstance(msg, _BINARY):
         if single and len(msg) <= MAX_PAYLOAD:
-            return [encode_single(i_tag, type_, msg, msg_id, latch)]
+            return [encode_single(i_tag, message_type, msg, msg_id, latch)]
         id_ = next(_fresh_ids)
-        data = {"iTag": i_tag, "type": type_, "msgID": msg_id, **_latch(latch), "msg*": id_}
+        data = {"iTag": i_tag, "type": message_type, "msgID": msg_id, **_latch(latch), "msg*": id_}
         return [_encode({"type": "DM", "data": data}).decode(), b"".join((id_.encode(), msg))]
-    return encode_message("DM", {"iTag": i_tag, "type": type_, "msgID": msg_id, **_latch(latch), "msg": msg})
+    return encode_message(
+        "DM", {"iTag": i_tag, "type": message_type, "msgID": msg_id, **_latch(latch), "msg": msg}
+    )
 
 
 def _latch(source: str) -> dict[str, str]:
@@ -101,7 +108,7 @@ def encode_message(type_: str, data: Any) -> list[Frame]:
             word for them.
 
     Raises:
-        TypeError: It holds something that JSON cannot express, or a list of which only a part is binary.
+        TypeError: It holds a value that JSON cannot express, or a list of which only a part is binary.
     """
     binaries: list[Frame] = []
     data = _extract(data, binaries)

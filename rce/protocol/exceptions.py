@@ -1,14 +1,22 @@
-"""What can be wrong with what a peer sent.
+"""Errors in messages of a peer.
 
 ::
 
     ProtocolError
-    +-- MessageError      a text frame is no message, or a message holds something wrong
+    +-- MessageError      a text frame is not a message, or a message has a fault
     +-- AssemblyError     a binary frame, or a reference to one, is wrong
     +-- HandshakeError    an HTTP request or a WebSocket handshake is refused
 """
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce.model.faults import FaultCode, FieldFault
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import Self
 
 
 class ProtocolError(Exception):
@@ -18,18 +26,28 @@ class ProtocolError(Exception):
 class MessageError(ProtocolError):
     """A message is refused.
 
+    Args:
+        place: The key that is wrong; empty for the message as a whole.
+        problem: The fault.
+        code: The kind of the fault.
+
     Attributes:
-        place: Where in the message, such as ``data.addNodes[2].pkg``; empty for the message as a whole.
-        problem: What is wrong there.
+        faults: The faults; never empty.
     """
 
-    def __init__(self, place: str, problem: str) -> None:
+    def __init__(self, place: str, problem: str, code: FaultCode = FaultCode.INVALID) -> None:
+        self.faults: tuple[FieldFault, ...] = (FieldFault((place,) if place else (), code, problem),)
         super().__init__(place, problem)
-        self.place = place
-        self.problem = problem
+
+    @classmethod
+    def of(cls, faults: Sequence[FieldFault]) -> Self:
+        """Make the error from faults."""
+        error = cls("", "; ".join(map(str, faults)))
+        error.faults = tuple(faults)
+        return error
 
     def __str__(self) -> str:
-        return f"{self.place}: {self.problem}" if self.place else self.problem
+        return "; ".join(map(str, self.faults))
 
 
 class AssemblyError(ProtocolError):
@@ -45,7 +63,7 @@ class HandshakeError(ProtocolError):
     """
 
     def __init__(self, status: int, reason: str) -> None:
-        # It may quote bytes of the request that are no text, which could not be sent back.
+        # It may quote bytes of the request that are not text and cannot be sent back.
         reason = reason.encode("utf-8", "backslashreplace").decode()
         super().__init__(status, reason)
         self.status = status

@@ -1,6 +1,6 @@
-"""The two HTTP requests with which a client comes in, without I/O.
+"""The two HTTP requests with which a client connects, without I/O.
 
-First ``GET /?userID=U&version=V`` at the master, which answers where the robot endpoint is; then the
+First ``GET /?userID=U&version=V`` at the master, which answers with the robot endpoint's URL; then the
 WebSocket handshake there, ``GET /?userID=U&robotID=R&password=P``, or without a password and with the header
 ``Authorization: Bearer``. Wire source: ``docs/protocol.md``.
 """
@@ -14,8 +14,8 @@ from urllib.parse import parse_qs, parse_qsl
 
 import msgspec
 
+from rce.model.names import is_name
 from rce.protocol.exceptions import HandshakeError
-from rce.protocol.names import is_name
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -54,7 +54,7 @@ class MasterRequest:
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """Who wants to connect a robot."""
+    """The credentials of a robot that connects."""
 
     user: str
     robot: str
@@ -92,9 +92,9 @@ def master_reply(request: MasterRequest, url: str, *, header: bool = False) -> b
     """Write the body of the master's answer (JSON, UTF-8).
 
     Args:
-        request: What was asked.
+        request: The client's request.
         url: WebSocket URL of the robot endpoint, such as ``ws://host:9010/``.
-        header: Whether that endpoint takes the credential in a header; only who asks is told.
+        header: Whether that endpoint takes the credential in a header; sent only to clients that ask.
     """
     body = {"url": url}
     if header and request.asks_for_header:
@@ -105,7 +105,7 @@ def master_reply(request: MasterRequest, url: str, *, header: bool = False) -> b
 
 
 def read_credentials(query: str, authorization: Sequence[str] = ()) -> Credentials:
-    """Read what a WebSocket handshake says of who comes.
+    """Read the credentials in a WebSocket handshake.
 
     Args:
         query: What comes after the ``?``, still percent-encoded.
@@ -113,7 +113,7 @@ def read_credentials(query: str, authorization: Sequence[str] = ()) -> Credentia
 
     Raises:
         HandshakeError: 400 for a missing, repeated or malformed parameter, or a credential in both places;
-            401 for a password that is no SHA-256, or a header that is not understood.
+            401 for a password that is not a SHA-256, or a header that is not understood.
     """
     if authorization:
         return _read_header(query, authorization)
@@ -144,19 +144,19 @@ def _read_header(query: str, authorization: Sequence[str]) -> Credentials:
 
 
 FEATURES_KEY = "features"
-"""Parameter of the WebSocket handshake: what the client knows beyond the first protocol, by commas."""
+"""Parameter of the WebSocket handshake: the client's features beyond the first protocol, by commas."""
 FEATURES_HEADER = "RCE-Features"
-"""Header of the answer: which of these the endpoint knows too."""
+"""Header of the answer: those features that the endpoint knows too."""
 LATCH = "latch"
 """Feature: latched messages name their source, and ``LT`` tells which sources' are in force."""
 SINGLE_FRAME = "single-frame"
 """Feature: a message that is binary as a whole travels in one frame, see :mod:`rce.protocol.single`."""
 FEATURES = frozenset((LATCH, SINGLE_FRAME))
-"""What is known here."""
+"""The features of this release."""
 
 
 def read_features(query: str) -> frozenset[str]:
-    """Return what a client asks for in its WebSocket handshake and is known here.
+    """Return the features that a client asks for in its WebSocket handshake and that are known here.
 
     Args:
         query: What comes after the ``?``, still percent-encoded; one that :func:`read_credentials` took.

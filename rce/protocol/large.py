@@ -1,4 +1,4 @@
-"""Reads data messages that :class:`~rce.protocol.stream.ProtocolStream` left to others; takes long."""
+"""Reads large data messages, which :class:`~rce.protocol.stream.ProtocolStream` does not parse; slow."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def read_large(
     Args:
         text: The text frame.
         binaries: The binary values that came for it, by id.
-        address: Where it was taken to go.
+        address: The address that was found in it.
         limits: How much it may hold.
 
     Returns:
         The message, or the ids of the binary values that it refers to if none were given.
 
     Raises:
-        ProtocolError: It is no data message, or goes somewhere else.
+        ProtocolError: It is not a data message, or has another address.
     """
     check_elements(text, max_elements=limits.max_elements, max_values=limits.max_values)
     value = parse_json(text)
@@ -46,10 +46,12 @@ def read_large(
         assembler.add_binary(b"".join((id_.encode(), data)), 0.0)
     message = message_from_json(value, ("DM",))
     assert isinstance(message, DataMessage)
-    if message.i_tag != address.i_tag or (address.type and message.type != address.type):
+    if message.i_tag != address.i_tag or (
+        address.message_type and message.message_type != address.message_type
+    ):
         raise MessageError(
             "data",
             f"in a large message iTag and type must come before msg, or after it within the last 4096 bytes; "
-            f"found {address.i_tag!r} and {address.type!r} there",
+            f"found {address.i_tag!r} and {address.message_type!r} there",
         )
     return message

@@ -1,4 +1,4 @@
-"""A data message whose ``msg`` is binary as a whole, in one frame; for peers that agreed on it. Pure.
+"""A data message whose ``msg`` is binary as a whole, in one frame; for peers with that feature. Pure.
 
 ::
 
@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec import UNSET, Struct, UnsetType, field
 
+from rce.model.written import MessageTypeName, Name
 from rce.protocol.exceptions import AssemblyError, MessageError
 from rce.protocol.limits import DEFAULT_LIMITS
-from rce.protocol.messages import NO_ID, ClassName, DataMessage, MessageId, Name, SourceName
+from rce.protocol.messages import NO_ID, DataMessage, MessageId, SourceName
 from rce.protocol.reading import parse_json
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ _encode = msgspec.json.Encoder().encode
 
 class _Header(Struct):
     i_tag: Name = field(name="iTag")
-    type: ClassName
+    message_type: MessageTypeName = field(name="type")
     msg_id: MessageId = field(name="msgID", default=NO_ID)
     latch: SourceName = ""
     msg: UnsetType = UNSET
@@ -55,7 +56,7 @@ _DECODE_FAULTS = (msgspec.MsgspecError, UnicodeError, RecursionError)
 
 
 def prefix(header: bytes) -> bytes:
-    """Return everything that stands before the serialized message.
+    """Return the bytes before the serialized message.
 
     Args:
         header: ``data`` without ``msg`` as JSON, at most :data:`MAX_HEADER` bytes.
@@ -63,9 +64,9 @@ def prefix(header: bytes) -> bytes:
     return _PREFIX.pack(MARK, len(header)) + header
 
 
-def encode_single(i_tag: str, type_: str, msg: Binary, msg_id: str = NO_ID, latch: str = "") -> bytes:
+def encode_single(i_tag: str, message_type: str, msg: Binary, msg_id: str = NO_ID, latch: str = "") -> bytes:
     """Write a data message as one frame; arguments as in :func:`rce.protocol.codec.encode_data`."""
-    data = {"iTag": i_tag, "type": type_, "msgID": msg_id}
+    data = {"iTag": i_tag, "type": message_type, "msgID": msg_id}
     if latch:
         data["latch"] = latch
     return b"".join((prefix(_encode(data)), msg))
@@ -85,7 +86,7 @@ class SingleReader:
 
         Returns:
             The message; or, if its header is unusual or wrong, its ``data`` as if it had come as JSON, for
-            :func:`rce.protocol.reading.message_from_json` to read or to say what is wrong.
+            :func:`rce.protocol.reading.message_from_json` to read or to find its faults.
 
         Raises:
             ProtocolError: It has no header.
@@ -105,7 +106,7 @@ class SingleReader:
         header = self._known.get(text) or self._learn(text)
         if header is None:
             return _read_data(text, payload)
-        return DataMessage(header.i_tag, header.type, payload, header.msg_id, header.latch)
+        return DataMessage(header.i_tag, header.message_type, payload, header.msg_id, header.latch)
 
     def _learn(self, text: bytes) -> _Header | None:
         try:

@@ -1,8 +1,8 @@
 """One side of a connection, without I/O: frames in, messages and faults out.
 
 The I/O around it is always the same: give each frame to :meth:`ProtocolStream.feed`, handle the events, and
-call :meth:`ProtocolStream.expire` now and then (or at :attr:`ProtocolStream.next_deadline`). What is sent is
-made by :mod:`rce.protocol.codec`, which needs no state.
+call :meth:`ProtocolStream.expire` periodically (or at :attr:`ProtocolStream.next_deadline`). To send, use
+:mod:`rce.protocol.codec`, which needs no state.
 """
 
 from __future__ import annotations
@@ -11,16 +11,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from msgspec import Struct
 
+from rce.model.faults import FieldFault
 from rce.protocol.assembler import Assembler, Binary
-from rce.protocol.calls import CallId, call_at, call_of
-from rce.protocol.exceptions import ProtocolError
+from rce.protocol.calls import call_at, call_of
+from rce.protocol.exceptions import MessageError, ProtocolError
 from rce.protocol.limits import DEFAULT_LIMITS, Limits
-from rce.protocol.messages import (
-    DOWNWARD,
-    UPWARD,
-    ClientMessage,
-    DataMessage,
-)
+from rce.protocol.messages import DOWNWARD, UPWARD, CallId, ClientMessage, DataMessage, ErrorReport
 from rce.protocol.reading import (
     SerializedData,
     check_depth,
@@ -42,25 +38,41 @@ if TYPE_CHECKING:
 
 
 class Fault(Struct, frozen=True):
-    """Something from the peer was refused or dropped; the stream goes on."""
+    """A message of the peer was refused or dropped; the stream continues."""
 
-    text: str
-    """Fit to be sent to the peer as ``ER``; it starts with the call, if there is one."""
+    problem: str
+    """The fault, without the call."""
     call: CallId | None = None
     """The service call that ends with this, because its request or its answer is lost."""
+    fields: tuple[FieldFault, ...] = ()
+    """The faults of a request."""
 
     @classmethod
-    def of(cls, problem: str, call: CallId | None) -> Self:
-        """Make the fault of a message, which is a service call's or not."""
-        return cls(problem if call is None else f"{call}: {problem}", call)
+    def of(cls, error: ProtocolError, call: CallId | None) -> Self:
+        """Make the fault of a message, of a service call or not."""
+        fields = error.faults if isinstance(error, MessageError) else ()
+        return cls(str(error), call, tuple(field for field in fields if field.path))
+
+    @property
+    def report(self) -> ErrorReport:
+        """The report to the peer."""
+        if not self.fields:
+            return ErrorReport(problem=self.problem, call=self.call)
+        first = self.fields[0]
+        return ErrorReport(problem=self.problem, call=self.call, path=first.path, code=first.code)
+
+    @property
+    def text(self) -> str:
+        """The text for users."""
+        return self.report.text
 
 
 class LargeData(Struct, frozen=True):
     """A data message that takes too long to be parsed where it came in.
 
-    :func:`rce.protocol.large.read_large` parses it. It is given out as it came. If it turns out to refer to
-    binary values, give their ids to :meth:`ProtocolStream.await_binaries`; it comes out again when they are
-    there.
+    :func:`rce.protocol.large.read_large` parses it. The stream returns it unparsed. If it turns out to refer
+    to binary values, give their ids to :meth:`ProtocolStream.await_binaries`; the stream returns it again
+    when these have come.
     """
 
     address: Address
@@ -80,11 +92,11 @@ class LargeData(Struct, frozen=True):
 
 
 Event: TypeAlias = ClientMessage | LargeData | Fault
-"""What comes out of a stream."""
+"""An output of a stream."""
 
 
 class _Serialized:
-    """A data message that waits for its one binary value; most that Forwarders get is such."""
+    """A data message that waits for its one binary value, as most messages of Forwarders do."""
 
     __slots__ = ("_data", "holder")
 
@@ -100,7 +112,7 @@ class _Serialized:
     def message(self) -> DataMessage:
         """Return the message with the bytes that were put into ``holder``."""
         data = self._data
-        return DataMessage(data.i_tag, data.type, self.holder[0], data.msg_id, data.latch)
+        return DataMessage(data.i_tag, data.message_type, self.holder[0], data.msg_id, data.latch)
 
 
 class _WaitingLarge:
@@ -125,7 +137,7 @@ class _WaitingLarge:
 class ProtocolStream:
     """Reads one peer's frames.
 
-    Never raises for what the peer sends: what is wrong comes out as :class:`Fault`, and nothing else is lost.
+    It never raises for input of the peer: faults are returned as :class:`Fault`, and nothing else is lost.
     Binary values in messages are memoryviews of the frames they came in.
     """
 
@@ -145,17 +157,17 @@ class ProtocolStream:
 
     @classmethod
     def for_engine(cls, limits: Limits = DEFAULT_LIMITS, *, single: bool = False) -> Self:
-        """Make the engine's side, which reads what clients send, and leaves large messages to others.
+        """Make the engine's side, which reads messages of clients, and returns large ones unparsed.
 
         Args:
-            limits: How much is taken.
+            limits: Limits on the peer's data.
             single: Whether the client may send messages in one frame; see :mod:`rce.protocol.single`.
         """
         return cls(UPWARD, limits, defer_large=True, single=single)
 
     @classmethod
     def for_client(cls, limits: Limits = DEFAULT_LIMITS, *, single: bool = False) -> Self:
-        """Make the client's side, which reads what the engine sends; the arguments are the same."""
+        """Make the client's side, which reads messages of the engine; the arguments are the same."""
         return cls(DOWNWARD, limits, single=single)
 
     @property
@@ -170,7 +182,7 @@ class ProtocolStream:
 
     @property
     def next_deadline(self) -> float | None:
-        """When :meth:`expire` has something to do next, if ever."""
+        """When :meth:`expire` must be called next; None if nothing waits."""
         return self._assembler.next_deadline
 
     def feed(self, frame: str | bytes, now: float) -> list[Event]:
@@ -183,7 +195,7 @@ class ProtocolStream:
         Args:
             text: Its text, or its UTF-8.
             now: Seconds on the caller's clock.
-            light: What :func:`~rce.protocol.weight.is_light` says of it; None if nobody has asked yet.
+            light: The result of :func:`~rce.protocol.weight.is_light`; None if it is not known yet.
         """
         if len(text) > self._limits.max_text:
             return [self._too_long(text)]
@@ -219,14 +231,14 @@ class ProtocolStream:
                 return [message_from_json(value, self._accept)]
             complete, dropped = self._assembler.add_message(value, len(text), now)
         except ProtocolError as error:
-            return [Fault.of(str(error), call_of(value))]
+            return [Fault.of(error, call_of(value))]
         return self._events(value if complete else None, dropped)
 
     def await_binaries(self, large: LargeData, ids: Collection[str], now: float) -> list[Event]:
-        """Have a large message wait for the binary values that it refers to.
+        """Keep a large message until the binary values that it refers to have come.
 
         Args:
-            large: As it came out.
+            large: The message, as the stream returned it.
             ids: The ids that were found in it, in order.
             now: Seconds on the caller's clock.
         """
@@ -236,7 +248,7 @@ class ProtocolStream:
                 waiting, ids, waiting.binaries, len(large.text), now
             )
         except ProtocolError as error:
-            return [Fault.of(str(error), waiting.call)]
+            return [Fault.of(error, waiting.call)]
         return self._events(waiting if complete else None, dropped)
 
     def feed_binary(self, frame: Binary, now: float) -> list[Event]:
@@ -266,10 +278,10 @@ class ProtocolStream:
             value = {"type": "DM", "data": message}
             return message_from_json(value, self._accept)
         except ProtocolError as error:
-            return Fault.of(str(error), call_of(value))
+            return Fault.of(error, call_of(value))
 
     def expire(self, now: float) -> list[Event]:
-        """Drop what has been incomplete for too long."""
+        """Drop messages that have been incomplete for too long."""
         return [_fault(dropped) for dropped in self._assembler.expire(now)]
 
     def drop_oldest(self, size: int) -> list[Event]:
@@ -277,7 +289,7 @@ class ProtocolStream:
         return [_fault(dropped) for dropped in self._assembler.drop_oldest(size)]
 
     def _events(self, value: Any, dropped: list[Dropped]) -> list[Event]:
-        """Make the events of a complete message, if there is one, and of what had to be dropped for it."""
+        """Make the events of a complete message, if there is one, and of dropped items."""
         events: list[Event] = [_fault(one) for one in dropped] if dropped else []
         if value is not None:
             events.append(self._message(value))
@@ -286,7 +298,7 @@ class ProtocolStream:
     def _too_long(self, text: str | bytes) -> Fault:
         limit = self._limits.max_text
         address = find_address(text) if isinstance(text, bytes) else None
-        return Fault.of(
+        return Fault(
             f"a text frame of {len(text)} is longer than the limit of {limit}",
             None if address is None else call_at(address.i_tag, address.msg_id),
         )
@@ -307,20 +319,20 @@ class ProtocolStream:
         try:
             return message_from_json(value, self._accept)
         except ProtocolError as error:
-            return Fault.of(str(error), call_of(value))
+            return Fault.of(error, call_of(value))
 
 
 def _fault(dropped: Dropped) -> Fault:
-    """Tell of what will not become a message."""
+    """Return the fault of a dropped item."""
     value = dropped.value
-    return Fault.of(
+    return Fault(
         dropped.text, value.call if isinstance(value, (_Serialized, _WaitingLarge)) else call_of(value)
     )
 
 
 def _may_be_starred(text: str | bytes) -> bool:
-    """Tell whether a key may end in a star, written plainly or as an escape."""
-    # One character is found ten times as fast as two, and most messages hold neither.
+    """Return whether a key may end in a star, written plainly or as an escape."""
+    # Searching for one character is ten times as fast as for two, and most messages hold neither.
     if isinstance(text, str):
         return ("*" in text and '*"' in text) or ("\\" in text and "\\u002" in text)
     return (b"*" in text and b'*"' in text) or (b"\\" in text and b"\\u002" in text)

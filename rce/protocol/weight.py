@@ -1,8 +1,8 @@
-"""How costly a JSON text is to parse, found by scans in C that make no objects.
+"""Estimates the cost of parsing a JSON text, by scans in C that make no objects.
 
-A text is *light* if parsing it, and converting what it holds, takes a few milliseconds at most. What is not
-light is parsed elsewhere than in an event loop. The measures count bytes, also those inside strings: a light
-text is light, a heavy one may turn out not to be.
+A text is *light* if parsing and converting it takes a few milliseconds at most. Other texts are parsed
+outside the event loop. The estimate counts bytes, also those inside strings: a text that counts as light is
+light; one that counts as heavy may turn out to be light.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 _SHORT = 8 << 10
-"""Bytes up to which a text is light whatever it holds."""
+"""Bytes up to which every text is light."""
 _SLICE = 64 << 10
 """Bytes that are counted at a time."""
 _CHECKED = 256 << 10
@@ -33,9 +33,9 @@ _ANY_CHARACTERS = 1 << 20
 _MAX_LIGHT = 12 << 20
 
 _EDGE = 4096
-"""Where the small values of a large message are: before its one large value, or after it."""
+"""Bytes at each end of a large message that hold its small values, before or after its one large value."""
 _TAG = re.compile(rb'"iTag"\s*:\s*"([^"\\]{1,256})"')
-_CLASS = re.compile(rb'"type"\s*:\s*"([^"\\]{1,256}/[^"\\]{1,256})"')
+_MESSAGE_TYPE = re.compile(rb'"type"\s*:\s*"([^"\\]{1,256}/[^"\\]{1,256})"')
 _MSG_ID = re.compile(rb'"msgID"\s*:\s*"?([^"\\,}]{1,255})')
 _LATCH = re.compile(rb'"latch"\s*:\s*"([^"\\]{1,64})"')
 _MSG = re.compile(rb'"msg\*?"\s*:')
@@ -43,10 +43,10 @@ _STRING = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+"', re.DOTALL)
 
 
 class Address(NamedTuple):
-    """Where a data message goes, as its text seems to tell."""
+    """The address of a data message, as found in its text without parsing."""
 
     i_tag: str
-    type: str = ""
+    message_type: str = ""
     """Empty if it was not found."""
     msg_id: str = NO_ID
     latch: str = ""
@@ -54,7 +54,7 @@ class Address(NamedTuple):
 
 
 def is_light(text: bytes) -> bool:
-    """Tell whether a text can be parsed and converted within a few milliseconds."""
+    """Return whether a text can be parsed and converted within a few milliseconds."""
     size = len(text)
     if size <= _SHORT:
         return True
@@ -85,7 +85,7 @@ def utf8_in_steps(text: bytes) -> Iterator[bool]:
 
 
 def check_elements(text: bytes, *, max_elements: int, max_values: int) -> None:
-    """Check how much a text holds, before anything is made of it.
+    """Check how much a text holds, before it is parsed.
 
     Args:
         text: JSON in UTF-8.
@@ -97,7 +97,7 @@ def check_elements(text: bytes, *, max_elements: int, max_values: int) -> None:
     """
     elements, values = _count(text)
     if elements > max_elements or values > max_values:
-        elements, values = _count(_STRING.sub(b'""', text))  # what stands in strings is text
+        elements, values = _count(_STRING.sub(b'""', text))  # braces and commas inside strings do not count
     if elements > max_elements:
         raise MessageError(
             "",
@@ -113,20 +113,20 @@ def check_elements(text: bytes, *, max_elements: int, max_values: int) -> None:
 
 
 def find_address(text: bytes) -> Address | None:
-    """Find where a large data message goes without parsing it.
+    """Find the address of a large data message without parsing it.
 
     All values of a data message but ``msg`` are short, so they stand near the beginning or near the end of
     the text, whatever the order of its keys.
 
     Returns:
-        What seems to be the address; whoever parses the text must compare. ``None``: it has none there.
+        The probable address, to be compared when the text is parsed. ``None``: it was not found there.
     """
     head, tail = text[:_EDGE], text[-_EDGE:]
     msg = _MSG.search(head)
     head = head[: msg.start()] if msg is not None else head
-    tag, type_, msg_id = (_find(pattern, head, tail) for pattern in (_TAG, _CLASS, _MSG_ID))
+    tag, message_type, msg_id = (_find(pattern, head, tail) for pattern in (_TAG, _MESSAGE_TYPE, _MSG_ID))
     latch = _find(_LATCH, head, b"")
-    return Address(tag, type_, msg_id or NO_ID, latch) if tag else None
+    return Address(tag, message_type, msg_id or NO_ID, latch) if tag else None
 
 
 def _find(pattern: re.Pattern[bytes], head: bytes, tail: bytes) -> str:
@@ -136,7 +136,7 @@ def _find(pattern: re.Pattern[bytes], head: bytes, tail: bytes) -> str:
 
 
 def _has_at_most(text: bytes, character: bytes, most: int) -> bool:
-    """Count a character, but not further than needed."""
+    """Count a character, up to a limit."""
     count, place = 0, text.find(character)
     while place >= 0 and count < _FEW:
         count += 1
@@ -151,6 +151,6 @@ def _has_at_most(text: bytes, character: bytes, most: int) -> bool:
 
 
 def _count(text: bytes) -> tuple[int, int]:
-    """Return the objects, lists and members of a text, and its values, if nothing stands in strings."""
+    """Return how many objects, lists and members, and how many values, a text without strings has."""
     openers = text.count(b"[") + text.count(b"{")
     return openers + text.count(b":"), openers + text.count(b",") + 1

@@ -1,8 +1,8 @@
-"""ROS 1 on the wire, with no ROS installed.
+"""ROS 1 on the wire, without a ROS installation.
 
 - :mod:`rce.ros.types`: message and service types, their checksums and serialization;
 - :mod:`rce.ros.packages`, :mod:`rce.ros.substitution`: folders of nodes and definitions, ``$(find PKG)``;
 - :mod:`rce.ros.core`: the Master API and the parameter server;
 - :mod:`rce.ros.tcpros`: connections of topics and services;
-- :mod:`rce.ros.node`: :class:`~rce.ros.node.Node`, the way to write a node.
+- :mod:`rce.ros.node`: :class:`~rce.ros.node.Node`, for writing nodes.
 """

@@ -11,16 +11,16 @@ from rce.dialing import connect_first, resolve
 _log = logging.getLogger(__name__)
 
 SLOW = 3.0
-"""Seconds after which a name that is still looked up is told of."""
+"""Seconds after which a name that is still being looked up is logged."""
 
 MAX_TOLD = 1024
-"""How many names are remembered as told of."""
+"""How many names are remembered as logged."""
 
 _told: dict[str, None] = {}
-"""Names that were told of and have not been resolved since, the oldest first."""
+"""Names that were logged and have not been resolved since, the oldest first."""
 
 
-class UnresolvedHost(OSError):  # noqa: N818 - named as the errors of rce.ros are
+class UnresolvedHostError(OSError):
     """A host name that nodes or masters gave cannot be resolved here.
 
     Attributes:
@@ -35,11 +35,11 @@ class UnresolvedHost(OSError):  # noqa: N818 - named as the errors of rce.ros ar
 async def open_peer_socket(host: str, port: int) -> socket.socket:
     """Connect to a node or master as :func:`rce.dialing.open_socket` does.
 
-    A name that cannot be resolved is told of in the log, once until it can be.
+    A name that cannot be resolved is logged once until it can be.
 
     Raises:
-        UnresolvedHost: The name cannot be resolved.
-        OSError: Nobody answers.
+        UnresolvedHostError: The name cannot be resolved.
+        OSError: No address answers.
     """
     slow = asyncio.get_running_loop().call_later(SLOW, _tell, host, f"no answer within {SLOW:g} s")
     try:
@@ -47,7 +47,7 @@ async def open_peer_socket(host: str, port: int) -> socket.socket:
     except (socket.gaierror, UnicodeError) as error:
         reason = error.strerror if isinstance(error, socket.gaierror) else str(error)
         _tell(host, reason or "no reason given")
-        raise UnresolvedHost(host, reason or "no reason given") from error
+        raise UnresolvedHostError(host, reason or "no reason given") from error
     finally:
         slow.cancel()
     _told.pop(host, None)

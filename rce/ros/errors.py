@@ -1,27 +1,27 @@
-"""Everything that can go wrong on a ROS graph.
+"""Errors of a ROS graph.
 
 ::
 
     RosError
-    +-- InvalidName             a graph name or remapping that ROS does not allow (also a ValueError)
-    +-- XmlRpcError             talking XML-RPC
-    |   +-- MalformedDocument   what came or should go is not acceptable XML-RPC
-    |   +-- RemoteFault         the server answered with a fault
-    |   +-- RpcUnreachable      no answer: refused, lost or timed out
+    +-- InvalidNameError            a graph name or remapping that ROS does not allow (also a ValueError)
+    +-- XmlRpcError                 an XML-RPC exchange failed
+    |   +-- MalformedDocumentError  a received document, or a value to send, is not valid XML-RPC
+    |   +-- RemoteFaultError        the server answered with a fault
+    |   +-- RpcUnreachableError     no answer: refused, lost or timed out
     +-- MasterError
-    |   +-- MasterUnreachable   the master gave no answer
-    |   +-- MasterRefused       the master answered that it could not or would not
-    +-- ParameterMissing        no such parameter (also a KeyError)
-    +-- TcprosError             talking TCPROS
-    |   +-- MalformedFrame      a header or length that breaks the protocol
-    |   +-- HandshakeRefused    the two ends do not agree on type or name
-    +-- TypeMismatch            one topic or service used with two types in one node
-    +-- ServiceError            a service call that has no response
-    |   +-- ServiceNotFound     nobody provides the service
-    |   +-- ServiceLost         the provider could not be reached or went away before it answered
-    |   +-- ServiceFault        the provider answered with an error; handlers raise it to do so
-    |   +-- ServiceTimeout      no answer in time (also a TimeoutError)
-    +-- NodeClosed              the node was used before it started or after it ended
+    |   +-- MasterUnreachableError  the master gave no answer
+    |   +-- MasterRefusedError      the master answered with a status other than success
+    +-- ParameterMissingError       no such parameter (also a KeyError)
+    +-- TcprosError                 a TCPROS connection cannot continue
+    |   +-- MalformedFrameError     a header or length that breaks the protocol
+    |   +-- HandshakeRefusedError   the two ends do not agree on type or name
+    +-- TypeMismatchError           one topic or service used with two types in one node
+    +-- ServiceError                a service call got no response
+    |   +-- ServiceNotFoundError    the service has no provider
+    |   +-- ServiceLostError        the provider could not be reached or went away before it answered
+    |   +-- ServiceFaultError       the provider answered with an error; handlers raise it to do so
+    |   +-- ServiceTimeoutError     no answer in time (also a TimeoutError)
+    +-- NodeClosedError             the node was used before it started or after it ended
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class RosError(Exception):
     """Base of all errors of :mod:`rce.ros`."""
 
 
-class InvalidName(RosError, ValueError):  # noqa: N818
+class InvalidNameError(RosError, ValueError):
     """A graph name or remapping that ROS does not allow."""
 
 
@@ -39,16 +39,16 @@ class XmlRpcError(RosError):
     """An XML-RPC exchange failed."""
 
 
-class MalformedDocument(XmlRpcError):  # noqa: N818
+class MalformedDocumentError(XmlRpcError):
     """A document is not XML-RPC, breaks a limit, or a value has no XML-RPC form."""
 
 
-class RemoteFault(XmlRpcError):  # noqa: N818
+class RemoteFaultError(XmlRpcError):
     """The server answered with a fault.
 
     Attributes:
         code: The server's fault code.
-        text: The server's words.
+        text: The server's text.
     """
 
     def __init__(self, code: int, text: str) -> None:
@@ -60,11 +60,11 @@ class RemoteFault(XmlRpcError):  # noqa: N818
         return f"fault {self.code}: {self.text}"
 
 
-class RpcUnreachable(XmlRpcError):  # noqa: N818
+class RpcUnreachableError(XmlRpcError):
     """No answer came from a server.
 
     Attributes:
-        uri: Who was called.
+        uri: The server's URI.
         reason: Why there is no answer.
     """
 
@@ -81,7 +81,7 @@ class MasterError(RosError):
     """The ROS master could not be used."""
 
 
-class MasterUnreachable(MasterError):  # noqa: N818
+class MasterUnreachableError(MasterError):
     """The ROS master gave no answer.
 
     Attributes:
@@ -98,13 +98,13 @@ class MasterUnreachable(MasterError):  # noqa: N818
         return f"the ROS master at {self.uri} does not answer: {self.reason}"
 
 
-class MasterRefused(MasterError):  # noqa: N818
+class MasterRefusedError(MasterError):
     """The ROS master answered with a status other than success.
 
     Attributes:
-        method: What was asked.
+        method: The method that was called.
         status: -1 for a caller's mistake, 0 for a failure of the master.
-        text: The master's words.
+        text: The master's text.
     """
 
     def __init__(self, method: str, status: int, text: str) -> None:
@@ -117,7 +117,7 @@ class MasterRefused(MasterError):  # noqa: N818
         return f"{self.method}: {self.text}"
 
 
-class ParameterMissing(RosError, KeyError):  # noqa: N818
+class ParameterMissingError(RosError, KeyError):
     """No such parameter on the parameter server.
 
     Attributes:
@@ -133,18 +133,18 @@ class ParameterMissing(RosError, KeyError):  # noqa: N818
 
 
 class TcprosError(RosError):
-    """A TCPROS connection cannot go on."""
+    """A TCPROS connection cannot continue."""
 
 
-class MalformedFrame(TcprosError):  # noqa: N818
+class MalformedFrameError(TcprosError):
     """A connection header or frame length that breaks the protocol or a limit."""
 
 
-class HandshakeRefused(TcprosError):  # noqa: N818
+class HandshakeRefusedError(TcprosError):
     """The two ends of a connection do not agree; the text says on what."""
 
 
-class TypeMismatch(RosError):  # noqa: N818
+class TypeMismatchError(RosError):
     """One topic or service is used with two types in the same node."""
 
 
@@ -167,30 +167,30 @@ class ServiceError(RosError):
         return f"service {self.service}: {self.text}"
 
 
-class ServiceNotFound(ServiceError):  # noqa: N818
-    """Nobody provides the service."""
+class ServiceNotFoundError(ServiceError):
+    """The service has no provider."""
 
-    text = "nobody provides it"
+    text = "it has no provider"
 
 
-class ServiceLost(ServiceError):  # noqa: N818
+class ServiceLostError(ServiceError):
     """The provider could not be reached, or its connection broke before the answer."""
 
     text = "the provider went away"
 
 
-class ServiceTimeout(ServiceError, TimeoutError):  # noqa: N818
+class ServiceTimeoutError(ServiceError, TimeoutError):
     """No answer came in time."""
 
     text = "no answer in time"
 
 
-class ServiceFault(ServiceError):  # noqa: N818
+class ServiceFaultError(ServiceError):
     """The provider answered with an error.
 
-    A service handler raises ``ServiceFault(service, text)`` to answer its caller with ``text``.
+    A service handler raises ``ServiceFaultError(service, text)`` to answer its caller with ``text``.
     """
 
 
-class NodeClosed(RosError):  # noqa: N818
+class NodeClosedError(RosError):
     """The node was used before it started or after it ended."""

@@ -65,8 +65,8 @@ class ExecutableFinder:
 
 
 def is_executable(file: str | Path) -> bool:
-    """Tell whether a path is a file that this user may execute."""
-    # Not pathlib's question: it raises where a folder may not be entered.
+    """Return whether a path is a file that this user may execute."""
+    # Not pathlib's method: it raises if a folder may not be entered.
     return os.path.isfile(file) and os.access(file, os.R_OK | os.X_OK)  # noqa: PTH113
 
 

@@ -1,4 +1,4 @@
-"""Files of log records, where a ROS installation has them: rotated, and never a reason to fail."""
+"""Files of log records, in the folders of a ROS installation: rotated; a failure to write never raises."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LATEST = "latest"
 
 
 def log_folder(environ: Mapping[str, str]) -> Path:
-    """Return where programs of ROS put their logs.
+    """Return the folder for the logs of ROS programs.
 
     That is ``ROS_LOG_DIR``, or ``log`` in ``ROS_HOME``, or ``~/.ros/log``.
     """
@@ -25,9 +25,9 @@ def log_folder(environ: Mapping[str, str]) -> Path:
 
 
 class LogFile(RotatingFileHandler):
-    """A file that is cut when it becomes large: ``x.log``, then ``x.log.1`` and so on, the oldest last.
+    """A file that is rotated when it becomes large: ``x.log``, then ``x.log.1`` and so on, the oldest last.
 
-    A disk that is full, for instance, is told of once; what cannot be written is lost then.
+    A failure, for instance because the disk is full, is reported once; unwritten records are lost.
     """
 
     def __init__(self, path: Path, form: str, *, max_bytes: int, backups: int) -> None:
@@ -48,14 +48,14 @@ class LogFile(RotatingFileHandler):
         self._complained = False
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: ARG002, N802
-        """Tell that a record was not written, the first time."""
+        """Report that a record was not written, the first time only."""
         if not self._complained:
             self._complained = True
             _log.warning("%s: records are lost", self.baseFilename, exc_info=True)
 
 
 def mark_latest(folder: Path) -> None:
-    """Let ``latest`` beside a run's folder point at it, as ``roslaunch`` does; a file of that name stays."""
+    """Make ``latest`` beside a run's folder point at it, as ``roslaunch`` does; a file of that name stays."""
     link = folder.with_name(LATEST)
     try:
         if link.is_symlink():

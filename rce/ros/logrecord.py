@@ -1,6 +1,6 @@
 """Log records of ROS nodes as they are on the wire (``rosgraph_msgs/Log``) and in ROS's log files.
 
-Read by hand: whoever only keeps records need not load the message type. Pure.
+Parsed by hand: programs that only keep records need not load the message type. Pure.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _WORD = struct.Struct("<I")
 
 
 class Level(IntEnum):
-    """How serious a record is."""
+    """The severity of a record."""
 
     DEBUG = 1
     INFO = 2
@@ -36,7 +36,7 @@ class LogRecord(NamedTuple):
     secs: int
     nsecs: int
     level: int
-    """A :class:`Level`, unless the node made one up."""
+    """A :class:`Level`, or any number that the node chose."""
     name: str
     """The node's global name."""
     text: str
@@ -44,11 +44,11 @@ class LogRecord(NamedTuple):
     function: str
     line: int
     topics: tuple[str, ...]
-    """What the node publishes."""
+    """The topics that the node publishes."""
 
     @property
     def level_name(self) -> str:
-        """The level in capitals, or its number if it is none of ROS's."""
+        """The level in capitals, or its number if it is not one of ROS's."""
         return _NAMES.get(self.level) or str(self.level)
 
     def in_file(self) -> str:
@@ -65,15 +65,15 @@ class LogRecord(NamedTuple):
 
 
 def started(seconds: float) -> str:
-    """What ROS's ``rosout`` node writes to its file when it starts, at that many seconds since the epoch."""
+    """Return the first line of ROS's ``rosout`` node when it starts, at that many seconds since the epoch."""
     return f"\n\n{seconds:.9f}  Node Startup\n"
 
 
 def read_record(payload: bytes | memoryview) -> LogRecord:
-    """Read a record; what is no UTF-8 in it is replaced.
+    """Read a record; bytes that are not UTF-8 are replaced.
 
     Raises:
-        ValueError: It is not one.
+        ValueError: The data is not a record.
     """
     try:
         return _Reader(payload).record()

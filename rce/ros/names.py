@@ -4,7 +4,7 @@ The rules are those of http://wiki.ros.org/Names and http://wiki.ros.org/Remappi
 
 - ``/global`` stands for itself, ``relative`` is in the node's namespace, ``~private`` below the node's name;
 - ``FROM:=TO`` renames, after both sides have been resolved;
-- ``__key:=value`` sets something of the node itself; ``_param:=value`` sets a private parameter.
+- ``__key:=value`` sets an attribute of the node itself; ``_param:=value`` sets a private parameter.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from rce.ros.errors import InvalidName
+from rce.ros.errors import InvalidNameError
 
 SEPARATOR = "/"
 PRIVATE = "~"
@@ -24,22 +24,22 @@ _BASE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
 def is_graph_name(name: str) -> bool:
-    """Tell whether ``name`` is a legal global, relative or private name."""
+    """Return whether ``name`` is a legal global, relative or private name."""
     return _GRAPH_NAME.fullmatch(name) is not None and "//" not in name
 
 
 def is_base_name(name: str) -> bool:
-    """Tell whether ``name`` is a legal name without any namespace, as nodes have it."""
+    """Return whether ``name`` is a legal name without any namespace, as nodes have it."""
     return _BASE_NAME.fullmatch(name) is not None
 
 
 def is_global(name: str) -> bool:
-    """Tell whether ``name`` stands for itself."""
+    """Return whether ``name`` is global."""
     return name.startswith(SEPARATOR)
 
 
 def is_private(name: str) -> bool:
-    """Tell whether ``name`` lives below a node's name."""
+    """Return whether ``name`` is private, below a node's name."""
     return name.startswith(PRIVATE)
 
 
@@ -66,13 +66,13 @@ def join(namespace: str, name: str) -> str:
 
 
 def namespace_of(name: str) -> str:
-    """Return the namespace that a global name lives in, with a trailing slash: ``/a/`` for ``/a/b``."""
+    """Return the namespace of a global name, with a trailing slash: ``/a/`` for ``/a/b``."""
     head, _, _ = name.rstrip(SEPARATOR).rpartition(SEPARATOR)
     return head + SEPARATOR
 
 
 def resolve(name: str, caller: str) -> str:
-    """Make ``name`` global the way the node ``caller`` (a global node name) means it, without remappings."""
+    """Make ``name`` global, as seen from the node ``caller`` (a global node name), without remappings."""
     if not name:
         return canonical(namespace_of(caller))
     if is_global(name):
@@ -84,7 +84,7 @@ def resolve(name: str, caller: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Arguments:
-    """A command line taken apart."""
+    """A parsed command line."""
 
     remappings: Mapping[str, str] = field(default_factory=dict)
     """``FROM:=TO``, as written."""
@@ -93,11 +93,11 @@ class Arguments:
     parameters: Mapping[str, str] = field(default_factory=dict)
     """``_name:=value``: private parameters, the name without its underscore, the value as written."""
     rest: tuple[str, ...] = ()
-    """What is no remapping: the program's own arguments."""
+    """Arguments that are not remappings: the program's own."""
 
 
 def parse_arguments(argv: Iterable[str]) -> Arguments:
-    """Take a command line apart. An argument with no usable name before ``:=`` belongs to the program."""
+    """Parse a command line. An argument without a valid name before ``:=`` belongs to the program."""
     remappings: dict[str, str] = {}
     specials: dict[str, str] = {}
     parameters: dict[str, str] = {}
@@ -130,16 +130,18 @@ class Resolver:
 
         Args:
             base_name: The node's name without namespace.
-            namespace: Where the node lives; made global when it is not.
+            namespace: The node's namespace; made global if it is not.
             remappings: ``{from: to}``, as given on a command line.
 
         Raises:
-            InvalidName: One of the names is not legal.
+            InvalidNameError: One of the names is not legal.
         """
         if not is_base_name(base_name):
-            raise InvalidName(f"{base_name!r} cannot name a node: letters, digits and _ only, a letter first")
+            raise InvalidNameError(
+                f"{base_name!r} cannot name a node: letters, digits and _ only, a letter first"
+            )
         if namespace and not is_graph_name(namespace):
-            raise InvalidName(f"{namespace!r} is not a legal namespace")
+            raise InvalidNameError(f"{namespace!r} is not a legal namespace")
         root = canonical(SEPARATOR + namespace)
         self.namespace = root if root == SEPARATOR else root + SEPARATOR
         self.node_name = self.namespace + base_name
@@ -151,12 +153,12 @@ class Resolver:
         """Make ``name`` global and apply the remappings.
 
         Raises:
-            InvalidName: ``name`` is not a legal graph name.
+            InvalidNameError: ``name`` is not a legal graph name.
         """
         globally = self._globally(name)
         return self._remappings.get(globally, globally)
 
     def _globally(self, name: str) -> str:
         if not is_graph_name(name):
-            raise InvalidName(f"{name!r} is not a legal graph name")
+            raise InvalidNameError(f"{name!r} is not a legal graph name")
         return resolve(name, self.node_name)

@@ -1,9 +1,9 @@
-"""Which packages are below a folder of the package path, searched in depth as rospack does.
+"""Search for packages below a folder of the package path, in depth as rospack does.
 
-A folder with a manifest is a package, and what is below it is not searched. Folders that hold a file of
-:data:`IGNORE_MARKS` are left out with all below; those with :data:`NO_SUBFOLDERS` end the search there;
-hidden folders are left out. Symbolic links are followed, each folder once, so that loops end. Of two packages
-of one name the one nearer to the root counts, then the first by the alphabet.
+A folder with a manifest is a package, and folders below it are not searched. Folders that hold a file of
+:data:`IGNORE_MARKS` are left out with their subfolders; those with :data:`NO_SUBFOLDERS` end the search
+there; hidden folders are left out. Symbolic links are followed, each folder once, so that loops end. Of two
+packages of one name the one nearer to the root counts, then the first by the alphabet.
 
 A search is remembered for as long as no folder or manifest that it looked at has changed: a package that is
 added or renamed later is found.
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 IGNORE_MARKS = ("CATKIN_IGNORE", "AMENT_IGNORE", "COLCON_IGNORE")
-"""Files that take a folder and all below out of the search."""
+"""Files that exclude a folder and its subfolders from the search."""
 
 NO_SUBFOLDERS = "rospack_nosubdirs"
 """File that ends the search below a folder."""
@@ -39,11 +39,11 @@ CHECK_SHARE = 10
 """A check of a larger search is good for this many times as long as it took: it takes a tenth of the time."""
 
 Stamp = tuple[int, int, int, int]
-"""What changes with a folder or file: device, inode, time of the last change, size."""
+"""Identifies a version of a folder or file: device, inode, time of the last change, size."""
 
 
 class _Found(NamedTuple):
-    """The result of a search and what it depends on."""
+    """The result of a search and its dependencies."""
 
     packages: dict[str, Path]
     stamps: dict[str, Stamp | None]
@@ -56,7 +56,7 @@ class PackageTree:
     Args:
         root: The folder; if it is a package itself, it is the only one.
         manifests: Names of files that make a folder a package.
-        name_of: Tells the name of the package in a folder.
+        name_of: Returns the name of the package in a folder.
     """
 
     def __init__(self, root: Path, manifests: tuple[str, ...], name_of: Callable[[Path], str]) -> None:
@@ -64,7 +64,7 @@ class PackageTree:
         self.searches = 0
         """How often the folders were searched."""
         self.checks = 0
-        """How often they were looked at for changes."""
+        """How often they were checked for changes."""
         self._manifests = manifests
         self._name_of = name_of
         self._names: dict[str, tuple[Stamp | None, str]] = {}
@@ -124,7 +124,7 @@ class PackageTree:
         try:
             with os.scandir(path) as scan:
                 entries = {entry.name: entry for entry in scan}
-        except OSError:  # as if it were empty: it may not be read, or it has just gone
+        except OSError:  # treated as empty: it may not be read, or was just removed
             return []
         if any(mark in entries for mark in IGNORE_MARKS):
             return []
@@ -156,7 +156,7 @@ def _is(entry: os.DirEntry[str], question: Callable[[os.DirEntry[str]], bool]) -
 
 
 def stamp_of(path: str) -> Stamp | None:
-    """Return what tells whether a folder or file has changed; None if there is none."""
+    """Return the stamp of a folder or file, which changes with it; None if it does not exist."""
     try:
         found = os.stat(path)  # noqa: PTH116 - thousands of times
     except OSError:

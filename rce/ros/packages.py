@@ -4,10 +4,10 @@ A package is a folder with a ``package.yaml`` (ours) or a ``package.xml`` (ROS's
 of the package path (:mod:`rce.ros.package_tree`), or one directly below that holds ``msg`` or ``srv`` folders
 only, as distributions install them. Its executables are files in the folder itself or in
 ``nodes``, ``scripts``, ``bin`` or ``lib`` below it; those of a package that is installed as
-``PREFIX/share/PKG`` are also in ``PREFIX/lib/PKG``. What is in none of these is looked for at any depth of
+``PREFIX/share/PKG`` are also in ``PREFIX/lib/PKG``. Executables in none of these are searched at any depth of
 the package's folder, as rosrun and roslaunch do (:mod:`rce.ros.executables`).
 
-An installed Python distribution adds packages and nodes by entry points; what is on the path goes before:
+An installed Python distribution adds packages and nodes by entry points; the path takes precedence:
 
 * group ``rce.packages``: named after a package; the value is the Python package whose folder it is.
 * group ``rce.nodes``: named ``PKG:EXE``; the value is a function, or a module that is run as a script.
@@ -50,7 +50,7 @@ FOLDERS = ("", "nodes", "scripts", "bin", "lib")
 """Folders below a package in which a node's file is looked for."""
 
 MANIFESTS = ("package.yaml", "package.xml")
-"""What a manifest may be called, the more important first."""
+"""Names of manifests, the more important first."""
 
 ROSBUILD_MANIFEST = "manifest.xml"
 """The manifest of packages from before catkin, which gives no name: the folder's counts."""
@@ -60,18 +60,18 @@ _PYTHONS = ("engine", "system")
 
 
 class PackageError(Exception):
-    """Base of what can go wrong with packages."""
+    """Base of all errors of packages."""
 
 
-class PackageNotFound(PackageError, LookupError):  # noqa: N818
-    """There is no package of a name on the path."""
+class PackageNotFoundError(PackageError, LookupError):
+    """A package was not found on the path."""
 
 
-class ExecutableNotFound(PackageError, LookupError):  # noqa: N818
+class ExecutableNotFoundError(PackageError, LookupError):
     """A package has no such executable, or it may not be executed."""
 
 
-class BadPackage(PackageError, ValueError):  # noqa: N818
+class BadPackageError(PackageError, ValueError):
     """A package's manifest cannot be read."""
 
 
@@ -84,34 +84,34 @@ class Package(NamedTuple):
     python: str = "system"
     """``engine``: .py files run with the engine's Python; ``system``: as their first line says."""
     version: str = ""
-    """As the manifest says it; empty if it does not."""
+    """As in the manifest; empty if it has none."""
 
     def executable(self, exe: str) -> list[str]:
-        """Return what to execute to start a node: the first words of its command line.
+        """Return the command that starts a node: the first words of its command line.
 
         Args:
             exe: Name of the file, with or without the folder below the package.
 
         Raises:
-            ExecutableNotFound: There is no such file, it may not be executed, or the name leads out of the
-            package.
+            ExecutableNotFoundError: The file does not exist, may not be executed, or the name leads out of
+            the package.
         """
         if not exe or exe.startswith("/") or "\0" in exe or ".." in PurePosixPath(exe).parts:
-            raise ExecutableNotFound(f"{exe!r} is not a file inside package {self.name}")
+            raise ExecutableNotFoundError(f"{exe!r} is not a file inside package {self.name}")
         files = [folder / exe for folder in self._folders()]
-        meant = [file for file in files if os.path.isfile(file)]  # noqa: PTH113 - pathlib's question may raise
+        meant = [file for file in files if os.path.isfile(file)]  # noqa: PTH113 - pathlib's method may raise
         for file in meant:
             if command := self._command(file):
                 return command
         if "/" not in exe and (found := _finder.find(self.path, exe)) is not None:
             return [str(found)]
         if meant:
-            raise ExecutableNotFound(f"{meant[0]} may not be executed (chmod +x makes it so)")
-        for name, target in _scripts(self.name):  # last, because all that is installed must be looked through
+            raise ExecutableNotFoundError(f"{meant[0]} may not be executed (chmod +x makes it so)")
+        for name, target in _scripts(self.name):  # last, because it searches all installed distributions
             if name == exe:
                 return [sys.executable, *_arguments_of(target)]
         where = ", ".join(str(folder) for folder in self._folders() if folder.is_dir())
-        raise ExecutableNotFound(
+        raise ExecutableNotFoundError(
             f"package {self.name} has no executable {exe!r} (looked in {where or self.path}, and below"
             f" {self.path} for one that may be executed)"
         )
@@ -123,7 +123,7 @@ class Package(NamedTuple):
             yield self.path.parent.parent / "lib" / self.name
 
     def _command(self, file: Path) -> list[str]:
-        """Return how to execute a file; empty if it may not be executed."""
+        """Return the command that executes a file; empty if it may not be executed."""
         if self.python == "engine" and file.suffix == ".py":
             return [sys.executable, str(file)]
         return [str(file)] if is_executable(file) else []
@@ -153,8 +153,8 @@ class PackageIndex:
         """Return the package of a name.
 
         Raises:
-            PackageNotFound: There is none on the path, and no distribution adds nodes under its name.
-            BadPackage: Its manifest cannot be read.
+            PackageNotFoundError: It is not on the path, and no distribution adds nodes under its name.
+            BadPackageError: Its manifest cannot be read.
         """
         folder = self.locate(name)
         if folder is not None:
@@ -164,13 +164,13 @@ class PackageIndex:
             return Package(name, _folder_of(scripts[0][1]), python="engine")
         closed = [str(root) for root in self.path if root.exists() and not os.access(root, os.R_OK | os.X_OK)]
         hint = f"; {os.pathsep.join(closed)} may not be read here" if closed else ""
-        raise PackageNotFound(f"no package {name!r} on the package path ({self.describe_path()}){hint}")
+        raise PackageNotFoundError(f"no package {name!r} on the package path ({self.describe_path()}){hint}")
 
     def locate(self, name: str) -> Path | None:
-        """Return the folder of a package, None if there is none on the path and no distribution has it.
+        """Return the folder of a package; None if it is neither on the path nor in a distribution.
 
         Raises:
-            BadPackage: A distribution names a folder that does not exist.
+            BadPackageError: A distribution names a folder that does not exist.
         """
         if _NAME.fullmatch(name) is None:
             return None
@@ -225,7 +225,7 @@ def _installed(share: Path, name: str) -> Path | None:
 
 
 def _holds_definitions(folder: Path) -> bool:
-    # Not pathlib's question: it raises where a folder may not be entered, and the other folders are to count.
+    # Not pathlib's method: it raises if a folder may not be entered, and the other folders must be searched.
     return any(os.path.isdir(folder / kind) for kind in ("msg", "srv", "action"))  # noqa: PTH112
 
 
@@ -260,7 +260,7 @@ def _declared_name(folder: Path) -> str:
     """Return the name in a manifest; empty if it gives none or cannot be read."""
     try:
         return _read_package(folder, "").name
-    except BadPackage:
+    except BadPackageError:
         return ""
 
 
@@ -271,7 +271,7 @@ def _read_package(folder: Path, name: str) -> Package:
     try:
         text = manifest.read_bytes()
     except OSError as error:
-        raise BadPackage(f"{manifest}: {error}") from error
+        raise BadPackageError(f"{manifest}: {error}") from error
     return parse_manifest(manifest, text, name)
 
 
@@ -279,12 +279,12 @@ def parse_manifest(manifest: Path, text: bytes, name: str) -> Package:
     """Read the text of a manifest.
 
     Args:
-        manifest: Where it is from; its suffix tells its kind.
-        text: What it holds.
+        manifest: Its path; the suffix tells its kind.
+        text: Its contents.
         name: The package's name if the manifest gives none.
 
     Raises:
-        BadPackage: It cannot be read.
+        BadPackageError: It cannot be read.
     """
     return (_parse_xml if manifest.suffix == ".xml" else _parse_yaml)(manifest, text, name)
 
@@ -295,22 +295,22 @@ def _parse_yaml(manifest: Path, text: bytes, name: str) -> Package:
     try:
         data = yaml.safe_load(text) or {}
     except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise BadPackage(f"{manifest}: {error}") from error
+        raise BadPackageError(f"{manifest}: {error}") from error
     if not isinstance(data, dict):
-        raise BadPackage(f"{manifest}: must hold 'key: value' lines")
+        raise BadPackageError(f"{manifest}: must hold 'key: value' lines")
     python = data.get("python", "engine")
     if python not in _PYTHONS:
-        raise BadPackage(
+        raise BadPackageError(
             f"{manifest}: python is {reprlib.repr(python)}, must be one of {', '.join(_PYTHONS)}"
         )
     declared = data.get("name", name)
     if declared != "" and (not isinstance(declared, str) or _NAME.fullmatch(declared) is None):
-        raise BadPackage(f"{manifest}: {reprlib.repr(declared)} is not a package name")
+        raise BadPackageError(f"{manifest}: {reprlib.repr(declared)} is not a package name")
     return Package(declared, manifest.parent, _text(data, "description"), python, _text(data, "version"))
 
 
 def _text(data: dict[Any, Any], key: str) -> str:
-    # Of anything else no text is made: a few lines of aliases may stand for a tree of any size.
+    # Other values are not converted to text: a few lines of aliases may expand to a tree of any size.
     found = data.get(key, "")
     return found if isinstance(found, str) else ""
 
@@ -321,7 +321,7 @@ def _parse_xml(manifest: Path, text: bytes, name: str) -> Package:
     try:
         root = ET.fromstring(text)  # noqa: S314  # expat limits what entities may become
     except (ET.ParseError, ValueError, LookupError) as error:
-        raise BadPackage(f"{manifest}: {error}") from error
+        raise BadPackageError(f"{manifest}: {error}") from error
     declared = (root.findtext("name") or name).strip()
     description = " ".join((root.findtext("description") or "").split())
     return Package(declared, manifest.parent, description, version=(root.findtext("version") or "").strip())
@@ -329,7 +329,7 @@ def _parse_xml(manifest: Path, text: bytes, name: str) -> Package:
 
 @cache
 def _distributed() -> Mapping[str, str]:
-    """Read which packages Python distributions add: name to Python package."""
+    """Return the packages that Python distributions add: name to Python package."""
     from importlib.metadata import entry_points
 
     return {point.name: point.value for point in entry_points(group=PACKAGE_ENTRY_POINTS)}
@@ -349,7 +349,7 @@ def _distributed_nodes() -> tuple[tuple[str, str, str], ...]:
 
 
 def _arguments_of(target: str) -> list[str]:
-    """Return what Python is given to run an entry point."""
+    """Return Python's arguments for running an entry point."""
     module, _, function = target.partition(":")
     if not function:
         return [str(_file_of(target))]
@@ -365,7 +365,7 @@ def _file_of(target: str) -> Path:
     try:
         spec = find_spec(module)
     except ImportError as error:
-        raise BadPackage(f"entry point {target}: {error}") from error
+        raise BadPackageError(f"entry point {target}: {error}") from error
     if spec is None or spec.origin is None or not spec.has_location:
-        raise BadPackage(f"entry point {target}: there is no file of a module {module}")
+        raise BadPackageError(f"entry point {target}: there is no file of a module {module}")
     return Path(spec.origin)

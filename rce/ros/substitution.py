@@ -1,6 +1,6 @@
 """``$(find PKG)`` and ``$(env VAR)`` in nodes' arguments and in string parameters.
 
-Nothing here is ever given to a shell.
+The texts are never passed to a shell.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ class SubstitutionError(ValueError):
 def substitute(text: str, packages: PackageIndex, environ: Mapping[str, str]) -> str:
     """Replace every ``$(find PKG)`` by the folder of a package and ``$(env VAR)`` by an environment variable.
 
-    What is put in is not searched again. All other text, a lone ``$`` too, stays as it is.
+    Inserted text is not searched again. All other text, a lone ``$`` too, stays as it is.
 
     Raises:
-        SubstitutionError: An expression is neither of the two, is not closed, or names what is not there.
+        SubstitutionError: An expression is neither of the two, is not closed, or names something unknown.
     """
     result = _EXPRESSION.sub(lambda match: _evaluate(match[1], packages, environ), text)
-    # What was put in may hold anything; the fault is looked for in what was there before.
+    # Inserted text may hold anything, so the fault is searched in the original text.
     if _OPEN.search(_EXPRESSION.sub("", text)):
         raise SubstitutionError(f"a '$(' without ')' in {text!r}")
     return result
@@ -42,8 +42,8 @@ def substitute(text: str, packages: PackageIndex, environ: Mapping[str, str]) ->
 def split_arguments(text: str, packages: PackageIndex, environ: Mapping[str, str]) -> list[str]:
     """Split arguments into words as a POSIX shell does, then substitute in each word.
 
-    ``$(find PKG)`` is one piece of a word in spite of its space, and what is put in stays inside its word,
-    whatever it holds.
+    ``$(find PKG)`` is one part of a word in spite of its space, and inserted text always stays inside its
+    word.
 
     Raises:
         SubstitutionError: A quote is not closed, or a substitution cannot be made.
@@ -75,4 +75,5 @@ def _evaluate(expression: str, packages: PackageIndex, environ: Mapping[str, str
             if variable not in environ:
                 raise SubstitutionError(f"$({expression}): there is no environment variable {variable}")
             return environ[variable]
-    raise SubstitutionError(f"$({expression}) is not known; use $(find PKG) or $(env VAR)")
+        case _:
+            raise SubstitutionError(f"$({expression}) is not known; use $(find PKG) or $(env VAR)")

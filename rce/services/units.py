@@ -1,7 +1,7 @@
 """Writes systemd units of the engine's programs. Pure: texts from settings.
 
-What a unit forbids is what its program never needs. `rce-container` makes namespaces, mounts and cgroups for
-its containers, so its unit forbids little; it has its cgroup's subtree delegated.
+A unit forbids everything that its program does not need. `rce-container` makes namespaces, mounts and cgroups
+for its containers, so its unit forbids little; systemd delegates its cgroup's subtree to it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _CREDENTIAL = "secret"
 
 
 class Role(StrEnum):
-    """What a service runs."""
+    """The role of a service."""
 
     ENGINE = "engine"
     """All programs, by ``rce up``."""
@@ -29,14 +29,14 @@ class Service:
     """A service that is to be installed.
 
     Attributes:
-        role: What it runs.
+        role: The programs that it runs.
         program: Path of the program.
         arguments: Its command line, without the program.
         system: A unit of the machine; else one of a user.
-        user: As whom it runs; empty for root, or the user whose unit it is.
+        user: The user that it runs as; empty for root, or the user whose unit it is.
         secret: File with the engine's secret, handed over as a credential; None: the program finds it itself.
         state: Folder that it may write; None for none.
-        hide_homes: Nothing that it needs is in a home folder.
+        hide_homes: Hide home folders: it needs nothing in them.
     """
 
     role: Role
@@ -113,7 +113,7 @@ def unit(service: Service) -> str:
 
 
 def _reload(service: Service, command: str) -> str:
-    """Return how the program starts anew in its own process, while its containers live on."""
+    """Return the lines for restarting the program in its own process, while its containers keep running."""
     if service.secret is not None:  # systemd 252 hands credentials to the main process only
         command += f" --secret-file {quoted(str(service.secret))}"
     return f"ExecReload={command} --check\nExecReload=/bin/kill -USR1 $MAINPID\n"
@@ -129,7 +129,7 @@ def quoted(text: str) -> str:
 
 
 def _place(service: Service) -> list[str]:
-    """Return who runs it, and what it may reach."""
+    """Return the lines on the unit's user and on the folders that it may access."""
     lines = [f"User={service.user}\n"] if service.user else []
     if service.secret is not None:
         lines.append(f"LoadCredential={_CREDENTIAL}:{service.secret}\n")

@@ -1,1 +1,1 @@
-"""Child programs: started, watched, restarted, ended, whatever happens to the program that watches them."""
+"""Supervision of child programs: start, watch, restart and end them, also if the supervisor is killed."""

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 async def run(plan: Plan, prepared: Mapping[str, Prepared]) -> int:
     """Run an engine until SIGINT, SIGTERM or SIGHUP; returns the exit code.
 
-    A second signal ends containers without waiting for their nodes. Whatever ends this, nothing is left.
+    A second signal ends containers without waiting for their nodes. No process is left, however this ends.
     """
     task = asyncio.current_task()
     assert task is not None
@@ -61,11 +61,11 @@ def _certificates(plan: Plan) -> AbstractAsyncContextManager[None]:
 
 
 def _say(line: str) -> None:
-    print(line, flush=True)  # noqa: T201 - what the programs print
+    print(line, flush=True)  # noqa: T201 - the programs' output
 
 
 def _complain(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)  # noqa: T201 - for whoever started it
+    print(line, file=sys.stderr, flush=True)  # noqa: T201 - for the caller
 
 
 def main() -> int:

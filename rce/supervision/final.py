@@ -12,9 +12,9 @@ _SHELL = 'trap "" HUP INT TERM; read -r word; [ "$word" = done ] || exec "$@"'
 
 
 class FinalCommand:
-    """Waits in a process of its own for the end of this one, then runs a command.
+    """Waits in a separate process for the end of this one, then runs a command.
 
-    No signal that is meant for this process reaches it, neither from a terminal nor from its end.
+    Signals for this process, from a terminal or at its end, do not reach the other one.
 
     Example:
         >>> final = await FinalCommand.arm(["rm", "-rf", folder])
@@ -27,7 +27,7 @@ class FinalCommand:
 
     @classmethod
     async def arm(cls, argv: Sequence[str]) -> Self:
-        """Have ``argv`` run as soon as this process has ended. Its output goes where this one's goes.
+        """Arrange that ``argv`` runs as soon as this process has ended, with the same output streams.
 
         Raises:
             OSError: No shell can be started.
@@ -38,7 +38,7 @@ class FinalCommand:
         return cls(argv, process)
 
     async def run(self) -> int:
-        """Run the command now, once more if it or what waits for it was killed; return its exit code.
+        """Run the command now, once more if it or its waiting process was killed; return its exit code.
 
         Raises:
             OSError: It was killed, and no other shell can be started.
@@ -50,7 +50,7 @@ class FinalCommand:
         return await again._close()  # noqa: SLF001 - of the same class
 
     async def disarm(self) -> None:
-        """Let the command not be run."""
+        """Cancel the command."""
         assert self._process.stdin is not None
         if self._process.returncode is None:
             self._process.stdin.write(_DISARM)

@@ -1,6 +1,6 @@
-"""What a supervisor is to run, handed from the program that read the command line to a small one.
+"""The plan of a supervisor, and its handover from the program that read the command line to a small one.
 
-What reads command lines and settings takes 10 MB, which the supervisor would hold for as long as it runs.
+The readers of command lines and settings take 10 MB, which the supervisor would hold for as long as it runs.
 """
 
 from __future__ import annotations
@@ -8,16 +8,41 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, NoReturn
 
-from rce.supervision.program import Program
 from rce.supervision.title import set_title
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """A program to keep running. It prints a line holding ``ready:`` once it can be used."""
+
+    name: str
+    argv: Sequence[str]
+    env: Mapping[str, str] = field(default_factory=dict)
+    final: Sequence[str] = ()
+    """A command that cleans up after the program if it is killed. It runs after the program's last end if
+    that was not a proper one, and also when the supervisor itself is killed."""
+    module: str = ""
+    """The Python package that :attr:`argv` runs, if the program may be a fork of its supervisor: its
+    ``__main__`` has a function ``main`` that takes no arguments, and reads ``sys.argv``."""
+
+    @classmethod
+    def of(cls, name: str, module: str, *arguments: str, env: Mapping[str, str]) -> Program:
+        """Return a program that is a Python package of the engine."""
+        return cls(name, [sys.executable, "-P", "-m", module, *arguments], env, module=module)
+
+    @property
+    def arguments(self) -> Sequence[str]:
+        """The arguments after the module on the command line."""
+        return self.argv[self.argv.index(self.module) + 1 :]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """The programs of an engine, and what to say of them."""
+    """The programs of an engine, and the lines to print."""
 
     programs: tuple[Program, ...]
     shared: tuple[str, ...] = ()
@@ -30,10 +55,10 @@ class Plan:
     """The engine's settings as a document, if its certificates are to be kept; empty without TLS."""
 
     def hand_over(self) -> NoReturn:
-        """Go on as the supervisor of this plan, in this process; what was loaded is given back.
+        """Become the supervisor of this plan, in this process; the memory of loaded modules is released.
 
         Raises:
-            OSError: The interpreter cannot be started, or the plan not be written.
+            OSError: The interpreter cannot be started, or the plan cannot be written.
         """
         from tempfile import TemporaryFile  # takes 1 MB, which the supervisor does not need
 
@@ -41,7 +66,7 @@ class Plan:
             file.write(json.dumps(asdict(self)).encode())
             file.seek(0)
             os.set_inheritable(file.fileno(), True)
-            # The command line is there for those who look for the process, its last word for the forks' own.
+            # The command line is for users who look for the process; its last word reserves room for forks.
             room = "-" * max(len("".join(program.argv)) for program in self.programs)
             os.execv(  # noqa: S606 - this interpreter
                 sys.executable,

@@ -1,8 +1,8 @@
 """Programs as forks of their supervisor, made before it does anything else.
 
-The supervisor loads what its programs share, and forks them: what they do not change is in memory once. Each
-fork waits until it is told to begin, and then is what ``python -P -m MODULE ARGUMENT ...`` would be. What is
-started again later is executed: a supervisor at work has an event loop, which must not be forked.
+The supervisor loads the modules that its programs share, and forks them: unchanged memory is shared. Each
+fork waits until it is told to begin, and then behaves like ``python -P -m MODULE ARGUMENT ...``. Later
+restarts execute the program: a running supervisor has an event loop, which must not be forked.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rce.supervision.title import set_title
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from rce.supervision.program import Program
+    from rce.supervision.plan import Program
 
 _READY = b"\n"
 _GO = b"g"
@@ -32,16 +32,16 @@ _GO = b"g"
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A fork that waits to become its program. It ends if nothing comes."""
+    """A fork that waits to become its program. It ends if the pipe closes first."""
 
     pid: int
     go: int
-    """Descriptor: a byte lets it begin, the end of the pipe lets it end."""
+    """Descriptor: at a byte it begins, at the end of the pipe it ends."""
     output: int
-    """Descriptor: what it prints."""
+    """Descriptor: its output."""
 
     def drop(self) -> None:
-        """Let it end without having begun. Blocks for a moment."""
+        """End it before it has begun. Blocks for a moment."""
         os.close(self.go)
         os.close(self.output)
         os.waitpid(self.pid, 0)
@@ -57,7 +57,7 @@ def prepare(programs: Iterable[Program], shared: Iterable[str]) -> Mapping[str, 
         shared: Modules that they load; they are loaded here, once for all.
 
     Returns:
-        The forks by the names of their programs; none where that cannot be done.
+        The forks by the names of their programs; empty where forks are not possible.
 
     Raises:
         SystemExit: In a fork: its program has ended.
@@ -67,17 +67,17 @@ def prepare(programs: Iterable[Program], shared: Iterable[str]) -> Mapping[str, 
         return {}
     for module in shared:
         import_module(module)
-    if threading.active_count() > 1:  # a fork would have their locks, and not them
+    if threading.active_count() > 1:  # a fork would have the threads' locks, but not the threads
         return {}
     gc.collect()
-    gc.freeze()  # no collection touches, and so copies, what the forks share
+    gc.freeze()  # the garbage collector would write to, and so copy, the shared memory
     sys.stdout.flush()
     sys.stderr.flush()
     return {program.name: _fork(program) for program in forkable}
 
 
 def _has_streams() -> bool:
-    """Tell whether the descriptors 0 to 2 are taken, so that no pipe gets their numbers."""
+    """Return whether the descriptors 0 to 2 are taken, so that no pipe gets their numbers."""
     return None not in (sys.stdin, sys.stdout, sys.stderr)
 
 
@@ -119,13 +119,13 @@ def _become(program: Program, parent: int, wait: int, print_: int) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(line_buffering=True, write_through=True)  # type: ignore[union-attr]  # as they are
     sys.argv = [program.module, *program.arguments]
-    sys.orig_argv = list(program.argv)  # by which a program executes itself anew
+    sys.orig_argv = list(program.argv)  # with these a program executes itself anew
     import_module(f"{program.module}.__main__").main()
     raise SystemExit(0)
 
 
 class ForkedProcess:
-    """A fork that runs its program; what :class:`asyncio.subprocess.Process` is of one that was executed."""
+    """A fork that runs its program, with the interface of :class:`asyncio.subprocess.Process`."""
 
     def __init__(self, pid: int, stdout: asyncio.StreamReader) -> None:
         self.pid = pid
@@ -137,13 +137,13 @@ class ForkedProcess:
 
     @classmethod
     async def begin(cls, prepared: Prepared) -> ForkedProcess:
-        """Let a fork become its program."""
+        """Tell a fork to become its program."""
         stdout = asyncio.StreamReader(limit=MAX_LINE)
         await asyncio.get_running_loop().connect_read_pipe(
             lambda: asyncio.StreamReaderProtocol(stdout), os.fdopen(prepared.output, "rb", 0)
         )
         process = cls(prepared.pid, stdout)
-        with contextlib.suppress(BrokenPipeError):  # it was killed, which is noticed as with all others
+        with contextlib.suppress(BrokenPipeError):  # it was killed; its end is noticed as for all processes
             os.write(prepared.go, _GO)
         os.close(prepared.go)
         return process

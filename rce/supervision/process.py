@@ -8,7 +8,7 @@ import ctypes
 import os
 import signal
 import sys
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from functools import partial
 from typing import Final, Protocol
 
@@ -44,7 +44,7 @@ class Process(Protocol):
 
     @property
     def stdout(self) -> asyncio.StreamReader | None:
-        """What it prints."""
+        """Its output."""
 
     async def wait(self) -> int:
         """Wait for its end; return the exit code."""
@@ -87,7 +87,7 @@ class Child:
         return self._process.returncode
 
     async def lines(self) -> AsyncIterator[str]:
-        """Yield what the program prints, until it closes its output."""
+        """Yield the lines of the program's output, until it closes the output."""
         assert self._process.stdout is not None
         while True:
             try:
@@ -116,18 +116,10 @@ class Child:
                 await self.wait()
 
     def hurry(self) -> None:
-        """Tell it once more to end, which programs take as a wish not to wait for others."""
+        """Send SIGTERM once more, which programs take as a request not to wait for others."""
         if self.returncode is None:
             self._signal(signal.SIGTERM)
 
     def _signal(self, number: signal.Signals) -> None:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.pid, number)
-
-
-async def relay(child: Child, show: Callable[[str], None], ready: asyncio.Event | None = None) -> None:
-    """Show a child's lines; set ``ready`` at its first line that says so."""
-    async for line in child.lines():
-        show(f"[{child.name}] {line}")
-        if ready is not None and " ready: " in line:
-            ready.set()

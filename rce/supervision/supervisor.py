@@ -6,17 +6,15 @@ import asyncio
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
+from rce.aio.backoff import Backoff
 from rce.supervision.final import FinalCommand
+from rce.supervision.keeper import Keeper, RestartPolicy
+from rce.supervision.plan import Program
 from rce.supervision.prefork import ForkedProcess, Prepared
-from rce.supervision.process import Child, relay
-from rce.supervision.program import Program
+from rce.supervision.process import Child
 
-RESTART_DELAY_S = 0.2
-RESTART_DELAY_MAX_S = 5.0
-STABLE_AFTER_S = 10.0
+RESTARTS = RestartPolicy(Backoff(first=0.2, longest=5.0), stable_s=10.0)
 READY_TIMEOUT_S = 60.0
-OUTPUT_TIMEOUT_S = 1.0
-"""How long the output of an ended program is read on; something that it started may hold it open."""
 
 
 class StartError(Exception):
@@ -29,7 +27,7 @@ class Supervisor:
     Args:
         programs: In the order in which they start.
         show: Gets every line they print.
-        prepared: Forks that are to become some of them, by their names, at their first start.
+        prepared: Forks for the first start of some of them, by their names.
     """
 
     def __init__(
@@ -41,13 +39,13 @@ class Supervisor:
         self._programs = programs
         self._show = show
         self._prepared = dict(prepared or {})
-        self._children: dict[str, Child] = {}
-        """The last process of each program, by name."""
+        self._keepers: dict[str, Keeper] = {}
+        """By the program's name."""
         self._finals: dict[str, FinalCommand] = {}
 
     def hurry(self) -> None:
-        """Pass on to the programs that the user wants the end at once."""
-        for child in self._children.values():
+        """Tell the programs that the user wants them to end at once."""
+        for child in self._children():
             child.hurry()
 
     async def run(self, on_ready: Callable[[], None]) -> None:
@@ -73,6 +71,10 @@ class Supervisor:
         finally:
             await _to_its_end(self._end_finally())
 
+    def _children(self) -> list[Child]:
+        """Return the last process of each program."""
+        return [keeper.child for keeper in self._keepers.values() if keeper.child is not None]
+
     async def _until_ready(self, program: Program, ready: asyncio.Event) -> None:
         try:
             async with asyncio.timeout(READY_TIMEOUT_S):
@@ -85,11 +87,11 @@ class Supervisor:
             self._finals[program.name] = await FinalCommand.arm(program.final)
 
     async def _end_finally(self) -> None:
-        """Remove what programs left that did not end properly.
+        """Clean up after programs that did not end properly.
 
-        One may have been killed before, and the next have ended before it removed what the first one left.
+        One may have been killed before, and the next may have ended before it cleaned up after the first one.
         """
-        is_clean = not any(child.returncode for child in self._children.values())
+        is_clean = not any(child.returncode for child in self._children())
         for name, final in self._finals.items():
             if is_clean:
                 await final.disarm()
@@ -97,30 +99,20 @@ class Supervisor:
                 self._show(f"[up] what {name} left could not be removed: exit code {code}")
 
     async def _keep(self, program: Program, ready: asyncio.Event) -> None:
-        loop = asyncio.get_running_loop()
-        delay = RESTART_DELAY_S
-        while True:
-            started = loop.time()
-            code = await self._run_once(program, ready)
+        def take_line(line: str) -> None:
+            self._show(f"[{program.name}] {line}")
+            if " ready: " in line:
+                ready.set()
+
+        def on_end(code: int, pause: float | None) -> bool:
             if not ready.is_set():
                 raise StartError(f"{program.name} ended with exit code {code} before it was ready")
-            if loop.time() - started > STABLE_AFTER_S:
-                delay = RESTART_DELAY_S
-            self._show(f"[up] {program.name} ended with exit code {code}; starting it again in {delay:.1f} s")
-            await asyncio.sleep(delay)
-            delay = min(2 * delay, RESTART_DELAY_MAX_S)
+            assert pause is not None, "the policy has no last end"
+            self._show(f"[up] {program.name} ended with exit code {code}; starting it again in {pause:.1f} s")
+            return True
 
-    async def _run_once(self, program: Program, ready: asyncio.Event) -> int:
-        child = await self._start(program)
-        self._children[program.name] = child
-        reader = asyncio.create_task(relay(child, self._show, ready))
-        try:
-            return await child.wait()
-        finally:
-            await child.stop()
-            await asyncio.wait([reader], timeout=OUTPUT_TIMEOUT_S)
-            reader.cancel()
-            await asyncio.gather(reader, return_exceptions=True)
+        keeper = self._keepers[program.name] = Keeper(lambda: self._start(program), take_line, RESTARTS)
+        await keeper.run(on_end)
 
     async def _start(self, program: Program) -> Child:
         prepared = self._prepared.pop(program.name, None)
@@ -132,13 +124,13 @@ class Supervisor:
 async def _end(tasks: Sequence[asyncio.Task[None]]) -> None:
     """Cancel tasks one after the other, the last one first."""
     for task in reversed(tasks):
-        if not task.cancelling():  # a second time would cut short how it ends its program
+        if not task.cancelling():  # a second cancellation would interrupt the end of its program
             task.cancel()
         await asyncio.wait([task])
 
 
 async def _to_its_end(work: Coroutine[Any, Any, None]) -> None:
-    """Do something whole, however often this is cancelled meanwhile."""
+    """Run something to its end, however often this is cancelled meanwhile."""
     task = asyncio.create_task(work)
     cancelled = False
     while not task.done():

@@ -1,4 +1,4 @@
-"""What a forked process shows of itself in ``/proc``: its command line, its variables, its name."""
+"""A forked process's entries in ``/proc``: its command line, its variables, its name."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _VARIABLES = (47, 48)
 
 
 def padding() -> str:
-    """An argument, or a variable's value, that does nothing but leave room."""
+    """Return an argument, or a variable's value, that only leaves room."""
     return "-" * ROOM
 
 
 def set_title(words: Sequence[str], name: str) -> None:
-    """Show other words as this process's command line, cut to the room there is, and another name.
+    """Change this process's command line, cut to the available room, and its name.
 
     Args:
         words: The command line to show.
@@ -36,9 +36,9 @@ def set_title(words: Sequence[str], name: str) -> None:
 
 
 def show_variables(environ: Mapping[str, str]) -> None:
-    """Show other variables as those that this process was started with, as far as there is room.
+    """Change the variables that this process appears to have been started with, as far as they fit.
 
-    Those that it was started with must not be in use any more.
+    The original ones must not be in use any more.
     """
     _show(_VARIABLES, (f"{name}={value}" for name, value in environ.items()))
 
@@ -48,5 +48,5 @@ def _show(place: tuple[int, int], words: Iterable[str]) -> None:
     fields = stat[stat.rindex(b")") + 2 :].split()
     start, end = (int(fields[number]) for number in place)
     text = b"".join(word.encode(errors="replace") + b"\0" for word in words)
-    # The last byte stays zero: else the kernel takes what follows for a part of it.
+    # The last byte stays zero: otherwise the kernel takes the bytes after it for a part of it.
     ctypes.memmove(start, text[: end - start - 1].ljust(end - start, b"\0"), end - start)

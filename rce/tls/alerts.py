@@ -1,4 +1,4 @@
-"""Have a TLS server say why it ends a handshake.
+"""Make a TLS server send the reason when a handshake fails.
 
 OpenSSL writes an alert for the client when a handshake fails. asyncio and uvloop drop it with the connection,
 so that the client sees a hang-up only. A context of this module keeps the alert in the error, for
@@ -40,6 +40,6 @@ AlertingContext.sslobject_class = _AlertingObject
 
 
 def alert_of(error: BaseException | None) -> bytes:
-    """Return what OpenSSL wanted to send when a handshake failed; empty if nothing."""
+    """Return the alert that OpenSSL wrote when a handshake failed; empty if it wrote none."""
     found = getattr(error, "alert", b"")
     return found if isinstance(found, bytes) else b""

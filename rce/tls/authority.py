@@ -45,23 +45,23 @@ class Issued:
 
 @dataclass(frozen=True, slots=True)
 class Details:
-    """What a certificate says."""
+    """The contents of a certificate."""
 
     subject: str
     issuer: str
     hosts: tuple[str, ...]
-    """Names and addresses that it is good for."""
+    """Names and addresses that it is valid for."""
     expires: datetime
     is_authority: bool
     serial: int = 0
-    """By which it is revoked."""
+    """The serial number, by which it is revoked."""
 
     def days_left(self, now: datetime | None = None) -> float:
         """Return the days until it expires; negative afterwards."""
         return (self.expires - (now or datetime.now(UTC))) / timedelta(days=1)
 
     def covers(self, host: str) -> bool:
-        """Tell whether it is good for a name or address, as clients check it."""
+        """Return whether it is valid for a name or address, as clients check it."""
         wanted = host.strip("[]").lower()
         names = [name.lower() for name in self.hosts]
         return wanted in names or f"*.{wanted.partition('.')[2]}" in names
@@ -88,8 +88,8 @@ def issue(authority: Issued, name: str, hosts: Iterable[str], days: float = CERT
     """Make a certificate.
 
     Args:
-        authority: What signs it.
-        name: Whose it is.
+        authority: The authority that signs it.
+        name: Its owner.
         hosts: Names and IP addresses that it is good for; may be empty for a client.
         days: How long it is valid; it ends with the authority at the latest.
 
@@ -124,10 +124,10 @@ def issue(authority: Issued, name: str, hosts: Iterable[str], days: float = CERT
 
 
 def read_details(pem: bytes) -> Details:
-    """Read what the first certificate of a PEM text says.
+    """Read the first certificate of a PEM text.
 
     Raises:
-        CertificateError: It holds none.
+        CertificateError: The text holds no certificate.
     """
     try:
         found = x509.load_pem_x509_certificate(pem)
@@ -152,7 +152,7 @@ def read_details(pem: bytes) -> Details:
 
 
 def is_signed_by(certificate: bytes, authority: bytes) -> bool:
-    """Tell whether an authority has signed a certificate, both as PEM."""
+    """Return whether an authority has signed a certificate, both as PEM."""
     try:
         x509.load_pem_x509_certificate(certificate).verify_directly_issued_by(
             x509.load_pem_x509_certificate(authority)

@@ -1,4 +1,4 @@
-"""Which certificates a program uses: what the options ``--tls``, ``--certificates``, ... come to."""
+"""The certificates that a program uses, by the options ``--tls``, ``--certificates``, ..."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ if TYPE_CHECKING:
     from rce.config.settings import EngineSettings
 
 ENGINE = "engine"
-"""Name of the certificate that an engine's programs use if nothing else was said."""
+"""Name of the certificate that an engine's programs use by default."""
 FOLDER = "certificates"
 WARNED_VARIABLE = "RCE_TLS_WARNED"
 """Set for programs whose starter has warned already."""
 
 
 def default_folder() -> Path:
-    """Return where certificates are kept if nothing else was said."""
+    """Return the default folder of certificates."""
     return default_state_dir() / FOLDER
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TlsChoice:
-    """What a program was told of TLS."""
+    """A program's settings of TLS."""
 
     enabled: bool = False
     """Use TLS everywhere, with certificates of the engine's own authority."""
@@ -53,7 +53,7 @@ class TlsChoice:
         )
 
     def for_clients(self) -> TlsIdentity | None:
-        """Return what a server shows to clients, robots and browsers; None for a plain one.
+        """Return the identity of a server for clients, robots and browsers; None for a plain one.
 
         Raises:
             CertificateError: The files cannot be used.
@@ -69,7 +69,7 @@ class TlsChoice:
         return identity
 
     def for_task_sets(self) -> TlsIdentity | None:
-        """Return what task sets show each other; None for plain connections.
+        """Return the identity of task sets for each other; None for plain connections.
 
         Raises:
             CertificateError: The files cannot be used.
@@ -86,10 +86,10 @@ class TlsChoice:
 
 
 def plain_warning(what: str, *hosts: str) -> str | None:
-    """Return the warning of a program that serves other machines without TLS; None if there is no reason.
+    """Return the warning of a program that serves other machines without TLS; None if it does not.
 
     Args:
-        what: What travels in clear.
+        what: The data that is sent in clear.
         hosts: The addresses that it listens on without TLS.
     """
     open_ones = [host or "all addresses" for host in hosts if not is_loopback(host)]
@@ -100,7 +100,7 @@ def plain_warning(what: str, *hosts: str) -> str | None:
 
 
 def is_loopback(host: str) -> bool:
-    """Tell whether an address is reached from this machine only."""
+    """Return whether an address is reached from this machine only."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

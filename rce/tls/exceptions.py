@@ -1,4 +1,4 @@
-"""What can go wrong with certificates."""
+"""Errors of certificates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Warn of certificates that expire soon, or that are not good for the name by which clients come."""
+"""Warn of certificates that expire soon, or that are not valid for the name that clients use."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 CHECK_EVERY_S = 6 * 3600.0
-"""How often certificates are looked at."""
+"""How often certificates are checked."""
 
 
 async def watch_expiry(files: Iterable[TlsFiles], every: float = CHECK_EVERY_S) -> None:
@@ -34,7 +34,7 @@ async def watch_expiry(files: Iterable[TlsFiles], every: float = CHECK_EVERY_S) 
 
 
 def expiry_warning(certificate: Path) -> str | None:
-    """Return what is to be done for a certificate; None if nothing."""
+    """Return the warning for a certificate; None if it need not be renewed."""
     from rce.tls.authority import RENEWAL_DAYS
 
     details = _details(certificate)
@@ -53,7 +53,7 @@ def expiry_warning(certificate: Path) -> str | None:
 
 
 def name_warning(identity: TlsIdentity, host: str) -> str | None:
-    """Return a warning if a server's certificate is not good for the name by which clients come."""
+    """Return a warning if a server's certificate is not valid for the name that clients use."""
     certificate = identity.files.certificate
     assert certificate is not None
     details = _details(certificate)
@@ -63,7 +63,7 @@ def name_warning(identity: TlsIdentity, host: str) -> str | None:
         return None
     return (
         f"clients are sent to {host}, but the certificate {certificate} is for"
-        f" {', '.join(details.hosts) or 'no host'}: issue it anew with --host {host}, or set --public-host"
+        f" {', '.join(details.hosts) or 'no host'}: issue it again with --host {host}, or set --public-host"
     )
 
 

@@ -1,4 +1,4 @@
-"""What a failed TLS handshake means, in words that say what to do."""
+"""Explanations of failed TLS handshakes, with what to do."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def find_tls_error(error: BaseException | None) -> ssl.SSLError | None:
         if error is None:
             return None
         further = error.__cause__ or error.__context__
-        # aiohttp has errors that inherit from ssl's and hold nothing of theirs, but were raised from one.
+        # Some errors of aiohttp inherit from ssl's without their attributes, but were raised from one.
         if isinstance(error, ssl.SSLError) and (hasattr(error, "reason") or further is None):
             return error
         error = further
@@ -68,7 +68,7 @@ def find_tls_error(error: BaseException | None) -> ssl.SSLError | None:
 
 
 def explain_to_client(error: BaseException) -> str | None:
-    """Say why a server cannot be talked to; None if TLS is not the reason."""
+    """Return why the connection to a server failed; None if TLS is not the reason."""
     found = find_tls_error(error)
     if isinstance(found, ssl.SSLCertVerificationError):
         return _explain_server(getattr(found, "verify_message", str(found)))
@@ -79,7 +79,7 @@ def explain_to_client(error: BaseException) -> str | None:
 
 
 def _explain_server(said: str) -> str:
-    """Say what is wrong with a server's certificate, of which OpenSSL said so much."""
+    """Return the fault of a server's certificate, from OpenSSL's error."""
     if "expired" in said:
         return (
             "the server's certificate has expired; renew it there: rce certificate issue NAME"
@@ -91,7 +91,7 @@ def _explain_server(said: str) -> str:
             " this machine, or that of the machine that issued the certificate"
         )
     if "revoked" in said:
-        return "the server's certificate was revoked; issue it anew there: rce certificate issue NAME"
+        return "the server's certificate was revoked; issue it again there: rce certificate issue NAME"
     if "not valid for" in said or "mismatch" in said.lower():
         return (
             f"the server's certificate is for another name ({said.rstrip('.')});"
@@ -108,7 +108,7 @@ def _clock() -> str:
 
 
 def explain_to_server(error: BaseException) -> str:
-    """Say why a client was not taken."""
+    """Return why a client was refused."""
     found = find_tls_error(error)
     if found is None:
         if isinstance(error, ConnectionError):

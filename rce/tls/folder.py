@@ -1,4 +1,4 @@
-"""The folder ``certificates/`` with an engine's authority and what it has issued.
+"""The folder ``certificates/`` with an engine's authority and its certificates.
 
 It holds ``authority.pem``, ``authority.key``, and ``NAME.pem`` with ``NAME.key`` for each name; beside them
 what was issued and what was revoked (:mod:`rce.tls.revocation`). Only its owner may enter it. A machine that
@@ -64,11 +64,11 @@ class CertificateFolder:
 
     @property
     def revoked(self) -> Path:
-        """The list of what the authority has revoked; there is none before the first."""
+        """The list of revoked certificates; missing before the first revocation."""
         return self.certificate(REVOKED)
 
     def has(self, name: str) -> bool:
-        """Tell whether a certificate and its key are there."""
+        """Return whether a certificate and its key are there."""
         return self.certificate(name).exists() and self.key(name).exists()
 
     def make_authority(self, days: float = AUTHORITY_DAYS) -> None:
@@ -89,13 +89,13 @@ class CertificateFolder:
         """Issue a certificate, or renew it: programs that run load the new one by themselves.
 
         Args:
-            name: Whose it is; the name of its files.
+            name: Its owner; also the name of its files.
             hosts: Names and IP addresses that it is good for. If empty, those of the certificate that it
                 replaces, or else its own name.
             days: How long it is valid.
 
         Returns:
-            What it says.
+            The contents of the certificate.
 
         Raises:
             CertificateError: The name cannot be used, no authority is here, or a file cannot be written.
@@ -149,7 +149,7 @@ class CertificateFolder:
         return added
 
     def revocations(self) -> list[Revocation]:
-        """Return what was revoked, oldest first.
+        """Return the revocations, oldest first.
 
         Raises:
             CertificateError: The list cannot be read.
@@ -165,12 +165,12 @@ class CertificateFolder:
         """Return the names of all certificates that were issued here and have not expired, by serial number.
 
         Raises:
-            CertificateError: What was recorded cannot be read.
+            CertificateError: The record cannot be read.
         """
         return {int(record.serial, 16): record.name for record in self._records()}
 
     def ensure(self, name: str, hosts: Iterable[str]) -> str:
-        """Have an authority and a certificate that is good for ``hosts`` and not about to expire.
+        """Make or renew the authority and a certificate that is valid for ``hosts``, if needed.
 
         Returns:
             What was done, in words; empty if nothing.
@@ -202,7 +202,7 @@ class CertificateFolder:
         return f"renewed the certificate {name} {why}"
 
     def details(self, name: str) -> Details:
-        """Read what a certificate says.
+        """Read a certificate.
 
         Raises:
             CertificateError: It cannot be read.
@@ -210,7 +210,7 @@ class CertificateFolder:
         return details_of(self.certificate(name))
 
     def all(self) -> Iterator[tuple[str, Details | str]]:
-        """Yield the names of all certificates with what they say, or why they cannot be read."""
+        """Yield the names of all certificates with their contents, or why they cannot be read."""
         for file in sorted(self.path.glob("*.pem")):
             if file == self.revoked:
                 continue
@@ -238,7 +238,7 @@ class CertificateFolder:
             raise CertificateError(f"{file}: {error}; remove the damaged line") from error
 
     def _record(self, name: str, issued: Details) -> None:
-        """Add to what was issued, before it is handed out, and leave out what has expired."""
+        """Record a certificate before it is handed out, and remove expired ones from the record."""
         now = datetime.now(UTC)
         kept = [record for record in self._records() if record.expires > now]
         kept.append(Record(name, f"{issued.serial:x}", issued.expires))
@@ -248,7 +248,7 @@ class CertificateFolder:
 
     def _write(self, name: str, issued: Issued) -> None:
         with self._writing():
-            # A program that looks between the two finds a pair that does not fit, and keeps the old one.
+            # A program that reads between the two writes finds a wrong pair, and keeps the old one.
             _write_private(self.key(name), issued.key)
             _write_private(self.certificate(name), issued.certificate)
 
@@ -266,7 +266,7 @@ _DECODER = msgspec.json.Decoder(Record)
 
 
 def details_of(file: Path) -> Details:
-    """Read what a certificate's file says.
+    """Read a certificate's file.
 
     Raises:
         CertificateError: It cannot be read.
@@ -285,7 +285,7 @@ def _read(file: Path) -> bytes:
 
 
 def _write_private(file: Path, content: bytes) -> None:
-    """Write a file that only its owner may read; it appears whole or not at all."""
+    """Write a file atomically that only its owner may read."""
     aside = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)

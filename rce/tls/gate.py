@@ -1,8 +1,8 @@
-"""Take TLS connections in: a server's protocol sees one only after its handshake.
+"""Accepts TLS connections: a server's protocol gets a connection only after its handshake.
 
-asyncio's own TLS servers tell of no handshake that fails, and count no connection while it lasts. Here an
-accepted connection waits in a lobby until its handshake is done; one that fails is one line in the log and an
-alert to the client, and a client that speaks plain HTTP is told so.
+asyncio's own TLS servers do not report failed handshakes, and do not count connections during the handshake.
+Here an accepted connection waits in a lobby until its handshake is done. A failed one gives one line in the
+log and an alert to the client, and a client that speaks plain HTTP is told so.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import os
 import socket
 from typing import TYPE_CHECKING, cast
 
+from rce.aio.tasks import BackgroundTasks
 from rce.guard.complaints import Complaints
 from rce.guard.lobby import address_of
 from rce.tls.alerts import alert_of
@@ -29,7 +30,7 @@ _log = logging.getLogger(__name__)
 HANDSHAKE_S = 10.0
 """From an accepted connection to the end of its handshake."""
 _SHUTDOWN_S = 1.0
-"""For the other end's farewell."""
+"""For the other end's close of TLS."""
 _HANDSHAKE_RECORD = 0x16
 """First byte of a TLS client."""
 _TEXT = b"This port speaks TLS only: use https:// or wss://\n"
@@ -43,7 +44,7 @@ class TlsGate:
     """Does the handshakes of one server.
 
     Args:
-        name: What is served, for the log.
+        name: The service, for the log.
         context: Gives the context for the next connection.
         lobby: Where connections wait until their handshake is done.
     """
@@ -52,33 +53,25 @@ class TlsGate:
         self._name = name
         self._context = context
         self._lobby = lobby
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._handshakes = BackgroundTasks()
         self._complaints = Complaints()
-        self._closed = False
 
     def guard(self, protocol: asyncio.Protocol) -> asyncio.Protocol:
-        """Return what ``loop.create_server`` is to have in place of ``protocol``."""
+        """Return a protocol factory for ``loop.create_server``, in place of ``protocol``."""
         return _Arrival(self, protocol)
 
     async def close(self) -> None:
-        """End the handshakes that go on."""
-        self._closed = True
-        tasks = list(self._tasks)
-        for task in tasks:
-            task.cancel()
-        if tasks:
-            await asyncio.wait(tasks)
+        """End the handshakes that are not over."""
+        await self._handshakes.close()
 
     def take(self, transport: asyncio.BaseTransport, protocol: asyncio.Protocol) -> None:
         """Take the socket of an accepted connection over, and shake hands on it."""
         accepted = transport.get_extra_info("socket")
-        sock = None if self._closed else socket.socket(fileno=os.dup(accepted.fileno()))
+        sock = None if self._handshakes.closed else socket.socket(fileno=os.dup(accepted.fileno()))
         address = address_of(transport.get_extra_info("peername"))
         cast("asyncio.Transport", transport).abort()  # uvloop's only behave like one
         if sock is not None:
-            task = asyncio.get_running_loop().create_task(self._run(sock, protocol, address))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            self._handshakes.spawn(self._run(sock, protocol, address), name=f"TLS handshake with {address}")
 
     async def _run(self, sock: socket.socket, protocol: asyncio.Protocol, address: str) -> None:
         task = asyncio.current_task()
@@ -105,7 +98,7 @@ class TlsGate:
 
     async def _shake_hands(self, sock: socket.socket, protocol: asyncio.Protocol) -> None:
         context = self._context()
-        # The transport owns this one and closes it in its own time; the other one is closed here.
+        # The transport owns this one and closes it later; the other one is closed here.
         own = socket.socket(fileno=os.dup(sock.fileno()))
         own.setblocking(False)
         try:
@@ -123,7 +116,7 @@ class TlsGate:
             raise
 
     def _complain(self, address: str, why: str) -> None:
-        # Each reason for itself: one that was told must not hide another.
+        # Limited for each reason: a logged one must not hide another.
         if self._complaints.is_due(f"{address} {why}", asyncio.get_running_loop().time()):
             _log.warning("%s: a client at %s was not taken: %s", self._name, address or "this machine", why)
 
@@ -152,7 +145,7 @@ async def _first_byte(sock: socket.socket) -> int | None:
 
 
 async def _part(sock: socket.socket, words: bytes) -> None:
-    """Send the last words to a client, and let it read them."""
+    """Send the last bytes to a client, and let it read them."""
     with contextlib.suppress(OSError):
         sock.send(words)
         sock.shutdown(socket.SHUT_WR)
@@ -160,7 +153,7 @@ async def _part(sock: socket.socket, words: bytes) -> None:
 
 
 async def _discard(sock: socket.socket) -> None:
-    """Read until the peer hangs up, so that what it was told is not lost by a reset."""
+    """Read until the peer hangs up, so that a reset does not discard the bytes sent to it."""
     loop = asyncio.get_running_loop()
     with contextlib.suppress(OSError, TimeoutError):
         async with asyncio.timeout(_SHUTDOWN_S):

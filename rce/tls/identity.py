@@ -28,19 +28,19 @@ class TlsFiles:
     certificate: Path | None = None
     key: Path | None = None
     authority: Path | None = None
-    """Whose certificates the other end may have; the system's authorities if None."""
+    """The authority of the other end's certificate; the system's authorities if None."""
     revoked: Path | None = None
-    """The authority's list of certificates that it has revoked; there may be no such file."""
+    """The authority's list of certificates that it has revoked; the file may be missing."""
 
 
 class TlsIdentity:
     """Makes contexts from files, and makes them anew when the files have changed.
 
-    The files are looked at when a connection begins. New ones that cannot be used are complained of once, and
-    the last good ones stay in use.
+    The files are checked when a connection begins. If new ones cannot be used, that is logged once, and the
+    last valid ones stay in use.
 
     Args:
-        files: Where everything is.
+        files: The files.
 
     Example::
 
@@ -80,7 +80,7 @@ class TlsIdentity:
         return self._get("client", self._make_client)
 
     def is_revoked(self, serial: int) -> bool:
-        """Tell whether the authority has revoked a certificate. For connections that are there already.
+        """Return whether the authority has revoked a certificate. For established connections.
 
         Args:
             serial: Of the certificate.
@@ -199,7 +199,7 @@ def client_context(authority: Path | None) -> ssl.SSLContext | None:
 
 
 def client_contexts(authority: Path | None) -> Context | None:
-    """Return what gives a client's context for each connection, by the authority's file as it is then.
+    """Return a function that returns a client's context for each connection, by the present authority's file.
 
     Raises:
         CertificateError: The authority cannot be used.

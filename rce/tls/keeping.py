@@ -1,4 +1,4 @@
-"""Have the certificates of an engine that ``rce up`` runs: made at first, renewed while it runs."""
+"""Makes the certificates of an engine that ``rce up`` runs, and renews them while it runs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import contextlib
 from typing import TYPE_CHECKING
 
 from rce.lookups import LOOKUPS
+from rce.masters import split_addresses
 from rce.tls.exceptions import CertificateError
 
 if TYPE_CHECKING:
@@ -19,11 +20,11 @@ CHECK_EVERY_S = 6 * 3600.0
 
 @contextlib.asynccontextmanager
 async def keep_certificates(settings: EngineSettings, say: Callable[[str], None]) -> AsyncIterator[None]:
-    """Keep the engine's certificate good while the context lasts. Does nothing for an engine without TLS.
+    """Keep the engine's certificate valid while the context lasts. Does nothing for an engine without TLS.
 
     Args:
         settings: Of the engine.
-        say: Told what was made or renewed.
+        say: Called with a text on each certificate that was made or renewed.
 
     Raises:
         CertificateError: The certificates cannot be made.
@@ -43,7 +44,7 @@ async def keep_certificates(settings: EngineSettings, say: Callable[[str], None]
 
 
 def ensure(settings: EngineSettings, full_name: str) -> str:
-    """Make what is missing of the engine's certificates; blocks.
+    """Make the missing certificates of the engine; blocks.
 
     Args:
         settings: Of the engine.
@@ -59,7 +60,7 @@ def ensure(settings: EngineSettings, full_name: str) -> str:
     from rce.tls.hosts import own_hosts
 
     binds = (settings.master.bind, settings.robot.bind, settings.container.bind)
-    named = (settings.master_host, settings.robot.public_host or "", *binds)
+    named = (*split_addresses(settings.master_host), settings.robot.public_host or "", *binds)
     folder = CertificateFolder(settings.certificates.absolute())
     return folder.ensure(settings.tls.name, own_hosts((full_name, *named)))
 

@@ -1,8 +1,8 @@
-"""Take certificates back: the authority's signed list of those that are refused, ``revoked.pem``.
+"""Revocation of certificates: the authority's signed list, ``revoked.pem``.
 
-The list is a CRL as OpenSSL reads it. It names certificates by their serial numbers, so what was issued is
-recorded beside it (``issued.jsonl``): a name that is revoked loses each of its certificates, also those that
-were renewed since and that nobody here has a copy of.
+The list is a CRL as OpenSSL reads it. It names certificates by their serial numbers, so issued certificates
+are recorded beside it (``issued.jsonl``): revoking a name revokes each of its certificates, also those that
+were renewed since and of which this machine has no copy.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Revocation:
 def make_list(authority: Issued, revoked: list[Revocation]) -> bytes:
     """Make the signed list, as PEM.
 
-    It is good as long as the authority: a list that lapses would lock everybody out.
+    It is valid as long as the authority: with an expired list, all connections would be refused.
 
     Raises:
         CertificateError: The authority cannot be read.

@@ -1,4 +1,4 @@
-"""WebSockets in TLS: servers that shake hands first, and clients that know why a server hung up."""
+"""WebSockets in TLS: servers that do the handshake first, and clients that report why a server hung up."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 class TlsClientConnection(ClientConnection):
     """A client's connection whose failed handshake names a TLS fault as its cause.
 
-    In TLS 1.3 a client has done its part of the handshake before the server judges its certificate, so it is
-    refused only when it waits for the answer to its first request.
+    In TLS 1.3 a client has done its part of the handshake before the server checks its certificate, so it
+    learns of a refusal only when it waits for the answer to its first request.
     """
 
     _lost_by: Exception | None = None
@@ -39,7 +39,7 @@ class TlsClientConnection(ClientConnection):
 
 
 def behind_gate(kind: type[ServerConnection], gate: TlsGate | None) -> Any:
-    """Return what makes connections of a kind, for ``serve(create_connection=...)``; no gate, no TLS."""
+    """Return a factory of connections, for ``serve(create_connection=...)``; no gate means no TLS."""
     if gate is None:
         return kind
 

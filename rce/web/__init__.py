@@ -1,1 +1,1 @@
-"""What the engine's HTTP servers share."""
+"""Shared code of the engine's HTTP servers."""

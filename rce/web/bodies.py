@@ -24,7 +24,7 @@ async def read_whole(request: web.Request) -> bytes:
     Raises:
         HTTPBadRequest: It is damaged, or the client is gone.
         HTTPRequestTimeout: It did not come in good time.
-        HTTPRequestEntityTooLarge: It is larger than the application takes.
+        HTTPRequestEntityTooLarge: It is larger than the application's limit.
     """
     with _faults():
         async with asyncio.timeout(BODY_S):

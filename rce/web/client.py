@@ -1,4 +1,4 @@
-"""What HTTP clients of the engine connect by."""
+"""Connectors of the engine's HTTP clients."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def session_connector(tls: ssl.SSLContext | None) -> aiohttp.TCPConnector:
 
 
 def _text(family: int, address: tuple[str, int] | tuple[str, int, int, int]) -> str:
-    """Write an address; one of a link with its interface."""
+    """Write an address; a link-local one with its interface."""
     if family == socket.AF_INET6 and len(address) == 4 and address[3] and "%" not in address[0]:  # noqa: PLR2004
         return f"{address[0]}%{address[3]}"
     return address[0]

@@ -1,4 +1,4 @@
-"""What the log says of requests that are no HTTP: one line, as it is no fault of the engine's."""
+"""Log lines for requests that are not HTTP: one line each, as it is not a fault of the engine."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ if TYPE_CHECKING:
 
     Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 
-logger = logging.getLogger("rce.web.requests")
+request_log = logging.getLogger("rce.web.requests")
 
 
 _CONTINUE = "100-continue"
 
 
 def _shorten(record: logging.LogRecord) -> bool:
-    """Make a line of the library's report of a fault of the client's; keep everything else as it is."""
+    """Shorten the library's report of a client's fault to a line; keep everything else as it is."""
     error = record.exc_info[1] if record.exc_info else None
     if isinstance(error, (HttpProcessingError, web.RequestPayloadError)):
-        # Only what kind of fault: what follows quotes the request, and there may be a password in it.
+        # Only the kind of the fault: the rest quotes the request, which may contain a password.
         kind = str(getattr(error, "message", error)).strip().partition(":")[0] or type(error).__name__
         record.msg, record.args = f"{record.getMessage()}: it is not HTTP: %.60r", (kind,)
         record.exc_info = record.exc_text = None
@@ -31,11 +31,11 @@ def _shorten(record: logging.LogRecord) -> bool:
     return True
 
 
-logger.addFilter(_shorten)
+request_log.addFilter(_shorten)
 
 
 def refuse_expectations(handler: Handler) -> Handler:
-    """Wrap what handles requests: the library's answer to an unknown ``Expect`` quotes it, text or not."""
+    """Wrap the handler of requests: the library's answer to an unknown ``Expect`` quotes it, text or not."""
 
     async def handle(request: web.BaseRequest) -> web.StreamResponse:
         if request.headers.get(hdrs.EXPECT, _CONTINUE).lower() != _CONTINUE:

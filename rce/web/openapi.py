@@ -1,4 +1,4 @@
-"""Makes the OpenAPI document of a route table, so that it cannot tell anything but what the server does."""
+"""Makes the OpenAPI document from a route table, so that it always matches the server."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Query:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Operation:
-    """What the document tells of a method of a path."""
+    """A method of a path in the document."""
 
     name: str
     method: str
@@ -61,7 +61,7 @@ class Operation:
     upload: str = ""
     """Media type of a body that is a file."""
     errors: tuple[int, ...] = ()
-    """All other statuses that an answer may have; none: not said, so any."""
+    """All other statuses that an answer may have; empty: any."""
 
 
 def build_document(
@@ -72,10 +72,10 @@ def build_document(
     Args:
         operations: All operations of the server.
         title: Names the server.
-        description: What it is for.
+        description: Its purpose.
         error: Model of every answer that is not a success.
     """
-    from pydantic.json_schema import models_json_schema  # takes memory that only asked servers spend
+    from pydantic.json_schema import models_json_schema  # takes memory; loaded on request only
 
     operations = list(operations)
     models = {model for known in operations for model in (known.body, known.reply) if model} | {error}

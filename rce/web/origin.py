@@ -1,4 +1,4 @@
-"""Keeps pages of other sites from using a server through their visitor's browser."""
+"""Prevents pages of other sites from using a server through their visitor's browser."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ def is_foreign(origin: str | None, host: str, allowed: Collection[str] = ()) -> 
     """Return whether a request comes from a page of another site.
 
     Args:
-        origin: The request's ``Origin``; programs that are no browser send none.
+        origin: The request's ``Origin``; programs that are not browsers send none.
         host: The request's ``Host``.
-        allowed: Origins that may use the server all the same.
+        allowed: Origins that may use the server nevertheless.
     """
     if origin is None or origin in allowed:
         return False

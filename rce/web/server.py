@@ -11,7 +11,7 @@ from yarl import URL
 from rce.guard.lobby import Guest, Lobby, address_of
 from rce.guard.plain import PlainPort
 from rce.tls.gate import TlsGate
-from rce.web.faults import logger, refuse_expectations
+from rce.web.faults import refuse_expectations, request_log
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rce.tls.identity import Context
 
 SHUTDOWN_S = 0.5
-"""How long open requests may go on when the server ends."""
+"""How long open requests may continue when the server ends."""
 IDLE_S = 30.0
 """A connection that sends no request, or does not come to its end, for so long is closed."""
 
@@ -32,11 +32,11 @@ _SWEEP_EVERY = 32
 class HttpServer:
     """Serves an application. Use it as an asynchronous context manager.
 
-    Who has no answer is a stranger, and so is who waits between requests; a connection that streams what it
-    was granted is not. When there are too many strangers, those without a request are closed first.
+    A connection without an answer counts as a stranger, also between requests; one with an accepted stream
+    does not. When there are too many strangers, those without a request are closed first.
 
     Args:
-        app: What is served.
+        app: The application.
         host: Address to listen on; empty for all.
         port: 0 takes a free one.
         tls: Gives the TLS context for each connection; none serves plain HTTP.
@@ -44,7 +44,7 @@ class HttpServer:
         lobby: Where strangers are counted; one of its own if none.
 
     Attributes:
-        url: Where it listens, once it does.
+        url: The URL of the server, once it listens.
         lobby: The strangers.
     """
 
@@ -66,7 +66,11 @@ class HttpServer:
         app.middlewares.insert(0, self._track)
         app.on_response_prepare.append(self._grant)
         self._runner = web.AppRunner(
-            app, access_log=None, logger=logger, shutdown_timeout=SHUTDOWN_S, keepalive_timeout=idle_timeout
+            app,
+            access_log=None,
+            logger=request_log,
+            shutdown_timeout=SHUTDOWN_S,
+            keepalive_timeout=idle_timeout,
         )
         self._host = host
         self._port = port
@@ -100,7 +104,7 @@ class HttpServer:
         await self._runner.cleanup()
         await self._server.wait_closed()
 
-    # Who comes
+    # Connections
 
     def _make_arrival(self) -> asyncio.Protocol:
         arrival = _Arrival(self._let_in)
@@ -143,7 +147,7 @@ class HttpServer:
             guest.rest()
 
     async def _grant(self, request: web.Request, response: web.StreamResponse) -> None:
-        """Take note that a handler began to stream: who may have that is no stranger."""
+        """Take note that a handler began to stream: the connection no longer counts as a stranger."""
         guest = None if request.transport is None else self._guests.get(request.transport)
         if guest in self._handled and response.status < _FIRST_ERROR:
             guest.leave()

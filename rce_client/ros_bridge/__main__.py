@@ -1,4 +1,4 @@
-"""The program ``rce-ros``: a robot's ROS graph in the cloud, by one config file."""
+"""The program ``rce-ros``: connects a robot's ROS graph to the engine, by one config file."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 import uvloop
 
+from rce.cli.options import Authority
 from rce.cli.streams import open_missing_streams
-from rce.cli.tls_options import Authority
 from rce.config.documents import read_file
 from rce.config.exceptions import ConfigError, ShippedFileError
 from rce.config.logs import start_logging
@@ -25,13 +25,14 @@ from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.tls.exceptions import CertificateError
 from rce.tls.identity import client_contexts
-from rce_client.connection import CONNECTING, Connection, State
+from rce_client.connection import Connection, State
 from rce_client.exceptions import ClientError
 from rce_client.reminder import Reminder
 from rce_client.ros_bridge.bridge import build, joined_graph, wait_ready
 from rce_client.ros_bridge.explain import dot, long_form, picture
 from rce_client.ros_bridge.plan import make_plan
 from rce_client.ros_bridge.robot_file import RobotFile
+from rce_client.session import CONNECTING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -52,22 +53,22 @@ DEFAULT_MASTER = "http://localhost:11311/"
 def bridge(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="The robot's config file, JSON or YAML.")],
     check_only: Annotated[
-        bool, typer.Option("--check", help="Only check the file and say what is in it.")
+        bool, typer.Option("--check", help="Check the file and print its content.")
     ] = False,
     ros_master_uri: Annotated[
-        str, typer.Option(envvar="ROS_MASTER_URI", help="The robot's ROS master.")
+        str, typer.Option(envvar="ROS_MASTER_URI", help="URI of the robot's ROS master.")
     ] = DEFAULT_MASTER,
     package_path: Annotated[
-        list[Path] | None, typer.Option(help="Folder with packages that define messages; may be repeated.")
+        list[Path] | None, typer.Option(help="Folder with packages of message types; may be repeated.")
     ] = None,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Only show the long form of the file, and its wiring.")
+        bool, typer.Option("--explain", help="Print the long form of the file and its wiring.")
     ] = False,
-    as_dot: Annotated[bool, typer.Option("--dot", help="Only show the wiring, for Graphviz.")] = False,
+    as_dot: Annotated[bool, typer.Option("--dot", help="Print the wiring for Graphviz.")] = False,
     authority: Authority = None,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show more log messages.")] = False,
 ) -> None:
-    """Join a robot's ROS graph to the engine as CONFIG says, until stopped; then remove what was made."""
+    """Connect a robot's ROS graph to the engine, until stopped."""
     start_logging(logging.DEBUG if verbose else logging.WARNING)
     types = TypeRegistry(_packages(package_path or ()))
     try:
@@ -89,12 +90,12 @@ def bridge(
 
 
 async def run(file: RobotFile, master_uri: str, tls: Context | None = None) -> None:
-    """Bridge until SIGINT or SIGTERM. A second signal ends the program at once, and leaves what it made.
+    """Bridge until SIGINT or SIGTERM. A second signal ends the program at once, without removing anything.
 
     Raises:
-        ClientError: The engine does not take this robot.
-        RosError: The robot's graph does not take part.
-        ConfigError: The robot's graph does not tell the type of a bridge.
+        ClientError: The engine refuses this robot.
+        RosError: The robot's graph refuses the node.
+        ConfigError: The type of a bridge cannot be read from the robot's graph.
     """
     task = asyncio.current_task()
     assert task is not None
@@ -119,7 +120,7 @@ async def serve(file: RobotFile, master_uri: str, tls: Context | None = None) ->
         config = await file.complete(node, say)
         plan = make_plan(config)
         for tag in plan.unbridged:
-            say(f"interface {tag} has no addr, so nothing in the robot's ROS graph is joined to it")
+            say(f"interface {tag} has no addr: it is not connected to the robot's ROS graph")
         async with _connection(config, tls) as conn:
             await _serve(config, plan, conn, node)
 
@@ -154,32 +155,35 @@ async def _serve(config: ClientConfig, plan: Plan, conn: Connection, node: Node)
 
 
 async def remove(conn: Connection) -> None:
-    """Remove what was made, if the engine is there."""
+    """Remove what was created, if the engine is connected."""
     if conn.connected:
-        say("removing what was made")
+        say("removing what this program created")
         await conn.remove_all()
     else:
-        say("the engine is away; what was made there stays")
+        say("the engine is not connected; what this program created there stays")
 
 
 def summary(config: ClientConfig) -> str:
-    """Say in words what a config file asks for."""
+    """Return the content of a config file in words."""
     plan = make_plan(config)
     lines = [f"{config.robot} of user {config.user} at {config.url}"]
     lines += [f"  container {item.tag}" for item in config.containers]
     lines += [
-        f"  node {item.container}/{item.tag}: {item.pkg} {item.exe} {item.args}".rstrip()
+        f"  node {item.container}/{item.node.tag}: {item.node.pkg} {item.node.exe} {item.node.args}".rstrip()
         for item in config.nodes
     ]
-    lines += [f"  parameter {item.container}: {item.name} = {item.value!r}" for item in config.parameters]
+    lines += [
+        f"  parameter {item.container}: {item.parameter.name} = {item.parameter.value!r}"
+        for item in config.parameters
+    ]
     lines += [f"  {span}" for span in plan.spans]
-    lines += [f"  connection {link.a} - {link.b}" for link in config.connections]
+    lines += [f"  connection {link.tag_a} - {link.tag_b}" for link in config.connections]
     lines += [f"  {bridge}: its type is read from the robot's graph" for bridge in config.untyped.values()]
     return "\n".join(lines)
 
 
 def say(text: str) -> None:
-    """Tell the user something that is no result."""
+    """Print a message for the user."""
     print(f"rce-ros: {text}", file=sys.stderr, flush=True)  # noqa: T201
 
 

@@ -1,13 +1,13 @@
-"""The bridge: each span joins an interface of the robot with a topic or service of its ROS graph."""
+"""The bridge: each span connects an interface of the robot with a topic or service of its ROS graph."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import itertools
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
-from rce.protocol.names import Role
+from rce.model.names import Role
 from rce.ros.errors import MasterError
 from rce.ros.node import Node
 
@@ -17,14 +17,15 @@ if TYPE_CHECKING:
     from rce.ros.node import Publisher as RosPublisher
     from rce.ros.types import TypeRegistry
     from rce_client.connection import Connection
-    from rce_client.ends import Publisher
+    from rce_client.own_interfaces import Serialized
     from rce_client.ros_bridge.plan import Plan, Span
+    from rce_client.topics import Publisher
 
-MASTER_PATIENCE = 2.0
-"""Seconds between two looks for the robot's ROS master."""
+MASTER_TIMEOUT = 2.0
+"""Seconds between two attempts to reach the robot's ROS master."""
 
 REMINDER = 5.0
-"""Seconds between two messages that tell which interfaces are still waited for."""
+"""Seconds between two messages about interfaces that are not connected yet."""
 
 CALL_TIMEOUT = 30.0
 """Seconds that a service of the robot's graph, or of the cloud, may take."""
@@ -34,7 +35,7 @@ CALL_TIMEOUT = 30.0
 async def joined_graph(
     robot: str, master_uri: str, types: TypeRegistry, say: Callable[[str], None]
 ) -> AsyncIterator[Node]:
-    """Be a node of the robot's ROS graph, once its master is there."""
+    """Start a node in the robot's ROS graph, once its master can be reached."""
     async with contextlib.AsyncExitStack() as stack:
         while True:
             node = Node(
@@ -43,7 +44,7 @@ async def joined_graph(
                 master_uri=master_uri,
                 types=types,
                 signals=False,
-                master_timeout=MASTER_PATIENCE,
+                master_timeout=MASTER_TIMEOUT,
             )
             try:
                 await stack.enter_async_context(node)
@@ -54,11 +55,11 @@ async def joined_graph(
 
 
 async def build(plan: Plan, conn: Connection, node: Node) -> None:
-    """Ask the engine for everything and lay all spans.
+    """Send all requests to the engine and create all spans.
 
     Raises:
-        rce.ros.errors.RosError: The robot's graph does not take part.
-        rce_client.exceptions.ClientError: The engine does not.
+        rce.ros.errors.RosError: The robot's graph refuses a registration.
+        rce_client.exceptions.ClientError: The engine refuses the client.
     """
     for request in plan.requests[: plan.first]:
         await conn.request(request)
@@ -69,45 +70,47 @@ async def build(plan: Plan, conn: Connection, node: Node) -> None:
 
 
 async def lay(span: Span, conn: Connection, node: Node) -> None:
-    """Join one interface with its topic or service. Messages are passed on as they are."""
+    """Connect one interface with its topic or service. Messages are passed on unchanged."""
     match span.role:
         case Role.SUBSCRIBER:
-            uplink = Uplink(conn, await conn.publisher(span.tag, span.cls, raw=True))
-            await node.listen(span.addr, span.cls, uplink)
+            uplink = Uplink(conn, await conn.publisher(span.tag, span.message_type, raw=True))
+            await node.listen(span.addr, span.message_type, uplink)
         case Role.PUBLISHER:
-            publisher = await node.advertise(span.addr, span.cls)
+            publisher = await node.advertise(span.addr, span.message_type)
             downlink = Downlink(publisher)
-            await conn.subscriber(span.tag, span.cls, downlink.received, raw=True, latches=downlink)
+            await conn.subscriber(span.tag, span.message_type, downlink.received, raw=True, latches=downlink)
         case Role.SERVICE_PROVIDER:
-            client = await conn.service_client(span.tag, span.cls, raw=True)
+            client = await conn.service_client(span.tag, span.message_type, raw=True)
 
             async def ask_cloud(request: bytes) -> bytes:
                 return bytes(await client(request, timeout=CALL_TIMEOUT))
 
-            await node.advertise_service_serialized(span.addr, span.cls, ask_cloud)
+            await node.advertise_service_serialized(span.addr, span.message_type, ask_cloud)
         case Role.SERVICE_CLIENT:
-            service = node.service_client(span.addr, span.cls)
+            service = node.service_client(span.addr, span.message_type)
 
-            async def ask_robot(request: bytes) -> bytes:
+            async def ask_robot(request: Serialized) -> bytes:
                 return bytes(await service.call_serialized(request, timeout=CALL_TIMEOUT))
 
-            await conn.service_provider(span.tag, span.cls, ask_robot, raw=True)
+            await conn.service_provider(span.tag, span.message_type, ask_robot, raw=True)
+        case _:
+            assert_never(span.role)
 
 
 class Uplink:
-    """A topic of the robot on its way to the cloud, where nothing is sent before somebody hears it.
+    """Sends a topic of the robot to the cloud, once its interface is connected there.
 
-    The engine makes an interface some time after it was asked to, and would complain of messages before. What
-    is latched waits for its time; any other message would be out of date by then.
+    The engine creates an interface some time after the request, and reports messages before that as errors.
+    Latched messages wait until then; other messages would be out of date and are dropped.
 
     Implements :class:`rce.ros.node.subscriber.TopicListener`.
 
     Args:
-        conn: What it goes over.
+        conn: The connection to the engine.
         publisher: Its interface.
     """
 
-    def __init__(self, conn: Connection, publisher: Publisher[bytes]) -> None:
+    def __init__(self, conn: Connection, publisher: Publisher[Serialized]) -> None:
         self._conn = conn
         self._publisher = publisher
         self._names: dict[str, str] = {}
@@ -127,15 +130,15 @@ class Uplink:
         self._publisher.publish(bytes(payload), latch=name)
 
     def source_ended(self, source: str) -> None:
-        """Take back what a publisher of the robot's graph latched."""
+        """Remove what a publisher of the robot's graph latched."""
         self._names.pop(source, None)
         self._publisher.keep_latched(tuple(self._names.values()))
 
 
 class Downlink:
-    """A topic of the cloud on its way to the robot's graph, where what is latched there is latched too.
+    """Publishes a topic of the cloud in the robot's graph; latched messages stay latched.
 
-    Implements :class:`rce_client.ends.LatchListener`.
+    Implements :class:`rce_client.interfaces.LatchListener`.
 
     Args:
         publisher: Its topic in the robot's graph.
@@ -144,24 +147,24 @@ class Downlink:
     def __init__(self, publisher: RosPublisher) -> None:
         self._publisher = publisher
 
-    def received(self, payload: bytes) -> None:
+    def received(self, payload: Serialized) -> None:
         """Publish a message."""
         self._publisher.publish_serialized(payload)
 
-    def received_latched(self, message: bytes, source: str) -> None:
+    def received_latched(self, message: Serialized, source: str) -> None:
         """Publish a message, and keep it for nodes that subscribe later."""
         self._publisher.publish_serialized(message, latch=True, source=source)
 
     def keep_latched(self, sources: Sequence[str]) -> None:
-        """Forget what all other sources latched."""
+        """Remove what all other sources latched."""
         for source in self._publisher.latched.keys() - set(sources):
             self._publisher.unlatch(source)
 
 
 async def wait_ready(plan: Plan, conn: Connection, say: Callable[[str], None]) -> None:
-    """Wait until every interface that the config connects is joined with its peer; tell what is missing.
+    """Wait until every interface that the config connects has its peer; log the missing ones.
 
-    Everything is asked for again now and then, because it may name what another robot makes a little later.
+    All requests are repeated from time to time: they may name what another robot creates later.
     """
     missing = sorted(plan.awaited)
     while missing:

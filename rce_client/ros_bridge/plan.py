@@ -1,4 +1,4 @@
-"""What is to be bridged, made of a robot's config. Pure, apart from looking up message types.
+"""The plan of a bridge, from a robot's config. Pure, apart from looking up message types.
 
 An interface of the robot with an ``addr`` ends in the robot's ROS graph. It is made as a Forwarder, whatever
 the file says: messages are serialized at both ends, so nothing is gained by taking them apart on the way.
@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rce.config.exceptions import ConfigError, Fault
-from rce.protocol.messages import ConfigureComponents
-from rce.protocol.names import Form, InterfaceType, Role
+from rce.model.names import Form, InterfaceType, Role
+from rce.model.requests import ConfigureComponents
 from rce.ros.types import TypesError
 
 if TYPE_CHECKING:
     from rce.config.client import ClientConfig
-    from rce.protocol.messages import Request
+    from rce.model.requests import Request
     from rce.ros.types import TypeRegistry
 
 
@@ -28,18 +28,18 @@ class Span:
 
     tag: str
     role: Role
-    """As the engine names it: a robot's sensor is a ``SUBSCRIBER``."""
-    cls: str
+    """The engine's name for it: a robot's sensor is a ``SUBSCRIBER``."""
+    message_type: str
     addr: str
     """Topic or service in the robot's graph."""
 
     @property
     def type(self) -> str:
-        """The interface type that is asked for."""
+        """The interface type to request."""
         return str(InterfaceType(self.role, Form.FORWARDER))
 
     def __str__(self) -> str:
-        return f"{self.tag}: {_WORDS[self.role].format(self.addr)}, {self.cls}"
+        return f"{self.tag}: {_WORDS[self.role].format(self.addr)}, {self.message_type}"
 
 
 _WORDS = {
@@ -57,30 +57,32 @@ class Plan:
     robot: str
     spans: tuple[Span, ...]
     requests: tuple[Request, ...]
-    """What else is asked of the engine, in order; those of :attr:`first` before the spans are made."""
+    """Other requests to the engine, in order; those of :attr:`first` before the spans are created."""
     first: int
     awaited: frozenset[str]
     """Tags of spans that the file connects, so that they become active."""
     unbridged: tuple[str, ...]
-    """Tags of the robot's interfaces that have no ``addr`` and so end nowhere."""
+    """Tags of the robot's interfaces without ``addr``, which are not connected to the ROS graph."""
 
 
 def make_plan(config: ClientConfig) -> Plan:
-    """Plan the bridge of a robot."""
+    """Return what is to be done for a robot's config."""
     spans = tuple(
-        Span(item.tag, item.kind.role, item.cls, item.addr) for item in config.robot_interfaces if item.addr
+        Span(own.tag, own.kind.role, own.message_type, own.addr)
+        for own in config.robot_interfaces
+        if own.addr
     )
     bridged = {span.tag for span in spans}
     requests = [_without(request, config.robot, bridged) for request in config.setup()]
     first = sum(1 for _ in config.containers)
-    ends = {end for link in config.connections for end in (link.a, link.b)}
+    ends = {end for link in config.connections for end in (link.tag_a, link.tag_b)}
     return Plan(
         robot=config.robot,
         spans=spans,
         requests=tuple(requests),
         first=first,
         awaited=frozenset(tag for tag in bridged if f"{config.robot}/{tag}" in ends),
-        unbridged=tuple(item.tag for item in config.robot_interfaces if not item.addr),
+        unbridged=tuple(own.tag for own in config.robot_interfaces if not own.addr),
     )
 
 
@@ -88,27 +90,28 @@ def check(config: ClientConfig, types: TypeRegistry, source: str) -> None:
     """Check what only matters to a bridge.
 
     Raises:
-        ConfigError: A class is not known here, or a service would be asked of itself; every fault is listed.
+        ConfigError: A message type is not known here, or a service would call itself; every fault is listed.
     """
     faults = []
     services: dict[str, Role] = {}
     for index, item in enumerate(config.interfaces):
-        if item.endpoint != config.robot or not item.addr:
+        own = item.interface
+        if item.endpoint != config.robot or not own.addr:
             continue
         place = f"interfaces[{index}]"
         try:
-            if item.kind.role.is_service:
-                types.service(item.cls)
+            if own.kind.role.is_service:
+                types.service(own.message_type)
             else:
-                types.message(item.cls)
+                types.message(own.message_type)
         except TypesError as error:
             faults.append(Fault(f"{place}.iCls", str(error)))
-        role = item.kind.role
-        if role.is_service and services.setdefault(item.addr.lstrip("/"), role) is role.complement:
+        role = own.kind.role
+        if role.is_service and services.setdefault(own.addr.lstrip("/"), role) is role.complement:
             faults.append(
                 Fault(
                     f"{place}.addr",
-                    f"service {item.addr} is answered in the cloud and called from it: a loop",
+                    f"service {own.addr} is answered in the cloud and called from it: a loop",
                 )
             )
     if faults:
@@ -120,8 +123,6 @@ def _without(request: Request, endpoint: str, tags: set[str]) -> Request:
     if not isinstance(request, ConfigureComponents):
         return request
     kept = tuple(
-        item
-        for item in request.add_interfaces
-        if item.endpoint_tag != endpoint or item.interface_tag not in tags
+        item for item in request.add_interfaces if item.endpoint != endpoint or item.interface.tag not in tags
     )
     return msgspec.structs.replace(request, add_interfaces=kept)

@@ -1,4 +1,4 @@
-"""A robot's file as ``rce-ros`` reads it: what it leaves out, the robot's ROS graph knows."""
+"""A robot's file as ``rce-ros`` reads it; types that it leaves out are read from the robot's ROS graph."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 
 class RobotFile:
-    """A robot's file, of which types may be known to the robot's graph only.
+    """A robot's file in which types of bridges may be missing.
 
     Args:
-        source: Its name, for errors.
-        text: What it says.
+        source: Name of the file, for errors.
+        text: Content of the file.
         types: The message types that are known here.
 
     Attributes:
         draft: The file without the bridges whose types are to be found out.
 
     Raises:
-        ConfigError: Something is wrong in it.
+        ConfigError: The file is not valid.
     """
 
     def __init__(self, source: str, text: str, types: TypeRegistry) -> None:
@@ -40,10 +40,10 @@ class RobotFile:
         check(self.draft, types, source)
 
     async def resolve(self, master_uri: str, say: Callable[[str], None]) -> ClientConfig:
-        """Return the whole file, for which the robot's graph is asked if it must be.
+        """Return the complete file; ask the robot's graph for missing types.
 
         Raises:
-            ConfigError: A type cannot be found out, or does not fit.
+            ConfigError: A type cannot be read, or does not fit.
         """
         if not self.draft.untyped:
             return self.draft
@@ -51,7 +51,11 @@ class RobotFile:
             return await self.complete(node, say)
 
     async def complete(self, node: Node, say: Callable[[str], None]) -> ClientConfig:
-        """Do the same with a node that is in the robot's graph already."""
+        """Return the complete file; ask the robot's graph for missing types, by a node that is in it.
+
+        Raises:
+            ConfigError: A type cannot be read, or does not fit.
+        """
         if not self.draft.untyped:
             return self.draft
         found = await find_types(self.draft.untyped, node, self._source, say)

@@ -1,9 +1,9 @@
-"""Finds the types of bridges that give none, in the robot's ROS graph."""
+"""Reads missing types of bridges from the robot's ROS graph."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 from rce.config.bridges import action_of
 from rce.config.exceptions import ConfigError, Fault
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from rce.config.bridges import Bridge
     from rce.ros.node import Node
 
-PATIENCE_S = 10.0
-"""How long the robot's nodes get to tell their types."""
+TIMEOUT_S = 10.0
+"""Seconds to wait for the robot's nodes."""
 _LOOK_S = 0.5
 _UNKNOWN = "*"
 
@@ -31,19 +31,19 @@ async def find_types(
     source: str,
     say: Callable[[str], None],
     *,
-    patience: float = PATIENCE_S,
+    timeout: float = TIMEOUT_S,
 ) -> dict[int, str]:
-    """Wait until the robot's graph tells the types of all bridges.
+    """Wait until the robot's graph has the types of all bridges.
 
     Args:
         bridges: Bridges without a type, by their index in the file.
         node: A node of the robot's graph.
         source: Name of the file, for errors.
-        say: Is told what is waited for.
-        patience: Seconds to wait.
+        say: Prints a line for the user.
+        timeout: Seconds to wait.
 
     Raises:
-        ConfigError: A bridge has no end in the robot's graph, or the graph did not tell in time; every such
+        ConfigError: A bridge has no end in the robot's graph, or its type was not found in time; every such
             bridge is named.
     """
     if faults := [
@@ -56,7 +56,7 @@ async def find_types(
     async with RpcClient() as rpc:
         master = MasterClient(node.master_uri, node.name, node.uri, rpc)
         try:
-            async with asyncio.timeout(patience):
+            async with asyncio.timeout(timeout):
                 told = False
                 while True:
                     await _look(bridges, master, found)
@@ -69,16 +69,16 @@ async def find_types(
                     await asyncio.sleep(_LOOK_S)
         except TimeoutError:
             left = [item for item in bridges.items() if item[0] not in found]
-            raise ConfigError(source, [_timeout_fault(*item, patience) for item in left]) from None
+            raise ConfigError(source, [_timeout_fault(*item, timeout) for item in left]) from None
 
 
-def _timeout_fault(index: int, bridge: Bridge, patience: float) -> Fault:
-    where = f"within {patience:g} s no node of the robot's graph told that of {bridge}"
+def _timeout_fault(index: int, bridge: Bridge, timeout: float) -> Fault:
+    where = f"no node of the robot's graph had the type of {bridge} within {timeout:g} s"
     return Fault(f"bridges[{index}].type", f"is missing, and {where}; start the node first, or give the type")
 
 
 async def _look(bridges: Mapping[int, Bridge], master: MasterClient, found: dict[int, str]) -> None:
-    """Enter the types that the graph tells now."""
+    """Set the types that the graph has now."""
     topics = {name: type_ for name, type_ in await master.call("getTopicTypes") if type_ != _UNKNOWN}
     for index, bridge in bridges.items():
         if index not in found and (type_ := await _type_of(bridge, topics, master)):
@@ -95,5 +95,7 @@ async def _type_of(bridge: Bridge, topics: Mapping[str, str], master: MasterClie
         case "service":
             try:
                 return await service_type(name, master)
-            except (ToolError, RosError):  # it is not there yet, or does not answer: both are waited for
+            except (ToolError, RosError):  # not there yet, or it does not answer: keep waiting
                 return None
+        case _:
+            assert_never(bridge.kind)

@@ -1,4 +1,4 @@
-"""``python -m rce_container.environment BOOT``: the first process of a container without a nursery."""
+"""``python -m rce_container.environment BOOT``: the first process of a container without a fork server."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import sys
 from rce_container.environment.messages import decode_boot
 from rce_container.environment.process import (
     OF_ENVIRONMENT,
-    die_before_others,
-    keep_to_oneself,
-    take_in_orphans,
+    become_subreaper,
+    set_oom_score,
+    set_undumpable,
 )
 from rce_container.environment.running import run_environment
 
@@ -22,11 +22,11 @@ def main() -> None:
     control, links = (socket.socket(fileno=os.dup(fd)) for fd in (0, 1))
     with open(os.devnull, "rb") as nothing:  # noqa: PTH123
         os.dup2(nothing.fileno(), 0)
-    die_before_others(OF_ENVIRONMENT)
+    set_oom_score(OF_ENVIRONMENT)
     if boot.isolated:
-        keep_to_oneself()
+        set_undumpable()
     else:
-        take_in_orphans()
+        become_subreaper()
     run_environment(boot, control, links)
 
 

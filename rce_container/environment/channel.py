@@ -23,7 +23,7 @@ class Channel:
     """One end of a connected unix stream socket.
 
     A descriptor arrives no later than the line it was sent with.
-    One task receives; anybody sends. The channel owns the socket and the descriptors that nobody took.
+    One task receives; any task may send. The channel owns the socket and the descriptors that were not taken.
 
     Args:
         sock: The socket.
@@ -44,7 +44,7 @@ class Channel:
         self._waiting: asyncio.Future[None] | None = None
 
     async def receive(self) -> bytes | None:
-        """Wait for the next line; None when the connection has ended.
+        """Wait for the next line; return None when the connection has ended.
 
         Raises:
             ChannelError: The line is longer than :data:`MAX_LINE`.
@@ -63,10 +63,10 @@ class Channel:
                 return None
 
     def take_fd(self) -> int:
-        """Take the oldest descriptor that came in; it is the caller's now.
+        """Take the oldest received descriptor; the caller owns it.
 
         Raises:
-            ChannelError: None came.
+            ChannelError: No descriptor was received.
         """
         if not self._fds:
             raise ChannelError("the message should have come with a file descriptor")
@@ -75,7 +75,7 @@ class Channel:
     def send(self, line: bytes, fd: int | None = None) -> None:
         """Send a line, and a duplicate of ``fd`` with it. Never blocks; does nothing on a closed channel.
 
-        A peer that leaves more than :data:`MAX_UNSENT` bytes unread is given up: the channel closes.
+        The channel closes if its peer leaves more than :data:`MAX_UNSENT` bytes unread.
         """
         if self._closed:
             return
@@ -164,7 +164,7 @@ def _wake(waiting: asyncio.Future[None]) -> None:
 
 
 async def accept(listener: socket.socket, take: Callable[[socket.socket], None]) -> None:
-    """Give every connection that comes in on a listening socket to ``take``, until cancelled."""
+    """Pass every connection that a listening socket accepts to ``take``, until cancelled."""
     loop = asyncio.get_running_loop()
     listener.setblocking(False)
     while True:
@@ -178,10 +178,10 @@ async def accept(listener: socket.socket, take: Callable[[socket.socket], None])
 
 
 async def connect(path: str) -> Channel:
-    """Connect to a unix socket, as a manager does: what listens there may send no descriptors.
+    """Connect to a unix socket, as a manager does: the listener cannot send descriptors.
 
     Raises:
-        OSError: Nobody listens there.
+        OSError: No process listens there.
     """
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:

@@ -1,4 +1,4 @@
-"""The environment: applies the container's desired state and reports what is."""
+"""The environment: applies the container's desired state and reports the actual state."""
 
 from __future__ import annotations
 
@@ -9,138 +9,138 @@ import os
 import socket
 from collections import deque
 from pathlib import Path
+from typing import assert_never
 
 import msgspec
 
-from rce.control.execution import FEATURE as EXEC
-from rce.control.model import EndpointKind, EndpointSpec, EndpointState, EndpointStatus, InterfaceSpec
+from rce.control.desired import DesiredState, Fit
+from rce.control.model import (
+    EndpointKind,
+    EndpointSpec,
+    EndpointState,
+    EndpointStatus,
+    InterfaceUsage,
+    SpecPatch,
+)
 from rce.control.tags import Unknown
 from rce.link import Endpoint, LinkHub
 from rce.link.handover import HandoverReceiver
-from rce.protocol.names import EndpointId
-from rce.ros.core import Core
-from rce.ros.core.events import Change
-from rce.ros.core.rosout import AGGREGATE
-from rce.ros.errors import RosError
-from rce.ros.logrecord import KIND, MD5SUM
-from rce.ros.node import Node
-from rce.ros.node.runtime import TypeName
-from rce.ros.node.settings import is_loopback
-from rce.ros.types import TypeRegistry
-from rce.ros.xmlrpc import RpcClient
+from rce.model.names import EndpointId
 from rce_container.environment import messages as m
-from rce_container.environment.bundles import Bundles
 from rce_container.environment.channel import Channel, accept
 from rce_container.environment.exceptions import ChannelError
 from rce_container.environment.executions import Executions
-from rce_container.environment.interfaces import InterfaceMaker, Readiness
+from rce_container.environment.graph import Graph
 from rce_container.environment.logs.rosout import RosoutLog
 from rce_container.environment.nodes.causes import Causes
-from rce_container.environment.nodes.cradle import Cradle
+from rce_container.environment.nodes.fork_server import NodeForkServer
 from rce_container.environment.nodes.heartbeats import Heartbeats
-from rce_container.environment.nodes.launch import OWN_NODE
-from rce_container.environment.nodes.node_life import Workshop
+from rce_container.environment.nodes.node_life import NodeContext
 from rce_container.environment.nodes.node_set import NodeSet
 from rce_container.environment.nodes.reaper import Reaper
 from rce_container.environment.parameters import Values, difference, evaluate_all
-from rce_container.environment.process import strike_all
-from rce_container.environment.reach import Operator
+from rce_container.environment.process import kill_marked
+from rce_container.environment.reach import DialProxy
+from rce_container.environment.reporting import Reporter
+from rce_container.environment.ros1_graph import ros1_graph
+from rce_container.environment.user_packages import UserPackages
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _MAX_UNTOLD = 100
-_GET_PID_TIMEOUT_S = 5.0
+_UNUSED = InterfaceUsage()
 
 
 class Environment:
-    """One container from the inside. Its :meth:`run` lives as long as the container.
+    """One container, seen from the inside. Its :meth:`run` lasts as long as the container.
 
     It ends when a manager says so, when :meth:`end` is called, or when no manager was connected for the
     grace time.
 
     Args:
-        boot: What the manager says of the container.
+        boot: The manager's description of the container.
         control: A listening unix socket; managers connect to it.
-        links: A listening unix socket; peers' links come in on it.
-        cradle: Starts nodes that are Python scripts; None for none.
+        links: A listening unix socket; accepts peers' links.
+        node_server: Starts nodes that are Python scripts; None for none.
     """
 
     def __init__(
-        self, boot: m.Boot, control: socket.socket, links: socket.socket, cradle: Cradle | None = None
+        self,
+        boot: m.Boot,
+        control: socket.socket,
+        links: socket.socket,
+        node_server: NodeForkServer | None = None,
     ) -> None:
         self._boot = boot
         self._control = control
         self._links = links
-        self._cradle = cradle
+        self._node_server = node_server
         self._loop = asyncio.get_running_loop()
         self._ending = asyncio.Event()
         self._end_reason = ""
-        self._desired = EndpointSpec(id=boot.id, kind=EndpointKind.CONTAINER, revision=-1)
+        self._desired = DesiredState(EndpointSpec(id=boot.id, kind=EndpointKind.CONTAINER, revision=-1))
+        self._patches: list[SpecPatch] = []
+        """Changes of interfaces and connections that are to be applied, unless all of them are due."""
+        self._all_due = False
+        self._holds_back = False
+        """Whether interfaces wait for packages."""
         self._applied_revision = -1
         self._news = asyncio.Event()
         self._parameters: Values = {}
         self._faulty: set[str] = set()
-        self._interfaces: tuple[InterfaceSpec, ...] = ()
         self._channel: Channel | None = None
         self._grace: asyncio.TimerHandle | None = None
         self._untold: deque[str] = deque(maxlen=_MAX_UNTOLD)
-        self._told: EndpointStatus | None = None
         self._report_due: asyncio.Handle | None = None
         self._handover: HandoverReceiver | None = None
-        self._bundles = Bundles(boot.bundles, boot.packages)
-        self._packages = self._bundles.index
-        self._operator = Operator(self._ask)
+        self._user_packages = UserPackages(boot.user_packages, boot.packages)
+        self._packages = self._user_packages.index
+        self._dial_proxy = DialProxy(self._ask)
         self._causes = Causes(self._ask)
 
     async def run(self) -> None:
-        """Live; returns when every process, socket and task of the container has ended."""
+        """Run the container; return when all its processes, sockets and tasks have ended."""
         async with contextlib.AsyncExitStack() as stack:
-            reaper = stack.enter_context(Reaper(self._cradle))
+            reaper = stack.enter_context(Reaper(self._node_server))
             self._executions = Executions(reaper, self._environ, self._boot.mark, self._boot.home)
-            self._core = await stack.enter_async_context(self._make_core())
-            types = TypeRegistry(self._packages)
-            node = await stack.enter_async_context(
-                Node(OWN_NODE, argv=[f"__ip:={self._boot.address}"], master_uri=self._core.uri, types=types)
+            boot = self._boot
+            graph = await stack.enter_async_context(
+                ros1_graph(boot.address, boot.ros_port, self._packages, lambda: self._nodes.is_settling)
             )
-            dial = self._operator.connect if self._boot.isolated else None
+            self._graph: Graph = graph
+            dial = self._dial_proxy.connect if self._boot.isolated else None
             hub = LinkHub(self._boot.machine, dial=dial, tls=self._boot.tls)
             stack.push_async_callback(hub.close)
             await hub.listen_socket(self._links)
             self._hub = hub
             async with asyncio.TaskGroup() as tasks:
                 self._tasks = tasks
-                self._nodes = NodeSet(self._workshop(reaper), tasks)
+                self._nodes = NodeSet(self._context(reaper), tasks)
                 self._rosout = stack.enter_context(contextlib.closing(self._keep_records()))
-                await node.subscribe_serialized(AGGREGATE, TypeName(KIND, MD5SUM), self._rosout.take)
-                self._heartbeats = Heartbeats(node, self._nodes.beat, self._fault)
-                readiness = Readiness(lambda: self._nodes.is_settling)
+                await graph.follow_records(self._rosout.take)
+                self._heartbeats = Heartbeats(graph, self._nodes.beat, self._fault)
                 self._endpoint = Endpoint(
                     EndpointId.parse(self._boot.id),
-                    InterfaceMaker(node, types, readiness),
+                    graph.make_interface,
                     hub,
                     on_change=self._changed,
                     on_fault=self._fault,
                 )
+                self._reporter = Reporter(self._endpoint)
                 applying = tasks.create_task(self._apply_for_ever(), name="endpoint")
                 serving = tasks.create_task(self._accept_managers(), name="control socket")
-                watching = tasks.create_task(self._watch_graph(), name="graph")
+                watching = tasks.create_task(graph.watch_nodes(self), name="graph")
                 self._wait_for_manager()
                 await self._ending.wait()
                 applying.cancel()
                 await self._close()
                 serving.cancel()
                 watching.cancel()
-        log.info("ended: %s", self._end_reason)
-
-    def _make_core(self) -> Core:
-        """The container's core, at its loopback and, if it has one, at its address in its group."""
-        address = self._boot.address
-        host = address if is_loopback(address) else "0.0.0.0"  # noqa: S104 - of the container's own network
-        return Core(host, self._boot.ros_port, advertised=address, rosout=True)
+        _log.info("ended: %s", self._end_reason)
 
     def end(self, reason: str) -> None:
-        """Begin to end the container, whole."""
-        log.info("ending: %s", reason)
+        """Begin to end the whole container."""
+        _log.info("ending: %s", reason)
         self._end_reason = self._end_reason or reason
         self._ending.set()
 
@@ -149,7 +149,7 @@ class Environment:
         await self._endpoint.close()
         await self._nodes.close()
         if not self._boot.isolated:
-            await strike_all(self._boot.mark)
+            await kill_marked(self._boot.mark)
         self._report()
         if self._handover is not None:
             await self._handover.close()
@@ -162,10 +162,10 @@ class Environment:
     def _keep_records(self) -> RosoutLog:
         return RosoutLog(Path(self._boot.logs), self._nodes.log_of, self._loop.time)
 
-    def _workshop(self, reaper: Reaper) -> Workshop:
-        return Workshop(
+    def _context(self, reaper: Reaper) -> NodeContext:
+        return NodeContext(
             reaper=reaper,
-            outfit=lambda node: self._bundles.outfit(node, self._environ()),
+            launch_environment=lambda node: self._user_packages.launch_environment(node, self._environ()),
             mark=self._boot.mark,
             home=self._boot.home,
             logs=Path(self._boot.logs),
@@ -180,41 +180,64 @@ class Environment:
         packages = os.pathsep.join(map(str, self._packages.path))
         return {
             **os.environ,
-            "ROS_MASTER_URI": self._core.uri,
-            "ROS_IP": self._boot.address,
+            **self._graph.variables,
             "PYTHONUNBUFFERED": "1",
             "RCE_PACKAGE_PATH": packages,
             "ROS_PACKAGE_PATH": packages,
         }
 
-    # What is desired
+    # Desired state
 
     def _apply(self, spec: EndpointSpec) -> None:
         if spec.revision < self._desired.revision or self._ending.is_set():
             return
-        self._desired = spec
-        self._bundles.apply(spec.bundles)
-        self._set_parameters(spec)
-        self._nodes.lack(self._bundles.lacking(spec.nodes))
-        self._nodes.apply(spec.nodes)
+        self._desired.replace(spec)
+        self._apply_contents()
+        self._apply_all()
+
+    def _apply_patch(self, channel: Channel, patch: SpecPatch) -> None:
+        fit = self._desired.fit(patch)
+        if fit is Fit.GAP:
+            channel.send(m.encode(m.SpecWanted()))
+        if fit is not Fit.NEXT or self._ending.is_set():
+            return
+        self._desired.patch(patch)
+        self._patches.append(patch)
+        if patch.contents is not None:
+            self._apply_contents()
         self._news.set()
 
-    def _take_bundles(self) -> None:
-        """Go on with what waited for packages that have come."""
-        self._bundles.look()
-        self._set_parameters(self._desired)
-        self._nodes.lack(self._bundles.lacking(self._desired.nodes))
+    def _apply_contents(self) -> None:
+        """Apply the desired parameters and nodes."""
+        contents = self._desired.contents
+        self._user_packages.apply(contents.packages)
+        self._set_parameters()
+        self._nodes.lack(self._user_packages.lacking(contents.nodes))
+        self._nodes.apply(contents.nodes)
+
+    def _apply_all(self) -> None:
+        """Schedule a check of all interfaces and connections."""
+        self._all_due = True
+        self._patches.clear()
         self._news.set()
 
-    def _set_parameters(self, spec: EndpointSpec) -> None:
-        desired, faults = evaluate_all(spec.parameters, self._packages, self._environ())
+    def _take_user_packages(self) -> None:
+        """Continue with the nodes and interfaces that waited for packages which have arrived."""
+        self._user_packages.look()
+        self._set_parameters()
+        self._nodes.lack(self._user_packages.lacking(self._desired.contents.nodes))
+        self._apply_all()
+
+    def _set_parameters(self) -> None:
+        parameters = self._desired.contents.parameters
+        desired, faults = evaluate_all(parameters, self._packages, self._environ())
         change = difference(self._parameters, desired)
         for name in change.delete:
-            self._core.delete_param(name)
+            self._graph.delete_parameter(name)
         for name, value in change.set.items():
-            self._core.set_param(name, value)
+            self._graph.set_parameter(name, value)
         self._parameters = desired
-        if self._bundles.is_waiting:  # they may name a package that is still to come
+        if self._user_packages.is_waiting:  # they may name a package that is still to come
             return
         texts = {str(fault) for fault in faults}
         for text in sorted(texts - self._faulty):
@@ -225,15 +248,28 @@ class Environment:
         while True:
             await self._news.wait()
             self._news.clear()
-            spec = self._desired
-            await self._heartbeats.follow(spec.nodes)
-            possible = self._bundles.hold_back(spec, self._interfaces)
-            self._interfaces = possible.interfaces
-            await self._endpoint.apply(possible)
-            self._applied_revision = spec.revision
+            patches, self._patches = self._patches, []
+            is_whole = self._all_due or self._holds_back or self._user_packages.is_waiting
+            self._all_due = False
+            desired = self._desired.whole if is_whole else None
+            revision = self._desired.revision
+            if desired is not None or any(patch.contents is not None for patch in patches):
+                await self._heartbeats.follow(self._desired.contents.nodes)
+            if desired is None:
+                for patch in patches:
+                    await self._endpoint.patch(patch)
+            else:
+                await self._apply_possible(desired)
+            self._applied_revision = revision
             self._changed()
 
-    # What is
+    async def _apply_possible(self, desired: EndpointSpec) -> None:
+        """Make all interfaces and connections, except those that wait for packages."""
+        possible = self._user_packages.hold_back(desired, self._endpoint.desired_interfaces)
+        self._holds_back = possible is not desired
+        await self._endpoint.apply(possible)
+
+    # Actual state
 
     def _changed(self) -> None:
         if self._report_due is None:
@@ -241,17 +277,15 @@ class Environment:
 
     def _report(self) -> None:
         self._report_due = None
-        status = EndpointStatus(
+        if self._channel is None:
+            return
+        header = EndpointStatus(
             id=self._boot.id,
             revision=self._applied_revision,
             state=self._state,
             nodes=self._nodes.statuses,
-            interfaces=dict(self._endpoint.interfaces),
-            connections=self._endpoint.connections,
         )
-        if status != self._told and self._channel is not None:
-            self._told = status
-            self._channel.send(m.encode(m.Report(status=status, features=(EXEC,))))
+        self._reporter.report(self._channel, header)
 
     @property
     def _state(self) -> EndpointState:
@@ -260,35 +294,25 @@ class Environment:
         return EndpointState.DEGRADED if self._nodes.is_degraded else EndpointState.RUNNING
 
     def _fault(self, text: str) -> None:
-        log.warning("%s", text)
+        _log.warning("%s", text)
         if self._channel is not None:
             self._channel.send(m.encode(m.Fault(text=text)))
         else:
             self._untold.append(text)
 
-    async def _watch_graph(self) -> None:
-        """Notice which of the container's nodes are up."""
-        with self._core.watch() as events:
-            async with RpcClient() as client, asyncio.TaskGroup() as tasks:
-                async for event in events:
-                    if event.change is not Change.NODE_APPEARED:
-                        continue
-                    if self._nodes.registered(event.node):
-                        self._rosout.known(event.node)
-                    else:
-                        tasks.create_task(self._identify(client, event.node), name="identify")
+    # rce_container.environment.graph.NodeListener
 
-    async def _identify(self, client: RpcClient, name: str) -> None:
-        """Ask a node whose name tells nothing for its process."""
-        uri = self._core.graph.nodes.get(name)
-        if uri is None or name == f"/{OWN_NODE}":
-            return
-        try:
-            _, _, pid = await client.call(uri, "getPid", (OWN_NODE,), timeout=_GET_PID_TIMEOUT_S)
-            if self._nodes.registered_process(name, int(pid)):
-                self._rosout.known(name)
-        except (RosError, TypeError, ValueError) as error:
-            log.info("node %s does not tell its process: %s", name, error)
+    def node_appeared(self, name: str) -> bool:
+        """Note that a node of the container has registered."""
+        if not self._nodes.registered(name):
+            return False
+        self._rosout.known(name)
+        return True
+
+    def node_identified(self, name: str, pid: int) -> None:
+        """Note the process of a node that has registered."""
+        if self._nodes.registered_process(name, pid):
+            self._rosout.known(name)
 
     # Managers
 
@@ -301,13 +325,13 @@ class Environment:
             await accept(self._control, self._greet)
 
     def _greet(self, sock: socket.socket) -> None:
-        """Take a new manager in place of the one before."""
+        """Replace the current manager by a new one."""
         if self._channel is not None:
             self._channel.close()
         elif self._grace is not None:
             self._grace.cancel()
         self._channel = Channel(sock)
-        self._told = None
+        self._reporter.begin()
         self._report()
         while self._untold:
             self._channel.send(m.encode(m.Fault(text=self._untold.popleft())))
@@ -318,7 +342,7 @@ class Environment:
             while (line := await channel.receive()) is not None:
                 await self._handle(channel, m.decode_to_environment(line))
         except (ChannelError, msgspec.DecodeError) as error:
-            log.error("the manager is not understood: %s", error)  # noqa: TRY400 - its text says it all
+            _log.error("the manager is not understood: %s", error)
         finally:
             channel.close()
             if self._channel is channel:
@@ -330,30 +354,38 @@ class Environment:
         match message:
             case m.Apply(spec=spec):
                 self._apply(spec)
+            case m.ApplyPatch(patch=patch):
+                self._apply_patch(channel, patch)
             case m.Shelved():
-                self._take_bundles()
+                self._take_user_packages()
             case m.Poll():
-                counters = m.Counters(interfaces=self._endpoint.usage(), traffic=self._endpoint.traffic)
+                used = {tag: one for tag, one in self._endpoint.usage().items() if one != _UNUSED}
+                counters = m.Counters(interfaces=used, traffic=self._endpoint.traffic)
                 channel.send(m.encode(counters))
             case m.Dialed(request=request, error=error):
-                self._operator.answered(request, error or socket.socket(fileno=channel.take_fd()))
+                self._dial_proxy.answered(request, error or socket.socket(fileno=channel.take_fd()))
             case m.Cause(request=request, text=text):
                 self._causes.answered(request, text)
-            case m.Handover():
+            case m.Handover(features=features):
+                self._reporter.learn(features)
                 if self._handover is not None:
                     await self._handover.close()
                 self._handover = HandoverReceiver(socket.socket(fileno=channel.take_fd()), self._hub.adopt)
-            case _:
+            case m.Execute() | m.Stop() | Unknown():
                 self._take_order(channel, message)
+            case _:
+                assert_never(message)
 
-    def _take_order(self, channel: Channel, message: m.ToEnvironment | Unknown) -> None:
+    def _take_order(self, channel: Channel, message: m.Execute | m.Stop | Unknown) -> None:
         match message:
             case m.Execute(command=command):
                 self._executions.start(command, socket.socket(fileno=channel.take_fd()))
             case m.Stop():
                 self.end("the manager says so")
             case Unknown(name=name):
-                log.info("the manager sent a %s, which this release does not know", name)
+                _log.info("the manager sent a %s, which this release does not know", name)
+            case _:
+                assert_never(message)
 
     def _ask(self, message: m.Dial | m.Killed) -> bool:
         if self._channel is None:

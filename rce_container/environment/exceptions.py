@@ -1,6 +1,6 @@
-"""What goes wrong inside a container.
+"""The errors inside a container.
 
-EnvironmentFault         told to the user as it is; the rest of the container goes on
+EnvironmentFaultError         told to the user as it is; the rest of the container continues
 ├── NodeError            a node cannot be started
 └── ParameterError       a parameter cannot be set
 ChannelError             the other end of the control socket breaks the protocol, or does not read
@@ -9,15 +9,15 @@ ChannelError             the other end of the control socket breaks the protocol
 from __future__ import annotations
 
 
-class EnvironmentFault(Exception):  # noqa: N818 - a fault of what the user asked for, not of the program
+class EnvironmentFaultError(Exception):
     """Something the user asked for cannot be done; the text says what to do."""
 
 
-class NodeError(EnvironmentFault):
+class NodeError(EnvironmentFaultError):
     """A node cannot be started."""
 
 
-class ParameterError(EnvironmentFault):
+class ParameterError(EnvironmentFaultError):
     """A parameter cannot be set."""
 
 

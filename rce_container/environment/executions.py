@@ -10,24 +10,25 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Mapping
-from typing import Self
+from typing import Self, assert_never
 
+from rce.aio.tasks import BackgroundTasks, cancel_and_wait
 from rce.control.execution import MAX_DATA, NOT_RUN, Command, Frame, Part, decode, ended_frame, read_size
 from rce_container.environment.descriptors import read_some, write_all
 from rce_container.environment.nodes.launch import NODE_MARK
 from rce_container.environment.nodes.reaper import Child, Reaper
-from rce_container.environment.process import strike_all
+from rce_container.environment.process import kill_marked
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 MAX_EXECUTIONS = 16
-"""Commands that run at the same time in one container."""
+"""How many commands may run at the same time in one container."""
 HANGUP_S = 2.0
-"""What a command gets to end after SIGHUP, when its user is gone."""
+"""Seconds that a command has to end after SIGHUP, when its user has disconnected."""
 REST_S = 1.0
-"""How long what it wrote last may take to be read, once the command has ended."""
+"""Seconds to read the last output of a command that has ended."""
 PART_S = 5.0
-"""How long the user's side may take to take what the command wrote last."""
+"""Seconds that the user's side may take to read the last output."""
 SHELLS = ("/bin/bash", "/bin/sh")
 _SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGKILL})
 _NOT_FOUND, _NOT_EXECUTABLE = 127, 126
@@ -38,8 +39,8 @@ class Executions:
 
     Args:
         reaper: Starts processes and waits for them.
-        environ: Gives the environment variables of the container's nodes.
-        mark: The container's; all processes of a command carry one made of it.
+        environ: Returns the environment variables of the container's nodes.
+        mark: The container's mark; all processes of a command carry a mark derived from it.
         home: Where commands start.
     """
 
@@ -50,22 +51,20 @@ class Executions:
         self._environ = environ
         self._mark = mark
         self._home = home
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = BackgroundTasks()
         self._number = 0
 
     def start(self, command: Command, sock: socket.socket) -> None:
-        """Run a command; ``sock`` keeps message boundaries, and is this object's now."""
+        """Run a command; ``sock`` keeps message boundaries, and this object owns it from now on."""
         self._number += 1
-        task = asyncio.create_task(self._run(command, sock, self._number), name=f"command {self._number}")
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        if self._tasks.closed:  # the container ends
+            sock.close()
+            return
+        self._tasks.spawn(self._run(command, sock, self._number), name=f"command {self._number}")
 
     async def close(self) -> None:
         """End all commands."""
-        tasks = list(self._tasks)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._tasks.close()
 
     async def _run(self, command: Command, sock: socket.socket, number: int) -> None:
         sock.setblocking(False)
@@ -80,8 +79,8 @@ class Executions:
                     last = await self._execute(command, sock, f"{self._mark}.command.{number}")
                 await loop.sock_sendall(sock, last.encode())
                 await _part(sock)
-            except OSError as error:  # the user is gone
-                log.info("command %d: %s", number, error)
+            except OSError as error:  # the user has disconnected
+                _log.info("command %d: %s", number, error)
 
     async def _execute(self, command: Command, sock: socket.socket, mark: str) -> Frame:
         argv = list(command.argv) or [next(filter(os.path.exists, SHELLS), SHELLS[-1])]
@@ -104,11 +103,11 @@ class Executions:
                 return await _Conversation(child, streams, sock).hold(mark)
             finally:
                 child.signal_group(signal.SIGKILL)
-                await strike_all(mark, variable=NODE_MARK)
+                await kill_marked(mark, variable=NODE_MARK)
 
 
 async def _part(sock: socket.socket) -> None:
-    """Wait until the user's side has taken all; closing with input unread would throw it away."""
+    """Wait until the user's side has read all output; closing with input unread would discard it."""
     sock.shutdown(socket.SHUT_WR)
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(PART_S):
@@ -135,7 +134,7 @@ class _Pipes:
         self._close(*self._open)
 
     def close_childs(self) -> None:
-        """Close the ends that are the child's."""
+        """Close the child's ends."""
         self._close(*self.of_child)
 
     def close_input(self) -> None:
@@ -169,7 +168,7 @@ class _Terminal:
         self._close(*self._open)
 
     def close_childs(self) -> None:
-        """Close the end that is the child's."""
+        """Close the child's end."""
         self._close(self.of_child[0])
 
     def close_input(self) -> None:
@@ -199,7 +198,7 @@ class _Conversation:
         self._turn = asyncio.Lock()
 
     async def hold(self, mark: str) -> Frame:
-        """Go on until the command has ended, or its user is gone.
+        """Pass data until the command has ended, or its user has disconnected.
 
         Returns:
             The last frame.
@@ -210,14 +209,11 @@ class _Conversation:
             await asyncio.wait((self._child.ended, listening), return_when=asyncio.FIRST_COMPLETED)
             if not self._child.ended.done():
                 await self._hang_up()
-            # What it left running in the background would keep its streams open.
-            await strike_all(mark, variable=NODE_MARK)
+            # Processes that the command left in the background would keep its streams open.
+            await kill_marked(mark, variable=NODE_MARK)
             await asyncio.wait(outputs, timeout=REST_S)
         finally:
-            tasks = (*outputs, listening)
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await cancel_and_wait(*outputs, listening)
         code = self._child.ended.result()
         return ended_frame(code if code >= 0 else 128 - code)
 
@@ -233,13 +229,13 @@ class _Conversation:
                 await self._loop.sock_sendall(self._sock, Frame(part, data).encode())
 
     async def _listen(self) -> None:
-        """Do what the user says; returns when the user is gone or says nothing that makes sense."""
+        """Handle the user's frames; return when the user disconnects or sends an invalid frame."""
         while received := await self._loop.sock_recv(self._sock, MAX_DATA + 2):
             try:
                 frame = decode(received)
                 await self._obey(frame)
             except ValueError as error:
-                log.warning("a command is ended: %s", error)
+                _log.warning("a command is ended: %s", error)
                 return
             except OSError:  # the command does not read, or has closed its input
                 self._streams.close_input()
@@ -259,3 +255,5 @@ class _Conversation:
                 self._child.signal_group(number)
             case Part.OUTPUT | Part.ERROR | Part.STARTED | Part.ENDED:
                 raise ValueError(f"a user sent {frame.part.name}")
+            case _:
+                assert_never(frame.part)

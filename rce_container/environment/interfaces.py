@@ -7,34 +7,35 @@ from abc import abstractmethod
 from collections.abc import Awaitable, Callable, Collection
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import cancel_and_wait
 from rce.link import Buffer, CallError, Interface, InterfaceError, Port
-from rce.protocol.names import Form, InterfaceType, Role
+from rce.model.names import Form, InterfaceType, Role
 from rce.ros import names
 from rce.ros.errors import RosError
 
 if TYPE_CHECKING:
-    from rce.control.model import InterfaceSpec
+    from rce.model.specs import InterfaceSpec
     from rce.ros.node import Node, Publisher, Service, ServiceClient, Subscriber
     from rce.ros.types import TypeRegistry
 
 READY_TIMEOUT_S = 30.0
-"""How long an interface waits for nodes that start one after the other, at most."""
+"""Maximum time that an interface waits for nodes that start one after the other."""
 _LOOK_AGAIN_S = 0.05
 
 
 class Readiness:
-    """Makes a started interface mean: it will be heard.
+    """Delays a started interface until nodes of the container are ready for it.
 
     Args:
-        settling: Whether nodes of the container are just starting, or soon will, and may yet take up a topic
-            or service.
+        settling: Whether nodes of the container are starting, or soon will, and may yet register a topic or
+            service.
     """
 
     def __init__(self, settling: Callable[[], bool]) -> None:
         self._settling = settling
 
     async def wait(self, ready: Awaitable[object]) -> None:
-        """Wait for ``ready`` while there is hope for it, and give it up then."""
+        """Wait for ``ready`` as long as nodes are starting."""
         task = asyncio.ensure_future(ready)
         try:
             async with asyncio.timeout(READY_TIMEOUT_S):
@@ -43,22 +44,21 @@ class Readiness:
         except TimeoutError:
             pass
         finally:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+            await cancel_and_wait(task)
 
 
 class RosInterface(Interface):
-    """What the four kinds have in common."""
+    """Base of the four kinds of interfaces."""
 
     def __init__(self, port: Port, node: Node, readiness: Readiness) -> None:
         super().__init__(port)
         self.node = node
         self.readiness = readiness
         self.addr = names.resolve(port.spec.addr, node.name)
-        self.cls = port.spec.cls
+        self.message_type = port.spec.message_type
 
     async def start(self) -> None:
-        """Take up the topic or service, and wait until a starting node did so too."""
+        """Register the topic or service, and wait until a starting node has registered it too."""
         try:
             await self.open()
         except RosError as error:
@@ -66,17 +66,17 @@ class RosInterface(Interface):
 
     @abstractmethod
     async def open(self) -> None:
-        """Do the work of :meth:`start`; errors of ROS may go through."""
+        """Do the work of :meth:`start`; may raise errors of ROS."""
 
 
 class PublisherInterface(RosInterface):
-    """Publishes in the container what the peers send."""
+    """Publishes the peers' messages in the container."""
 
     publisher: Publisher | None = None
 
     async def open(self) -> None:
         """Advertise the topic."""
-        self.publisher = await self.node.advertise(self.addr, self.cls)
+        self.publisher = await self.node.advertise(self.addr, self.message_type)
         await self.readiness.wait(self.publisher.wait_for_subscribers(1))
 
     def receive(self, payload: bytes, *, latched: bool) -> None:
@@ -90,19 +90,19 @@ class PublisherInterface(RosInterface):
             self.publisher.publish_serialized(payload, latch=True, source=source)
 
     def unlatch(self, sources: Collection[str]) -> None:
-        """Give later nodes nothing of these sources any more."""
+        """Stop giving messages of these sources to nodes that subscribe later."""
         if self.publisher is not None:
             for source in sources:
                 self.publisher.unlatch(source)
 
     async def close(self) -> None:
-        """Take the topic back."""
+        """Unadvertise the topic."""
         if self.publisher is not None:
             await self.publisher.close()
 
 
 class SubscriberInterface(RosInterface):
-    """Sends to the peers what nodes of the container publish, not what its own interfaces do."""
+    """Sends messages of the container's nodes to the peers, but not those of its own interfaces."""
 
     subscriber: Subscriber | None = None
 
@@ -113,7 +113,7 @@ class SubscriberInterface(RosInterface):
 
     async def open(self) -> None:
         """Subscribe to the topic."""
-        self.subscriber = await self.node.listen(self.addr, self.cls, self)
+        self.subscriber = await self.node.listen(self.addr, self.message_type, self)
 
     def received(self, payload: bytes) -> None:
         """Send a node's message."""
@@ -125,7 +125,7 @@ class SubscriberInterface(RosInterface):
         self.port.send(payload, latched=True, source=source)
 
     def source_ended(self, source: str) -> None:
-        """Give later peers nothing of a node that ended."""
+        """Stop giving messages of an ended node to peers that come later."""
         self._sources.pop(source, None)
         self.port.keep_latched(self._sources)
 
@@ -141,12 +141,12 @@ class ServiceClientInterface(RosInterface):
     client: ServiceClient | None = None
 
     async def open(self) -> None:
-        """Look for the service."""
-        self.client = self.node.service_client(self.addr, self.cls)
+        """Look up the service."""
+        self.client = self.node.service_client(self.addr, self.message_type)
         await self.readiness.wait(self.node.wait_for_service(self.addr))
 
     async def serve(self, payload: bytes) -> Buffer:
-        """Pass one request on and return the answer; a failing service's text reaches the caller."""
+        """Pass a request on and return the answer; the caller gets the error text of a failing service."""
         assert self.client is not None
         return await self.client.call_serialized(payload)
 
@@ -157,13 +157,13 @@ class ServiceClientInterface(RosInterface):
 
 
 class ServiceProviderInterface(RosInterface):
-    """Offers a service in the container that the peer provides."""
+    """Offers in the container a service that the peer provides."""
 
     service: Service | None = None
 
     async def open(self) -> None:
         """Advertise the service."""
-        self.service = await self.node.advertise_service_serialized(self.addr, self.cls, self._ask)
+        self.service = await self.node.advertise_service_serialized(self.addr, self.message_type, self._ask)
 
     async def _ask(self, payload: bytes) -> bytes:
         try:
@@ -172,7 +172,7 @@ class ServiceProviderInterface(RosInterface):
             raise RosError(f"{self.addr}: {error}") from error
 
     async def close(self) -> None:
-        """Take the service back."""
+        """Unadvertise the service."""
         if self.service is not None:
             await self.service.close()
 
@@ -189,9 +189,9 @@ class InterfaceMaker:
     """Makes a container's interfaces; a :data:`rce.link.InterfaceFactory`.
 
     Args:
-        node: The environment's own node, which takes up topics and services.
+        node: The environment's own node, which registers topics and services.
         types: Knows the messages' and services' types.
-        readiness: What the interfaces wait for.
+        readiness: Decides how long interfaces wait for nodes.
     """
 
     def __init__(self, node: Node, types: TypeRegistry, readiness: Readiness) -> None:
@@ -217,9 +217,9 @@ class InterfaceMaker:
         if kind.form is not Form.INTERFACE:
             raise ValueError(f"a container has no {spec.type}; use {kind.role.value}Interface")
         if not spec.addr or not names.is_graph_name(spec.addr):
-            raise ValueError(f"addr {spec.addr!r} is no ROS name; give the topic or service it stands for")
+            raise ValueError(f"addr {spec.addr!r} is not a ROS name; give the topic or service it stands for")
         if kind.role.is_service:
-            self._types.service(spec.cls)
+            self._types.service(spec.message_type)
         else:
-            self._types.message(spec.cls)
+            self._types.message(spec.message_type)
         return _KINDS[kind.role]

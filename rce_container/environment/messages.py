@@ -1,22 +1,30 @@
 """The messages between the manager and an environment (JSON lines on the control socket, tagged by ``t``).
 
 Both run on one machine, and are of one release but for a manager that was upgraded while its containers ran:
-what is added later has a default, or is sent only to an environment whose ``features`` name it. A manager may
-die and another one come: the newest connection counts, and an environment first says a :class:`Report` on it.
+later additions have a default, or are sent only to an environment whose ``features`` name them. Another
+manager may replace one that died: the newest connection counts, and an environment first sends a
+:class:`Report` on it.
 """
 
 from __future__ import annotations
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, field
 
 from rce.control.execution import Command
-from rce.control.model import EndpointSpec, EndpointStatus, InterfaceUsage, LinkAddress
+from rce.control.model import (
+    EndpointSpec,
+    EndpointStatus,
+    InterfaceUsage,
+    LinkAddress,
+    SpecPatch,
+    StatusPatch,
+)
 from rce.control.tags import TaggedReader
 
 
 class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What an environment is told when it is started, as JSON in its first argument. Holds no secret.
+    """The configuration of an environment at its start, as JSON in its first argument. Holds no secret.
 
     Its standard input is a listening unix socket for managers, its standard output one for peers' links.
     """
@@ -24,7 +32,7 @@ class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
     id: str
     """Endpoint id, ``user/tag``."""
     mark: str
-    """Names this life of the container; see :data:`rce_container.environment.proc.MARK`."""
+    """Names this incarnation of the container; see :data:`rce_container.environment.proc.MARK`."""
     machine: str
     """See :class:`rce.control.model.LinkAddress`."""
     home: str
@@ -38,10 +46,10 @@ class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):
     address: str = "127.0.0.1"
     """Where the container's nodes are reached by others of its group; loopback if it has none."""
     rlimits: dict[int, int] = {}
-    """What each of its processes limits for itself, by the numbers of :mod:`resource`."""
+    """The limits that each of its processes sets for itself, by the numbers of :mod:`resource`."""
     packages: tuple[str, ...] = ()
-    bundles: str = ""
-    """Folder in which packages that the user brought appear; see :mod:`rce_container.environment.bundles`."""
+    user_packages: str = field(default="", name="bundles")
+    """Folder in which the user's packages appear; see :mod:`rce_container.environment.user_packages`."""
     grace: float = 30.0
     """Seconds without a manager after which the environment ends itself."""
     interrupt_timeout: float = 15.0
@@ -58,17 +66,26 @@ class _Message(Struct, kw_only=True, omit_defaults=True, tag_field="t"):
 
 
 class Apply(_Message):
-    """The container is desired like this."""
+    """The whole desired state of the container."""
 
     spec: EndpointSpec
 
 
+class ApplyPatch(_Message):
+    """A change of the container's desired state. Only to environments with the feature ``patches``."""
+
+    patch: SpecPatch
+
+
 class Shelved(_Message):
-    """Packages that the user brought have appeared."""
+    """Packages that the user brought have arrived."""
 
 
 class Handover(_Message):
     """Comes with a socket, on which the manager hands accepted links over (:mod:`rce.link.handover`)."""
+
+    features: tuple[str, ...] = ()
+    """The features of this manager that earlier releases do not have."""
 
 
 class Dialed(_Message):
@@ -83,7 +100,7 @@ class Cause(_Message):
 
     request: int
     text: str = ""
-    """In words; empty if no cause is known."""
+    """As text; empty if no cause is known."""
 
 
 class Poll(_Message):
@@ -104,12 +121,22 @@ class Stop(_Message):
 
 
 class Report(_Message):
-    """All there is; sent on connection and whenever something in it changed."""
+    """The whole status; sent on connection and after every change."""
 
     status: EndpointStatus
     """Without incarnation and address, which the manager knows; pids as the environment sees them."""
     features: tuple[str, ...] = ()
-    """What this environment can do that one of an earlier release could not."""
+    """The features of this environment that earlier releases do not have."""
+
+
+class ReportPatch(_Message):
+    """A change of the status. Only to managers with the feature ``patches``."""
+
+    patch: StatusPatch
+
+
+class SpecWanted(_Message):
+    """A patch did not fit the desired state here. Answered by :class:`Apply`."""
 
 
 class Fault(_Message):
@@ -134,13 +161,13 @@ class Dial(_Message):
 
 
 class Killed(_Message):
-    """A process ended by SIGKILL: why? Answered by :class:`Cause`."""
+    """Asks why a process ended by SIGKILL. Answered by :class:`Cause`."""
 
     request: int
 
 
-ToEnvironment = Apply | Shelved | Handover | Dialed | Cause | Poll | Execute | Stop
-ToManager = Report | Fault | Counters | Dial | Killed
+ToEnvironment = Apply | ApplyPatch | Shelved | Handover | Dialed | Cause | Poll | Execute | Stop
+ToManager = Report | ReportPatch | SpecWanted | Fault | Counters | Dial | Killed
 
 encode = msgspec.json.Encoder().encode
 """Write a message as JSON; holds no newline."""

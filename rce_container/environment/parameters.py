@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from rce.control.model import ParameterSpec, ParameterValue
+from rce.model.specs import ParameterSpec, ParameterValue
 from rce.ros import names
 from rce.ros.packages import PackageIndex
 from rce.ros.substitution import substitute
@@ -16,14 +16,14 @@ Values = dict[str, ParameterValue]
 
 
 class Difference(NamedTuple):
-    """How to get from one set of parameters to another: delete first, then set."""
+    """The difference between two sets of parameters: delete first, then set."""
 
     delete: list[str]
     set: Values
 
 
 def difference(now: Values, desired: Values) -> Difference:
-    """Work out what to change. An equal value of another type (``1``, ``1.0``, ``True``) is a change."""
+    """Return the difference. An equal value of another type (``1``, ``1.0``, ``True``) is a change."""
     changed = {
         name: value for name, value in desired.items() if name not in now or not _same(now[name], value)
     }
@@ -33,10 +33,10 @@ def difference(now: Values, desired: Values) -> Difference:
 def evaluate(
     spec: ParameterSpec, packages: PackageIndex, environ: Mapping[str, str]
 ) -> tuple[str, ParameterValue]:
-    """Work out a parameter's global name and its value, with the substitutions made in strings.
+    """Return a parameter's global name and its value, with the substitutions in strings done.
 
     Raises:
-        ParameterError: The name is no ROS name, or a substitution cannot be made.
+        ParameterError: The name is not a ROS name, or a substitution cannot be made.
     """
 
     def filled(value: bool | float | str) -> bool | float | str:
@@ -44,7 +44,7 @@ def evaluate(
 
     name = names.canonical(f"/{spec.name}")
     if not names.is_graph_name(name) or name == "/":
-        raise ParameterError(f"parameter {spec.name!r}: this is no ROS name")
+        raise ParameterError(f"parameter {spec.name!r}: this is not a ROS name")
     try:
         if isinstance(spec.value, list):
             return name, [filled(item) for item in spec.value]
@@ -56,7 +56,7 @@ def evaluate(
 def evaluate_all(
     specs: Iterable[ParameterSpec], packages: PackageIndex, environ: Mapping[str, str]
 ) -> tuple[Values, list[ParameterError]]:
-    """Work out all parameters; what is wrong with one leaves the others alone."""
+    """Resolve all parameters; an error in one does not affect the others."""
     values: Values = {}
     faults = []
     for spec in specs:

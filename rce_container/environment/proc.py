@@ -1,7 +1,7 @@
-"""Processes as ``/proc`` shows them: who descends from whom, who carries a mark, who is still the same.
+"""Processes as ``/proc`` shows them: their descendants, their marks and their identity.
 
-Runs inside containers too, and as a script (``proc.py MARK``: kill all that carry the mark), so it imports
-nothing but the standard library. Where there is no ``/proc`` the functions find nothing.
+Runs inside containers too, and as a script (``proc.py MARK``: kill all processes that carry the mark), so it
+imports only the standard library. Without ``/proc`` the functions find no processes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import time
 from typing import NamedTuple
 
 MARK = "RCE_MARK"
-"""Environment variable of every process of a container without isolation; names one life of it."""
+"""Environment variable of every process of a container without isolation; names its incarnation."""
 
 _PROC = "/proc"
 _PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -24,16 +24,16 @@ _PAUSE_S = 0.02
 
 
 class Process(NamedTuple):
-    """One process. It is told by ``pid`` and ``start``: a reused pid has another start."""
+    """One process, identified by ``pid`` and ``start``: a reused pid has another start."""
 
     pid: int
     start: int
-    """Clock ticks between the machine's start and the process's."""
+    """Clock ticks between the start of the machine and of the process."""
     parent: int
     group: int
     session: int
     cpu_s: float
-    """CPU seconds of the process and of the children it waited for."""
+    """CPU seconds of the process and of the children that it waited for."""
     resident: int
     """Bytes."""
 
@@ -70,7 +70,7 @@ def table() -> dict[int, Process]:
 
 
 def descendants(root: int, processes: dict[int, Process]) -> list[Process]:
-    """Find ``root`` and all that descends from it, parents before children."""
+    """Return ``root`` and all its descendants, parents before children."""
     children: dict[int, list[Process]] = {}
     for process in processes.values():
         children.setdefault(process.parent, []).append(process)
@@ -81,7 +81,7 @@ def descendants(root: int, processes: dict[int, Process]) -> list[Process]:
 
 
 def marked(mark: str, *, variable: str = MARK) -> list[Process]:
-    """Find all processes whose environment holds ``variable=mark`` since their start."""
+    """Return all processes that were started with ``variable=mark`` in their environment."""
     needle = f"{variable}={mark}".encode()
     found = []
     for process in table().values():
@@ -96,18 +96,18 @@ def marked(mark: str, *, variable: str = MARK) -> list[Process]:
 
 
 def same(process: Process, other: Process | None) -> bool:
-    """Tell whether two looks at a pid saw the same process."""
+    """Return whether two records of a pid are of the same process."""
     return other is not None and (process.pid, process.start) == (other.pid, other.start)
 
 
 def alive(pid: int, start: int) -> bool:
-    """Tell whether the process that had this pid and start time still runs."""
+    """Return whether the process with this pid and start time still runs."""
     process = read(pid)
     return process is not None and process.start == start
 
 
 def proportional(pid: int) -> int | None:
-    """The process's proportional share of memory (PSS) in bytes; None if it may not be read."""
+    """Return the process's proportional share of memory (PSS) in bytes; None if it may not be read."""
     try:
         with open(f"{_PROC}/{pid}/smaps_rollup", "rb") as file:  # noqa: PTH123
             for line in file:
@@ -119,7 +119,7 @@ def proportional(pid: int) -> int | None:
 
 
 def inner_pid(pid: int) -> int:
-    """The pid that the process has inside its innermost pid namespace; 0 if it is gone."""
+    """Return the process's pid in its innermost pid namespace; 0 if the process has ended."""
     try:
         with open(f"{_PROC}/{pid}/status", "rb") as file:  # noqa: PTH123
             for line in file:
@@ -131,17 +131,17 @@ def inner_pid(pid: int) -> int:
 
 
 def kill(process: Process) -> None:
-    """Kill -9 a process, unless it is gone or its pid belongs to another one now."""
+    """Kill -9 a process, unless it has ended or its pid now belongs to another process."""
     if alive(process.pid, process.start):
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.kill(process.pid, signal.SIGKILL)
 
 
 def strike(mark: str, *, variable: str = MARK) -> int:
-    """Kill -9 all that carries the mark now.
+    """Kill -9 all processes that carry the mark now.
 
     Returns:
-        How many were found; what they forked meanwhile needs another strike, so strike until it is 0.
+        How many were found. They may have forked meanwhile, so repeat until it is 0.
     """
     found = marked(mark, variable=variable)
     for process in found:

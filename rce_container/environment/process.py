@@ -1,4 +1,4 @@
-"""What is asked of the kernel about processes. Linux only; elsewhere nothing happens."""
+"""Settings of processes that the kernel keeps. Linux only; without effect elsewhere."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from pathlib import Path
 from rce_container.environment import proc
 
 OF_ENVIRONMENT = 300
-"""When memory has run out, containers die before the engine, of which a process has the score 0."""
+"""When memory runs out, the kernel kills containers before the engine, whose processes have the score 0."""
 OF_NODES = 600
-"""And nodes die before the environment that would have to tell of it."""
+"""The kernel kills nodes before the environment, which has to report it."""
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_DUMPABLE = 4
@@ -27,25 +27,26 @@ _STRIKES = 100
 _STRIKE_PAUSE_S = 0.02
 
 
-def keep_to_oneself() -> None:
-    """Keep other processes of the same user, the container's nodes, from looking into this one.
+def set_undumpable() -> None:
+    """Prevent other processes of the same user, such as the container's nodes, from inspecting this one.
 
     It holds the sockets of the container's control and links and the links' tokens.
     """
     _prctl(_PR_SET_DUMPABLE, 0)
 
 
-def die_before_others(score: int, pid: int | None = None) -> None:
-    """Offer this process, or another one, to the kernel for the time when memory has run out.
+def set_oom_score(score: int, pid: int | None = None) -> None:
+    """Set the out-of-memory score of this process or another one.
 
     Args:
-        score: How much it is offered, and what it starts from then on; see :data:`OF_ENVIRONMENT`.
-        pid: Another process of the same user. One that executes a program just now is waited for, briefly.
+        score: The score of the process, and of the children that it starts from then on; see
+            :data:`OF_ENVIRONMENT`.
+        pid: Another process of the same user. Waits briefly for one that is just executing a program.
     """
     for _ in range(_ATTEMPTS):
         try:
             Path(f"/proc/{pid or 'self'}/oom_score_adj").write_text(str(score))
-        except PermissionError:  # it is still as closed to others as the one that forked it
+        except PermissionError:  # it is still as protected as the process that forked it
             time.sleep(_ATTEMPT_PAUSE_S)
         except OSError:  # not Linux, or the process is gone
             return
@@ -53,8 +54,8 @@ def die_before_others(score: int, pid: int | None = None) -> None:
             return
 
 
-def limit_oneself(rlimits: Mapping[int, int]) -> None:
-    """Limit this process and each one that it starts, as far as it is not limited further already.
+def set_rlimits(rlimits: Mapping[int, int]) -> None:
+    """Limit this process and its future children; stricter limits stay.
 
     Args:
         rlimits: Limits by the numbers of :mod:`resource`.
@@ -65,17 +66,17 @@ def limit_oneself(rlimits: Mapping[int, int]) -> None:
             resource.setrlimit(number, (limit, limit))
 
 
-def take_in_orphans() -> None:
-    """Become the parent of what descendants leave behind, and end when the own parent ends."""
+def become_subreaper() -> None:
+    """Adopt the orphans of descendants, and end when the parent process ends."""
     _prctl(_PR_SET_CHILD_SUBREAPER, 1)
     _prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
-async def strike_all(mark: str, *, variable: str = proc.MARK) -> bool:
-    """Kill -9 all that carries a mark, and what that forks meanwhile.
+async def kill_marked(mark: str, *, variable: str = proc.MARK) -> bool:
+    """Kill -9 all processes that carry a mark, and their new children.
 
     Returns:
-        Whether nothing is left; False after two seconds of trying.
+        Whether no process is left; False after two seconds of attempts.
     """
     for _ in range(_STRIKES):
         if not proc.strike(mark, variable=variable):

@@ -1,6 +1,6 @@
 """The container's way to its peers.
 
-A container has no network: the manager connects for it and hands the socket in.
+A container has no network: the manager connects for it and passes the socket in.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from rce_container.environment.messages import Dial
 _TIMEOUT_S = 10.0
 
 
-class Operator:
+class DialProxy:
     """Asks the manager for connections to peers, which a container cannot make by itself.
 
     Args:
-        send: Sends a message to the manager; whether there is one.
+        send: Sends a message to the manager; returns whether one is connected.
     """
 
     def __init__(self, send: Callable[[Dial], bool]) -> None:
@@ -32,7 +32,7 @@ class Operator:
         """Get a connected socket.
 
         Raises:
-            OSError: The peer cannot be reached, or there is no manager now.
+            OSError: The peer cannot be reached, or no manager is connected.
         """
         number = next(self._numbers)
         answer: asyncio.Future[socket.socket] = asyncio.get_running_loop().create_future()
@@ -46,7 +46,7 @@ class Operator:
             del self._asked[number]
 
     def answered(self, request: int, result: socket.socket | str) -> None:
-        """Take the manager's answer: a connected socket or an error."""
+        """Handle the manager's answer: a connected socket or an error."""
         answer = self._asked.get(request)
         if isinstance(result, str):
             if answer is not None and not answer.done():

@@ -11,8 +11,8 @@ from pathlib import Path
 from rce_container.environment.environment import Environment
 from rce_container.environment.logs.files import ENVIRONMENT_LOG, LogWriter
 from rce_container.environment.messages import Boot
-from rce_container.environment.nodes.cradle import Cradle
-from rce_container.environment.process import limit_oneself
+from rce_container.environment.nodes.fork_server import NodeForkServer
+from rce_container.environment.process import set_rlimits
 
 
 class _Handler(logging.Handler):
@@ -29,7 +29,7 @@ class _Handler(logging.Handler):
 
 
 def run_environment(
-    boot: Boot, control: socket.socket, links: socket.socket, cradle: Cradle | None = None
+    boot: Boot, control: socket.socket, links: socket.socket, node_server: NodeForkServer | None = None
 ) -> None:
     """Live as a container's environment; returns when the container has ended properly.
 
@@ -37,22 +37,24 @@ def run_environment(
         boot: What the manager says of the container.
         control: A listening unix socket for managers.
         links: A listening unix socket for peers' links.
-        cradle: See :class:`Environment`.
+        node_server: See :class:`Environment`.
     """
-    limit_oneself(boot.rlimits)
+    set_rlimits(boot.rlimits)
     writer = LogWriter(Path(boot.logs), ENVIRONMENT_LOG, mirror=(1, 2))
     logging.basicConfig(level=logging.INFO, handlers=[_Handler(writer)])
     try:
         import uvloop
     except ImportError:
-        asyncio.run(_live(boot, control, links, cradle))
+        asyncio.run(_live(boot, control, links, node_server))
     else:
-        uvloop.run(_live(boot, control, links, cradle))
+        uvloop.run(_live(boot, control, links, node_server))
 
 
-async def _live(boot: Boot, control: socket.socket, links: socket.socket, cradle: Cradle | None) -> None:
+async def _live(
+    boot: Boot, control: socket.socket, links: socket.socket, node_server: NodeForkServer | None
+) -> None:
     loop = asyncio.get_running_loop()
-    environment = Environment(boot, control, links, cradle)
+    environment = Environment(boot, control, links, node_server)
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, environment.end, number.name)
     await environment.run()

@@ -1,6 +1,6 @@
-"""What limits are, and what every way to enforce them offers.
+"""Limits, and the interface of the ways to enforce them.
 
-A container has one *cell*: the place in which the machine counts and limits all of its processes together.
+A container has one *control group*, in which the machine counts and limits all of its processes together.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from typing import ClassVar, NamedTuple, Protocol
 
-from rce.control.limits import MEGABYTE, MIN_MEMORY
-from rce.control.model import Resources
+from rce.control.machine import MEGABYTE, MIN_MEMORY
+from rce.model.specs import Resources
 
 
 class Limits(NamedTuple):
-    """What a container may use. Zero means: no limit."""
+    """The limits of a container. Zero means: no limit."""
 
     cpu: float = 0.0
     """Cores."""
@@ -23,11 +23,11 @@ class Limits(NamedTuple):
     processes: int = 0
     """Processes and threads."""
     weight: int = 0
-    """Its share of a processor that others want too, relative to theirs; 100 for each slot."""
+    """Its share of a contended processor, relative to the shares of others; 100 for each slot."""
 
 
 class SlotSettings(Protocol):
-    """How much a slot is."""
+    """The size of a slot."""
 
     @property
     def slot_memory(self) -> int:
@@ -42,9 +42,9 @@ WEIGHT_PER_SLOT = 100
 
 
 def limits_of(resources: Resources, settings: SlotSettings) -> Limits:
-    """The limits of a container: what it asks for itself, else as many slots' as its size says.
+    """Return the limits of a container: as it requests, else those of its number of slots.
 
-    Stores of earlier releases may hold wishes for less memory than a container can live with.
+    Stores of earlier releases may hold requests for less memory than a container needs.
     """
     size = max(1, resources.size)
     return Limits(
@@ -56,27 +56,27 @@ def limits_of(resources: Resources, settings: SlotSettings) -> Limits:
 
 
 def in_megabytes(size: int) -> str:
-    """Write a number of bytes as users do, rounded up."""
+    """Format a number of bytes as users write it, rounded up."""
     return f"{-(-size // MEGABYTE)} MB"
 
 
-class CellUsage(NamedTuple):
-    """What all processes of a cell consume, or consumed since it was made. None: nobody counts."""
+class ControlGroupUsage(NamedTuple):
+    """The usage of all processes of a control group, now or since it was made. None: not counted."""
 
     cpu_s: float | None = None
     throttled_s: float = 0.0
     """Seconds in which it was held back by its CPU limit."""
     memory: int | None = None
-    """Bytes that cannot be had back without harm: files that are only cached do not count."""
+    """Bytes that the kernel cannot reclaim without harm: files that are only cached do not count."""
     memory_peak: int = 0
-    """Bytes, cached files included; 0 if nobody counts."""
+    """Bytes, cached files included; 0 if it is not counted."""
     io_read: int = 0
     """Bytes from disks."""
     io_written: int = 0
 
 
 class Troubles(NamedTuple):
-    """How often a cell's limits struck since it was made."""
+    """How often a control group's limits were hit since it was made."""
 
     oom_kills: int = 0
     """Processes that were killed because memory ran out."""
@@ -84,56 +84,56 @@ class Troubles(NamedTuple):
     """Processes and threads that could not be started."""
 
 
-class Cell(ABC):
-    """The place of one container. Its methods do short, blocking file I/O."""
+class ControlGroup(ABC):
+    """The control group of one container. Its methods do short, blocking file I/O."""
 
     limits: Limits
-    """What is in force."""
+    """The limits in force."""
 
     @property
     @abstractmethod
     def join(self) -> tuple[str, ...]:
-        """Files into which a process writes its pid to get into the cell, before anything else of it runs."""
+        """Files into which a process writes its pid to join the group, before anything else of it runs."""
 
     @property
     @abstractmethod
     def rlimits(self) -> Mapping[int, int]:
-        """What the container's own processes must limit by :func:`resource.setrlimit`, each for itself."""
+        """The limits that each process of the container must set for itself by :func:`resource.setrlimit`."""
 
     @abstractmethod
     def apply(self, limits: Limits) -> None:
-        """Put other limits in force. May take long where memory has to be got back first.
+        """Apply other limits. May take long if memory has to be reclaimed first.
 
         Raises:
-            LimitError: They cannot be; the old ones stay. The text says what to do.
+            LimitError: They cannot be applied; the old ones stay. The text says what to do.
         """
 
     @abstractmethod
-    def usage(self) -> CellUsage:
-        """What its processes consume."""
+    def usage(self) -> ControlGroupUsage:
+        """Return the usage of its processes."""
 
     @abstractmethod
     def troubles(self) -> Troubles:
-        """How often its limits struck; a few microseconds."""
+        """Return how often its limits were hit; takes a few microseconds."""
 
     @abstractmethod
     def pids(self) -> list[int] | None:
-        """Its processes; None if nobody knows."""
+        """Its processes; None if unknown."""
 
     @abstractmethod
     def kill(self) -> None:
-        """Kill -9 all its processes, let it start no more, and wait until none is left. Blocks.
+        """Kill -9 all its processes, prevent new ones, and wait until none is left. Blocks.
 
         Raises:
-            KillError: Some process does not die.
+            KillError: A process does not end.
         """
 
     @abstractmethod
     def remove(self) -> None:
-        """Remove the cell, which has to be empty. Removing what is gone already does nothing.
+        """Remove the control group, which has to be empty. Does nothing if it is already removed.
 
         Raises:
-            LimitError: Something is left in it.
+            LimitError: It is not empty.
         """
 
 
@@ -142,7 +142,7 @@ class Limiter(ABC):
 
     name: ClassVar[str]
     detail: str = ""
-    """What it cannot do on this machine, and what would help, in words; empty if nothing is missing."""
+    """What it cannot do on this machine and how to fix that, as text; empty if it can do everything."""
 
     @abstractmethod
     def probe(self) -> None:
@@ -155,28 +155,28 @@ class Limiter(ABC):
     @property
     @abstractmethod
     def missing(self) -> frozenset[str]:
-        """What of ``cpu``, ``memory``, ``processes`` and ``io`` it cannot limit or count here."""
+        """Those of ``cpu``, ``memory``, ``processes`` and ``io`` that it cannot limit or count here."""
 
     @abstractmethod
-    def create(self, mark: str, limits: Limits) -> Cell:
-        """Make the cell of one life of a container.
+    def create(self, incarnation_id: str, limits: Limits) -> ControlGroup:
+        """Make the control group of one incarnation of a container.
 
         Raises:
-            LimitError: It cannot be made with these limits; nothing is left of it.
+            LimitError: It cannot be made with these limits; a partly made group is removed.
         """
 
     @abstractmethod
-    def adopt(self, mark: str) -> Cell:
-        """The cell of a container that an earlier manager started; an empty shell if it has none."""
+    def adopt(self, incarnation_id: str) -> ControlGroup:
+        """Return the control group of an adopted container; a stand-in if it has none."""
 
     @abstractmethod
     def sweep(self, keep: Collection[str]) -> None:
-        """End and remove what earlier managers of this task set left, but for the cells of these marks."""
+        """End and remove the groups that earlier managers left, except those of these marks."""
 
     @abstractmethod
     def close(self) -> None:
-        """Remove what is not needed any more; cells that are there stay."""
+        """Remove what is not needed any more; existing control groups stay."""
 
     @abstractmethod
     def ceiling(self) -> Limits:
-        """What the engine itself, and so all containers together, may use at most on this machine."""
+        """Return the limits of the engine itself, and so of all containers together, on this machine."""

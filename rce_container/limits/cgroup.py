@@ -1,7 +1,7 @@
-"""What cells and limiters of both versions of cgroups have in common.
+"""Base of the control groups and limiters of both versions of cgroups.
 
 Below this program's own cgroup (in each hierarchy of version 1) there is one folder ``rce-TOKEN`` for each
-container task set, and in it one for each life of a container, named by its mark.
+container task set, and in it one for each incarnation of a container, named by its mark.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from pathlib import Path
 from typing import ClassVar
 
 from rce_container.exceptions import KillError, LimitError
+from rce_container.files import write_whole
 from rce_container.limits import files, hierarchy
-from rce_container.limits.base import Cell, Limiter, Limits, in_megabytes
+from rce_container.limits.base import ControlGroup, Limiter, Limits, in_megabytes
 from rce_container.limits.rlimit import rlimits_of
-from rce_container.writing import write_whole
 
 PERIOD_US = 100_000
-"""A CPU limit holds over each period of this length."""
+"""Length of the period of a CPU limit, in microseconds."""
 MIN_QUOTA_US = 1000
-"""The kernel gives no less than this in a period."""
+"""The smallest quota that the kernel accepts for a period, in microseconds."""
 
 _KILL_TIMEOUT_S = 10.0
 _REMOVE_TIMEOUT_S = 2.0
@@ -33,13 +33,13 @@ _PAUSE_S = 0.01
 _ATTEMPTS = 3
 
 
-class CgroupCell(Cell):
+class CgroupControlGroup(ControlGroup):
     """One cgroup, or one in each of several hierarchies of version 1.
 
-    Which of them holds a control file is found by looking for it.
+    A control file is searched for in all of them.
 
     Args:
-        folders: Those that exist; none for a container without.
+        folders: The existing ones; empty for a container without cgroups.
     """
 
     def __init__(self, folders: Sequence[Path]) -> None:
@@ -86,7 +86,7 @@ class CgroupCell(Cell):
         return files.pids(self._folders[0]) if self._folders else []
 
     def kill(self) -> None:
-        """By the kernel, where it can; else one by one, with no new ones allowed meanwhile."""
+        """The kernel kills them if it can; else they are killed one by one, while new ones are prevented."""
         deadline = time.monotonic() + _KILL_TIMEOUT_S
         while pids := {pid for folder in self._folders for pid in files.pids(folder)} - {os.getpid()}:
             if time.monotonic() > deadline:
@@ -95,7 +95,7 @@ class CgroupCell(Cell):
             time.sleep(_PAUSE_S)
 
     def remove(self) -> None:
-        """A process that is just dying may still be in it, so this tries for a while.
+        """Retry for a while, because an ending process may still be in it.
 
         The folder of the task set goes with its last container.
         """
@@ -123,7 +123,7 @@ class CgroupCell(Cell):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 
-    # Control files, wherever they are
+    # Control files, in any of the folders
 
     def _has(self, name: str) -> bool:
         if name not in self._files:
@@ -144,7 +144,7 @@ class CgroupCell(Cell):
         if self._has(name):
             files.write(self._files[name], value)
 
-    # What the versions do differently
+    # Differences between the versions
 
     _memory_file: ClassVar[str]
 
@@ -156,7 +156,7 @@ class CgroupCell(Cell):
 
     @abstractmethod
     def _needed(self) -> int:
-        """Bytes of memory that the kernel cannot take back."""
+        """Bytes of memory that the kernel cannot reclaim."""
 
     def _too_low(self, wanted: int) -> LimitError:
         return LimitError(
@@ -166,16 +166,16 @@ class CgroupCell(Cell):
 
 
 class CgroupLimiter(Limiter):
-    """Makes cells below this program's own cgroups.
+    """Makes control groups below this program's own cgroups.
 
     Args:
-        token: Names the task set on this machine, for ever.
-        ledger: A file of the task set; holds where its cells were, since the next manager may be started
-            in another cgroup.
+        token: A permanent name of the task set on this machine.
+        ledger: A file of the task set; holds where its control groups were, since the next manager may be
+            started in another cgroup.
         proc: See :func:`rce_container.limits.hierarchy.find`.
     """
 
-    cell: ClassVar[type[CgroupCell]]
+    control_group: ClassVar[type[CgroupControlGroup]]
 
     def __init__(self, token: str, ledger: Path, proc: Path = hierarchy.PROC) -> None:
         self._folder = f"rce-{token}"
@@ -188,12 +188,12 @@ class CgroupLimiter(Limiter):
 
     @property
     def missing(self) -> frozenset[str]:
-        """What no controller is there for."""
+        """The resources without a controller."""
         return self._missing
 
-    def create(self, mark: str, limits: Limits) -> Cell:
+    def create(self, incarnation_id: str, limits: Limits) -> ControlGroup:
         """Make its folders and write its limits."""
-        folders = [parent / mark for parent in self._parents]
+        folders = [parent / incarnation_id for parent in self._parents]
         try:
             self._make(folders)
         except OSError as error:
@@ -201,27 +201,27 @@ class CgroupLimiter(Limiter):
                 with contextlib.suppress(OSError):
                     files.drop(folder)
             raise LimitError(f"its cgroup cannot be made: {error}") from error
-        cell = self.cell(folders)
+        control_group = self.control_group(folders)
         try:
-            cell.apply(limits)
+            control_group.apply(limits)
         except LimitError:
-            cell.remove()
+            control_group.remove()
             raise
-        return cell
+        return control_group
 
-    def adopt(self, mark: str) -> Cell:
+    def adopt(self, incarnation_id: str) -> ControlGroup:
         """Find its folders, also where an earlier manager made them."""
-        folders = [parent / mark for parent in self._all_parents()]
-        return self.cell([folder for folder in folders if folder.is_dir()])
+        folders = [parent / incarnation_id for parent in self._all_parents()]
+        return self.control_group([folder for folder in folders if folder.is_dir()])
 
     def sweep(self, keep: Collection[str]) -> None:
-        """Look where this and earlier managers made cells."""
+        """Find where this and earlier managers made control groups."""
         parents = self._all_parents()
-        marks = {child.name for parent in parents for child in files.children(parent)}
-        for mark in sorted(marks - set(keep)):
-            cell = self.adopt(mark)
-            cell.kill()
-            cell.remove()
+        incarnation_ids = {child.name for parent in parents for child in files.children(parent)}
+        for incarnation_id in sorted(incarnation_ids - set(keep)):
+            control_group = self.adopt(incarnation_id)
+            control_group.kill()
+            control_group.remove()
         for parent in parents:
             if parent not in self._parents:
                 _drop_if_empty(parent)
@@ -229,14 +229,14 @@ class CgroupLimiter(Limiter):
         write_whole(self._ledger, "".join(f"{parent}\n" for parent in kept).encode())
 
     def close(self) -> None:
-        """Remove this task set's folders, if nothing is in them."""
+        """Remove this task set's folders, if they are empty."""
         for parent in self._parents:
             _drop_if_empty(parent)
 
     def ceiling(self) -> Limits:
-        """The least of what is set from this program's own cgroup up."""
+        """Return the smallest of the limits of this program's own cgroup and its ancestors."""
         found = [
-            self.cell([folder]).limits
+            self.control_group([folder]).limits
             for base, mount in zip(self._bases, self._mounts, strict=True)
             for folder in _up(base, mount)
         ]
@@ -250,7 +250,7 @@ class CgroupLimiter(Limiter):
         return tuple(base / self._folder for base in self._bases)
 
     def _all_parents(self) -> list[Path]:
-        """Of this manager, and of earlier ones of the task set."""
+        """Return the folders of this manager and of earlier ones of the task set."""
         former = map(Path, files.read(self._ledger).splitlines())
         return list(dict.fromkeys((*self._parents, *(one for one in former if one.name == self._folder))))
 
@@ -270,7 +270,7 @@ class CgroupLimiter(Limiter):
 
     @abstractmethod
     def _make_parent(self, parent: Path) -> None:
-        """Make ``rce-TOKEN`` as containers need it, if it is not there.
+        """Make ``rce-TOKEN`` as containers need it, if it does not exist.
 
         Raises:
             OSError: It cannot be made.

@@ -8,34 +8,34 @@ from pathlib import Path
 
 from rce_container.exceptions import LimitsUnavailableError
 from rce_container.limits import files, hierarchy
-from rce_container.limits.base import WEIGHT_PER_SLOT, CellUsage, Limits, Troubles
-from rce_container.limits.cgroup import PERIOD_US, CgroupCell, CgroupLimiter, quota
+from rce_container.limits.base import WEIGHT_PER_SLOT, ControlGroupUsage, Limits, Troubles
+from rce_container.limits.cgroup import PERIOD_US, CgroupControlGroup, CgroupLimiter, quota
 
 CONTROLLERS = {"memory": "memory", "pids": "processes", "cpu": "cpu", "cpuacct": "", "blkio": "io"}
-"""The controllers that are used, the most important first, and what is missing without them."""
+"""The controllers that are used, the most important first, and the resources that need them."""
 
 _UNLIMITED = 1 << 60
-"""A memory limit beyond this is none."""
+"""Memory limits beyond this mean: no limit."""
 _SHARES = 1024
-"""The shares of a cgroup that nobody set, and the weight of a single process."""
+"""The default shares of a cgroup, and the weight of a single process."""
 _MAX_SHARES = 1 << 18
 _SHARES_PER_CORE = 4 * _SHARES
-"""What all containers together weigh against the single processes beside them, the engine's among them."""
+"""The weight of all containers together against single processes beside them, such as the engine's."""
 
 
-class Cell1(CgroupCell):
+class ControlGroupV1(CgroupControlGroup):
     """A folder in each hierarchy."""
 
     _memory_file = "memory.limit_in_bytes"
 
-    def usage(self) -> CellUsage:
+    def usage(self) -> ControlGroupUsage:
         """Read the counters."""
         memory = None
         if self._has("memory.usage_in_bytes"):
             idle = files.keyed(self._read("memory.stat")).get("total_inactive_file", 0)
             memory = max(0, self._number("memory.usage_in_bytes") - idle)
         io = parse_io(self._read("blkio.throttle.io_service_bytes_recursive"))
-        return CellUsage(
+        return ControlGroupUsage(
             cpu_s=self._number("cpuacct.usage") / 1e9 if self._has("cpuacct.usage") else None,
             throttled_s=files.keyed(self._read("cpu.stat")).get("throttled_time", 0) / 1e9,
             memory=memory,
@@ -63,8 +63,8 @@ class Cell1(CgroupCell):
 
     def _write_limits(self, limits: Limits) -> None:
         self._write_memory(limits.memory or -1)
-        # What waits in TCP connections is no part of the memory in this version, and comes from one store for
-        # the whole machine. Beyond this limit a connection gets no more than it cannot do without.
+        # Data that waits in TCP connections is not part of the memory in this version, and comes from one
+        # store for the whole machine. Beyond this limit a connection gets only the minimum.
         self._write("memory.kmem.tcp.limit_in_bytes", limits.memory or -1)
         self._write("pids.max", limits.processes or "max")
         self._write("cpu.cfs_period_us", PERIOD_US)
@@ -72,7 +72,7 @@ class Cell1(CgroupCell):
         self._write("cpu.shares", min(_MAX_SHARES, round((limits.weight or WEIGHT_PER_SLOT) / 100 * _SHARES)))
 
     def _write_memory(self, limit: int) -> None:
-        """Limit memory, and memory with swap: that may never be the smaller of both."""
+        """Limit memory, and memory with swap, which may never be the smaller of both."""
         names = ["memory.limit_in_bytes", "memory.memsw.limit_in_bytes"]
         if limit < 0 or limit > self._number(names[0]):
             names.reverse()
@@ -89,7 +89,7 @@ class Cgroup1(CgroupLimiter):
     """Needs one of the controllers memory, pids and cpu; usually that means root."""
 
     name = "cgroup1"
-    cell = Cell1
+    control_group = ControlGroupV1
 
     def probe(self) -> None:
         """Try to make this task set's folder in each hierarchy."""
@@ -123,7 +123,7 @@ class Cgroup1(CgroupLimiter):
         if parent.is_dir():
             return
         files.make(parent)
-        with contextlib.suppress(OSError):  # only there where the controller cpu is
+        with contextlib.suppress(OSError):  # exists only with the controller cpu
             files.write(parent / "cpu.shares", min(_MAX_SHARES, _SHARES_PER_CORE * (os.cpu_count() or 1)))
 
 

@@ -1,7 +1,7 @@
 """Cgroups of version 2: one hierarchy, in which a subtree may be delegated to a user or a service.
 
-A cgroup that gives controllers to cgroups below it may hold no processes itself (but for the root). So if
-this program's own cgroup holds any, they move into one below it, ``rce-engine``, the program among them.
+A cgroup that gives controllers to cgroups below it may not hold processes itself (except the root). So the
+processes of this program's own cgroup, the program included, move into one below it, ``rce-engine``.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from pathlib import Path
 
 from rce_container.exceptions import LimitsUnavailableError
 from rce_container.limits import files, hierarchy
-from rce_container.limits.base import WEIGHT_PER_SLOT, CellUsage, Limits, Troubles
-from rce_container.limits.cgroup import PERIOD_US, CgroupCell, CgroupLimiter, quota
+from rce_container.limits.base import WEIGHT_PER_SLOT, ControlGroupUsage, Limits, Troubles
+from rce_container.limits.cgroup import PERIOD_US, CgroupControlGroup, CgroupLimiter, quota
 
 ENGINE = "rce-engine"
 CONTROLLERS = {"memory": "memory", "pids": "processes", "cpu": "cpu", "io": "io"}
-"""The controllers that are used, the most important first, and what is missing without them."""
+"""The controllers that are used, the most important first, and the resources that need them."""
 
 _SUBTREE = "cgroup.subtree_control"
 _MAX_WEIGHT = 10_000
@@ -27,12 +27,12 @@ _WEIGHT_PER_CORE = 400
 _HINT = "give it one: a systemd unit with Delegate=yes, or `systemd-run --scope -p Delegate=yes ...`"
 
 
-class Cell2(CgroupCell):
+class ControlGroupV2(CgroupControlGroup):
     """One folder."""
 
     _memory_file = "memory.max"
 
-    def usage(self) -> CellUsage:
+    def usage(self) -> ControlGroupUsage:
         """Read the counters."""
         cpu = files.keyed(self._read("cpu.stat"))
         memory = None
@@ -40,7 +40,7 @@ class Cell2(CgroupCell):
             idle = files.keyed(self._read("memory.stat")).get("inactive_file", 0)
             memory = max(0, self._number("memory.current") - idle)
         io = parse_io(self._read("io.stat"))
-        return CellUsage(
+        return ControlGroupUsage(
             cpu_s=cpu["usage_usec"] / 1e6 if "usage_usec" in cpu else None,
             throttled_s=cpu.get("throttled_usec", 0) / 1e6,
             memory=memory,
@@ -67,7 +67,7 @@ class Cell2(CgroupCell):
         )
 
     def _write_limits(self, limits: Limits) -> None:
-        # memory.oom.group stays off: the kernel ends the one process that is too large, not the container.
+        # memory.oom.group stays off: the kernel kills the one process that is too large, not the container.
         self._write("memory.max", limits.memory or "max")
         self._write("memory.swap.max", 0 if limits.memory else "max")
         self._write("pids.max", limits.processes or "max")
@@ -81,13 +81,13 @@ class Cell2(CgroupCell):
 
 
 class Cgroup2(CgroupLimiter):
-    """Needs a subtree that is this user's own: as root, or delegated."""
+    """Needs a subtree that belongs to this user: as root, or delegated."""
 
     name = "cgroup2"
-    cell = Cell2
+    control_group = ControlGroupV2
 
     def probe(self) -> None:
-        """Have controllers given to the cgroups below, and try to make this task set's folder."""
+        """Give controllers to the cgroups below, and try to make this task set's folder."""
         place = next((one for one in hierarchy.find(self._proc) if one.version == 2), None)  # noqa: PLR2004
         if place is None:
             raise LimitsUnavailableError("no hierarchy of version 2 is mounted")
@@ -129,10 +129,10 @@ class Cgroup2(CgroupLimiter):
 
 
 def _enable(base: Path, controllers: list[str]) -> None:
-    """Give controllers to the cgroups below ``base``; its own processes make room if they have to.
+    """Give controllers to the cgroups below ``base``; move its own processes away if necessary.
 
     Raises:
-        OSError: This is not allowed.
+        OSError: Not permitted.
     """
     if set(controllers) <= set(files.read(base / _SUBTREE).split()):
         return

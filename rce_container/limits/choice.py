@@ -12,16 +12,16 @@ from rce_container.limits.cgroup2 import Cgroup2
 from rce_container.limits.hierarchy import PROC
 from rce_container.limits.rlimit import RlimitLimiter
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _ESSENTIAL = frozenset({"cpu", "memory", "processes"})
 
 
 def choose_limiter(token: str, ledger: Path, proc: Path = PROC) -> Limiter:
-    """Find the best way that works: cgroups of the version that can do more, else limits of each process.
+    """Find the best way that works: cgroups of the more capable version, else limits of each process.
 
     Args:
-        token: Names the task set on this machine, for ever.
+        token: A permanent name of the task set on this machine.
         ledger: A file of the task set, for where its cgroups are.
         proc: This process in ``/proc``.
     """
@@ -42,5 +42,5 @@ def choose_limiter(token: str, ledger: Path, proc: Path = PROC) -> Limiter:
         if limiter is not chosen:
             limiter.close()
     if chosen.detail:
-        log.warning("%s", chosen.detail)
+        _log.warning("%s", chosen.detail)
     return chosen

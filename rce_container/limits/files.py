@@ -14,7 +14,7 @@ def write(path: Path, value: int | str) -> None:
     """Write a control file.
 
     Raises:
-        OSError: There is none, or the kernel does not take the value; names the file.
+        OSError: It does not exist, or the kernel rejects the value; the error names the file.
     """
     fd = os.open(path, os.O_WRONLY | os.O_TRUNC | os.O_CLOEXEC)
     try:
@@ -27,7 +27,7 @@ def write(path: Path, value: int | str) -> None:
 
 
 def read(path: Path) -> str:
-    """Read a control file; empty if there is none."""
+    """Read a control file; return an empty text if it does not exist."""
     try:
         return path.read_text()
     except OSError:
@@ -35,7 +35,7 @@ def read(path: Path) -> str:
 
 
 def number(path: Path) -> int:
-    """Read a file with one number; 0 if there is none, or it says ``max``."""
+    """Read a file with one number; return 0 if it does not exist or contains ``max``."""
     word = read(path).strip()
     return int(word) if word.lstrip("-").isdigit() else 0
 
@@ -47,12 +47,12 @@ def keyed(text: str) -> dict[str, int]:
 
 
 def tree(folder: Path) -> Iterator[Path]:
-    """All cgroups from ``folder`` down, children before parents; none if it does not exist."""
+    """Return all cgroups from ``folder`` down, children before parents; none if it does not exist."""
     return (Path(path) for path, _, _ in os.walk(folder, topdown=False))
 
 
 def children(folder: Path) -> list[Path]:
-    """The cgroups in a cgroup; none if it does not exist."""
+    """Return the cgroups in a cgroup; none if it does not exist."""
     try:
         return [one for one in folder.iterdir() if one.is_dir()]
     except OSError:
@@ -60,12 +60,12 @@ def children(folder: Path) -> list[Path]:
 
 
 def pids(folder: Path) -> list[int]:
-    """The processes in a cgroup and below it."""
+    """Return the processes in a cgroup and below it."""
     return [int(word) for one in tree(folder) for word in read(one / PROCS).split()]
 
 
 def make(folder: Path) -> None:
-    """Make a cgroup, if it is not there.
+    """Make a cgroup, if it does not exist.
 
     Raises:
         OSError: It cannot be made.
@@ -74,13 +74,13 @@ def make(folder: Path) -> None:
 
 
 def drop(folder: Path) -> None:
-    """Remove a cgroup and those below it; nothing happens if it does not exist.
+    """Remove a cgroup and those below it; do nothing if it does not exist.
 
     Raises:
-        OSError: A process is in there.
+        OSError: It contains a process.
     """
     for one in tree(folder):
-        with contextlib.suppress(FileNotFoundError):  # the container's last process removes it too
+        with contextlib.suppress(FileNotFoundError):  # the shim removes it too
             remove(one)
 
 
@@ -88,6 +88,6 @@ def remove(folder: Path) -> None:
     """Remove a cgroup.
 
     Raises:
-        OSError: It does not exist, or something is in there.
+        OSError: It does not exist, or is not empty.
     """
     folder.rmdir()

@@ -1,4 +1,4 @@
-"""Where this process is in the machine's cgroups, from what ``/proc/self`` says.
+"""The place of this process in the machine's cgroups, from ``/proc/self``.
 
 A kernel has one hierarchy of version 2, and any number of version 1, each with controllers of its own.
 They may be mounted anywhere, several times, or in part: a container sees its own subtree only.
@@ -18,7 +18,7 @@ _OCTAL = re.compile(r"\\([0-7]{3})")
 
 
 class Hierarchy(NamedTuple):
-    """One hierarchy that is mounted, and this process's place in it."""
+    """One mounted hierarchy, and this process's place in it."""
 
     version: int
     controllers: frozenset[str]
@@ -33,7 +33,7 @@ class Mount(NamedTuple):
 
     version: int
     root: str
-    """What of the hierarchy is mounted."""
+    """The mounted part of the hierarchy."""
     point: Path
     options: frozenset[str]
 
@@ -49,7 +49,7 @@ class Membership(NamedTuple):
 
 
 def find(proc: Path = PROC) -> list[Hierarchy]:
-    """Find all hierarchies with controllers, or of version 2, in which this process can find itself.
+    """Find all hierarchies with controllers, or of version 2, in which this process can find its cgroup.
 
     Args:
         proc: A folder with the files ``cgroup`` and ``mountinfo``.
@@ -100,7 +100,7 @@ def _place(membership: Membership, mounts: Iterable[Mount]) -> Hierarchy | None:
 
 
 def _below(path: str, root: str) -> str | None:
-    """The path relative to what is mounted; None if it is not in there."""
+    """Return the path relative to the mounted part; None if it is outside of it."""
     if "/.." in root or "/.." in path:  # outside of this process's cgroup namespace
         return None
     if root == "/":

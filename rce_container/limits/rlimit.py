@@ -1,7 +1,7 @@
-"""Limits for machines without cgroups: of each process by itself, and of a user's number of processes.
+"""Limits for machines without cgroups: for each process, and for a user's number of processes.
 
-They keep one process from taking the machine's memory, not a container of many; processors are shared as
-the kernel sees fit. Nothing is counted, and nothing changes while a container runs.
+They prevent one process from taking the machine's memory, but not a container with many processes; the kernel
+shares the processors. Usage is not counted, and limits do not change while a container runs.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import resource
 from collections.abc import Collection, Mapping
 
 from rce_container.exceptions import LimitError
-from rce_container.limits.base import Cell, CellUsage, Limiter, Limits, Troubles
+from rce_container.limits.base import ControlGroup, ControlGroupUsage, Limiter, Limits, Troubles
 
 _DETAIL = (
     "limits of containers are weak: no cgroup can be used, so memory is limited for each process only, "
@@ -19,20 +19,20 @@ _DETAIL = (
 
 
 def rlimits_of(limits: Limits) -> dict[int, int]:
-    """What a process must limit for itself, so that memory and number of processes are bounded at all.
+    """Return the limits that a process must set for itself, to bound memory and the number of processes.
 
-    The data segment is limited, not the address space: that counts what is only reserved, and programs with
-    many threads or a garbage collector reserve much more than they ever use.
+    The data segment is limited, not the address space: the address space includes memory that is only
+    reserved, and programs with many threads or a garbage collector reserve much more than they ever use.
     """
     found = {resource.RLIMIT_DATA: limits.memory, resource.RLIMIT_NPROC: limits.processes}
     return {number: limit for number, limit in found.items() if limit}
 
 
-class RlimitCell(Cell):
-    """Exists on paper only.
+class RlimitControlGroup(ControlGroup):
+    """A control group without a cgroup: only holds the limits.
 
     Args:
-        limits: What its processes limit; None if that is not known (yet).
+        limits: The limits that its processes set; None if not known (yet).
     """
 
     def __init__(self, limits: Limits | None) -> None:
@@ -41,16 +41,16 @@ class RlimitCell(Cell):
 
     @property
     def join(self) -> tuple[str, ...]:
-        """There is nothing to join."""
+        """Return an empty tuple: processes have no group to join."""
         return ()
 
     @property
     def rlimits(self) -> Mapping[int, int]:
-        """All that there is."""
+        """Return the limits that each process sets for itself."""
         return rlimits_of(self.limits)
 
     def apply(self, limits: Limits) -> None:
-        """Refuse: nobody can change another process's limits for it and its children at once."""
+        """Refuse: the limits of a process and its children cannot be changed at once from outside."""
         if not self._known:
             self._known, self.limits = True, limits._replace(cpu=0.0)
         if limits._replace(cpu=0.0) != self.limits:
@@ -59,29 +59,29 @@ class RlimitCell(Cell):
                 "destroy it and create it again"
             )
 
-    def usage(self) -> CellUsage:
-        """Nobody counts."""
-        return CellUsage()
+    def usage(self) -> ControlGroupUsage:
+        """Return an empty usage: it is not counted."""
+        return ControlGroupUsage()
 
     def troubles(self) -> Troubles:
-        """Nobody counts."""
+        """Return no troubles: they are not counted."""
         return Troubles()
 
     def pids(self) -> None:
-        """Nobody knows."""
+        """Return None: the processes are unknown."""
 
     def kill(self) -> None:
-        """The runtime finds its processes."""
+        """Do nothing: the runtime finds its processes."""
 
     def remove(self) -> None:
-        """Nothing is left of it."""
+        """Do nothing."""
 
 
 class RlimitLimiter(Limiter):
-    """Works everywhere.
+    """Sets limits by :func:`resource.setrlimit`; works on every machine.
 
     Args:
-        reason: Why nothing better works.
+        reason: Why the other limiters do not work.
     """
 
     name = "rlimit"
@@ -90,27 +90,27 @@ class RlimitLimiter(Limiter):
         self.detail = f"{_DETAIL} ({reason})" if reason else _DETAIL
 
     def probe(self) -> None:
-        """Nothing to find out."""
+        """Do nothing."""
 
     @property
     def missing(self) -> frozenset[str]:
-        """It counts nothing."""
+        """Return all resources: none is counted."""
         return frozenset({"cpu", "memory", "processes", "io"})
 
-    def create(self, mark: str, limits: Limits) -> RlimitCell:  # noqa: ARG002
-        """Note the limits."""
-        return RlimitCell(limits)
+    def create(self, incarnation_id: str, limits: Limits) -> RlimitControlGroup:  # noqa: ARG002
+        """Make a control group with these limits."""
+        return RlimitControlGroup(limits)
 
-    def adopt(self, mark: str) -> RlimitCell:  # noqa: ARG002
-        """Take the next limits that are asked for as those that it has."""
-        return RlimitCell(None)
+    def adopt(self, incarnation_id: str) -> RlimitControlGroup:  # noqa: ARG002
+        """Return a control group whose limits are the first requested ones."""
+        return RlimitControlGroup(None)
 
     def sweep(self, keep: Collection[str]) -> None:
-        """Nothing is ever left."""
+        """Do nothing."""
 
     def close(self) -> None:
-        """Nothing is ever left."""
+        """Do nothing."""
 
     def ceiling(self) -> Limits:
-        """Unknown."""
+        """Return no limits: the ceiling is unknown."""
         return Limits()

@@ -1,4 +1,4 @@
-"""Which address a container gets in its group. Pure."""
+"""Chooses the address of a container in its group. Pure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ipaddress import AddressValueError, IPv4Interface, IPv4Network, NetmaskValu
 from rce_container.exceptions import NetworkError
 
 DEFAULT_NETWORK = IPv4Network("10.77.0.0/24")
-"""Of groups whose containers name no addresses. Every group may have the same: they never meet."""
+"""The network of groups whose containers name no addresses. All groups may use it: they are separate."""
 _DEFAULT_PREFIX = 24
 _LONGEST_PREFIX = 30
 _SHORTEST_PREFIX = 8
@@ -18,13 +18,13 @@ def parse_address(text: str) -> IPv4Interface:
     """Read a ``groupIp``: an IPv4 address, with ``/24`` understood if it names no prefix.
 
     Raises:
-        NetworkError: It is none that a container can have.
+        NetworkError: It is not an address that a container can have.
     """
     whole = text if "/" in text else f"{text}/{_DEFAULT_PREFIX}"
     try:
         address = IPv4Interface(whole)
     except (AddressValueError, NetmaskValueError, ValueError) as error:
-        raise NetworkError(f"the groupIp {text!r} is no IPv4 address, such as 10.0.0.2/16") from error
+        raise NetworkError(f"the groupIp {text!r} is not an IPv4 address, such as 10.0.0.2/16") from error
     network = address.network
     if not _SHORTEST_PREFIX <= network.prefixlen <= _LONGEST_PREFIX:
         raise NetworkError(
@@ -37,28 +37,28 @@ def parse_address(text: str) -> IPv4Interface:
     return address
 
 
-def choose(wish: str, taken: Mapping[IPv4Interface, str]) -> IPv4Interface:
+def choose(requested: str, taken: Mapping[IPv4Interface, str]) -> IPv4Interface:
     """Find the address of a new member of a group.
 
     Args:
-        wish: Its ``groupIp``; if empty, a free one is found.
-        taken: The group's addresses, and which container has each.
+        requested: Its ``groupIp``; if empty, a free one is found.
+        taken: The group's addresses, and the container of each.
 
     Raises:
-        NetworkError: The wish cannot be granted; the text says what to do.
+        NetworkError: The request cannot be granted; the text says what to do.
     """
     network = next((address.network for address in taken), None)
-    if not wish:
+    if not requested:
         return _free(network or DEFAULT_NETWORK, taken)
-    address = parse_address(wish)
+    address = parse_address(requested)
     if network is not None and address.network != network:
         raise NetworkError(
-            f"the groupIp {wish} is in {address.network}, but the group's other containers are in {network}: "
-            "give all of them addresses of one network, or none"
+            f"the groupIp {requested} is in {address.network}, but the group's other containers are in "
+            f"{network}: give all of them addresses of one network, or none"
         )
     if address in taken:
         raise NetworkError(
-            f"the groupIp {wish} belongs to container {taken[address]} of the same group; take another"
+            f"the groupIp {requested} belongs to container {taken[address]} of the same group; take another"
         )
     return address
 

@@ -8,16 +8,16 @@ MAX_HOSTNAME = 63
 
 
 def hostname(tag: str) -> str:
-    """The host name of the container with this tag."""
+    """Return the host name of the container with this tag."""
     return tag[:MAX_HOSTNAME]
 
 
 def hosts_text(tag: str, members: Iterable[tuple[str, str]] = ()) -> str:
-    """Write it.
+    """Return the contents of the file.
 
     Args:
         tag: The container's.
-        members: Tag and address of each container of its group, itself included; empty if it has none.
+        members: Tag and address of each container of its group, itself included; empty without a group.
     """
     lines = [f"{address} {hostname(name)}" for name, address in sorted(members)]
     own = "" if lines else f" {hostname(tag)}"

@@ -22,10 +22,10 @@ T = TypeVar("T")
 
 
 def make_namespace() -> int:
-    """Make a network namespace; it lives as long as the descriptor that is returned, or copies of it.
+    """Make a network namespace; it exists as long as the returned descriptor or its copies.
 
     Raises:
-        NetworkError: This process may not.
+        NetworkError: This process lacks the permission.
     """
     return _in_thread(_unshare)
 
@@ -34,7 +34,7 @@ def open_namespace(pid: int) -> int:
     """Open the network namespace that a container's process is in.
 
     Raises:
-        NetworkError: The process is gone, or it has no network namespace of its own.
+        NetworkError: The process has ended, or does not have its own network namespace.
     """
     try:
         fd = os.open(f"/proc/{pid}/ns/net", os.O_RDONLY | os.O_CLOEXEC)
@@ -47,7 +47,7 @@ def open_namespace(pid: int) -> int:
 
 
 def configure(namespace: int, commands: Sequence[str], *, others: Sequence[int] = ()) -> None:
-    """Carry out commands of ``ip`` in a namespace, without IPv6 on the interfaces that they make.
+    """Run commands of ``ip`` in a namespace, without IPv6 on the interfaces that they make.
 
     Args:
         namespace: Descriptor of it.
@@ -55,13 +55,13 @@ def configure(namespace: int, commands: Sequence[str], *, others: Sequence[int] 
         others: Descriptors of further namespaces, which a command names as ``/proc/self/fd/N``.
 
     Raises:
-        NetworkError: One fails, or there is no ``ip``.
+        NetworkError: A command fails, or ``ip`` is not installed.
     """
     _in_thread(lambda: _configure(namespace, commands, others))
 
 
 def _in_thread(action: Callable[[], T]) -> T:
-    """Do it in a thread of its own, which may change namespaces and takes that with it when it ends."""
+    """Call a function in a separate thread, which may change its namespaces until it ends."""
     with ThreadPoolExecutor(1, thread_name_prefix="namespace") as pool:
         return pool.submit(action).result()
 

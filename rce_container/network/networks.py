@@ -12,14 +12,14 @@ from ipaddress import IPv4Interface
 from pathlib import Path
 from typing import NamedTuple
 
-from rce.protocol.names import EndpointId
+from rce.model.names import EndpointId
 from rce_container.exceptions import NetworkError
 from rce_container.folder import Record
 from rce_container.network.addresses import choose
 from rce_container.network.hosts import hosts_text
 from rce_container.network.namespaces import configure, make_namespace, open_namespace
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 INTERFACE = "eth0"
 """A member's interface to its group, as seen from inside."""
@@ -28,12 +28,15 @@ _MULTICAST = "224.0.0.0/4"
 _NAMESPACE_LINK = "net:["
 
 
-class Seat(NamedTuple):
+class Membership(NamedTuple):
     """A container's place in its group."""
 
     address: IPv4Interface
     switch: int
-    """Descriptor of the switch's namespace. What lives as long as the container must open it too."""
+    """Descriptor of the switch's namespace.
+
+    A process that lives as long as the container must open it too.
+    """
 
     @property
     def path(self) -> str:
@@ -52,7 +55,7 @@ class _Member:
 
 @dataclass(slots=True)
 class _Group:
-    """The containers of one group, by mark; never empty. The one who changes the switch has the lock."""
+    """The containers of one group, by id; never empty. Changing the switch requires the lock."""
 
     switch: int
     has_bridge: bool
@@ -63,20 +66,20 @@ class _Group:
 class Networks:
     """All groups of one container task set. Containers of two task sets, or two users, never meet.
 
-    A container is *enrolled* before it is started, *attached* when its namespaces are there and *detached*
-    when its processes have ended.
+    A container is *enrolled* before it is started, *attached* when its namespaces exist and *detached* when
+    its processes have ended.
     """
 
     def __init__(self) -> None:
         self._groups: dict[tuple[str, str], _Group] = {}
         self._of: dict[str, tuple[str, str]] = {}
-        """The group that a container is in, by mark."""
+        """The group of each container, by id."""
 
     def probe(self) -> None:
         """Find out whether groups work on this machine. Blocks.
 
         Raises:
-            NetworkError: They do not; the text says why.
+            NetworkError: They do not work; the text says why.
         """
         with contextlib.ExitStack() as stack:
             switch, inside = make_namespace(), make_namespace()
@@ -84,18 +87,20 @@ class Networks:
             stack.callback(os.close, inside)
             _plug_in(switch, inside, "probe", IPv4Interface("10.77.0.1/24"), bridge=True)
 
-    def enroll(self, container: EndpointId, group: str, group_ip: str, mark: str, hosts: Path) -> Seat:
-        """Give a container that is to be started its place.
+    def enroll(
+        self, container: EndpointId, group: str, group_ip: str, incarnation_id: str, hosts: Path
+    ) -> Membership:
+        """Give a container that is to be started its place in its group.
 
         Args:
             container: Who it is.
             group: Its group.
-            group_ip: The address that it is to have there; empty for any.
-            mark: Names this life of it.
+            group_ip: Its requested address there; empty for any.
+            incarnation_id: The id of its incarnation.
             hosts: Its ``/etc/hosts``, which is kept up to date from now on.
 
         Raises:
-            NetworkError: There is no such place.
+            NetworkError: The place cannot be given.
         """
         key = container.user, group
         if not group:
@@ -105,16 +110,16 @@ class Networks:
         address = choose(group_ip, taken)
         if found is None:
             found = self._groups[key] = _Group(make_namespace(), has_bridge=False)
-        found.members[mark] = _Member(container.tag, address, hosts, plugged=False)
-        self._of[mark] = key
-        return Seat(address, found.switch)
+        found.members[incarnation_id] = _Member(container.tag, address, hosts, plugged=False)
+        self._of[incarnation_id] = key
+        return Membership(address, found.switch)
 
     def adopt(self, container: EndpointId, record: Record, hosts: Path) -> None:
         """Take over a member that an earlier manager attached.
 
         Args:
             container: Who it is.
-            record: What that manager noted of it.
+            record: That manager's record of it.
             hosts: Its ``/etc/hosts``.
 
         Raises:
@@ -125,50 +130,50 @@ class Networks:
         if found is None:
             found = self._groups[key] = _Group(_held_by(record.pid), has_bridge=True)
         address = IPv4Interface(record.address)
-        found.members[record.mark] = _Member(container.tag, address, hosts, plugged=True)
-        self._of[record.mark] = key
+        found.members[record.incarnation_id] = _Member(container.tag, address, hosts, plugged=True)
+        self._of[record.incarnation_id] = key
 
-    async def attach(self, mark: str, pid: int) -> None:
-        """Plug a container in that is enrolled, and tell all members' ``/etc/hosts`` of it.
+    async def attach(self, incarnation_id: str, pid: int) -> None:
+        """Connect an enrolled container to its switch, and add it to all members' ``/etc/hosts``.
 
         Args:
-            mark: The life of the container.
+            incarnation_id: The incarnation of the container.
             pid: A process in its network namespace.
 
         Raises:
-            NetworkError: It cannot be done.
+            NetworkError: The container cannot be connected.
         """
-        key = self._of.get(mark)
+        key = self._of.get(incarnation_id)
         if key is None:
             return
         group = self._groups[key]
-        member = group.members[mark]
+        member = group.members[incarnation_id]
         async with group.lock:
             bridge = not group.has_bridge
             inside = open_namespace(pid)
             try:
                 await asyncio.to_thread(
-                    _plug_in, group.switch, inside, _port(mark), member.address, bridge=bridge
+                    _plug_in, group.switch, inside, _port(incarnation_id), member.address, bridge=bridge
                 )
             finally:
                 os.close(inside)
             group.has_bridge = member.plugged = True
             await asyncio.to_thread(_write_hosts, list(group.members.values()))
 
-    async def detach(self, mark: str) -> None:
-        """Take a container whose processes have ended out of its group, if it is in one."""
-        key = self._of.pop(mark, None)
+    async def detach(self, incarnation_id: str) -> None:
+        """Remove a container whose processes have ended from its group, if it has one."""
+        key = self._of.pop(incarnation_id, None)
         if key is None:
             return
         group = self._groups[key]
         async with group.lock:
-            member = group.members[mark]
+            member = group.members[incarnation_id]
             if member.plugged and len(group.members) > 1:
                 try:
-                    await asyncio.to_thread(configure, group.switch, [f"link delete {_port(mark)}"])
+                    await asyncio.to_thread(configure, group.switch, [f"link delete {_port(incarnation_id)}"])
                 except NetworkError as error:
-                    log.debug("the kernel has removed the port of %s already: %s", mark, error)
-            del group.members[mark]
+                    _log.debug("the kernel has removed the port of %s already: %s", incarnation_id, error)
+            del group.members[incarnation_id]
             if group.members:
                 await asyncio.to_thread(_write_hosts, list(group.members.values()))
         if not group.members and self._groups.get(key) is group:
@@ -176,20 +181,20 @@ class Networks:
             os.close(group.switch)
 
     def close(self) -> None:
-        """Let go of all switches; those of containers that live on stay."""
+        """Close all switches; those of running containers stay."""
         for group in self._groups.values():
             os.close(group.switch)
         self._groups.clear()
         self._of.clear()
 
 
-def _port(mark: str) -> str:
-    """The interface in the switch that a container is plugged into; at most 15 characters."""
-    return f"v{mark}"
+def _port(incarnation_id: str) -> str:
+    """Return the switch's interface for a container; at most 15 characters."""
+    return f"v{incarnation_id}"
 
 
 def _plug_in(switch: int, inside: int, port: str, address: IPv4Interface, *, bridge: bool) -> None:
-    """Make the cable between a container and its switch, and with ``bridge`` the switch first."""
+    """Make the veth pair between a container and its switch; with ``bridge``, make the switch first."""
     if bridge:
         configure(switch, [f"link add name {_BRIDGE} type bridge mcast_snooping 0", f"link set {_BRIDGE} up"])
     cable = f"link add name {INTERFACE} type veth peer name {port} netns /proc/self/fd/{switch}"
@@ -208,7 +213,7 @@ def _plug_in(switch: int, inside: int, port: str, address: IPv4Interface, *, bri
 
 
 def _held_by(pid: int) -> int:
-    """A copy of the switch's descriptor that a process holds."""
+    """Return a copy of the switch's descriptor that a process holds."""
     folder = Path(f"/proc/{pid}/fd")
     try:
         for entry in folder.iterdir():
@@ -220,7 +225,7 @@ def _held_by(pid: int) -> int:
 
 
 def _write_hosts(members: Iterable[_Member]) -> None:
-    """Write the members' files anew, in place: containers may see the file itself, not its folder."""
+    """Rewrite the members' files in place: containers may see the file itself, not its folder."""
     rows = [(member.tag, str(member.address.ip)) for member in members]
     for member in members:
         text = hosts_text(member.tag, rows)
@@ -229,4 +234,4 @@ def _write_hosts(members: Iterable[_Member]) -> None:
                 file.write(text)
                 file.truncate()
         except OSError as error:
-            log.debug("%s is gone: %s", member.hosts, error)
+            _log.debug("%s is gone: %s", member.hosts, error)

@@ -1,6 +1,6 @@
-"""What a runtime is: the way in which a container's first process is started and all its processes are ended.
+"""The interface of runtimes: how a container's first process is started and all its processes are ended.
 
-Whatever the runtime, a container hangs on a *shim* (:mod:`rce_container.runtimes.shim`), which outlives the
+In every runtime a container depends on a *shim* (:mod:`rce_container.runtimes.shim`), which outlives the
 manager.
 """
 
@@ -29,11 +29,11 @@ _KILL_TIMEOUT_S = 10.0
 
 
 class Order(NamedTuple):
-    """One container to start."""
+    """An order to start a container."""
 
     tag: str
     boot: Boot
-    """As the environment sees it; :meth:`Runtime.start` puts the paths in."""
+    """For the environment; :meth:`Runtime.start` adds the paths."""
     folder: ContainerFolder
     packages: tuple[Path, ...]
     control: int
@@ -45,13 +45,13 @@ class Order(NamedTuple):
     host_network: bool = False
     """Whether the container sees the machine's own network."""
     image: str = ""
-    """See :attr:`rce.control.model.Resources.image`."""
+    """See :attr:`rce.model.specs.Resources.image`."""
     switch: str = ""
-    """A file of the network namespace that joins its group; it stays as long as the container."""
+    """A file of the network namespace of its group; it stays as long as the container."""
 
 
 Prepare = Callable[[int], Awaitable[None]]
-"""Readies a container's namespaces, given the pid of a process in them, before anything else runs there."""
+"""Prepares a container's namespaces, given the pid of a process in them, before other processes run there."""
 
 
 class Handle:
@@ -59,19 +59,19 @@ class Handle:
 
     Args:
         process: The shim.
-        mark: What the container's processes carry, where a kill must look for it; else empty.
+        incarnation_id: The mark of the container's processes, if a kill has to search for it; else empty.
         popen: The shim as a child, if it is one.
     """
 
     def __init__(
-        self, process: proc.Process, mark: str, popen: subprocess.Popen[bytes] | None = None
+        self, process: proc.Process, incarnation_id: str, popen: subprocess.Popen[bytes] | None = None
     ) -> None:
         self.process = process
         self.namespaces_pid = 0
-        """A process that lives as long as the container's namespaces, and in them; 0 if there are none."""
+        """A process that lives as long as the container's namespaces, and in them; 0 without namespaces."""
         self.environment: proc.Process | None = None
         """The environment, if it does not descend from :attr:`process`."""
-        self._mark = mark
+        self._mark = incarnation_id
         self._popen = popen
 
     @property
@@ -80,7 +80,7 @@ class Handle:
         return proc.alive(self.process.pid, self.process.start)
 
     async def launch(self, prepare: Prepare | None = None) -> None:
-        """Bring the environment to life; returns at once where it lives already.
+        """Start the environment; return at once if it runs already.
 
         Args:
             prepare: Awaited when the namespaces exist and before the environment starts.
@@ -90,7 +90,7 @@ class Handle:
         """
 
     def members(self, processes: dict[int, proc.Process]) -> list[proc.Process]:
-        """Find all processes of the container in a table of the machine's."""
+        """Return all processes of the container, from a table of the machine's processes."""
         found: list[proc.Process] = []
         for root in (self.process, self.environment):
             if root is not None and proc.same(root, processes.get(root.pid)):
@@ -112,13 +112,13 @@ class Handle:
         """Kill all processes of the container, and wait until none is left.
 
         Raises:
-            KillError: Some process does not die, not even by SIGKILL.
+            KillError: A process does not end, even after SIGKILL.
         """
         seen: dict[int, proc.Process] = {}
         loop = asyncio.get_running_loop()
         deadline = loop.time() + _KILL_TIMEOUT_S
         while True:
-            if self._mark or seen or self._has_roots:  # else there is nothing that a look could find
+            if self._mark or seen or self._has_roots:  # else a search would find nothing
                 seen.update((found.pid, found) for found in self.members(proc.table()))
             if self._mark:
                 seen.update((found.pid, found) for found in proc.marked(self._mark))
@@ -134,18 +134,18 @@ class Handle:
 
     @property
     def _has_roots(self) -> bool:
-        """Whether something lives from which other processes may descend; cheap, unlike a look at all."""
+        """Whether a process runs that may have descendants; cheap, unlike a scan of all processes."""
         environment = self.environment
         return self.alive or (environment is not None and proc.alive(environment.pid, environment.start))
 
     def _collect(self) -> None:
-        """Take the exit code, so that no zombie is left."""
+        """Collect the exit code, so that no zombie is left."""
         if self._popen is not None and not self.alive:
             self._popen.wait()
             self._popen = None
 
     def abandon(self) -> None:
-        """Leave the container to itself: the manager ends and another may adopt it."""
+        """Leave the container running: the manager ends and another may adopt it."""
         if self._popen is not None:
             self._popen.returncode = 0
             self._popen = None
@@ -160,14 +160,14 @@ class Runtime(ABC):
     image: str = ""
     """Root file system of containers that name none; empty for the machine's programs."""
     detail: str = ""
-    """What is not as it should be, for the machine's record; known after :meth:`probe`."""
+    """A text about restrictions, for the machine's record; known after :meth:`probe`."""
 
     @abstractmethod
     def probe(self) -> None:
         """Find out whether the runtime works on this machine. Blocks.
 
         Raises:
-            RuntimeUnavailableError: It does not; the text says why.
+            RuntimeUnavailableError: It does not work; the text says why.
         """
 
     @abstractmethod
@@ -178,29 +178,29 @@ class Runtime(ABC):
             StartError: It cannot be started.
         """
 
-    def is_unborn(self, record: Record) -> bool:  # noqa: ARG002
-        """Whether the manager that noted this died before it had noted the environment."""
+    def is_starting(self, record: Record) -> bool:  # noqa: ARG002
+        """Whether the manager that wrote this record ended before it had recorded the environment."""
         return False
 
     def review(self, packages: Iterable[Path]) -> str:  # noqa: ARG002
-        """Say what containers will miss of the package path; empty if nothing."""
+        """Return a text about folders of the package path that containers cannot see; empty if none."""
         return ""
 
-    def close(self) -> None:  # noqa: B027 - most keep nothing
-        """End what the runtime keeps running for itself; containers live on."""
+    def close(self) -> None:  # noqa: B027 - most have no processes
+        """End the runtime's own processes; containers keep running."""
 
-    def bundles(self, folder: ContainerFolder) -> str:
-        """Where the container sees the packages that its user brought; it cannot write there if isolated."""
-        return str(folder.bundles)
+    def user_packages(self, folder: ContainerFolder) -> str:
+        """Return where the container sees the packages that its user brought; read-only if isolated."""
+        return str(folder.user_packages)
 
     def adopt(self, process: proc.Process, record: Record) -> Handle:
         """Take over a container that an earlier manager started.
 
         Args:
-            process: The shim, which was found alive.
-            record: What the earlier manager noted.
+            process: The running shim.
+            record: The earlier manager's record.
         """
-        handle = Handle(process, "" if self.isolated else record.mark)
+        handle = Handle(process, "" if self.isolated else record.incarnation_id)
         handle.namespaces_pid = record.namespaces_pid
         environment = proc.read(record.environment) if record.environment else None
         if environment is not None and environment.start == record.environment_start:
@@ -213,11 +213,11 @@ class ExecRuntime(Runtime):
 
     @abstractmethod
     def paths(self, folder: ContainerFolder) -> tuple[str, str]:
-        """Where the container's home and logs are, as seen from inside."""
+        """Return the container's home and log folder, as seen from inside."""
 
     @abstractmethod
     def command(self, order: Order, argv: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-        """The command line, and its environment, by which ``argv`` runs as the container's environment."""
+        """Return the command line, and its variables, that runs ``argv`` as the container's environment."""
 
     def start(self, order: Order) -> Handle:
         """Start a container with its environment.
@@ -228,18 +228,18 @@ class ExecRuntime(Runtime):
         home, logs = self.paths(order.folder)
         boot = encode_boot(order.boot, home, logs)
         argv, env = self.command(order, [sys.executable, "-P", "-m", "rce_container.environment", boot])
-        mark = "" if self.isolated else order.folder.mark
+        incarnation_id = "" if self.isolated else order.folder.incarnation_id
         popen, process = spawn_shim(order, argv, env, (order.control, order.links), sweep=not self.isolated)
-        return Handle(process, mark, popen)
+        return Handle(process, incarnation_id, popen)
 
 
 def encode_boot(boot: Boot, home: str, logs: str) -> str:
-    """Write what the environment is told, with its paths."""
+    """Write the environment's configuration, with its paths."""
     return encode(msgspec.structs.replace(boot, home=home, logs=logs)).decode()
 
 
 def clean_environ(home: str) -> dict[str, str]:
-    """The environment variables of a container: nothing of the machine's comes in."""
+    """Return the environment variables of a container: none of the machine's are included."""
     environ = {
         "PATH": os.pathsep.join((str(Path(sys.executable).parent), "/usr/local/bin", "/usr/bin", "/bin")),
         "HOME": home,
@@ -253,7 +253,7 @@ def clean_environ(home: str) -> dict[str, str]:
 
 
 def source_root() -> Path:
-    """The folder that holds the packages ``rce`` and ``rce_container``."""
+    """Return the folder that contains the packages ``rce`` and ``rce_container``."""
     return Path(__file__).resolve().parents[2]
 
 

@@ -1,4 +1,4 @@
-"""Containers whose namespaces a holder keeps, and whose environment is a child of the nursery."""
+"""Containers with a holder for their namespaces and an environment forked by the fork server."""
 
 from __future__ import annotations
 
@@ -13,41 +13,47 @@ from typing import Self
 from rce_container.environment import proc
 from rce_container.environment.logs.files import ENVIRONMENT_LOG, segment_path
 from rce_container.exceptions import StartError
-from rce_container.nursery.keeper import Nursery, hear_credentials
-from rce_container.nursery.messages import FAREWELL, Birth, Gifts
+from rce_container.forkserver.messages import FAREWELL, Descriptors, SpawnRequest
+from rce_container.forkserver.process import ForkServer, hear_credentials
 from rce_container.runtimes.base import Handle, Order, Prepare
 from rce_container.runtimes.shim import SHELL, spawn_shim
 
 HOLDER = (SHELL, "-c", f'echo && read -r word && [ "$word" = {FAREWELL.decode().strip()} ]')
-"""Says that the namespaces and mounts are there, then waits for the environment's farewell."""
+"""Reports that the namespaces and mounts exist, then waits for the environment's last message."""
 
 _GENERATIONS = 4
-"""How far the holder is from the shim, at most: podman takes three processes between them."""
+"""Maximum number of generations between the shim and the holder: podman starts three processes in between."""
 
 
 class HeldHandle(Handle):
     """A container whose namespaces exist before its environment does."""
 
     def __init__(
-        self, process: proc.Process, popen: subprocess.Popen[bytes], birth: Birth, nursery: Nursery
+        self,
+        process: proc.Process,
+        popen: subprocess.Popen[bytes],
+        request: SpawnRequest,
+        fork_server: ForkServer,
     ) -> None:
         super().__init__(process, "", popen)
         self.complaint = "its namespaces cannot be made"
-        """What is said when there is no holder."""
-        self._birth = birth
-        self._nursery = nursery
+        """The error text without a holder."""
+        self._request = request
+        self._fork_server = fork_server
         self._fds: dict[str, int] = {}
-        """What the environment will get; ours until then."""
+        """The environment's descriptors; owned by this object until they are sent."""
 
     @classmethod
-    def start(cls, argv: Sequence[str], order: Order, birth: Birth, nursery: Nursery, lock: int) -> Self:
+    def start(
+        cls, argv: Sequence[str], order: Order, request: SpawnRequest, fork_server: ForkServer, lock: int
+    ) -> Self:
         """Start the shim, and with it the holder.
 
         Args:
             argv: Makes the namespaces and runs :data:`HOLDER` in them.
             order: The container.
-            birth: Its environment.
-            nursery: Makes the environment.
+            request: Its environment.
+            fork_server: Makes the environment.
             lock: A descriptor that shim and holder keep open; -1 for none.
 
         Raises:
@@ -55,10 +61,10 @@ class HeldHandle(Handle):
         """
         log = segment_path(order.folder.logs, ENVIRONMENT_LOG, 0)
         try:
-            tether, theirs = socket.socketpair()
+            lifeline, theirs = socket.socketpair()
             with theirs, contextlib.ExitStack() as undo:
-                tether.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
-                fds = {"tether": tether.detach()}
+                lifeline.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
+                fds = {"lifeline": lifeline.detach()}
                 undo.callback(_close_all, fds)
                 fds["control"] = os.dup(order.control)
                 fds["links"] = os.dup(order.links)
@@ -69,37 +75,37 @@ class HeldHandle(Handle):
                 undo.pop_all()
         except OSError as error:
             raise StartError(f"its processes cannot be started: {error}") from error
-        handle = cls(process, popen, birth, nursery)
+        handle = cls(process, popen, request, fork_server)
         handle._fds = fds
         return handle
 
     async def launch(self, prepare: Prepare | None = None) -> None:
-        """Wait for the namespaces, ready them, and let the nursery give birth to the environment."""
+        """Wait for the namespaces, prepare them, and let the fork server make the environment."""
         try:
             self.namespaces_pid = await self._holder()
             holder = self._fds["holder"] = self._open_holder(self.namespaces_pid)
             if prepare is not None:
                 await prepare(self.namespaces_pid)
             fds = self._fds
-            gifts = Gifts(holder, -1, fds["tether"], fds["control"], fds["links"], fds["log"])
-            self.environment = proc.read(await self._nursery.bear(self._birth, gifts))
+            descriptors = Descriptors(holder, -1, fds["lifeline"], fds["control"], fds["links"], fds["log"])
+            self.environment = proc.read(await self._fork_server.spawn(self._request, descriptors))
         finally:
             self._close()
 
     def abandon(self) -> None:
-        """Leave the container to itself; one without an environment ends then."""
+        """Leave the container running; without an environment it ends."""
         self._close()
         super().abandon()
 
     async def _holder(self) -> int:
-        with socket.socket(fileno=os.dup(self._fds["tether"])) as tether:
-            said, pid = await hear_credentials(tether, 1)
+        with socket.socket(fileno=os.dup(self._fds["lifeline"])) as lifeline:
+            said, pid = await hear_credentials(lifeline, 1)
         if not said or not pid:
             raise StartError(self.complaint)
         return pid
 
     def _open_holder(self, pid: int) -> int:
-        """Open the process, and make sure that it is the holder and not one that took over its pid."""
+        """Open the process, and verify that it is the holder and not a process that reused its pid."""
         try:
             holder = os.pidfd_open(pid)
         except OSError as error:

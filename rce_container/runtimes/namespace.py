@@ -1,10 +1,10 @@
-"""The runtime of Linux namespaces: bubblewrap makes them, the nursery's children live in them.
+"""The runtime of Linux namespaces: bubblewrap makes them, the fork server's children run in them.
 
 A container has its own user, pid, mount, network, ipc, uts and cgroup namespaces. Its root is read-only and
 holds the system's programs, the engine's Python and the packages; its home and /tmp live in memory and are
-limited. Process 1 is the *holder*, a shell that waits for the environment's farewell: when the environment
-dies, however that happens, the holder ends, and the kernel kills every other process of the container. Shim,
-bubblewrap and holder are tied to each other, so that none outlives the one outside of it.
+limited. Process 1 is the *holder*, a shell that waits for the environment's last message: when the
+environment ends for any reason, the holder ends, and the kernel kills every other process of the container.
+Shim, bubblewrap and holder are linked to each other, so that none outlives the one outside of it.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from rce_container.environment.logs.files import ENVIRONMENT_LOG, segment_path
 from rce_container.environment.messages import Boot
 from rce_container.exceptions import ContainerError, RuntimeUnavailableError, StartError
 from rce_container.folder import ContainerFolder, Record
+from rce_container.forkserver.confine import USER_ID
+from rce_container.forkserver.messages import SpawnRequest
+from rce_container.forkserver.mounts import HOME, LOGS, TEMPORARY
+from rce_container.forkserver.process import ForkServer
 from rce_container.network.hosts import hostname, hosts_text
-from rce_container.nursery.confine import USER_ID
-from rce_container.nursery.keeper import Nursery
-from rce_container.nursery.messages import Birth
-from rce_container.nursery.mounts import HOME, LOGS, TEMPORARY
 from rce_container.runtimes.base import Order, Runtime, clean_environ, source_root
 from rce_container.runtimes.held import HOLDER, HeldHandle
 from rce_container.seccomp.library import FilterUnavailableError, make_filter
@@ -64,11 +64,11 @@ _READ_BY_OTHERS = stat.S_IROTH | stat.S_IXOTH
 class NamespaceRuntime(Runtime):
     """Isolation by namespaces, as root and as any user who may make user namespaces.
 
-    As root each container runs as a user of the machine of its own; else all run as the engine's user.
+    As root each container runs as a separate user of the machine; else all run as the engine's user.
 
     Args:
         home_bytes: Size of a container's home.
-        uids: The users for containers, if this is root; None takes the default ones.
+        uids: The users for containers, as root; None takes the default ones.
     """
 
     name = "namespace"
@@ -79,7 +79,7 @@ class NamespaceRuntime(Runtime):
         self._uids = uids or UidPool(FIRST_UID, UIDS)
         self._root = os.geteuid() == 0
         self._bwrap = shutil.which("bwrap") or ""
-        self._nursery = Nursery(b"", {})
+        self._fork_server = ForkServer(b"", {})
 
     def probe(self) -> None:
         """Make a container and start the engine's Python in it."""
@@ -87,12 +87,12 @@ class NamespaceRuntime(Runtime):
             raise RuntimeUnavailableError(self.name, "it needs Linux")
         self.require()
         _compile()
-        self._nursery.close()
+        self._fork_server.close()
         program, missing = _make_filter()
         self.detail = "; ".join(filter(None, (missing, self._claimed())))
-        self._nursery = Nursery(program, clean_environ(HOME))
+        self._fork_server = ForkServer(program, clean_environ(HOME))
         failures: list[Exception] = []
-        trying = threading.Thread(target=self._try, args=(failures,))  # there may be a loop in this one
+        trying = threading.Thread(target=self._try, args=(failures,))  # this thread may run an event loop
         trying.start()
         trying.join()
         if failures:
@@ -103,41 +103,41 @@ class NamespaceRuntime(Runtime):
         """Look for the programs that are needed. Blocks.
 
         Raises:
-            RuntimeUnavailableError: One is missing.
+            RuntimeUnavailableError: A program is missing.
         """
         if not self._bwrap:
             raise RuntimeUnavailableError(
                 self.name, "bwrap is not installed (Debian, Ubuntu: apt install bubblewrap)"
             )
 
-    def bundles(self, folder: ContainerFolder) -> str:  # noqa: ARG002
+    def user_packages(self, folder: ContainerFolder) -> str:  # noqa: ARG002
         """The same in every container."""
         return BUNDLES
 
-    def is_unborn(self, record: Record) -> bool:
-        """An environment is noted when the nursery has answered."""
+    def is_starting(self, record: Record) -> bool:
+        """An environment is noted when the fork server has answered."""
         return not record.environment
 
     def review(self, packages: Iterable[Path]) -> str:
-        """As root, containers are users to whom a private folder is closed."""
+        """As root, containers run as users who cannot read a private folder."""
         closed = [str(path) for path in packages if self._root and _is_closed(path)]
         if not closed:
             return ""
-        return f"containers cannot read {', '.join(closed)}: make it readable by everybody (chmod -R o+rX)"
+        return f"containers cannot read {', '.join(closed)}: make it readable by all users (chmod -R o+rX)"
 
     def _claimed(self) -> str:
-        """Say whose the containers' users are; empty if nobody's."""
+        """Return a text about the owners of the containers' users; empty if they have none."""
         owners = self._uids.owners() if self._root else []
         if not owners:
             return ""
         return f"users for containers belong to {', '.join(owners)} too: choose others by --first-uid"
 
     def close(self) -> None:
-        """End the nursery; the containers live on."""
-        self._nursery.close()
+        """End the fork server; the containers keep running."""
+        self._fork_server.close()
 
     def start(self, order: Order) -> HeldHandle:
-        """Make the container's namespaces; the environment comes to life by the handle's ``launch``."""
+        """Make the container's namespaces; the handle's ``launch`` starts the environment."""
         return self._start(order)
 
     def _start(self, order: Order, check: tuple[str, ...] = ()) -> HeldHandle:
@@ -146,7 +146,7 @@ class NamespaceRuntime(Runtime):
         except OSError as error:
             raise StartError(f"its /etc cannot be written: {error}") from error
         uid, lock = self._uids.take() if self._root else (0, -1)
-        birth = Birth(
+        request = SpawnRequest(
             boot=order.boot,
             environ={**clean_environ(HOME), "USER": USER, "LOGNAME": USER},
             uid=uid,
@@ -157,7 +157,7 @@ class NamespaceRuntime(Runtime):
             check=check,
         )
         try:
-            handle = HeldHandle.start(self._command(order), order, birth, self._nursery, lock)
+            handle = HeldHandle.start(self._command(order), order, request, self._fork_server, lock)
         finally:
             if lock >= 0:
                 os.close(lock)
@@ -172,7 +172,7 @@ class NamespaceRuntime(Runtime):
             failures.append(error)
 
     async def _try_once(self) -> None:
-        """Make a container in which Python looks whether it finds the engine.
+        """Make a container in which Python checks whether it can import the engine.
 
         Raises:
             ContainerError: It did not work; the text says why.
@@ -182,7 +182,7 @@ class NamespaceRuntime(Runtime):
             folder.make()
             boot = Boot(
                 id="probe/probe",
-                mark=folder.mark,
+                mark=folder.incarnation_id,
                 machine="",
                 home="",
                 logs="",
@@ -220,7 +220,7 @@ class NamespaceRuntime(Runtime):
 
 
 def _make_filter() -> tuple[bytes, str]:
-    """Make the filter of system calls; returns it, or what to say if there is none."""
+    """Make the filter of system calls; return it, or a text about why it cannot be made."""
     try:
         return make_filter(), ""
     except FilterUnavailableError as error:
@@ -228,26 +228,26 @@ def _make_filter() -> tuple[bytes, str]:
 
 
 def interpreter_paths() -> list[Path]:
-    """All that the engine's Python needs to be seen inside, as paths of the machine."""
+    """Return the machine's paths that the engine's Python needs inside."""
     wanted = [Path(sys.prefix), Path(sys.base_prefix), Path(sys.base_exec_prefix)]
     wanted.append(Path(sys.executable).resolve().parents[1])
     return [*wanted, *(path.resolve() for path in wanted), *_python_packages()]
 
 
 def _compile() -> None:
-    """Have the modules compiled here: inside nothing can be written, and every container would do it anew."""
+    """Compile the modules here: inside they are read-only, and every container would compile them again."""
     for folder in _python_packages():
         compileall.compile_dir(folder, quiet=2)
 
 
 def _python_packages() -> list[Path]:
-    """The engine's and those that hold nodes; in a checkout they are outside of the interpreter's folders."""
+    """Return the engine's packages and those with nodes; a checkout is outside the interpreter's folders."""
     root = source_root()
     return [root / "rce", root / "rce_container", *distributed_folders()]
 
 
 def _mounts(order: Order) -> list[str]:
-    """The container's tree of files; the rest is done from inside (:mod:`rce_container.nursery.mounts`)."""
+    """Return the mounts of the container's files; :mod:`rce_container.forkserver.mounts` mounts the rest."""
     folder = order.folder
     return [
         *system_mounts(),
@@ -257,7 +257,7 @@ def _mounts(order: Order) -> list[str]:
         *("--ro-bind", str(folder.etc), "/etc"),
         *(word for name in _etc(order) for word in ("--ro-bind-try", f"/etc/{name}", f"/etc/{name}")),
         *("--bind", str(folder.logs), LOGS),
-        *("--dir", "/opt", "--dir", "/opt/rce", "--ro-bind", str(folder.bundles), BUNDLES),
+        *("--dir", "/opt", "--dir", "/opt/rce", "--ro-bind", str(folder.user_packages), BUNDLES),
         *read_only_mounts([*interpreter_paths(), *order.packages]),
         *("--dir", "/run", "--symlink", "../run", "/var/run"),
         *("--symlink", "../tmp", "/var/tmp", "--remount-ro", "/"),  # noqa: S108 - the container's own
@@ -265,7 +265,7 @@ def _mounts(order: Order) -> list[str]:
 
 
 def system_mounts() -> list[str]:
-    """The machine's programs and libraries."""
+    """Return the mounts of the machine's programs and libraries."""
     options = ["--ro-bind", "/usr", "/usr"]
     for path in map(Path, _SYSTEM):
         if path.is_symlink():
@@ -276,7 +276,7 @@ def system_mounts() -> list[str]:
 
 
 def read_only_mounts(paths: Iterable[Path]) -> list[str]:
-    """Bind paths where they are, leaving out what lies inside the system's."""
+    """Bind paths at the same place, except those inside the system's folders."""
     options: list[str] = []
     for path in outermost(paths, Path("/usr")):
         for parent in reversed(path.parents[:-1]):
@@ -286,7 +286,7 @@ def read_only_mounts(paths: Iterable[Path]) -> list[str]:
 
 
 def _is_closed(folder: Path) -> bool:
-    """Whether a folder is there that not everybody may read."""
+    """Whether a folder exists that is not world-readable."""
     try:
         mode = folder.stat().st_mode
     except OSError:
@@ -295,7 +295,7 @@ def _is_closed(folder: Path) -> bool:
 
 
 def outermost(paths: Iterable[Path], *bound: Path) -> list[Path]:
-    """Leave out paths that lie inside another one or inside one that is ``bound``, or that do not exist."""
+    """Leave out paths inside another one or inside a ``bound`` one, and paths that do not exist."""
     found: list[Path] = []
     for path in sorted({path.absolute() for path in paths}, key=lambda path: len(path.parts)):
         if path == Path("/") or any(map(path.is_relative_to, (*bound, *found))) or not path.exists():
@@ -305,12 +305,12 @@ def outermost(paths: Iterable[Path], *bound: Path) -> list[Path]:
 
 
 def _etc(order: Order) -> tuple[str, ...]:
-    """What is the machine's in ``/etc``: with its network also its name servers."""
+    """Return the machine's files in ``/etc``: with its network also its name servers."""
     return (*_ETC, "resolv.conf") if order.host_network else _ETC
 
 
 def write_etc(order: Order) -> None:
-    """Write the container's own ``/etc``, for its user to read. Its hosts may be known already."""
+    """Write the container's own ``/etc``, readable by its user. Its hosts may be known already."""
     etc, host = order.folder.etc, hostname(order.tag)
     etc.chmod(0o755)
     for name, text in (

@@ -1,11 +1,12 @@
-"""The runtime of images: podman makes the namespaces, the nursery's children live in them.
+"""The runtime of images: podman makes the namespaces, the fork server's children run in them.
 
 It is the ``namespace`` runtime with another root. The holder is a shell of the image, started by podman; the
-environment joins it from outside and confines itself as everywhere, so an image needs no Python of its own.
+environment joins it from outside and confines itself as in the ``namespace`` runtime, so an image does not
+need its own Python.
 
-Podman, its monitor and the holder have a pid namespace to themselves whose process 1 is podman: they die
-together. All that podman notes of the container is in memory, in a mount namespace of theirs, and goes with
-them; neither the machine's mounts nor its own ``podman ps`` ever show it. Images are read where they are.
+Podman, its monitor and the holder share a separate pid namespace whose process 1 is podman, so they end
+together. Podman's records of the container are in memory, in their mount namespace, and end with them;
+neither the machine's mounts nor its own ``podman ps`` show them. Images are read in place.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from itertools import chain
 from pathlib import Path
 
 from rce_container.exceptions import RuntimeUnavailableError, StartError
+from rce_container.forkserver.mounts import HOME, LOGS
 from rce_container.network.hosts import hostname
-from rce_container.nursery.mounts import HOME, LOGS
 from rce_container.runtimes.base import Order
 from rce_container.runtimes.held import HOLDER, HeldHandle
 from rce_container.runtimes.namespace import (
@@ -43,12 +44,12 @@ _TRANSPORTS = (
     *("ostree", "sif", "tarball"),
 )
 STATE = Path("/run/rce/podman")
-"""Where podman keeps its state; podmans that run at the same time each see their own there."""
+"""Where podman keeps its state; each running podman sees its own state there."""
 _TIMEOUT_S = 20.0
 _DRIVER = "overlay"
 
 # Podman's own state is in memory, its locks in files, because those in memory are the whole machine's. crun
-# refuses machines that have controllers in cgroups of both versions, though it is to leave cgroups alone: the
+# refuses machines that have controllers in cgroups of both versions, although it is not to use cgroups: the
 # newer version is hidden from it.
 _SCRIPT = """
 mount -t tmpfs -o mode=700 tmpfs "$1" && cd "$1" || exit 1
@@ -59,7 +60,7 @@ shift
 exec "$@" 3<&0 0</dev/null 1>&2
 """
 _HOLDER = f"exec <&3 >&3 3<&-; {HOLDER[-1]}"
-"""Podman passes the tether on as descriptor 3; the holder wants it as its standard input and output."""
+"""Podman passes the lifeline on as descriptor 3; the holder needs it as standard input and output."""
 
 _APART = ("--mount", "--pid", "--fork", "--kill-child", "--mount-proc", "--propagation", "private")
 _MACHINE = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32")
@@ -101,7 +102,7 @@ class PodmanRuntime(NamespaceRuntime):
 
     @property
     def is_installed(self) -> bool:
-        """Whether podman is there, whether it works or not."""
+        """Whether podman is installed, even if it does not work."""
         return bool(self._podman)
 
     def require(self) -> None:
@@ -166,7 +167,7 @@ class PodmanRuntime(NamespaceRuntime):
             "--storage-opt": f"additionalimagestore={self._store}",
         }
         run = {
-            "--name": order.folder.mark,
+            "--name": order.folder.incarnation_id,
             "--hostname": hostname(order.tag),
             "--network": "host" if order.host_network else "none",
         }
@@ -183,12 +184,12 @@ class PodmanRuntime(NamespaceRuntime):
         """The options that say what is mounted, and the image at their end.
 
         Raises:
-            StartError: There is no such image for containers.
+            StartError: The image does not exist, or is not for containers.
         """
         folder = order.folder
         mounts = [(path, str(path)) for path in outermost(_paths(order))]
         mounts += [(folder.etc / name, f"/etc/{name}") for name in _OWN_ETC]
-        mounts.append((folder.bundles, BUNDLES))
+        mounts.append((folder.user_packages, BUNDLES))
         image = order.image
         if not image:
             root = folder.path / "root"
@@ -211,18 +212,18 @@ class PodmanRuntime(NamespaceRuntime):
 
 
 def is_image_name(text: str) -> bool:
-    """Whether podman takes this for an image's name, and not for an option or a place to read one from."""
+    """Whether podman reads this as an image's name, and not as an option or a location of an image."""
     return bool(_IMAGE.fullmatch(text)) and text.partition(":")[0] not in _TRANSPORTS
 
 
 def _paths(order: Order) -> list[Path]:
-    """What is seen inside at the same place as outside. What an image may have itself is the image's."""
+    """Return the paths that are the same inside and outside, except those of the image."""
     packages = [path for path in order.packages if not any(map(path.is_relative_to, _OF_THE_IMAGE))]
     return [*_engine_paths(), *packages]
 
 
 def _engine_paths() -> list[Path]:
-    """The engine and its Python; of a Python among the system's programs only what is its own."""
+    """Return the paths of the engine and its Python; of a system Python, only its own files."""
     found: list[Path] = []
     python = f"python{sys.version_info.major}.{sys.version_info.minor}"
     for path in interpreter_paths():

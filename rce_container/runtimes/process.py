@@ -12,21 +12,21 @@ _ENV = "/usr/bin/env"
 
 
 class ProcessRuntime(ExecRuntime):
-    """No isolation: nodes see and may do all that the user of the container task set may."""
+    """No isolation: nodes have all permissions of the user of the container task set."""
 
     name = "process"
     isolated = False
 
     def probe(self) -> None:
-        """Works everywhere."""
+        """Do nothing: this runtime works on every machine."""
 
     def paths(self, folder: ContainerFolder) -> tuple[str, str]:
-        """The folders as they are."""
+        """Return the folders unchanged."""
         return str(folder.home), str(folder.logs)
 
     def command(self, order: Order, argv: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-        """Run it as it is, with a clean environment, and a mark by which its processes are found.
+        """Return the command unchanged, with a clean environment and a mark that identifies its processes.
 
-        The shim itself carries no mark: it is the one that looks for them.
+        The shim itself does not carry the mark: it searches for it.
         """
-        return [_ENV, f"{MARK}={order.folder.mark}", *argv], clean_environ(str(order.folder.home))
+        return [_ENV, f"{MARK}={order.folder.incarnation_id}", *argv], clean_environ(str(order.folder.home))

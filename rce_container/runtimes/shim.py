@@ -1,8 +1,8 @@
-"""The shim: a shell in a session of its own that outlives the manager and waits for a container's end.
+"""The shim: a shell in its own session that outlives the manager and waits for a container's end.
 
-It enters the container's cgroups, runs the command that the container hangs on, waits for it, and removes the
-container's folders and cgroups. After a command that did not end properly it lingers, so that a manager can
-look at what is left.
+It enters the container's cgroups, runs the container's main command, waits for it, and removes the
+container's folders and cgroups. If the command did not end properly, the shim waits longer, so that a manager
+can inspect the remains.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SHELL = "/bin/sh"
 
 # When all has ended, the shim leaves the container's cgroups BASE/TASK_SET/MARK, each for the one in which
-# the engine is (see rce_container.limits.cgroup2), and removes them: there may be no manager to do it.
+# the engine is (see rce_container.limits.cgroup2), and removes them: the manager may have ended.
 _SHIM = """
 trap : HUP INT TERM
 folder=$1 run=$2 linger=$3 python=$4 sweeper=$5 mark=$6 switch=$7 joined=1 cells=
@@ -67,7 +67,7 @@ def spawn_shim(
         argv: The command. If it ends with another code than 0, the folders stay for the grace time.
         env: Its environment variables.
         streams: Its standard input and output; standard error is the environment's log.
-        sweep: Whether processes that carry the container's mark may be left, and are to be killed.
+        sweep: Kill remaining processes that carry the container's mark.
         keep: Descriptors that it inherits.
 
     Raises:
@@ -79,7 +79,7 @@ def spawn_shim(
         f"{order.boot.grace:g}",
         sys.executable,
         proc.__file__ if sweep else "",
-        folder.mark,
+        folder.incarnation_id,
         order.switch,
     ]
     shim += [*order.join, "--", *argv]

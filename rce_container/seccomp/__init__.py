@@ -1,1 +1,1 @@
-"""The filter of system calls of containers: what is allowed, and its translation for the kernel."""
+"""The filter of system calls of containers: the allowed calls, and their translation for the kernel."""

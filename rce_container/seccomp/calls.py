@@ -1,8 +1,7 @@
-"""Which system calls the processes of a container may make.
+"""The system calls that the processes of a container may make.
 
-What is not named here does not exist for them (``ENOSYS``), so that programs fall back to older calls; what
-is named as refused answers as it would for lack of a right (``EPERM``). Names that an architecture does not
-have are passed over.
+Calls that are not listed here do not exist for them (``ENOSYS``), so that programs fall back to older calls;
+refused calls fail as without permission (``EPERM``). Names that an architecture does not have are skipped.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import errno
 import socket
 from typing import NamedTuple
 
-from rce_container.nursery.kernel import Namespaces
+from rce_container.forkserver.kernel import Namespaces
 
 _LOW_HALF = 0xFFFF_FFFF
 _NAMESPACE_TIME = 0x80
@@ -34,7 +33,7 @@ class Rule(NamedTuple):
 
 
 def _word(argument: int, value: int) -> Match:
-    """A 32-bit argument's value; what the register holds above it does not count for the kernel either."""
+    """A 32-bit argument's value; the kernel ignores the upper half of the register too."""
     return Match(argument, _LOW_HALF, value)
 
 
@@ -94,10 +93,10 @@ _PERSONALITIES = (0x0, 0x8, 0x2_0000, 0x2_0008, _LOW_HALF)
 """Linux, with 32-bit addresses, with an old version's number, and the question which one it is."""
 
 _HUGE = {"mmap": (3, 0x4_0000), "mmap2": (3, 0x4_0000), "memfd_create": (1, 0x4), "shmget": (2, 0o4000)}
-"""Where each call is told to take huge pages: the machine has a few for all, and no limit counts them."""
+"""The flags that request huge pages: the machine has few of them, and no limit counts them."""
 _FILE_COMMANDS_BELOW = 64
 _FILE_COMMANDS = range(1025, 1039)
-"""What ``fcntl`` may be told: leases (1024) are not on it, by which an owner holds up all who open a file."""
+"""Allowed commands of ``fcntl``; without leases (1024), by which an owner blocks others that open a file."""
 
 CONDITIONAL = (
     *(Rule(call, (_word(0, family),)) for call in ("socket", "socketpair") for family in _FAMILIES),
@@ -109,7 +108,7 @@ CONDITIONAL = (
     *(Rule(call, (_word(1, code),)) for call in ("fcntl", "fcntl64") for code in _FILE_COMMANDS),
     *(Rule("personality", (_word(0, personality),)) for personality in _PERSONALITIES),
 )
-"""Calls that are allowed with some arguments. A socket of netlink is what lists a machine's addresses."""
+"""Calls that are allowed with some arguments. A netlink socket lists a machine's addresses."""
 
 _REFUSED = """
 acct add_key adjtimex bpf chroot clock_adjtime clock_settime delete_module fanotify_init fanotify_mark
@@ -122,12 +121,15 @@ uselib userfaultfd vhangup vm86 vm86old
 """
 
 REFUSED = tuple(_REFUSED.split())
-"""Calls that are known, and denied."""
+"""Calls that exist and are denied."""
 
 PRETENDED = ("sync", "syncfs")
-"""Calls that do nothing and succeed: nothing of a container is on a disk, and the disks are others'."""
+"""Calls that do nothing and succeed: containers have no data on disks, and others share the disks."""
 
 INVISIBLE = errno.ENOSYS
-"""What a call answers that is not known. ``clone3`` is such a one: its flags lie where no filter can look. So
-is ``io_setup``: the machine has a number of those contexts for all."""
+"""The result of unknown calls.
+
+They include ``clone3``, whose flags are in memory that a filter cannot read, and ``io_setup``, of whose
+contexts the machine has a fixed number.
+"""
 DENIED = errno.EPERM

@@ -1,4 +1,4 @@
-"""Translating the list of system calls into a program for the kernel, by libseccomp."""
+"""Translates the list of system calls into a program for the kernel, with libseccomp."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _UNKNOWN = -1
 
 
 class FilterUnavailableError(Exception):
-    """No filter can be made on this machine; the text says why."""
+    """A filter cannot be made on this machine; the text says why."""
 
 
 class _Comparison(ctypes.Structure):
@@ -44,10 +44,10 @@ def make_filter() -> bytes:
     A process that makes calls as another architecture (32-bit programs) is killed.
 
     Returns:
-        Instructions, for :func:`rce_container.nursery.kernel.filter_calls`.
+        Instructions, for :func:`rce_container.forkserver.kernel.filter_calls`.
 
     Raises:
-        FilterUnavailableError: libseccomp is missing, or does not do it.
+        FilterUnavailableError: libseccomp is missing, or fails.
     """
     try:
         library = ctypes.CDLL(LIBRARY)
@@ -68,7 +68,7 @@ def make_filter() -> bytes:
 
 def _translate(library: ctypes.CDLL, context: ctypes.c_void_p) -> bytes:
     _check(library.seccomp_attr_set, context, _ATTRIBUTE_BAD_ARCHITECTURE, ctypes.c_uint32(_KILL_PROCESS))
-    # An older library makes a list of it, which does the same more slowly.
+    # An older library makes a linear list of conditions, which is slower.
     library.seccomp_attr_set(context, _ATTRIBUTE_OPTIMIZE, ctypes.c_uint32(_AS_A_TREE))
     add = partial(_add, library, context)
     for call in ALLOWED:

@@ -1,1 +1,1 @@
-"""Handing out cells to robots, so that no two of them ever claim the same one."""
+"""Grants cells to robots, so that no two of them ever claim the same one. Pure."""

@@ -1,8 +1,8 @@
-"""What a move client says on the topic that its lists come by, for graphs that share no other. Pure.
+"""A move client's answer on the topic of its cell lists, for graphs that share no other topic. Pure.
 
 An answer is a ``std_msgs/Int32MultiArray`` with three parts, one for each dimension: the list's cells; the
 last cell reached and the one driven to, -1 for none; and cells that the robot has found blocked. The label of
-the first is ``answer=17 driving``: the list's number, and what the move client does. Lists have other labels.
+the first is ``answer=17 driving``: the list's number and the move client's state. Lists have other labels.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _NONE = -1
 
 
 class Answer(NamedTuple):
-    """What a move client says."""
+    """A move client's answer."""
 
     report: ClientReport
     blocked: tuple[int, ...] = ()
@@ -28,12 +28,12 @@ class Answer(NamedTuple):
 
 
 def is_answer(labels: Sequence[str]) -> bool:
-    """Tell by the labels of an array's dimensions whether it is an answer, no list."""
+    """Return whether an array with these labels is an answer and not a list."""
     return bool(labels) and labels[0].startswith(_MARK)
 
 
 def answer_array(answer: Answer) -> dict[str, Any]:
-    """The fields of a ``std_msgs/Int32MultiArray`` that holds an answer."""
+    """Return the fields of a ``std_msgs/Int32MultiArray`` for an answer."""
     report = answer.report
     progress = [_NONE if cell is None else cell for cell in (report.reached, report.target)]
     parts = {
@@ -49,15 +49,17 @@ def read_answer(labels: Sequence[str], sizes: Sequence[int], data: Sequence[int]
     """Read an answer.
 
     Args:
-        labels: Of the array's dimensions.
-        sizes: Of the array's dimensions.
+        labels: Labels of the array's dimensions.
+        sizes: Sizes of the array's dimensions.
         data: The array's numbers.
 
     Raises:
-        ValueError: It has another form.
+        ValueError: The array has another form.
     """
     if not is_answer(labels) or len(sizes) != 3 or sizes[1] != 2 or sum(sizes) != len(data):  # noqa: PLR2004
-        raise ValueError(f"no answer of a move client: {list(labels)}, {list(sizes)}, {len(data)} numbers")
+        raise ValueError(
+            f"not a move client's answer: labels {list(labels)}, sizes {list(sizes)}, {len(data)} numbers"
+        )
     revision, _, state = labels[0].removeprefix(_MARK).partition(" ")
     ends = accumulate(sizes, initial=0)
     cells, progress, blocked = (tuple(data[begin:end]) for begin, end in pairwise(ends))

@@ -1,4 +1,4 @@
-"""What the planner takes in and what it gives out."""
+"""Events that the planner handles, and instructions that it returns."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rce_fleet.coordination.move_client import ClientReport
+    from rce_fleet.coordination.replanning import PlanRequest, PlanResult
 
-# -- events -------------------------------------------------------------------------------------
+# Events
 
 
 @dataclass(frozen=True, slots=True)
 class PoseSeen:
-    """A robot says where it is: metres and radians in the map."""
+    """A robot reported its pose: metres and radians in the map."""
 
     robot: str
     x: float
@@ -23,7 +24,7 @@ class PoseSeen:
 
 @dataclass(frozen=True, slots=True)
 class ReportSeen:
-    """A robot's move client says what it does."""
+    """A robot's move client reported its state."""
 
     robot: str
     report: ClientReport
@@ -39,7 +40,7 @@ class ObstacleSeen:
 
 @dataclass(frozen=True, slots=True)
 class GoalSet:
-    """Somebody sends a robot to a cell, or (``None``) takes its goal away. Answered by :class:`Reply`."""
+    """A robot is sent to a cell, or (``None``) its goal is removed. Answered by :class:`Reply`."""
 
     robot: str
     cell: int | None
@@ -47,33 +48,42 @@ class GoalSet:
 
 @dataclass(frozen=True, slots=True)
 class CellBlocked:
-    """Somebody blocks a cell. Answered by :class:`Reply`."""
+    """A cell is blocked. Answered by :class:`Reply`."""
 
     cell: int
 
 
 @dataclass(frozen=True, slots=True)
 class CellFreed:
-    """Somebody frees a blocked cell. Answered by :class:`Reply`."""
+    """A blocked cell is freed. Answered by :class:`Reply`."""
 
     cell: int
 
 
 @dataclass(frozen=True, slots=True)
 class RobotRemoved:
-    """Somebody took a robot off the floor. Answered by :class:`Reply`."""
+    """A robot was removed. Answered by :class:`Reply`."""
 
     robot: str
 
 
 @dataclass(frozen=True, slots=True)
+class PlanMade:
+    """The plan that :class:`MakePlan` requested is ready."""
+
+    result: PlanResult
+
+
+@dataclass(frozen=True, slots=True)
 class Tick:
-    """Time goes by; wanted a few times a second."""
+    """Time passed; to be sent a few times a second."""
 
 
-Event = PoseSeen | ReportSeen | ObstacleSeen | GoalSet | CellBlocked | CellFreed | RobotRemoved | Tick
+Event = (
+    PoseSeen | ReportSeen | ObstacleSeen | GoalSet | CellBlocked | CellFreed | RobotRemoved | PlanMade | Tick
+)
 
-# -- instructions -------------------------------------------------------------------------------
+# Instructions
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +91,8 @@ class SendCells:
     """Give a robot its granted cells, beginning with its own; an empty list means to stay.
 
     Attributes:
-        robot: Whom.
-        revision: Grows from list to list of a robot.
+        robot: Id of the robot.
+        revision: Number of the list; grows from list to list of a robot.
         cells: The granted cells.
     """
 
@@ -93,7 +103,7 @@ class SendCells:
 
 @dataclass(frozen=True, slots=True)
 class SendCancel:
-    """Stop a robot and let it drop its cells."""
+    """Stop a robot and drop its cells."""
 
     robot: str
 
@@ -108,14 +118,19 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class BlockedChanged:
-    """These cells, all of them, are blocked from now on (walls of the map not counted), ascending."""
+    """All cells that are blocked now (without the map's walls), ascending."""
 
     cells: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class StateChanged:
-    """The snapshot is another one, poses not counted."""
+class MakePlan:
+    """Compute this plan and return it as :class:`PlanMade`. Until then no robot is granted new cells.
+
+    There is one request at a time. It may take seconds; other events are handled meanwhile.
+    """
+
+    request: PlanRequest
 
 
-Instruction = SendCells | SendCancel | Reply | BlockedChanged | StateChanged
+Instruction = SendCells | SendCancel | Reply | BlockedChanged | MakePlan

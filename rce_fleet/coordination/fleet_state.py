@@ -1,12 +1,14 @@
-"""All that the planner remembers."""
+"""The planner's state: records of the robots, blocked cells, the ledger and the indexes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from rce_fleet.coordination.changes import ChangeLog, FleetChanges
+from rce_fleet.coordination.indexes import FleetIndex
 from rce_fleet.coordination.ledger import CellLedger
-from rce_fleet.coordination.robot import Phase, RobotRecord
+from rce_fleet.coordination.robot import Cause, Phase, RobotRecord
 from rce_fleet.coordination.snapshot import FleetSnapshot, RobotSnapshot, RobotState
 from rce_fleet.exceptions import InvariantError
 
@@ -15,15 +17,20 @@ if TYPE_CHECKING:
 
 
 @dataclass(slots=True)
-class FleetBooks:
+class FleetState:
     """The fleet's state.
+
+    Records are changed in place: call :meth:`touch` after a change, and :meth:`refresh` before reading
+    indexes. The ledger records its own changes.
 
     Attributes:
         grid: The map; its blocked cells are walls.
-        robots: Every robot ever heard and not removed.
-        ledger: Who claims which cell.
-        blocked: Cells that were blocked; nobody claims one.
-        pending: Cells that will be blocked when those who claim them have left; nobody may enter one.
+        robots: All robots that sent a message and were not removed.
+        ledger: Which robot claims which cell.
+        blocked: Cells that were blocked; no robot claims one.
+        pending: Cells that will be blocked once no robot claims them; no robot may enter one.
+        index: Indexes of the robots.
+        log: Changes that are not published yet.
     """
 
     grid: GridMap
@@ -31,37 +38,111 @@ class FleetBooks:
     ledger: CellLedger = field(default_factory=CellLedger)
     blocked: set[int] = field(default_factory=set)
     pending: set[int] = field(default_factory=set)
+    index: FleetIndex = field(default_factory=FleetIndex)
+    log: ChangeLog = field(default_factory=ChangeLog)
+    _touched: set[str] = field(default_factory=set)
 
     @property
     def shut(self) -> frozenset[int]:
-        """Cells that nobody may enter."""
+        """Cells that no robot may enter."""
         return self.grid.blocked.union(self.blocked, self.pending)
 
-    def in_phase(self, phase: Phase) -> list[RobotRecord]:
-        """Robots in a phase of their lives."""
-        return [record for record in self.robots.values() if record.phase is phase]
+    def is_shut(self, cell: int) -> bool:
+        """Return whether robots may not enter a cell."""
+        return cell in self.grid.blocked or cell in self.blocked or cell in self.pending
+
+    def is_blocked(self, cell: int) -> bool:
+        """Return whether a cell is a wall or blocked already."""
+        return cell in self.grid.blocked or cell in self.blocked
+
+    # Changes
+
+    def touch(self, record: RobotRecord) -> None:
+        """Note that a record was changed."""
+        self._touched.add(record.id)
+
+    def change(self, record: RobotRecord, cause: Cause, reason: str) -> None:
+        """Change a robot's phase.
+
+        Raises:
+            TransitionError: The phase does not allow the cause.
+        """
+        record.change(cause)
+        record.reason = reason
+        self._touched.add(record.id)
+
+    def remove(self, robot: str) -> None:
+        """Remove a robot; its cells are free."""
+        del self.robots[robot]
+        self.ledger.remove(robot)
+        self._touched.add(robot)
+
+    def want_blocked(self, cell: int) -> None:
+        """Make a cell pending: no robot may enter it from now on."""
+        self.pending.add(cell)
+        self.log.note_cell(cell)
+
+    def block(self, cell: int) -> None:
+        """Block a cell that no robot claims."""
+        self.pending.discard(cell)
+        self.blocked.add(cell)
+        self.log.note_cell(cell)
+
+    def free(self, cell: int) -> None:
+        """Let robots enter a cell again."""
+        self.pending.discard(cell)
+        self.blocked.discard(cell)
+        self.log.note_cell(cell)
+
+    def refresh(self) -> None:
+        """Update the indexes with the changes since the last call."""
+        touched = self.ledger.take_changed() | self._touched
+        self._touched = set()
+        for robot in sorted(touched, key=self._held_at):
+            self.log.note_robot(robot)
+            record = self.robots.get(robot)
+            if record is None:
+                self.index.leave(robot)
+            else:
+                self.index.enter(record, self.ledger)
+
+    def _held_at(self, robot: str) -> float:
+        record = self.robots.get(robot)
+        return record.held_at if record else 0.0
+
+    # Publishing
+
+    def take_changes(self) -> FleetChanges | None:
+        """Return the changes that are not published yet; None if there are none."""
+        return self.log.take(self.describe, self._cell_state)
 
     def snapshot(self) -> FleetSnapshot:
-        """The state as the outside sees it."""
+        """Return the state for publishing."""
         return FleetSnapshot(
             robots=tuple(self._describe(self.robots[robot]) for robot in sorted(self.robots)),
             blocked=tuple(sorted(self.blocked)),
             pending=tuple(sorted(self.pending)),
         )
 
+    def describe(self, robot: str) -> RobotSnapshot | None:
+        """Return a robot's state for publishing; None if the robot is unknown."""
+        record = self.robots.get(robot)
+        return None if record is None else self._describe(record)
+
     def validate(self) -> None:
         """Check the invariants.
 
         Raises:
-            InvariantError: One does not hold.
+            InvariantError: An invariant does not hold.
         """
         self.ledger.validate()
+        self.index.validate(self.robots.values(), self.ledger)
         if self.blocked & (self.pending | self.grid.blocked) or self.pending & self.grid.blocked:
             raise InvariantError("a cell is a wall, blocked or pending, and only one of these")
         for record in self.robots.values():
             route, claims = self.ledger.route(record.id), self.ledger.claims(record.id)
             if not self.grid.is_path(route):
-                raise InvariantError(f"the route of {record.id} is no path: {route}")
+                raise InvariantError(f"the route of {record.id} is not a path: {route}")
             if route and claims & self.blocked:
                 raise InvariantError(f"{record.id} claims blocked cells: {claims & self.blocked}")
             if record.phase is not Phase.ACTIVE:
@@ -70,6 +151,10 @@ class FleetBooks:
                 raise InvariantError(f"{record.id} is active without a cell")
             if self.shut.intersection(route[1:]):
                 raise InvariantError(f"the route of {record.id} leads through blocked cells: {route}")
+
+    def _cell_state(self, cell: int) -> bool | None:
+        """Return whether a cell is blocked (True), pending (False) or neither (None)."""
+        return True if cell in self.blocked else False if cell in self.pending else None
 
     def _describe(self, record: RobotRecord) -> RobotSnapshot:
         route = self.ledger.route(record.id)
@@ -106,4 +191,4 @@ _AT_REST = {
     (True, False): RobotState.WAITING,
     (True, True): RobotState.ARRIVED,
 }
-"""State of a robot that stands in its cell, by whether it has a goal and is there."""
+"""State of a robot at rest in its cell, by whether it has a goal and is there."""

@@ -1,8 +1,12 @@
-"""Who claims which cell, and who is next to enter it.
+"""Which robot claims which cell, and which robot enters it next.
 
-A joint plan says at which step robots enter cells. Real robots keep no steps, so the plan is carried out
-by order: a robot is granted a cell only once everybody who is to use the cell before has left it. Because
-nobody in a plan follows others around in a circle, somebody can always go on, however slow the others are.
+A joint plan says at which step robots enter cells. Real robots do not keep these steps, so the plan is
+carried out in order: a robot is granted a cell only once every robot that uses the cell before it has left
+it. Robots never follow each other in a circle, so one of them can always drive, however slow the others are.
+
+The cost of an operation depends on what it changes, not on the ledger's size: cells have an owner and a
+queue, and the ledger records what became possible (:meth:`CellLedger.take_freed`,
+:meth:`CellLedger.take_ripe`).
 """
 
 from __future__ import annotations
@@ -22,16 +26,18 @@ class _Account:
     """One robot's part of the ledger.
 
     Attributes:
-        route: The cell that it is in, then those it will enter. Empty for a robot without a place.
+        route: The cell that it is in, then those it will enter. Empty for a robot without a cell.
         granted: How many cells of the route it may use; the first always.
         extra: Further cells that it overlaps.
-        passed: How many cells of its life it has left; numbers its visits.
+        passed: Number of cells that it has left so far; numbers its visits.
+        owned: The cells whose owner it is.
     """
 
     route: list[int] = field(default_factory=list)
     granted: int = 0
     extra: frozenset[int] = frozenset()
     passed: int = 0
+    owned: set[int] = field(default_factory=set)
 
     @property
     def claims(self) -> set[int]:
@@ -39,47 +45,82 @@ class _Account:
 
 
 class CellLedger:
-    """The books of claims and turns.
+    """The record of claims and turns.
 
     Invariants, checked by :meth:`validate`:
 
     - the claims of two robots are disjoint;
     - a robot's granted cells are different from each other;
-    - a cell's queue begins with the visit of the robot that was granted it.
+    - a cell's queue begins with the visit of the robot that was granted it;
+    - queues hold the visits of all routes, and nothing else.
     """
 
     def __init__(self) -> None:
         self._accounts: dict[str, _Account] = {}
         self._owners: dict[int, str] = {}
         self._queues: dict[int, deque[tuple[str, int]]] = {}
+        self._changed: set[str] = set()
+        self._freed: set[int] = set()
+        self._ripe: set[str] = set()
 
-    # -- reading --------------------------------------------------------------------------------
+    # Reading
 
     def claims(self, robot: str) -> frozenset[int]:
-        """Cells that are the robot's now."""
+        """Return the cells that the robot claims."""
         account = self._accounts.get(robot)
         return frozenset(account.claims) if account else frozenset()
 
     def owner(self, cell: int) -> str | None:
-        """The robot that claims a cell."""
+        """Return the robot that claims a cell."""
         return self._owners.get(cell)
 
     def route(self, robot: str) -> list[int]:
-        """The robot's cell and all cells that it will enter."""
+        """Return the robot's cell and all cells that it will enter."""
         account = self._accounts.get(robot)
         return list(account.route) if account else []
 
     def granted(self, robot: str) -> list[int]:
-        """The robot's cell and the cells that it may enter now."""
+        """Return the robot's cell and the cells that it may enter now."""
         account = self._accounts.get(robot)
         return account.route[: account.granted] if account else []
 
+    def visitors(self, cell: int) -> set[str]:
+        """Return the robots whose routes lead through a cell or begin there."""
+        return {robot for robot, _ in self._queues.get(cell, ())}
+
+    def length(self, robot: str) -> int:
+        """Return the number of cells of the robot's route; 0 for a robot without a cell."""
+        account = self._accounts.get(robot)
+        return len(account.route) if account else 0
+
+    def end_of_grant(self, robot: str) -> int | None:
+        """Return the last cell that the robot may enter; None for a robot without a cell."""
+        account = self._accounts.get(robot)
+        return account.route[account.granted - 1] if account and account.granted else None
+
     def extra(self, robot: str) -> frozenset[int]:
-        """Cells that the robot overlaps without being on its way through them."""
+        """Return cells that the robot overlaps outside its route."""
         account = self._accounts.get(robot)
         return account.extra if account else frozenset()
 
-    # -- places ---------------------------------------------------------------------------------
+    # What became possible
+
+    def take_changed(self) -> set[str]:
+        """Return the robots whose route or grant changed since the last call."""
+        changed, self._changed = self._changed, set()
+        return changed
+
+    def take_freed(self) -> set[int]:
+        """Return the cells that lost their owner since the last call; they may have a new one by now."""
+        freed, self._freed = self._freed, set()
+        return freed
+
+    def take_ripe(self) -> set[str]:
+        """Return the robots to which :meth:`grant` may grant further cells now; all others get none."""
+        ripe, self._ripe = self._ripe, set()
+        return ripe
+
+    # Places
 
     def place(self, robot: str, cell: int, overlaps: Iterable[int] = ()) -> None:
         """Put a robot in a cell; what it claimed before is free again, its route ends there.
@@ -96,50 +137,67 @@ class CellLedger:
         account.passed += len(account.route)
         account.route, account.granted, account.extra = [cell], 1, frozenset(wanted - {cell})
         self._queues.setdefault(cell, deque()).appendleft((robot, account.passed))
+        self._changed.add(robot)
         self._settle_owners(robot, account)
 
     def overlap(self, robot: str, cells: Iterable[int]) -> None:
-        """Claim for a robot without a place those cells that nobody else claims."""
+        """Claim cells for a robot without a cell; skip those that other robots claim."""
         account = self._account(robot)
         if account.route:
-            raise InvariantError(f"{robot} has a place")
+            raise InvariantError(f"{robot} has a cell already")
         account.extra = frozenset(cell for cell in cells if self._owners.get(cell, robot) == robot)
         self._settle_owners(robot, account)
 
     def remove(self, robot: str) -> None:
-        """Forget a robot; its cells are free."""
+        """Remove a robot; its cells are free."""
         account = self._account(robot)
         self._withdraw(robot, account)
         account.route, account.granted, account.extra = [], 0, frozenset()
+        self._changed.add(robot)
         self._settle_owners(robot, account)
         del self._accounts[robot]
 
-    # -- plans ----------------------------------------------------------------------------------
+    # Plans
 
     def truncate(self, robot: str) -> None:
-        """Drop what a robot was not yet granted."""
+        """Drop the cells of a route that are not granted yet."""
         account = self._account(robot)
+        if account.granted == len(account.route):
+            return
         for index in range(account.granted, len(account.route)):
-            self._queues[account.route[index]].remove((robot, account.passed + index))
+            self._drop_visit(account.route[index], (robot, account.passed + index))
         del account.route[account.granted :]
+        self._changed.add(robot)
 
-    def adopt(self, routes: Mapping[str, list[tuple[int, int]]]) -> None:
-        """Take a new plan. It begins where the granted cells end; the rest of older plans is dropped.
+    def adopt(self, starts: Mapping[str, int], visits: Iterable[tuple[str, int]]) -> None:
+        """Set a new plan. It begins where the granted cells end; the rest of older plans is dropped.
 
         Args:
-            routes: For every robot with a plan ``(step, cell)``, its last granted cell first.
+            starts: For every robot with a plan its last granted cell.
+            visits: The cells that these robots enter next, in the order of the plan: ``(robot, cell)``.
+
+        Raises:
+            InvariantError: A robot's start is not its last granted cell; nothing was changed.
         """
+        for robot, start in starts.items():
+            if self.end_of_grant(robot) != start:
+                raise InvariantError(f"the plan of {robot} does not begin where its granted cells end")
         for robot in self._accounts:
             self.truncate(robot)
-        visits: list[tuple[int, str, int]] = []
-        for robot, route in routes.items():
-            if route[0][1] != self._accounts[robot].route[-1]:
-                raise InvariantError(f"the plan of {robot} does not begin where its granted cells end")
-            visits.extend((step, robot, cell) for step, cell in route[1:])
-        for _, robot, cell in sorted(visits):
-            account = self._accounts[robot]
-            self._queues.setdefault(cell, deque()).append((robot, account.passed + len(account.route)))
-            account.route.append(cell)
+        # A plan has tens of thousands of visits: this is the planner's longest operation.
+        accounts, queues = self._accounts, self._queues
+        for robot, cell in visits:
+            account = accounts[robot]
+            route = account.route
+            visit = robot, account.passed + len(route)
+            queue = queues.get(cell)
+            if queue is None:
+                queues[cell] = deque((visit,))
+            else:
+                queue.append(visit)
+            route.append(cell)
+        self._changed.update(starts)
+        self._ripe.update(starts)
 
     def grant(self, robot: str, ahead: int) -> bool:
         """Grant a robot the next cells of its route, at most ``ahead`` beyond its own.
@@ -149,37 +207,47 @@ class CellLedger:
         """
         account = self._account(robot)
         before = account.granted
-        while account.granted < min(len(account.route), ahead + 1):
+        while self._may_enter_next(robot, account, ahead):
             cell = account.route[account.granted]
-            if self._queues[cell][0] != (robot, account.passed + account.granted):
-                break
-            if self._owners.get(cell, robot) != robot:
-                break
             account.granted += 1
+            account.owned.add(cell)
             self._owners[cell] = robot
+            self._changed.add(robot)
         return account.granted > before
 
+    def may_grant(self, robot: str, ahead: int) -> bool:
+        """Return whether :meth:`grant` would grant a robot a further cell."""
+        return self._may_enter_next(robot, self._account(robot), ahead)
+
     def arrive(self, robot: str, index: int) -> None:
-        """The robot has fully arrived in granted cell number ``index`` and overlaps no other."""
+        """Record that a robot has fully arrived in granted cell number ``index`` and overlaps no other."""
         account = self._account(robot)
         if not 0 <= index < account.granted:
             raise InvariantError(f"{robot} arrived in a cell that it was not granted")
+        if index == 0 and not account.extra:
+            return
         for cell in account.route[:index]:
-            if self._queues[cell].popleft() != (robot, account.passed):
+            queue = self._queues[cell]
+            if queue.popleft() != (robot, account.passed):
                 raise InvariantError(f"{robot} left cell {cell} out of turn")
+            if not queue:
+                del self._queues[cell]
             account.passed += 1
         del account.route[:index]
         account.granted -= index
         account.extra = frozenset()
+        if index:
+            self._changed.add(robot)
+            self._ripe.add(robot)
         self._settle_owners(robot, account)
 
-    # -- books ----------------------------------------------------------------------------------
+    # Consistency
 
     def validate(self) -> None:
         """Check the invariants.
 
         Raises:
-            InvariantError: One does not hold.
+            InvariantError: An invariant does not hold.
         """
         owners: dict[int, str] = {}
         for robot, account in self._accounts.items():
@@ -192,19 +260,52 @@ class CellLedger:
             for cell in account.claims:
                 if owners.setdefault(cell, robot) != robot:
                     raise InvariantError(f"cell {cell} is claimed by {robot} and {owners[cell]}")
+            if account.owned != account.claims:
+                raise InvariantError(f"{robot} owns {account.owned}, but claims {account.claims}")
         if owners != self._owners:
             raise InvariantError(f"the owners {self._owners} are not the claims {owners}")
+        visits = {
+            (cell, (robot, account.passed + index))
+            for robot, account in self._accounts.items()
+            for index, cell in enumerate(account.route)
+        }
+        queued = [(cell, visit) for cell, queue in self._queues.items() for visit in queue]
+        if len(queued) != len(visits) or set(queued) != visits or not all(self._queues.values()):
+            raise InvariantError(f"the queues {self._queues} are not the visits {visits}")
 
     def _account(self, robot: str) -> _Account:
         return self._accounts.setdefault(robot, _Account())
 
+    def _may_enter_next(self, robot: str, account: _Account, ahead: int) -> bool:
+        if account.granted >= min(len(account.route), ahead + 1):
+            return False
+        cell = account.route[account.granted]
+        is_first = self._queues[cell][0] == (robot, account.passed + account.granted)
+        # A robot can drive over a cell twice; it is granted it again once it has left it.
+        return is_first and self._owners.get(cell, robot) == robot
+
     def _withdraw(self, robot: str, account: _Account) -> None:
-        """Take all visits of a robot out of the queues."""
+        """Remove all visits of a robot from the queues."""
         for index, cell in enumerate(account.route):
-            self._queues[cell].remove((robot, account.passed + index))
+            self._drop_visit(cell, (robot, account.passed + index))
+
+    def _drop_visit(self, cell: int, visit: tuple[str, int]) -> None:
+        queue = self._queues[cell]
+        was_first = queue[0] == visit
+        queue.remove(visit)
+        if not queue:
+            del self._queues[cell]
+        elif was_first:
+            self._ripe.add(queue[0][0])
 
     def _settle_owners(self, robot: str, account: _Account) -> None:
+        """Make a robot the owner of exactly the cells that it claims."""
         claims = account.claims
-        for cell in [cell for cell, owner in self._owners.items() if owner == robot and cell not in claims]:
+        for cell in account.owned - claims:
             del self._owners[cell]
+            self._freed.add(cell)
+            queue = self._queues.get(cell)
+            if queue:
+                self._ripe.add(queue[0][0])
         self._owners.update(dict.fromkeys(claims, robot))
+        account.owned = claims

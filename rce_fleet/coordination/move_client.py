@@ -15,6 +15,9 @@ from enum import Enum
 from math import atan2
 from typing import TYPE_CHECKING, Any
 
+from rce.lifecycle import LifeCycle, remember
+from rce_fleet.exceptions import TransitionError
+
 if TYPE_CHECKING:
     from rce_fleet.planning.grid import GridMap
 
@@ -22,32 +25,63 @@ REPEAT_AFTER = 1.0
 """Seconds after which a goal or cancellation that had no effect is sent again."""
 
 QUIET_TIME = 1.0
-"""Seconds without any goal under way after which a robot is taken to have none."""
+"""Seconds without an active goal after which the robot is considered to have none."""
 
 
 class ClientState(Enum):
     """What a move client does."""
 
     IDLE = "idle"
-    """No goal is under way; the list is driven to its end or empty."""
+    """No goal is active; the list is empty or driven to its end."""
     DRIVING = "driving"
-    """A goal of the list is under way."""
+    """A goal of the list is active."""
     CANCELLING = "cancelling"
-    """A goal may still be under way and is being stopped."""
+    """A goal may still be active and is being cancelled."""
     FAILED = "failed"
-    """The robot gave up a goal; its list was dropped."""
+    """The robot aborted a goal; its list was dropped."""
 
 
-_TRANSITIONS: dict[ClientState, frozenset[ClientState]] = {
-    ClientState.IDLE: frozenset({ClientState.DRIVING}),
-    ClientState.DRIVING: frozenset({ClientState.IDLE, ClientState.CANCELLING, ClientState.FAILED}),
-    ClientState.CANCELLING: frozenset({ClientState.IDLE}),
-    ClientState.FAILED: frozenset({ClientState.IDLE}),
-}
+class ClientEvent(Enum):
+    """Causes of a change of state."""
+
+    DRIVE = "drive"
+    """A goal is sent."""
+    ARRIVE = "arrive"
+    """The robot is at its goal, or the list that it is driven along has ended."""
+    FAIL = "fail"
+    """The robot aborted a goal."""
+    STOP = "stop"
+    """The active goal is outdated: it is cancelled."""
+    STOPPED = "stopped"
+    """No goal is active any more."""
+    RENEW = "renew"
+    """A new list came after a failure."""
+
+
+CLIENT_LIFE: LifeCycle[ClientState, ClientEvent] = LifeCycle(
+    "move client",
+    {
+        ClientState.IDLE: {
+            ClientEvent.DRIVE: ClientState.DRIVING,
+        },
+        ClientState.DRIVING: {
+            ClientEvent.ARRIVE: ClientState.IDLE,
+            ClientEvent.STOP: ClientState.CANCELLING,
+            ClientEvent.FAIL: ClientState.FAILED,
+        },
+        ClientState.CANCELLING: {
+            ClientEvent.STOPPED: ClientState.IDLE,
+        },
+        ClientState.FAILED: {
+            ClientEvent.RENEW: ClientState.IDLE,
+        },
+    },
+    error=TransitionError,
+)
 
 
 class GoalState(Enum):
-    """How a navigation goal stands; the numbers are those of ``actionlib_msgs/GoalStatus``."""
+    """State of a navigation goal; the numbers are those of ``actionlib_msgs/GoalStatus``."""
 
     PENDING = 0
     ACTIVE = 1
@@ -62,7 +96,7 @@ class GoalState(Enum):
 
     @property
     def over(self) -> bool:
-        """Whether nothing more will happen to the goal."""
+        """Whether the state is final."""
         return self not in _UNDER_WAY
 
 
@@ -74,9 +108,9 @@ class SendGoal:
     """Give the robot a navigation goal. A goal sent again has the same id and stamp.
 
     Attributes:
-        id: Names the goal.
-        stamp: When it was made, seconds; a cancellation with a later stamp also stops it.
-        cell: Where to go.
+        id: Id of the goal.
+        stamp: Time stamp, seconds; a cancellation with a later stamp also stops it.
+        cell: The goal cell.
         heading: Direction of travel, radians.
     """
 
@@ -88,7 +122,7 @@ class SendGoal:
 
 @dataclass(frozen=True, slots=True)
 class SendStop:
-    """Cancel every goal made up to ``stamp`` (seconds), also those that arrive later."""
+    """Cancel every goal with a time stamp up to ``stamp`` (seconds), also if it arrives later."""
 
     stamp: float
 
@@ -98,9 +132,9 @@ class ClientReport:
     """Progress of a move client, the acknowledgement for the planner.
 
     Attributes:
-        revision: Of the last list accepted; 0 before the first.
-        state: What the client does.
-        cells: The list accepted; empty after a cancellation.
+        revision: Number of the last accepted list; 0 before the first.
+        state: State of the client.
+        cells: The accepted list; empty after a cancellation.
         reached: The last cell of the list that was reached.
         target: The cell that the robot is sent to.
     """
@@ -119,13 +153,13 @@ Instruction = SendGoal | SendStop | ClientReport
 class MoveClient:
     """Turns lists of cells into navigation goals.
 
-    It begins in ``CANCELLING``: a goal of an earlier life of this client may be under way, and only the
-    robot can tell that there is none.
+    It begins in ``CANCELLING``: a goal from before a restart of this client may be active, and only the
+    robot knows that.
 
     Args:
         grid: Size and place of the cells.
-        name: Goals are named after it; two clients of one robot must differ.
-        started: Time of the start, seconds; makes goal ids unlike those of an earlier life.
+        name: Prefix of goal ids; two clients of one robot must have different ones.
+        started: Time of the start, seconds; makes goal ids different from those before a restart.
     """
 
     grid: GridMap
@@ -138,22 +172,23 @@ class MoveClient:
     _sent_at: float = float("-inf")
     _quiet_since: float | None = None
     _count: int = 0
+    _recent: tuple[ClientEvent, ...] = ()
 
     @property
     def report(self) -> ClientReport:
-        """The current progress."""
+        """The current report."""
         return self._report
 
     def take_cells(self, revision: int | None, cells: list[int], now: float) -> list[Instruction]:
         """Accept a list of cells, unless a newer one is known.
 
         Args:
-            revision: Grows from list to list; ``None`` if the sender does not number them.
-            cells: Beginning with the cell that the robot is in; empty to stop it.
+            revision: Number of the list, growing; ``None`` if the sender does not number them.
+            cells: The cells, from the robot's own on; empty to stop it.
             now: Time, seconds.
 
         Raises:
-            ValueError: The list leaves the map or is no path; nothing was changed.
+            ValueError: The list leaves the map or is not a path; nothing was changed.
         """
         known = self._report
         if revision is None:
@@ -163,7 +198,7 @@ class MoveClient:
         if revision <= known.revision:
             return []
         if any(cell not in self.grid for cell in cells) or not self.grid.is_path(cells):
-            raise ValueError(f"{cells} is no path on the map")
+            raise ValueError(f"{cells} is not a path on the map")
         if not cells:
             return self._drop(revision, now)
         return self._follow(revision, tuple(cells), now)
@@ -173,7 +208,7 @@ class MoveClient:
         return self._drop(self._report.revision, now)
 
     def take_goal_states(self, states: dict[str, GoalState], now: float) -> list[Instruction]:
-        """Take the robot's list of goals, the finished ones that it remembers included."""
+        """Handle the robot's status list, with the finished goals in it."""
         if self._report.state is ClientState.CANCELLING:
             return self._await_stop(states, now)
         if self._goal is None:
@@ -185,7 +220,7 @@ class MoveClient:
         return self._finished(state, now) if state is not None and state.over else []
 
     def take_result(self, goal_id: str, state: GoalState, now: float) -> list[Instruction]:
-        """Take the end of a goal. Ends of goals that were replaced mean nothing."""
+        """Handle the result of a goal; results of replaced goals are ignored."""
         if self._goal is None or goal_id != self._goal.id or not state.over:
             return []
         if self._report.state is ClientState.CANCELLING:
@@ -199,20 +234,20 @@ class MoveClient:
             return [SendStop(now)]
         return []
 
-    # -- lists ----------------------------------------------------------------------------------
+    # Lists
 
     def _drop(self, revision: int, now: float) -> list[Instruction]:
         self._update(revision=revision, cells=(), reached=None)
         if self._report.state is ClientState.DRIVING:
             return [*self._stop(now), self._report]
         if self._report.state is ClientState.FAILED:
-            self._become(ClientState.IDLE)
+            self._advance(ClientEvent.RENEW)
         return [self._report]
 
     def _follow(self, revision: int, cells: tuple[int, ...], now: float) -> list[Instruction]:
         before = self._report
         if before.state is ClientState.FAILED:
-            self._become(ClientState.IDLE)
+            self._advance(ClientEvent.RENEW)
         reached = before.reached if before.reached in cells else None
         self._update(revision=revision, cells=cells, reached=reached)
         if before.state is ClientState.DRIVING and before.target not in cells:
@@ -221,14 +256,14 @@ class MoveClient:
         return [*self._proceed(now), self._report]
 
     def _proceed(self, now: float) -> list[Instruction]:
-        """Send the next goal, or a farther one in place of the present one."""
+        """Return the next goal, or a farther one in place of the current one."""
         report = self._report
         if report.state is ClientState.CANCELLING:
             return []
         index = self._next_index()
         if index is None:
             if report.state is ClientState.DRIVING:
-                self._become(ClientState.IDLE)
+                self._advance(ClientEvent.ARRIVE)
                 self._update(target=None)
             self._goal = None
             return []
@@ -236,7 +271,7 @@ class MoveClient:
         if report.state is ClientState.DRIVING and cell == report.target:
             return []
         if report.state is ClientState.IDLE:
-            self._become(ClientState.DRIVING)
+            self._advance(ClientEvent.DRIVE)
         self._heading = self._heading_to(index)
         self._step = cell - report.cells[index - 1] if index else None
         self._update(target=cell)
@@ -246,9 +281,9 @@ class MoveClient:
         return [self._goal]
 
     def _next_index(self) -> int | None:
-        """Index of the farthest cell straight ahead; ``None`` at the end of the list.
+        """Return the index of the farthest cell straight ahead; ``None`` at the end of the list.
 
-        The first cell of a list is driven to by itself, since where the robot comes from is unknown then.
+        The first cell of a list is a goal of its own, because the robot's direction before it is unknown.
         """
         cells, target, reached = self._report.cells, self._report.target, self._report.reached
         if self._report.state is ClientState.DRIVING and target in cells:
@@ -265,7 +300,7 @@ class MoveClient:
         return index
 
     def _heading_to(self, index: int) -> float:
-        """Direction of travel at a cell of the list; towards the second cell at the first."""
+        """Return the direction of travel at a cell of the list; at the first, towards the second."""
         cells = self._report.cells
         if len(cells) == 1:
             return self._heading
@@ -273,30 +308,31 @@ class MoveClient:
         (x, y), (to_x, to_y) = self.grid.centre(before), self.grid.centre(after)
         return atan2(to_y - y, to_x - x)
 
-    # -- goals ----------------------------------------------------------------------------------
+    # Goals
 
     def _finished(self, state: GoalState, now: float) -> list[Instruction]:
         self._goal = None
         if state is not GoalState.SUCCEEDED:
-            self._become(ClientState.FAILED)
+            self._advance(ClientEvent.FAIL)
             self._update(cells=(), reached=None, target=None)
             return [self._report]
         self._update(reached=self._report.target)
-        self._become(ClientState.IDLE)
+        self._advance(ClientEvent.ARRIVE)
         self._update(target=None)
         return [*self._proceed(now), self._report]
 
     def _stop(self, now: float) -> list[Instruction]:
-        self._become(ClientState.CANCELLING)
+        self._advance(ClientEvent.STOP)
         self._update(target=None)
         self._sent_at = now
         return [SendStop(now)]
 
     def _await_stop(self, states: dict[str, GoalState], now: float) -> list[Instruction]:
-        """See whether everything is over.
+        """Return whether all goals have ended.
 
-        The goal of this client must be listed so. Of what was lost or is of an earlier life nothing can be
-        known, except that nothing has been under way for a while: what comes later the stop's stamp catches.
+        The goal of this client must be listed as ended. Goals that were lost or are from before a restart
+        cannot be checked: no goal must have been active for a while; the cancellation's time stamp stops
+        those that arrive later.
         """
         if self._sent_at == float("-inf"):
             return self.tick(now)
@@ -311,14 +347,14 @@ class MoveClient:
 
     def _stopped(self, now: float) -> list[Instruction]:
         self._goal = self._quiet_since = None
-        self._become(ClientState.IDLE)
+        self._advance(ClientEvent.STOPPED)
         return [*self._proceed(now), self._report]
 
-    # -- books ----------------------------------------------------------------------------------
+    # State
 
-    def _become(self, state: ClientState) -> None:
-        if state not in _TRANSITIONS[self._report.state]:
-            raise AssertionError(f"{self._report.state.value} cannot become {state.value}")
+    def _advance(self, event: ClientEvent) -> None:
+        state = CLIENT_LIFE.advance(self._report.state, event, self.name, self._recent)
+        self._recent = remember(self._recent, event)
         self._update(state=state)
 
     def _update(self, **changes: Any) -> None:

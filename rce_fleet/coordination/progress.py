@@ -1,4 +1,4 @@
-"""How far a robot has come on its granted cells, and where one stands that was stopped between cells."""
+"""A robot's progress on its granted cells, and its cell when it was stopped between cells."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 def arrived_index(
     grid: GridMap, cells: Sequence[int], x: float, y: float, settings: FleetSettings
 ) -> int | None:
-    """Index of the last cell of a path that a robot at ``(x, y)`` has fully arrived in.
+    """Return the index of the last path cell in which a robot at ``(x, y)`` has fully arrived.
 
-    It has arrived in a cell when it is near the centre, or between it and the next centre. ``None`` if it has
-    not even arrived in the first.
+    It has arrived in a cell when it is near the centre, or between it and the next centre. ``None`` if
+    it has not arrived in the first.
     """
     centres = [grid.centre(cell) for cell in cells]
     for index in range(len(cells) - 1, -1, -1):
@@ -37,9 +37,9 @@ def arrived_index(
 def standing_cell(
     grid: GridMap, touched: Collection[int], x: float, y: float, shut: Collection[int]
 ) -> int | None:
-    """The cell that a robot which stands at ``(x, y)`` and overlaps ``touched`` shall take its place in.
+    """Return the cell for a robot that stands at ``(x, y)`` and overlaps ``touched``.
 
-    The nearest one is taken that is not ``shut``; the nearest of all if all are.
+    It is the nearest one that is not ``shut``; the nearest of all if all are.
     """
     open_cells = [cell for cell in touched if cell not in shut] or list(touched)
 

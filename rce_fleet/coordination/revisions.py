@@ -1,7 +1,7 @@
-"""How the number of a list of cells travels in a ``std_msgs/Int32MultiArray``.
+"""The number of a list of cells in a ``std_msgs/Int32MultiArray``.
 
-The array's one dimension is labelled ``revision=17``. Who does not number lists leaves the label as it
-likes, and who does not care need not look at it.
+The array's one dimension is labelled ``revision=17``. Programs that do not number lists may use
+any other label, and may ignore it.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ _MARK = "revision="
 
 
 def numbered_array(cells: Sequence[int], revision: int) -> dict[str, Any]:
-    """The fields of a ``std_msgs/Int32MultiArray`` that holds a numbered list of cells."""
+    """Return the fields of a ``std_msgs/Int32MultiArray`` for a numbered list of cells."""
     dimension = {"label": f"{_MARK}{revision}", "size": len(cells), "stride": len(cells)}
     return {"layout": {"dim": [dimension], "data_offset": 0}, "data": list(cells)}
 
 
 def revision_of(labels: Sequence[str]) -> int | None:
-    """The number in the labels of an array's dimensions; ``None`` if there is none."""
+    """Return the number in the labels of an array's dimensions; ``None`` without one."""
     for label in labels:
         text = label.removeprefix(_MARK)
         if text != label and text.isdecimal():

@@ -1,4 +1,4 @@
-"""What the planner knows of one robot, and the robot's life cycle."""
+"""The planner's record of a robot, and the robot's life cycle."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from enum import Enum
 from math import hypot, inf
 from typing import TYPE_CHECKING
 
+from rce.lifecycle import LifeCycle, remember
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.exceptions import TransitionError
 
@@ -15,34 +16,47 @@ if TYPE_CHECKING:
 
 
 class Phase(Enum):
-    """Where a robot is in its life."""
+    """Phase of a robot's life cycle."""
 
     HOLDING = "holding"
-    """It is told to stand still, and gets a cell once it does. Every robot begins here."""
+    """It is stopped, and gets a cell once it stands still. Every robot begins here."""
     ACTIVE = "active"
     """It has a cell, takes part in plans and is granted cells."""
     SILENT = "silent"
-    """It or its move client is not heard. Its cells stay its own: it may stand in any of them."""
+    """The robot or its move client sends no messages. It keeps its cells: it may stand in any of them."""
 
 
 class Cause(Enum):
-    """What moves a robot from phase to phase."""
+    """Causes of a change of phase."""
 
     SETTLED = "settled"
+    """It stands still, and a cell is its own."""
     HELD = "held"
+    """It is told to stand still."""
     LOST = "lost"
+    """The robot or its move client sends no messages any more."""
     HEARD = "heard"
+    """It sends messages again."""
 
 
-TRANSITIONS: dict[tuple[Phase, Cause], Phase] = {
-    (Phase.HOLDING, Cause.SETTLED): Phase.ACTIVE,
-    (Phase.HOLDING, Cause.HELD): Phase.HOLDING,
-    (Phase.HOLDING, Cause.LOST): Phase.SILENT,
-    (Phase.ACTIVE, Cause.HELD): Phase.HOLDING,
-    (Phase.ACTIVE, Cause.LOST): Phase.SILENT,
-    (Phase.SILENT, Cause.HEARD): Phase.HOLDING,
-}
-"""The life cycle; any other cause in a phase is an error."""
+ROBOT_LIFE: LifeCycle[Phase, Cause] = LifeCycle(
+    "robot",
+    {
+        Phase.HOLDING: {
+            Cause.SETTLED: Phase.ACTIVE,
+            Cause.HELD: Phase.HOLDING,
+            Cause.LOST: Phase.SILENT,
+        },
+        Phase.ACTIVE: {
+            Cause.HELD: Phase.HOLDING,
+            Cause.LOST: Phase.SILENT,
+        },
+        Phase.SILENT: {
+            Cause.HEARD: Phase.HOLDING,
+        },
+    },
+    error=TransitionError,
+)
 
 
 @dataclass(slots=True)
@@ -52,20 +66,21 @@ class RobotRecord:
     Attributes:
         id: Name of the robot, for example ``Robot1``.
         revision: Number of the last list of cells sent.
-        phase: Where it is in its life.
+        phase: Its phase.
         x, y, yaw: Last pose, metres and radians; not a number before the first.
-        posed_at: When the last pose came; at first, when the robot was first heard.
-        report: What its move client said last.
+        posed_at: When the last pose came; at first, when the robot's first message came.
+        report: Last report of its move client.
         reported_at: When that came, likewise.
-        obeyed_at: When its move client first said that it follows the last list and is at its end.
-        goal: Where it was sent, a cell.
-        rest: Where it returns to when it has nowhere to go.
-        unreachable: Whether there is no way to its goal.
+        obeyed_at: When its move client first reported to be at the end of the last list.
+        goal: Its goal cell.
+        rest: The cell it returns to when it has no goal.
+        unreachable: Whether no path leads to its goal.
         centred: Whether it has been at the centre of its cell since it was placed there.
-        replans: How often it lost its path because a cell of it was blocked.
+        replans: How often it lost its path because a cell on it was blocked.
         held_at: When it was last told to stand still.
         sent_at: When it was last sent a message.
-        reason: Why it is not active, for people.
+        reason: Why it is not active, in words.
+        recent: The last causes of phase changes.
     """
 
     id: str
@@ -86,6 +101,7 @@ class RobotRecord:
     held_at: float = -inf
     sent_at: float = -inf
     reason: str = "new"
+    recent: tuple[Cause, ...] = ()
     _anchor: tuple[float, float] = (inf, inf)
     _anchored_at: float = inf
 
@@ -93,29 +109,27 @@ class RobotRecord:
         """Go to the next phase.
 
         Raises:
-            TransitionError: The cause does not belong to the phase.
+            TransitionError: The phase does not allow the cause.
         """
-        phase = TRANSITIONS.get((self.phase, cause))
-        if phase is None:
-            raise TransitionError(f"{self.id} is {self.phase.value} and cannot be {cause.value}")
-        self.phase = phase
+        self.phase = ROBOT_LIFE.advance(self.phase, cause, self.id, self.recent)
+        self.recent = remember(self.recent, cause)
 
     def see(self, x: float, y: float, yaw: float, now: float, settings: FleetSettings) -> None:
-        """Take a pose."""
+        """Update the pose."""
         self.x, self.y, self.yaw, self.posed_at = x, y, yaw, now
         if hypot(x - self._anchor[0], y - self._anchor[1]) > settings.still_distance:
             self._anchor, self._anchored_at = (x, y), now
 
     def still_since(self) -> float:
-        """Since when the poses seen have stayed in one place."""
+        """Since when the poses have stayed in one place."""
         return self._anchored_at
 
     def heard(self, now: float, settings: FleetSettings) -> bool:
-        """Whether both the robot and its move client were heard lately."""
+        """Return whether robot and move client sent messages recently."""
         return now - min(self.posed_at, self.reported_at) <= settings.silence_timeout
 
     def take(self, report: ClientReport, now: float) -> None:
-        """Take what the move client says."""
+        """Update the move client's report."""
         self.report, self.reported_at = report, now
         if report.revision != self.revision or report.state not in (ClientState.IDLE, ClientState.FAILED):
             self.obeyed_at = inf
@@ -129,6 +143,6 @@ class RobotRecord:
         return self.revision
 
     def stands(self, settings: FleetSettings) -> bool:
-        """Whether it was told to stand still, has done so, and was seen to."""
+        """Whether it was told to stand still, acknowledged it, and its poses stay in one place."""
         still_for = self.posed_at - self._anchored_at
         return still_for >= settings.settle_time and self.posed_at >= self.obeyed_at

@@ -1,4 +1,4 @@
-"""The numbers that the planner works with."""
+"""Settings of the planner."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ class FleetSettings:
 
     Attributes:
         robot_radius: Radius of the robots' hulls.
-        clearance: How much a hull is taken to be wider than it is, for errors of the pose.
-        arrival_tolerance: A robot this near to a cell's centre has arrived there. Must leave the hull inside
-            of the cell.
-        corridor: How far a robot may be beside its path and still be on it.
+        clearance: Margin added to a hull's radius, for errors of the pose.
+        arrival_tolerance: A robot this near to a cell's centre has arrived. The hull must still be inside
+            the cell.
+        corridor: Maximum distance of a robot from its path.
         still_distance: A robot that stays within this distance stands still ...
         settle_time: ... after this time.
-        ahead: How many cells beyond its own a robot is granted at most.
-        silence_timeout: A robot that has not been heard for this time is lost.
-        hold_timeout: The others wait this long for a robot that shall stop.
+        ahead: Maximum number of granted cells beyond a robot's own.
+        silence_timeout: A robot without messages for this time is silent.
+        hold_timeout: The others wait this long for a robot that is stopping.
         repeat_after: A message without effect is sent again after this time.
-        stall_timeout: A robot that has somewhere to go and stands still this long is stopped and sent anew.
+        stall_timeout: A robot with cells to drive to that stands still this long is stopped and sent again.
         seed: Breaks ties in plans.
         effort: Work spent on one plan, see :func:`rce_fleet.planning.lacam.plan`.
     """

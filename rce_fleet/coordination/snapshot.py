@@ -1,4 +1,4 @@
-"""The planner's state as the outside sees it."""
+"""The planner's state for publishing."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from enum import Enum
 
 
 class RobotState(Enum):
-    """What a robot does, in one word."""
+    """State of a robot, in one word."""
 
     JOINING = "joining"
     """It has no cell yet; ``reason`` says what it waits for."""
     STOPPING = "stopping"
-    """It lost its path and is being stopped."""
+    """It lost its path and is stopping."""
     SILENT = "silent"
-    """It is not heard."""
+    """No messages come from it."""
     UNREACHABLE = "unreachable"
-    """There is no way to its goal at present."""
+    """No path leads to its goal now."""
     DRIVING = "driving"
     """It has cells to drive to."""
     WAITING = "waiting"
-    """It waits for others to clear its way."""
+    """It waits for other robots to leave its path."""
     ARRIVED = "arrived"
     """It is at its goal."""
     IDLE = "idle"
@@ -33,11 +33,11 @@ class RobotSnapshot:
 
     Attributes:
         id: Name of the robot.
-        state: What it does.
+        state: Its state.
         reason: Why it is joining, stopping or silent, for people; else empty.
         x, y, yaw: Last pose, metres and radians; not a number before the first.
-        cell: The cell that it has its place in.
-        goal: Where it was sent.
+        cell: Its cell.
+        goal: Its goal cell.
         plan: Its cell and all cells that it will enter.
         granted: Those of them that are its own now.
         replans: How often it lost its path because a cell of it was blocked.
@@ -62,7 +62,7 @@ class FleetSnapshot:
 
     Attributes:
         robots: By name.
-        blocked: Blocked cells, walls of the map not counted, ascending.
+        blocked: Blocked cells without the map's walls, ascending.
         pending: Cells that will be blocked as soon as the robots in them have left, ascending.
     """
 

@@ -1,4 +1,4 @@
-"""Where every robot shall end up: at its goal, or somewhere out of the way."""
+"""The target of each robot in a plan: its goal, or a cell out of the way."""
 
 from __future__ import annotations
 
@@ -31,18 +31,19 @@ def assign_targets(
     """Give every robot a target.
 
     Robots with a goal that can be reached get it. The others get their place of rest, or if that is blocked
-    or somebody's target, the nearest free cell that is not.
+    or another robot's target, the nearest free cell that is not.
 
     Args:
-        grid: The map. Robots may stand in blocked cells; nobody can enter one.
-        starts: Where the robots are.
-        goals: Where some of them are sent, all different.
-        rests: Where those rest that have no goal; the start by default.
+        grid: The map. Robots may stand in blocked cells; no robot can enter one.
+        starts: Cells of the robots.
+        goals: Goals of some robots, all different.
+        rests: Cells where robots without a goal rest; the start by default.
     """
     cells: dict[str, int] = {}
     unreachable = set()
+    reach = _Reach(grid)
     for robot, goal in goals.items():
-        if goal not in grid.blocked and goal in grid.reachable(starts[robot]):
+        if goal not in grid.blocked and goal in reach.of(starts[robot]):
             cells[robot] = goal
         else:
             unreachable.add(robot)
@@ -50,14 +51,30 @@ def assign_targets(
     for robot, start in starts.items():
         if robot not in cells:
             rest = start if robot in unreachable else rests.get(robot, start)
-            cells[robot] = _refuge(grid, start, rest, taken)
+            cells[robot] = _refuge(grid, reach.of(start), start, rest, taken)
             taken.add(cells[robot])
     return Targets(cells, frozenset(unreachable))
 
 
-def _refuge(grid: GridMap, start: int, rest: int, taken: set[int]) -> int:
-    """The place of rest, or else the free cell nearest to it that can be reached and is nobody's target."""
-    within = grid.reachable(start)
+class _Reach:
+    """Cells that can be reached from a start; each connected part is searched once."""
+
+    def __init__(self, grid: GridMap) -> None:
+        self._grid = grid
+        self._known: dict[int, set[int]] = {}
+
+    def of(self, start: int) -> set[int]:
+        """Return the cells that can be reached from ``start``, with ``start`` itself."""
+        found = self._known.get(start)
+        if found is None:
+            found = self._grid.reachable(start)
+            if start not in self._grid.blocked:
+                self._known.update(dict.fromkeys(found, found))
+        return found
+
+
+def _refuge(grid: GridMap, within: set[int], start: int, rest: int, taken: set[int]) -> int:
+    """Return the cell of rest, or the nearest free cell that can be reached and is not a target."""
     seen = {rest}
     queue = deque(seen)
     while queue:

@@ -1,1 +1,1 @@
-"""``rce demo``: engine, containers, simulated robots and operator station, all in one terminal."""
+"""``rce demo``: engine, containers, simulated robots and operator station in one terminal."""

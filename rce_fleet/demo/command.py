@@ -8,7 +8,7 @@ from collections.abc import Callable, Coroutine, Iterable
 from dataclasses import fields
 from pathlib import Path
 from random import Random
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, assert_never
 
 import aiohttp
 import typer
@@ -17,17 +17,16 @@ import uvloop
 from rce.cli.program_files import from_file
 from rce.config.settings import Runtime
 from rce.supervision.signals import end_signals
-from rce_fleet.demo.exceptions import DemoError
-from rce_fleet.demo.floor import draw
-from rce_fleet.demo.folder import run_folder
+from rce_fleet.demo.config import CoreProgram, DemoConfig, MachineBackend, Mode
 from rce_fleet.demo.headless import run_headless
-from rce_fleet.demo.play import CoreKind, Machines, Mode, Play
-from rce_fleet.demo.ports import ANY, Ports
-from rce_fleet.demo.roaming import roam
-from rce_fleet.demo.stage import set_stage
-from rce_fleet.demo.station import StationApi
+from rce_fleet.demo.modes import start_demo
+from rce_fleet.demo.random_goals import send_random_goals
+from rce_fleet.demo.resources import ANY, Ports, run_folder
+from rce_fleet.demo.scenario import choose_scenario
+from rce_fleet.exceptions import FleetError
+from rce_fleet.station.client import StationClient
 
-ROBOTS, ROBOTS_OF_SCEN = 3, 4
+DEFAULT_ROBOTS, DEFAULT_ROBOTS_OF_SCEN = 3, 4
 MAX_ROBOTS = 99
 TIMEOUT = 180.0
 
@@ -37,51 +36,68 @@ T = TypeVar("T")
 @from_file("demo")
 def demo(
     mode: Annotated[
-        Mode, typer.Option(help="What carries the messages: the engine, one ROS core, or one per robot.")
+        Mode, typer.Option(help="What carries messages: the engine, one ROS core, or one core per robot.")
     ] = Mode.CLOUD,
     headless: Annotated[
-        bool, typer.Option("--headless", help="No page to look at: drive to goals once, report, exit.")
+        bool, typer.Option("--headless", help="Drive to goals once without a page, report, exit.")
     ] = False,
     robots: Annotated[
         int | None, typer.Option(min=1, max=MAX_ROBOTS, help="Number of robots [3; 4 with --scen].")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Draws starts, goals, boxes and errors.")] = 0,
-    timeout: Annotated[float, typer.Option(min=1, help="Seconds for a headless run.")] = TIMEOUT,
-    report: Annotated[Path | None, typer.Option(help="File for the report of a headless run (JSON).")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of starts, goals, boxes and sensor noise.")] = 0,
+    timeout: Annotated[
+        float, typer.Option(min=1, help="Maximum duration of a headless run, seconds.")
+    ] = TIMEOUT,
+    report: Annotated[
+        Path | None, typer.Option(help="Write the report of a headless run to this file (JSON).")
+    ] = None,
     blocked_cells: Annotated[
-        int, typer.Option(min=0, help="Block so many cells in a headless run; fewer where goals need them.")
+        int,
+        typer.Option(
+            min=0, help="Number of cells to block in a headless run; fewer if goals would be cut off."
+        ),
     ] = 1,
     world: Annotated[
-        Path | None, typer.Option(help="Drive on this map (MovingAI .map).", exists=True, dir_okay=False)
+        Path | None, typer.Option(help="Map to drive on (MovingAI .map).", exists=True, dir_okay=False)
     ] = None,
     scen: Annotated[
         Path | None,
-        typer.Option(help="Starts and goals on it (MovingAI .scen).", exists=True, dir_okay=False),
+        typer.Option(help="Starts and goals on the map (MovingAI .scen).", exists=True, dir_okay=False),
     ] = None,
     auto: Annotated[
-        bool, typer.Option("--auto/--no-auto", help="Send robots about until you send them.")
+        bool, typer.Option("--auto/--no-auto", help="Send robots to random goals until you set a goal.")
     ] = True,
-    port: Annotated[int | None, typer.Option(help="The page [9080; headless: any].")] = None,
-    http_port: Annotated[int | None, typer.Option(help="The engine's clients and REST [9000].")] = None,
-    control_port: Annotated[int | None, typer.Option(help="Its task sets [8080].")] = None,
-    ws_port: Annotated[int | None, typer.Option(help="Its robots' WebSockets [9010].")] = None,
-    robot_link_port: Annotated[int | None, typer.Option(help="Its links to robot endpoints [10030].")] = None,
-    container_link_port: Annotated[int | None, typer.Option(help="Its links to containers [10031].")] = None,
-    runtime: Annotated[Runtime | None, typer.Option(help="How containers are isolated [auto].")] = None,
-    core_port: Annotated[int | None, typer.Option(help="The ROS core of --mode single [11311].")] = None,
-    core: Annotated[CoreKind, typer.Option(help="Which program it is.")] = CoreKind.RCE,
-    core_uri: Annotated[
-        str, typer.Option(help="A ROS master that runs already, in place of a core of its own.")
-    ] = "",
-    machines: Annotated[
-        Machines, typer.Option(help="What stands for the machines of --mode multi.")
-    ] = Machines.AUTO,
-    state_dir: Annotated[
-        Path | None, typer.Option(help="Keep configs, logs and state in a new folder in here.")
+    port: Annotated[int | None, typer.Option(help="Port of the page [9080; headless: any].")] = None,
+    http_port: Annotated[
+        int | None, typer.Option(help="Port of the engine's clients and REST [9000].")
     ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show what the programs print.")] = False,
+    control_port: Annotated[int | None, typer.Option(help="Port of the engine's task sets [8080].")] = None,
+    ws_port: Annotated[int | None, typer.Option(help="Port of the robots' WebSockets [9010].")] = None,
+    robot_link_port: Annotated[
+        int | None, typer.Option(help="Port of links to robot endpoints [10030].")
+    ] = None,
+    container_link_port: Annotated[
+        int | None, typer.Option(help="Port of links to containers [10031].")
+    ] = None,
+    runtime: Annotated[Runtime | None, typer.Option(help="Runtime of the containers [auto].")] = None,
+    core_port: Annotated[
+        int | None, typer.Option(help="Port of the ROS core of --mode single [11311].")
+    ] = None,
+    core: Annotated[
+        CoreProgram, typer.Option(help="Program that is the ROS core of --mode single.")
+    ] = CoreProgram.RCE,
+    core_uri: Annotated[str, typer.Option(help="Use this running ROS master in --mode single.")] = "",
+    machines: Annotated[
+        MachineBackend, typer.Option(help="What stands for a machine in --mode multi.")
+    ] = MachineBackend.AUTO,
+    state_dir: Annotated[
+        Path | None, typer.Option(help="Keep configs, logs and state in a new subfolder of this folder.")
+    ] = None,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Show the output of all programs.")
+    ] = False,
 ) -> None:
-    """Run a simulated fleet with its planner, on the engine or on ROS cores, and its page."""
+    """Run a simulated fleet with its planner and the operator's page."""
     given = {
         "page": port,
         "http": http_port,
@@ -92,10 +108,11 @@ def demo(
         "core": core_port,
     }
     try:
-        scenario = draw(robots or (ROBOTS if scen is None else ROBOTS_OF_SCEN), seed, world=world, scen=scen)
+        count = robots or (DEFAULT_ROBOTS if scen is None else DEFAULT_ROBOTS_OF_SCEN)
+        scenario = choose_scenario(count, seed, world=world, scen=scen)
         ports = _choose_ports(headless, given, _needed_ports(mode, core_uri))
         with run_folder(state_dir) as folder:
-            play = Play(
+            config = DemoConfig(
                 scenario,
                 seed,
                 ports,
@@ -109,49 +126,55 @@ def demo(
             )
             show = typer.echo if verbose else _show_warning
             if headless:
-                code = _run(_headless(play, timeout, report, show), stopped=1)
+                code = _run(_headless(config, timeout, report, show), stopped=1)
             else:
-                code = _run(_with_page(play, show, auto=auto), stopped=0)
-    except DemoError as error:
+                code = _run(_with_page(config, show, auto=auto), stopped=0)
+    except FleetError as error:
         typer.echo(f"rce demo: {error}", err=True)
         raise typer.Exit(1) from None
     raise typer.Exit(code)
 
 
 def say(text: str) -> None:
-    """Tell the user something."""
+    """Print a line for the user."""
     typer.echo(f"rce demo: {text}")
 
 
-async def _headless(play: Play, timeout: float, report: Path | None, show: Callable[[str], None]) -> int:
-    say(f"{len(play.scenario.robots)} robots, mode {play.mode}, seed {play.seed}, at most {timeout:g} s")
-    result = await run_headless(play, timeout, say, show)
+async def _headless(
+    config: DemoConfig, timeout: float, report: Path | None, show: Callable[[str], None]
+) -> int:
+    say(
+        f"{len(config.scenario.robots)} robots, mode {config.mode}, seed {config.seed}, at most {timeout:g} s"
+    )
+    result = await run_headless(config, timeout, say, show)
     if report is not None:
         result.write(report)
     for fault in result.faults:
         typer.echo(f"rce demo: {fault}", err=True)
     if result.ok:
-        say(f"every robot is at its goal, {result.as_json()['duration_s']} s after it got it")
+        say(f"all robots reached their goals in {result.as_json()['duration_s']} s")
     return 0 if result.ok else 1
 
 
-async def _with_page(play: Play, show: Callable[[str], None], *, auto: bool) -> int:
-    say(f"starting the fleet, mode {play.mode}")
-    async with set_stage(play, show) as stage, aiohttp.ClientSession() as session:
-        stage.children.revive(say)
-        typer.echo(f"RCE demo: {stage.page}")
-        station = StationApi(session, stage.page)
-        rng = Random(play.seed)  # noqa: S311 - draws goals, keeps no secret
-        await stage.children.while_alive(roam(station, rng, say) if auto else _for_ever())
+async def _with_page(config: DemoConfig, show: Callable[[str], None], *, auto: bool) -> int:
+    say(f"starting the fleet, mode {config.mode}")
+    async with start_demo(config, show) as demo, aiohttp.ClientSession() as session:
+        demo.group.enable_restarts(say)
+        typer.echo(f"RCE demo: {demo.page}")
+        station = StationClient(session, demo.page)
+        rng = Random(config.seed)  # noqa: S311 - for goals, not for secrets
+        await demo.group.run_while_alive(
+            send_random_goals(station, rng, say) if auto else _wait_until_cancelled()
+        )
     return 0
 
 
-async def _for_ever() -> None:
+async def _wait_until_cancelled() -> None:
     await asyncio.Event().wait()
 
 
 def _run(work: Coroutine[Any, Any, int], *, stopped: int) -> int:
-    """Run until it is done, or SIGINT or SIGTERM came; a second signal ends this program at once.
+    """Run ``work`` until it returns or SIGINT or SIGTERM arrives; a second signal ends the program at once.
 
     Args:
         work: Returns the exit code.
@@ -182,20 +205,22 @@ def _needed_ports(mode: Mode, core_uri: str) -> tuple[str, ...]:
     match mode:
         case Mode.CLOUD:
             return tuple(field.name for field in fields(Ports) if field.name != "core")
-        case Mode.SINGLE if not core_uri:
-            return ("page", "core")
-        case _:
+        case Mode.SINGLE:
+            return ("page",) if core_uri else ("page", "core")
+        case Mode.MULTI:
             return ("page",)
+        case _:
+            assert_never(mode)
 
 
 def _choose_ports(headless: bool, given: dict[str, int | None], needed: Iterable[str]) -> Ports:
-    """The ports to use; free ones where a headless run was not told which."""
+    """Return the ports to use; a headless run uses free ones for those without an option."""
     base = ANY if headless else Ports()
-    wished = {name: value for name, value in given.items() if value is not None}
-    return Ports(**{name: getattr(base, name) for name in given} | wished).chosen(needed)
+    chosen = {name: value for name, value in given.items() if value is not None}
+    return Ports(**{name: getattr(base, name) for name in given} | chosen).choose(needed)
 
 
 def _show_warning(line: str) -> None:
-    """Show a line of a program if it warns: that containers are not isolated, for instance."""
+    """Print a program's line if it is a warning or an error."""
     if " WARNING " in line or " ERROR " in line:
         typer.echo(line, err=True)

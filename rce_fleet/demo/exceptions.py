@@ -1,15 +1,12 @@
-"""What can go wrong in the demo.
+"""Errors of the demo.
 
 ::
 
     DemoError
-    +-- PortTakenError      a port that the demo needs is in use
-    +-- ChildDiedError      a program of the demo ended before it should
-    +-- NotReadyError       something did not come up in time
-    +-- NetworkError        the machines of the mode multi cannot be made
-    +-- StationError        the operator station does not do what was asked
-        +-- StationAwayError    ... at this moment: it, or the planner, cannot be reached
-        +-- WishRefusedError    ... and asking again does not help
+    +-- PortInUseError      a port that the demo needs is in use
+    +-- ProgramEndedError   a program of the demo ended unexpectedly
+    +-- NotReadyError       a program was not ready in time
+    +-- NetworkError        the network of the mode multi cannot be created
 """
 
 from __future__ import annotations
@@ -17,17 +14,19 @@ from __future__ import annotations
 import signal
 from collections.abc import Sequence
 
-
-class DemoError(Exception):
-    """Base of what the demo tells its user in place of a traceback."""
+from rce_fleet.exceptions import FleetError
 
 
-class PortTakenError(DemoError):
+class DemoError(FleetError):
+    """Base of the errors that the demo shows to its user without a traceback."""
+
+
+class PortInUseError(DemoError):
     """A port is in use.
 
     Attributes:
         port: The port.
-        option: The option by which another one is chosen.
+        option: The option that sets another port.
     """
 
     def __init__(self, port: int, option: str) -> None:
@@ -39,13 +38,13 @@ class PortTakenError(DemoError):
         return f"port {self.port} is in use; choose another one with {self.option}"
 
 
-class ChildDiedError(DemoError):
+class ProgramEndedError(DemoError):
     """A program of the demo ended.
 
     Attributes:
-        name: Which.
+        name: Name of the program.
         code: Its exit code, negative for a signal.
-        tail: The last lines it printed.
+        tail: The last lines that it printed.
     """
 
     def __init__(self, name: str, code: int, tail: Sequence[str]) -> None:
@@ -55,12 +54,12 @@ class ChildDiedError(DemoError):
         self.tail = tuple(tail)
 
     def __str__(self) -> str:
-        said = "".join(f"\n    {line}" for line in self.tail) or " and printed nothing"
-        return f"{self.name} {end_of(self.code)}{said}"
+        printed = "".join(f"\n    {line}" for line in self.tail) or " and printed nothing"
+        return f"{self.name} {describe_exit(self.code)}{printed}"
 
 
-def end_of(code: int) -> str:
-    """Say in words how a program ended.
+def describe_exit(code: int) -> str:
+    """Return how a program ended, in words.
 
     Args:
         code: Its exit code, negative for a signal.
@@ -74,20 +73,8 @@ def end_of(code: int) -> str:
 
 
 class NotReadyError(DemoError):
-    """Something did not come up in time."""
+    """A program was not ready in time."""
 
 
 class NetworkError(DemoError):
-    """The machines of the mode ``multi`` cannot be made."""
-
-
-class StationError(DemoError):
-    """The operator station does not do what was asked."""
-
-
-class StationAwayError(StationError):
-    """The station, or the planner behind it, cannot be reached at this moment."""
-
-
-class WishRefusedError(StationError):
-    """The station refuses, with a reason."""
+    """The network of the mode ``multi`` cannot be created."""

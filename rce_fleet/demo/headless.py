@@ -1,82 +1,171 @@
-"""``rce demo --headless``: one mission, and a report of it."""
+"""``rce demo --headless``: one run of the scenario, and its report."""
 
 from __future__ import annotations
 
 import asyncio
+import json
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import aiohttp
 
-from rce_fleet.demo.counters import Counters
+from rce_fleet.demo.config import DemoConfig, Mode
 from rce_fleet.demo.exceptions import DemoError
-from rce_fleet.demo.mission import Mission
-from rce_fleet.demo.play import Play
-from rce_fleet.demo.result import Result
-from rce_fleet.demo.stage import Stage, set_stage
-from rce_fleet.demo.station import StationApi
-from rce_fleet.drivers.report import read_report
+from rce_fleet.demo.modes import RunningDemo, start_demo
+from rce_fleet.demo.scenario_run import ScenarioRun
+from rce_fleet.demo.traffic import MessageTotals
+from rce_fleet.drivers.report import WorldReport, read_report
+from rce_fleet.exceptions import FleetError
+from rce_fleet.planning.scenario import Scenario
+from rce_fleet.station.client import StationClient
 
-TAIL = 8
-"""How many of the last lines of each program are shown when the time is over."""
+TAIL_LINES = 8
+"""How many of each program's last lines are shown after a timeout."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunReport:
+    """The outcome of a headless run.
+
+    Attributes:
+        scenario: The scenario.
+        seed: Seed that it was drawn from.
+        run: The run; None if it did not begin.
+        truth: The simulated world at the end; None if the world did not report it.
+        totals: Messages that were received; None if they could not be read.
+        problem: Why the run was stopped early; empty if it was not.
+        mode: What carried the fleet's messages.
+    """
+
+    scenario: Scenario
+    seed: int
+    run: ScenarioRun | None
+    truth: WorldReport | None
+    totals: MessageTotals | None
+    problem: str = ""
+    mode: Mode = Mode.CLOUD
+
+    @property
+    def ok(self) -> bool:
+        """Whether every robot reached its goal without a collision."""
+        return not self.faults
+
+    @property
+    def faults(self) -> list[str]:
+        """What went wrong, in words."""
+        faults = [self.problem] if self.problem else []
+        reached = self.run.reached if self.run is not None else set()
+        missing = [robot for robot in self.scenario.robots if robot not in reached]
+        if missing:
+            faults.append(f"not at their goals: {', '.join(missing)}")
+        if self.truth is None:
+            faults.append("the simulated world wrote no report")
+        elif self.truth.collisions.total:
+            faults.append(f"robots collided {self.truth.collisions.total} times")
+        return faults
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the report as it is written to the file."""
+        truth, run, totals = self.truth, self.run, self.totals
+        scenario = self.scenario
+        blocked = [] if run is None else run.blocker.done
+        distances = {} if truth is None else {robot.id: robot.distance_m for robot in truth.robots}
+        return {
+            "ok": self.ok,
+            "mode": self.mode.value,
+            "duration_s": 0.0 if run is None else round(run.duration, 2),
+            "collisions": None if truth is None else truth.collisions.total,
+            "min_separation_m": None if truth is None else truth.min_separation_m,
+            "robots": [
+                {
+                    "id": robot,
+                    "start_cell": start,
+                    "goal_cell": goal,
+                    "reached": run is not None and robot in run.reached,
+                    "replans": 0 if run is None else run.replans[robot],
+                    "distance_m": distances.get(robot, 0.0),
+                }
+                for robot, start, goal in zip(scenario.robots, scenario.starts, scenario.goals, strict=True)
+            ],
+            "engine": {
+                "messages": None if totals is None else totals.messages,
+                "dropped": None if totals is None else totals.dropped,
+            },
+            "blocked_cell": blocked[0] if blocked else None,
+            "blocked_cells": blocked,
+            "seed": self.seed,
+            "faults": self.faults,
+        }
+
+    def write(self, path: Path) -> None:
+        """Write the report to a file, as JSON."""
+        path.write_text(json.dumps(self.as_json(), indent=2) + "\n", encoding="utf-8")
 
 
 async def run_headless(
-    play: Play, timeout: float, say: Callable[[str], None], show: Callable[[str], None]
-) -> Result:
-    """Set the stage, run a mission, and end everything again.
+    config: DemoConfig, timeout: float, say: Callable[[str], None], show: Callable[[str], None]
+) -> RunReport:
+    """Start the demo, run its scenario, and stop everything.
 
     Args:
-        play: What is to be played.
-        timeout: Seconds for all of it.
-        say: Gets lines for people.
-        show: Gets every line that a program prints.
+        config: What to run.
+        timeout: Seconds for start and run.
+        say: Prints a line for the user.
+        show: Called with every line that a program prints.
     """
-    run = _Run(play, say)
+    headless = _HeadlessRun(config, say)
     problem = ""
     try:
-        async with asyncio.timeout(timeout) as limit, set_stage(play, show) as stage:
-            await stage.children.while_alive(run.perform(stage))
-            limit.reschedule(None)  # what was started is ended in peace
+        async with asyncio.timeout(timeout) as limit, start_demo(config, show) as demo:
+            await demo.group.run_while_alive(headless.perform(demo))
+            limit.reschedule(None)  # stopping the programs has its own time limits
     except TimeoutError:
-        problem = f"the time of {timeout:g} s is over"
-        _tell_tails(play, say)
-    except (DemoError, OSError) as error:
+        problem = f"timeout: the run was not complete after {timeout:g} s"
+        _show_tails(config, say)
+    except (FleetError, OSError) as error:
         problem = str(error)
-    # The world's last word comes at its end: what was touched until then counts.
-    truth = read_report(play.report)
-    return Result(play.scenario, play.seed, run.mission, truth, run.counters, problem, play.mode)
+    # The world writes its last report when it stops, with all collisions until then.
+    truth = read_report(config.report)
+    return RunReport(config.scenario, config.seed, headless.run, truth, headless.totals, problem, config.mode)
 
 
-def _tell_tails(play: Play, say: Callable[[str], None]) -> None:
-    """Say what all programs printed last."""
-    for log in sorted(play.folder.glob("*.log")):
-        for line in log.read_text(encoding="utf-8", errors="replace").splitlines()[-TAIL:]:
+def _show_tails(config: DemoConfig, say: Callable[[str], None]) -> None:
+    """Print the last lines of all programs."""
+    for log in sorted(config.folder.glob("*.log")):
+        for line in log.read_text(encoding="utf-8", errors="replace").splitlines()[-TAIL_LINES:]:
             say(f"[{log.stem}] {line}")
 
 
-class _Run:
-    """What is known of a run, however it ends."""
+class _HeadlessRun:
+    """A run and its message totals, as far as they came before an error.
 
-    def __init__(self, play: Play, say: Callable[[str], None]) -> None:
-        self.mission: Mission | None = None
-        self.counters: Counters | None = None
-        self._play = play
+    Args:
+        config: What to run.
+        say: Prints a line for the user.
+    """
+
+    def __init__(self, config: DemoConfig, say: Callable[[str], None]) -> None:
+        self.run: ScenarioRun | None = None
+        self.totals: MessageTotals | None = None
+        self._config = config
         self._say = say
 
-    async def perform(self, stage: Stage) -> None:
+    async def perform(self, demo: RunningDemo) -> None:
         async with aiohttp.ClientSession() as session:
-            station = StationApi(session, stage.page)
-            self.mission = Mission(
-                station, self._play.scenario, stage.truth, self._say, self._play.blocked_cells
+            station = StationClient(session, demo.page)
+            self.run = ScenarioRun(
+                station, self._config.scenario, demo.truth, self._say, self._config.blocked_cells
             )
             try:
-                await self.mission.run()
+                await self.run.run()
             finally:
-                self.counters = await self._count(stage)
+                self.totals = await self._read_totals(demo)
 
-    async def _count(self, stage: Stage) -> Counters | None:
+    async def _read_totals(self, demo: RunningDemo) -> MessageTotals | None:
         try:
-            return await stage.setting.count()
+            return await demo.mode.read_totals()
         except DemoError as error:
             self._say(str(error))
             return None

@@ -1,4 +1,4 @@
-"""Where the machines of the mode ``multi`` are: in network namespaces, or on ports of loopback."""
+"""The machines of the mode ``multi``: network namespaces, or ports of the loopback interface."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ from ipaddress import IPv4Address, IPv4Network
 import psutil
 
 from rce.ros.multimaster.addresses import DEFAULT_MASTER_PORT, DEFAULT_PORT, RPC_PORT_OFFSET
-from rce_fleet.demo.children import Children
+from rce_fleet.demo.config import MachineBackend
 from rce_fleet.demo.exceptions import NetworkError
-from rce_fleet.demo.play import Machines
-from rce_fleet.demo.ports import LOOPBACK, free_ports
+from rce_fleet.demo.programs import ProgramGroup
+from rce_fleet.demo.resources import LOOPBACK, free_ports
 
 HOST, WORLD, FIRST = 1, 2, 10
-"""Numbers in the subnet: this machine, the world, the first of the others."""
-HOLDER_TIMEOUT = 10.0
+"""Host numbers in the subnet: this machine, the world, the first of the others."""
+START_TIMEOUT_S = 10.0
 TOOLS = ("unshare", "nsenter", "ip")
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
+class DemoMachine:
     """A machine of the fleet, with a ROS core.
 
     Attributes:
-        name: Its name, which is its master's too.
-        address: Its address.
+        name: Name of the machine and of its ROS master.
+        address: Its IP address.
         core_port: Port of its core.
         rpc_port: Port of its discovery.
-        enter: Command before each program's own, which lets it run there.
+        prefix: Words before each program's command that run it on this machine.
     """
 
     name: str
     address: str
     core_port: int
     rpc_port: int
-    enter: tuple[str, ...] = ()
+    prefix: tuple[str, ...] = ()
 
     @property
     def core_uri(self) -> str:
-        """The ROS master."""
+        """URI of the ROS master."""
         return f"http://{self.address}:{self.core_port}/"
 
 
@@ -54,73 +54,77 @@ class Network:
     """All machines.
 
     Attributes:
-        sites: Those with a core, in the order in which they were asked for.
-        multicast_port: Where their discoveries meet.
-        enter_world: Command before the world's own.
+        machines: Machines with a core, in the order of the given names.
+        multicast_port: Port on which their discoveries find each other.
+        world_prefix: Words before the world's command that run it in the network.
     """
 
-    sites: tuple[Site, ...]
+    machines: tuple[DemoMachine, ...]
     multicast_port: int = DEFAULT_PORT
-    enter_world: tuple[str, ...] = ()
+    world_prefix: tuple[str, ...] = ()
 
 
-async def make_network(kind: Machines, names: Sequence[str], children: Children) -> Network:
-    """Make machines. They last as long as the programs on them, however these end.
+async def create_network(backend: MachineBackend, names: Sequence[str], group: ProgramGroup) -> Network:
+    """Create machines. The kernel removes them with the last program that runs on them.
 
     Args:
-        kind: What stands for machines.
-        names: Their names.
-        children: Get what keeps the network.
+        backend: What stands for a machine.
+        names: Names of the machines.
+        group: Gets the programs that keep the network namespaces.
 
     Raises:
-        NetworkError: There can be no such network.
+        NetworkError: The network cannot be created.
     """
-    if kind is Machines.AUTO:
-        kind = Machines.NAMESPACES if await _may_make_namespaces() else Machines.PORTS
-    if kind is Machines.NAMESPACES:
-        return await _Namespaces(children).make(names)
+    if backend is MachineBackend.AUTO:
+        backend = MachineBackend.NAMESPACES if await _can_create_namespaces() else MachineBackend.PORTS
+    if backend is MachineBackend.NAMESPACES:
+        return await _NamespaceNetwork(group).create(names)
     multicast_port, *ports = free_ports(1 + 2 * len(names))
     pairs = zip(ports[::2], ports[1::2], strict=True)
-    sites = (Site(name, LOOPBACK, core, rpc) for name, (core, rpc) in zip(names, pairs, strict=True))
-    return Network(tuple(sites), multicast_port)
+    machines = (
+        DemoMachine(name, LOOPBACK, core, rpc) for name, (core, rpc) in zip(names, pairs, strict=True)
+    )
+    return Network(tuple(machines), multicast_port)
 
 
-class _Namespaces:
-    """Network namespaces without names, held by programs, and cables between them and a switch.
+class _NamespaceNetwork:
+    """Unnamed network namespaces, kept by programs, with a veth pair from each to a bridge.
 
-    The kernel removes a namespace with its last process, and a cable with the namespace of one of its ends.
+    The kernel removes a namespace with its last process, and a veth pair with the namespace of one end.
     """
 
-    def __init__(self, children: Children) -> None:
-        self._children = children
+    def __init__(self, group: ProgramGroup) -> None:
+        self._group = group
         self._subnet = _free_subnet()
 
-    async def make(self, names: Sequence[str]) -> Network:
-        switch = await self._hold("switch", needed=True)
+    async def create(self, names: Sequence[str]) -> Network:
+        switch = await self._create_namespace("switch", stop_last=True)
         await _ip(["link add switch type bridge mcast_snooping 0", "link set switch up"], switch)
-        cable = f"rce{secrets.token_hex(4)}"
+        veth = f"rce{secrets.token_hex(4)}"
         await _ip(
             [
-                f"link add {cable} type veth peer name host netns {switch}",
-                f"address add {self._address(HOST)}/{self._subnet.prefixlen} dev {cable}",
-                f"link set {cable} up",
+                f"link add {veth} type veth peer name host netns {switch}",
+                f"address add {self._address(HOST)}/{self._subnet.prefixlen} dev {veth}",
+                f"link set {veth} up",
             ]
         )
         await _ip(["link set host master switch", "link set host up"], switch)
-        world = await self._plug_in("world", WORLD, switch)
-        sites = []
+        world = await self._add_machine("world", WORLD, switch)
+        machines = []
         for number, name in enumerate(names, start=FIRST):
-            enter = await self._plug_in(name, number, switch)
+            prefix = await self._add_machine(name, number, switch)
             port = DEFAULT_MASTER_PORT
-            sites.append(Site(name, str(self._address(number)), port, port + RPC_PORT_OFFSET, enter))
-        return Network(tuple(sites), enter_world=world)
+            machines.append(
+                DemoMachine(name, str(self._address(number)), port, port + RPC_PORT_OFFSET, prefix)
+            )
+        return Network(tuple(machines), world_prefix=world)
 
     def _address(self, number: int) -> IPv4Address:
         return self._subnet[number]
 
-    async def _plug_in(self, name: str, number: int, switch: int) -> tuple[str, ...]:
-        """Make a machine that is cabled to the switch; returns how to run something on it."""
-        holder = await self._hold(name)
+    async def _add_machine(self, name: str, number: int, switch: int) -> tuple[str, ...]:
+        """Create a machine that is connected to the bridge; return the prefix that runs a command on it."""
+        holder = await self._create_namespace(name)
         await _ip(
             [
                 "link set lo up",
@@ -131,22 +135,22 @@ class _Namespaces:
             holder,
         )
         await _ip([f"link set port{number} master switch", f"link set port{number} up"], switch)
-        return _entering(holder)
+        return _command_prefix(holder)
 
-    async def _hold(self, name: str, *, needed: bool = False) -> int:
-        """Make a namespace; returns the id of the process that holds it."""
+    async def _create_namespace(self, name: str, *, stop_last: bool = False) -> int:
+        """Create a namespace; return the id of the process that keeps it."""
         argv = ["unshare", "--net", "sh", "-c", "echo made; exec sleep infinity"]
-        holder = await self._children.start(f"network-{name}", argv, needed=needed)
-        await self._children.wait_line(holder, "made", HOLDER_TIMEOUT)
+        holder = await self._group.start(f"network-{name}", argv, stop_last=stop_last)
+        await self._group.wait_line(holder, "made", START_TIMEOUT_S)
         return holder.child.pid
 
 
-async def _may_make_namespaces() -> bool:
+async def _can_create_namespaces() -> bool:
     if os.geteuid() != 0 or not all(map(shutil.which, TOOLS)):
         return False
-    cable = f"rce{secrets.token_hex(4)}"
+    veth = f"rce{secrets.token_hex(4)}"
     try:
-        await _ip([f"link add {cable} type veth peer name {cable}p", f"link delete {cable}"])
+        await _ip([f"link add {veth} type veth peer name {veth}p", f"link delete {veth}"])
         await _run("unshare", "--net", "true")
     except NetworkError:
         return False
@@ -154,15 +158,15 @@ async def _may_make_namespaces() -> bool:
 
 
 async def _ip(commands: Sequence[str], holder: int | None = None) -> None:
-    """Give commands to ``ip`` in a namespace, or here."""
-    enter = () if holder is None else _entering(holder)
-    await _run(*enter, "ip", "-batch", "-", given="".join(f"{command}\n" for command in commands))
+    """Run commands of ``ip`` in a namespace, or in this one."""
+    prefix = () if holder is None else _command_prefix(holder)
+    await _run(*prefix, "ip", "-batch", "-", given="".join(f"{command}\n" for command in commands))
 
 
 async def _run(*argv: str, given: str = "") -> None:
-    # Not by asyncio: under uvloop, what is given to a program that has ended already is a RuntimeError.
+    # Not by asyncio: under uvloop, input to a program that has ended already raises RuntimeError.
     def run() -> subprocess.CompletedProcess[str]:
-        return subprocess.run(  # noqa: S603 - its words are this module's own
+        return subprocess.run(  # noqa: S603 - the command is made in this module
             argv, input=given, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
         )
 
@@ -174,12 +178,12 @@ async def _run(*argv: str, given: str = "") -> None:
         raise NetworkError(ended.stdout.strip())
 
 
-def _entering(holder: int) -> tuple[str, ...]:
+def _command_prefix(holder: int) -> tuple[str, ...]:
     return ("nsenter", f"--net=/proc/{holder}/ns/net", "--")
 
 
 def _free_subnet() -> IPv4Network:
-    """A subnet of which this machine has no address."""
+    """Return a subnet in which this machine has no address."""
     own = {entry.address for entries in psutil.net_if_addrs().values() for entry in entries}
     while True:
         subnet = IPv4Network((f"10.{secrets.randbelow(256)}.{secrets.randbelow(256)}.0", 24))

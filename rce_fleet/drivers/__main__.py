@@ -15,11 +15,9 @@ from rce.config.exceptions import ConfigError
 from rce.config.logs import start_logging
 from rce.ros.types import TypeRegistry
 from rce_client.exceptions import RefusedError
-from rce_fleet.drivers.account import Account
-from rce_fleet.drivers.block_watch import BlockWatch
 from rce_fleet.drivers.cell_watch import CellWatch, GraphCellWatch
-from rce_fleet.drivers.cores import Cores
-from rce_fleet.drivers.program import Simulation
+from rce_fleet.drivers.engine_cell_watch import EngineCellWatch, WorldAccount
+from rce_fleet.drivers.program import Cores, Simulation
 from rce_fleet.drivers.scene import load_scene
 
 BAD_SCENE = 2
@@ -27,18 +25,20 @@ FAILED = 1
 
 
 def simulate(
-    scene: Annotated[Path, typer.Argument(help="What stands where, JSON or YAML.")],
-    report: Annotated[Path | None, typer.Option(help="File to write what truly happens to.")] = None,
+    scene: Annotated[Path, typer.Argument(help="Map, boxes and robots (JSON or YAML).")],
+    report: Annotated[
+        Path | None, typer.Option(help="Write the state of the world to this file (JSON).")
+    ] = None,
     master: Annotated[
-        str, typer.Option(help="The engine whose planner blocks cells; without it, no cell is blocked.")
+        str, typer.Option(help="URL of the engine's master, to put boxes into cells that the planner blocks.")
     ] = "",
-    user: Annotated[str, typer.Option(help="Whose fleet it is.")] = "testUser",
+    user: Annotated[str, typer.Option(help="User that the fleet belongs to.")] = "testUser",
     password: Annotated[str, typer.Option(envvar="RCE_PASSWORD", help="The user's password.")] = "testUser",  # noqa: S107 - the development user's
-    robot_id: Annotated[str, typer.Option(help="The robotID by which the world comes.")] = "world",
+    robot_id: Annotated[str, typer.Option(help="The robotID with which the world connects.")] = "world",
     container: Annotated[str, typer.Option(help="Tag of the planner's container.")] = "cTag_fleet",
     planner_core: Annotated[
         str,
-        typer.Option(help="In place of --master: the ROS master of a planner that runs without the engine."),
+        typer.Option(help="Instead of --master: ROS master of a planner that runs without the engine."),
     ] = "",
     core: Annotated[
         list[str] | None,
@@ -47,14 +47,14 @@ def simulate(
         ),
     ] = None,
 ) -> None:
-    """Simulate robots in a world, in real time; each is a ROS graph of its own unless --core names one."""
+    """Simulate a world with robots in real time; each robot has its own ROS graph unless --core names one."""
     start_logging(logging.WARNING)
     types = TypeRegistry()
     watch: CellWatch | None = None
     if planner_core:
         watch = GraphCellWatch(planner_core, types)
     elif master:
-        watch = BlockWatch(Account(master, user, password, robot_id), container)
+        watch = EngineCellWatch(WorldAccount(master, user, password, robot_id), container)
     cores = Cores.read(core or ())
     try:
         simulation = Simulation(load_scene(scene), types, typer.echo, report=report, watch=watch, cores=cores)
@@ -64,7 +64,7 @@ def simulate(
     try:
         uvloop.run(_until_signal(simulation))
     except* RefusedError as group:
-        typer.echo(f"simulation: the engine refused the world: {group.exceptions[0]}", err=True)
+        typer.echo(f"simulation: the engine refused the connection: {group.exceptions[0]}", err=True)
         raise typer.Exit(FAILED) from None
 
 

@@ -1,4 +1,4 @@
-"""How the world hears of cells that the planner blocks: they get a box."""
+"""Watches the cells that the planner blocks, so that the world puts boxes there."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ NODE = "world"
 
 
 class CellWatch(Protocol):
-    """Hears the planner's blocked cells, for as long as it runs."""
+    """Watches the planner's blocked cells."""
 
     joined: asyncio.Event
-    """Set once the planner can be heard."""
+    """Set once the planner is connected."""
 
     async def run(self, follow: Callable[[list[int]], None]) -> None:
-        """Watch until cancelled; ``follow`` gets all cells that are blocked now, whenever they change."""
+        """Watch until cancelled; ``follow`` is called with all blocked cells whenever they change."""
 
 
 class GraphCellWatch:
-    """Hears them in the planner's ROS graph.
+    """Watches them in the planner's ROS graph.
 
     Args:
-        master_uri: The graph's master, which need not be up yet.
+        master_uri: The graph's master, which may start later.
         types: Where message types come from.
     """
 
@@ -42,7 +42,7 @@ class GraphCellWatch:
         self.joined = asyncio.Event()
 
     async def run(self, follow: Callable[[list[int]], None]) -> None:
-        """Watch until cancelled; ``follow`` gets all cells that are blocked now, whenever they change."""
+        """Watch until cancelled; ``follow`` is called with all blocked cells whenever they change."""
 
         def take(message: Message) -> None:
             follow(cells_of(message.data))
@@ -54,5 +54,5 @@ class GraphCellWatch:
 
 
 def cells_of(data: Iterable[int]) -> list[int]:
-    """The cells of a message's array."""
+    """Return the cells of a message's array."""
     return [int(cell) for cell in data]

@@ -1,22 +1,21 @@
-"""Runs a world and its robots until told to stop."""
+"""Runs a world and its robots in real time."""
 
 from __future__ import annotations
 
 import asyncio
 from contextlib import AsyncExitStack
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.tf import frames
-from rce_fleet.drivers.cores import Cores
 from rce_fleet.drivers.report import look_at, write_report
 from rce_fleet.drivers.robot_driver import RobotDriver
-from rce_fleet.drivers.runner import run_world
 from rce_fleet.simulation.boxes import BoxKeeper
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable, Mapping
     from pathlib import Path
 
     from rce.ros.types import TypeRegistry
@@ -27,18 +26,47 @@ if TYPE_CHECKING:
 REPORT_EVERY = 0.5
 """Seconds between two reports."""
 ROBOT_NODE = "robot"
-"""Name of a robot's node in its namespace, where it joins a graph that is there."""
+"""Name of a robot's node in its namespace, if it joins an existing graph."""
+PERIOD = 0.05
+"""Seconds between two updates of the robots."""
+MAX_LAG = 0.5
+"""Maximum delay behind the clock that is caught up, seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cores:
+    """URIs of ROS masters. A robot without one gets its own graph and no namespace."""
+
+    default: str | None = None
+    """For robots that are not listed."""
+    robots: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, texts: Iterable[str]) -> Cores:
+        """Read ``URI`` (for all robots) and ``ROBOT=URI``."""
+        default, robots = None, {}
+        for text in texts:
+            robot, separator, uri = text.partition("=")
+            if separator and "/" not in robot:
+                robots[robot] = uri
+            else:
+                default = text
+        return cls(default, robots)
+
+    def of(self, robot: str) -> str | None:
+        """Return the master of a robot's graph; None for its own graph."""
+        return self.robots.get(robot, self.default)
 
 
 class Simulation:
-    """A world in real time, each robot a node in a ROS graph.
+    """Runs a world in real time, with a ROS node for each robot.
 
     Args:
-        scene: What stands where.
+        scene: Map, boxes and robots.
         types: Where message types come from.
-        say: Gets lines for people and for programs that start this one.
+        say: Prints a line for the user and for the program that started this one.
         report: File that the report is written to; none if None.
-        watch: Hears the cells that the planner blocks; nobody blocks any if None.
+        watch: Watches the cells that the planner blocks; None if no planner does.
         cores: The ROS graphs that the robots join.
     """
 
@@ -50,7 +78,7 @@ class Simulation:
         *,
         report: Path | None = None,
         watch: CellWatch | None = None,
-        cores: Cores = Cores(),  # noqa: B008 - it cannot be changed
+        cores: Cores = Cores(),
     ) -> None:
         self._scene = scene
         self._types = types
@@ -118,3 +146,33 @@ class Simulation:
     def _write_report(self) -> None:
         if self._report is not None:
             write_report(look_at(self._world), self._report)
+
+
+async def run_world(
+    world: World,
+    drivers: Iterable[RobotDriver],
+    *,
+    after_update: Callable[[], None] | None = None,
+    pace: float = 1.0,
+) -> None:
+    """Run a world in real time until cancelled.
+
+    On a machine that is too slow the world runs slower; delays above MAX_LAG are not caught up.
+
+    Args:
+        world: The world.
+        drivers: The robots in it.
+        after_update: Called after each update.
+        pace: Simulated seconds per second.
+    """
+    loop = asyncio.get_running_loop()
+    robots = list(drivers)
+    due = loop.time()
+    while True:
+        world.step(PERIOD)
+        for robot in robots:
+            robot.update()
+        if after_update is not None:
+            after_update()
+        due = max(due + PERIOD / pace, loop.time() - MAX_LAG)
+        await asyncio.sleep(max(0.0, due - loop.time()))

@@ -1,4 +1,4 @@
-"""What truly happened in the world: the file that the simulation program writes."""
+"""The state of the simulated world: the file that the simulation program writes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Contacts(BaseModel):
-    """How often something touched something."""
+    """Number of collisions by what collided."""
 
     robot_robot: int
     robot_box: int
@@ -24,22 +24,22 @@ class Contacts(BaseModel):
 
 
 class RobotTruth(BaseModel):
-    """Where a robot truly is."""
+    """True state of a robot."""
 
     id: str
     cell: int | None
-    """None outside of the map."""
+    """None outside the map."""
     x: float
     """Metres."""
     y: float
     yaw: float
     """Radians."""
     distance_m: float
-    """Way driven so far."""
+    """Distance driven so far."""
 
 
 class WorldReport(BaseModel):
-    """The world at one moment, and what happened until then."""
+    """The world at one time, and all collisions until then."""
 
     time_s: float
     """Simulated time."""
@@ -50,7 +50,7 @@ class WorldReport(BaseModel):
     robots: list[RobotTruth]
 
     def robot(self, robot: str) -> RobotTruth:
-        """One robot; KeyError if there is none of that id."""
+        """Return a robot by id; raise KeyError if it does not exist."""
         for known in self.robots:
             if known.id == robot:
                 return known
@@ -58,7 +58,7 @@ class WorldReport(BaseModel):
 
 
 def look_at(world: World) -> WorldReport:
-    """Report on a world as it is now."""
+    """Return the report of a world."""
     seen, apart = world.collisions, world.min_separation
     robots = []
     for robot in world.robots.values():
@@ -88,17 +88,17 @@ def look_at(world: World) -> WorldReport:
 
 
 def write_report(report: WorldReport, path: Path) -> None:
-    """Write a report so that readers see the old file or the new one, never half of it."""
+    """Write a report atomically: readers see the old file or the new one."""
     draft = path.with_name(f".{path.name}.draft")
     draft.write_text(json.dumps(report.model_dump(), indent=1) + "\n", encoding="utf-8")
     draft.replace(path)
 
 
 def read_report(path: Path) -> WorldReport | None:
-    """Read a report; None if there is none yet.
+    """Read a report; return None if the file does not exist yet.
 
     Raises:
-        ValueError: The file is no report.
+        ValueError: The file is not a report.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -107,4 +107,4 @@ def read_report(path: Path) -> WorldReport | None:
     try:
         return WorldReport.model_validate_json(text)
     except ValidationError as error:
-        raise ValueError(f"{path} is no report of a world: {error}") from error
+        raise ValueError(f"{path} is not a report of the simulation: {error}") from error

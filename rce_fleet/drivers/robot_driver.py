@@ -1,8 +1,8 @@
-"""A simulated robot as a ROS node: sensors go out, ``move_base`` goals come in.
+"""A simulated robot as a ROS node: publishes sensors, accepts ``move_base`` goals.
 
 Topics, relative to the node's namespace: publishes ``amcl_pose``, ``odom``, ``scan``, ``blockedCells``,
 ``move_base/status`` and ``move_base/result``; subscribes to ``move_base/goal`` and ``move_base/cancel``. On
-``/tf`` it tells where ``odom``, ``base_link`` and ``base_scan`` are on the ``map``.
+``/tf`` it publishes the frames ``odom``, ``base_link`` and ``base_scan`` below ``map``.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 SENSE_EVERY = 0.1
 """Seconds between two poses, and between two scans."""
 STATUS_EVERY = 0.2
-"""Seconds between two lists of goals."""
+"""Seconds between two status lists."""
 RANGE_MIN = 0.05
 """Smallest range that the lidar reports, metres."""
 
@@ -52,14 +52,14 @@ class _Topics:
 class RobotDriver:
     """Runs one robot of a world as a node.
 
-    The caller keeps time: after every step of the world it calls :meth:`update`, some 20 times a second.
+    The caller calls :meth:`update` after every step of the world, about 20 times a second.
 
     Args:
         node: Running node; its namespace is the robot's.
         world: The world.
         robot: Id of the robot in the world.
-        limits: What the robot can do.
-        tf_prefix: What the robot's own frames live below, where several robots share a graph.
+        limits: Speeds and accelerations of the robot.
+        tf_prefix: Prefix of the robot's frames, if several robots share a graph.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class RobotDriver:
         self._listed_at = -math.inf
 
     async def start(self) -> None:
-        """Join the graph. Everything is taken back when the node is left."""
+        """Create publishers and subscribers. They end with the node."""
         node = self._node
         self._topics = _Topics(
             pose=await node.advertise("amcl_pose", "geometry_msgs/PoseWithCovarianceStamped"),
@@ -99,7 +99,7 @@ class RobotDriver:
         await node.subscribe("move_base/cancel", "actionlib_msgs/GoalID", self._take_cancel)
 
     def update(self) -> None:
-        """Sense, decide and say what is new; call it after a step of the world."""
+        """Publish sensors and drive; call it after a step of the world."""
         if self._topics is None:
             return
         now, stamp = self._world.time, Time.now()
@@ -115,7 +115,7 @@ class RobotDriver:
             self._listed_at = now
             self._list(self._topics, stamp)
 
-    # -- what comes in ------------------------------------------------------------------------------
+    # What comes in
 
     def _take_goal(self, message: Message) -> None:
         place = message.goal.target_pose.pose.position
@@ -125,7 +125,7 @@ class RobotDriver:
     def _take_cancel(self, message: Message) -> None:
         self._base.cancel(message.id, message.stamp.to_sec())
 
-    # -- what goes out ------------------------------------------------------------------------------
+    # What goes out
 
     def _sense(self, topics: _Topics, stamp: Time) -> None:
         robot, spec = self._robot, self._world.spec.lidar
@@ -157,7 +157,7 @@ class RobotDriver:
             )
 
     def _tree(self, stamp: Time) -> list[StampedTransform]:
-        """The robot's frames, from the map down; the laser is in the robot's middle."""
+        """Return the robot's frames, from the map down; the lidar is in the robot's middle."""
         map_from_base, odom_from_base = map(_transform, (self._robot.estimate, self._robot.odometry))
         map_from_odom = map_from_base @ odom_from_base.inverse()
         return [
@@ -167,7 +167,7 @@ class RobotDriver:
         ]
 
     def _list(self, topics: _Topics, stamp: Time) -> None:
-        """Publish the list of goals, and cells found blocked for as long as they stop the robot."""
+        """Publish the status list, and the cells found blocked while they stop the robot."""
         if self._base.blocked:
             topics.blocked.publish(data=list(self._base.blocked))
         topics.status.publish(
@@ -185,7 +185,7 @@ def _pose_fields(pose: Pose) -> dict[str, Any]:
 
 
 def _covariance(variances: tuple[float, float, float]) -> list[float]:
-    """The 6 x 6 matrix of ``geometry_msgs/PoseWithCovariance`` with x, y and yaw filled in."""
+    """Return the 6 x 6 matrix of ``geometry_msgs/PoseWithCovariance`` with x, y and yaw set."""
     matrix = np.zeros((6, 6))
     matrix[[0, 1, 5], [0, 1, 5]] = variances
     return [float(value) for value in matrix.reshape(-1)]

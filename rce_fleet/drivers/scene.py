@@ -1,4 +1,4 @@
-"""What stands where at the beginning: the file that the simulation program reads."""
+"""The initial state of the simulated world: the file that the simulation program reads."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAX_CELLS = 1_000_000
 
 
 class RobotStart(Strict):
-    """A robot, and where it begins."""
+    """A robot and its start."""
 
     id: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
     cell: int = Field(ge=0)
@@ -38,12 +38,12 @@ class Scene(Strict):
     cell_size: float = Field(default=1.0, gt=0, allow_inf_nan=False)
     """Edge of a cell, metres."""
     walls: tuple[int, ...] = Field(default=(), strict=False)
-    """Cells that are solid for ever."""
+    """Cells that are always solid."""
     boxes: tuple[int, ...] = Field(default=(), strict=False)
-    """Cells with a box, whether somebody knows of it or not."""
+    """Cells with a box, whether the planner knows of it or not."""
     robots: tuple[RobotStart, ...] = Field(default=(), strict=False)
     seed: int = Field(default=0, ge=0)
-    """Of the errors of the robots' senses."""
+    """Seed of the sensor noise."""
 
     @model_validator(mode="after")
     def _check_cells(self) -> Scene:
@@ -58,7 +58,7 @@ class Scene(Strict):
             raise ValueError("two robots have the same id or the same cell")
         taken = sorted({*self.walls, *self.boxes}.intersection(starts))
         if taken:
-            raise ValueError(f"robots cannot begin in the blocked cells {taken}")
+            raise ValueError(f"robots start in the blocked cells {taken}; choose other cells")
         return self
 
     @property
@@ -67,7 +67,7 @@ class Scene(Strict):
         return GridMap(self.rows, self.columns, self.cell_size, blocked=frozenset(self.walls))
 
     def build(self) -> World:
-        """Make the world."""
+        """Create the world."""
         world = World(self.grid, seed=self.seed)
         try:
             for robot in self.robots:
@@ -80,7 +80,7 @@ class Scene(Strict):
 
 
 def scene_of(scenario: Scenario, seed: int = 0) -> Scene:
-    """The scene in which a scenario begins; hidden boxes stand there from the beginning."""
+    """Return the initial state of a scenario, with known and hidden boxes."""
     grid = scenario.grid
     starts = zip(scenario.robots, scenario.starts, scenario.headings, strict=True)
     return Scene(
@@ -98,7 +98,7 @@ def load_scene(path: Path) -> Scene:
     """Read a scene, JSON or YAML.
 
     Raises:
-        ConfigError: It cannot be read, or something is wrong in it.
+        ConfigError: The file cannot be read, or is not valid.
     """
     try:
         return Scene.model_validate(parse(read_file(path), str(path)))

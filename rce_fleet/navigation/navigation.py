@@ -1,7 +1,7 @@
-"""Drives a differential-drive robot along waypoints: turn on the spot, then straight on, smoothly.
+"""Drives a differential-drive robot along waypoints: turn on the spot, then drive straight, smoothly.
 
-The speed follows the distance left, ``v = sqrt(2 a d)``, so that a robot brakes with its own deceleration and
-stands at the waypoint, and never goes faster than it could stop before an obstacle ahead.
+The speed follows the remaining distance, ``v = sqrt(2 a d)``: the robot brakes with its own deceleration,
+stops at the waypoint, and can always stop in front of an obstacle ahead.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DriveLimits:
-    """What a robot can do: metres, radians, seconds.
+    """Speeds and accelerations of a robot: metres, radians, seconds.
 
     Attributes:
         speed: Highest forward speed.
@@ -26,8 +26,8 @@ class DriveLimits:
         turn_rate: Highest rate of turn.
         turn_acceleration: Highest change of the rate of turn.
         reach: A waypoint this near is reached.
-        facing: A robot whose waypoint is farther off its heading turns on the spot.
-        gap: Distance kept to an obstacle ahead, from the hull.
+        facing: Turn on the spot if the waypoint is farther off the heading than this.
+        gap: Minimum distance from the hull to an obstacle ahead.
     """
 
     speed: float = 0.8
@@ -41,7 +41,7 @@ class DriveLimits:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """A place and direction in the plane: metres, radians."""
+    """A position and direction in the plane: metres, radians."""
 
     x: float
     y: float
@@ -50,7 +50,7 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Twist:
-    """A speed, metres a second forward, and a rate of turn, radians a second."""
+    """A forward speed, metres per second, and a turn rate, radians per second."""
 
     speed: float = 0.0
     turn_rate: float = 0.0
@@ -60,7 +60,7 @@ class Navigator:
     """Follows a list of waypoints.
 
     Args:
-        limits: What the robot can do.
+        limits: Speeds and accelerations of the robot.
     """
 
     def __init__(self, limits: DriveLimits | None = None) -> None:
@@ -71,32 +71,32 @@ class Navigator:
 
     @property
     def waypoints(self) -> Sequence[tuple[float, float]]:
-        """What is left of the list, metres."""
+        """The remaining waypoints, metres."""
         return self._waypoints
 
     @property
     def standing(self) -> bool:
-        """Whether the robot was told to stand still in the last step."""
+        """Whether the last step's speeds were zero."""
         return self._twist == Twist()
 
     @property
     def done(self) -> bool:
-        """Whether the robot is at the end of its list and stands still."""
+        """Whether the robot stands still at its last waypoint."""
         return not self._waypoints and self.standing
 
     def follow(self, waypoints: Sequence[tuple[float, float]]) -> None:
-        """Drive along these points instead, without stopping first."""
+        """Replace the waypoints, without stopping first."""
         self._waypoints = list(waypoints)
 
     def stop(self) -> None:
-        """Brake, and forget the rest of the list."""
+        """Brake, and drop the remaining waypoints."""
         self._waypoints = []
 
     def update(self, pose: Pose, dt: float, clear: float = inf) -> Twist:
-        """The speeds to drive for the next ``dt`` seconds.
+        """Return the speeds for the next ``dt`` seconds.
 
         Args:
-            pose: Where the robot is.
+            pose: Pose of the robot.
             dt: Time since the last step.
             clear: Free distance ahead of the hull, metres.
         """
@@ -113,7 +113,7 @@ class Navigator:
             x, y = self._waypoints[0]
             away = hypot(x - pose.x, y - pose.y)
             bearing = wrap(atan2(y - pose.y, x - pose.x) - pose.yaw)
-            # Close by and already beside the robot: it cannot get nearer without turning back.
+            # The waypoint is close and beside the robot: it cannot get nearer without turning back.
             passed = away < 3 * self.limits.reach and cos(bearing) <= 0
             if away > self.limits.reach and not passed:
                 return
@@ -136,13 +136,13 @@ class Navigator:
             sqrt(2 * limits.acceleration * max(away - limits.reach / 2, 0.0)),
             sqrt(2 * limits.acceleration * room),
         )
-        # Close to a waypoint small errors of the pose are large errors of the bearing: go straight on there.
+        # Close to a waypoint, small errors of the pose are large errors of the bearing: drive straight there.
         gain = min(1.0, away / (6 * limits.reach))
         return Twist(speed * max(cos(error), 0.0), gain * max(-turn, min(turn, 3.0 * error)))
 
 
 def _braking(angle: float, limits: DriveLimits) -> float:
-    """The rate of turn from which a robot comes to rest after ``angle``, with half of its deceleration."""
+    """Return the turn rate from which a robot stops within ``angle``, with half of its deceleration."""
     return sqrt(limits.turn_acceleration * angle)
 
 

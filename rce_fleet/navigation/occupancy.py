@@ -1,4 +1,4 @@
-"""The map as an occupancy grid: plain numbers in the layout of ``nav_msgs/OccupancyGrid``."""
+"""The map as an occupancy grid, in the layout of ``nav_msgs/OccupancyGrid``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ OCCUPIED = 100
 
 @dataclass(frozen=True, slots=True)
 class Occupancy:
-    """What ``nav_msgs/OccupancyGrid`` holds, without the message.
+    """The fields of ``nav_msgs/OccupancyGrid``.
 
     Attributes:
         resolution: Edge of a pixel, metres.
@@ -38,7 +38,7 @@ class Occupancy:
 
 
 def occupancy(grid: GridMap, blocked: Iterable[int] = (), *, pixels_per_cell: int = 1) -> Occupancy:
-    """Draw a map, its own blocked cells and the ``blocked`` ones given.
+    """Return the occupancy grid of a map, with its own blocked cells and the given ones.
 
     With one pixel per cell the index in ``data`` is the cell number.
     """

@@ -1,1 +1,1 @@
-"""The fleet's ROS nodes: they carry messages to the coordination and from it."""
+"""The fleet's ROS nodes: they pass messages to the coordination and from it."""

@@ -1,7 +1,7 @@
-"""Steers a fleet: gives every robot cells of the map to drive on, so that no two ever claim the same one.
+"""Plans for a fleet: grants each robot cells of the map, so that no two robots ever claim the same one.
 
-A robot is whatever publishes ``/NAME/amcl_pose`` and has a move client. The work is done by
-:mod:`rce_fleet.coordination`; this node carries messages to it and from it. ``share/README.md`` lists
+A robot is found by its topic ``/NAME/amcl_pose`` and needs a move client. The work is done by
+:mod:`rce_fleet.coordination`; this node passes messages to it and from it. ``share/README.md`` lists
 topics and parameters.
 """
 
@@ -11,7 +11,7 @@ import asyncio
 import re
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, assert_never
 
 from rce.ros.errors import MasterError
 from rce.ros.node import Node, run
@@ -26,14 +26,15 @@ from rce_fleet.coordination.events import (
     Event,
     GoalSet,
     Instruction,
+    MakePlan,
     ObstacleSeen,
+    PlanMade,
     PoseSeen,
     Reply,
     ReportSeen,
     RobotRemoved,
     SendCancel,
     SendCells,
-    StateChanged,
     Tick,
 )
 from rce_fleet.coordination.move_client import ClientReport, ClientState
@@ -43,15 +44,18 @@ from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.navigation.angles import yaw_of
 from rce_fleet.navigation.occupancy import occupancy
 from rce_fleet.nodes.parameters import make_grid
+from rce_fleet.nodes.plan_worker import PlanWorker
+from rce_fleet.nodes.state_publisher import StatePublisher
 
 if TYPE_CHECKING:
     from rce.ros.node import Publisher
     from rce.ros.types import Message
+    from rce_fleet.coordination.replanning import PlanRequest
 
 TICK = 0.1
-"""Seconds between two looks at the clock; the state is published at most as often."""
+"""Seconds between two timer events; changes of the state are published at most this often."""
 LOOK_AROUND = 0.5
-"""Seconds between two looks for new robots."""
+"""Seconds between two searches for new robots."""
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 ROBOT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/amcl_pose")
 MAP_FRAME = "map"
@@ -63,7 +67,7 @@ class PlannerNode:
     Args:
         node: Running node.
         planner: The planner.
-        takes_answers: Move clients answer on ``goalNodesList`` instead of topics of their own.
+        takes_answers: Move clients answer on ``goalNodesList`` instead of their own topics.
     """
 
     def __init__(self, node: Node, planner: FleetPlanner, *, takes_answers: bool = False) -> None:
@@ -72,36 +76,37 @@ class PlannerNode:
         self._planner = planner
         self._cells: dict[str, Publisher] = {}
         self._cancels: dict[str, Publisher] = {}
-        self._state_changed = True
-        self._started = Time.now()
-        self._state: Publisher
+        self._requests: asyncio.Queue[PlanRequest] = asyncio.Queue()
+        self._state = StatePublisher(node, planner)
         self._blocked: Publisher
         self._map: Publisher
 
     async def run(self, blocked: list[int]) -> None:
-        """Steer until the node is told to stop.
+        """Run until the node is stopped.
 
         Args:
-            blocked: Cells that are blocked from the beginning, and can be freed.
+            blocked: Cells that are blocked at the start, and can be freed.
         """
         node = self._node
-        self._state = await node.advertise("/fleet/state", "fleet/FleetState", latch=True)
         self._blocked = await node.advertise("/fleet/blockedCells", "std_msgs/Int32MultiArray", latch=True)
         self._map = await node.advertise("/map", "nav_msgs/OccupancyGrid", latch=True)
         self._publish_blocked(())
         for cell in blocked:
             self._handle(CellBlocked(cell))
+        await self._state.start()
         await node.advertise_service("/fleet/set_goal", "fleet/SetGoal", self._set_goal)
         await node.advertise_service("/fleet/block_cell", "fleet/BlockCell", self._block_cell)
         await node.advertise_service("/fleet/remove_robot", "fleet/RemoveRobot", self._remove_robot)
-        async with asyncio.TaskGroup() as tasks:
+        async with PlanWorker(node.log) as worker, asyncio.TaskGroup() as tasks:
+            planning = tasks.create_task(self._make_plans(worker))
             tasks.create_task(self._look_around())
-            tasks.create_task(self._keep_time())
+            await self._keep_time()
+            planning.cancel()
 
-    # -- what comes in ------------------------------------------------------------------------------
+    # What comes in
 
     async def _look_around(self) -> None:
-        """Take in every robot whose pose is published."""
+        """Add every robot whose pose is published."""
         async with RpcClient() as rpc:
             master = MasterClient(self._node.master_uri, self._node.name, self._node.uri, rpc)
             while True:
@@ -111,7 +116,7 @@ class PlannerNode:
                         if found is not None and found[1] not in self._cells:
                             await self._join(found[1])
                 except MasterError as error:
-                    self._node.log.warning("cannot look for robots: %s", error)
+                    self._node.log.warning("cannot search for robots: %s", error)
                 if not await self._node.sleep(LOOK_AROUND):
                     return
 
@@ -127,7 +132,7 @@ class PlannerNode:
             )
         else:
             await self._hear_apart(robot)
-        # Who watches the planner cannot hear what other interfaces of its container publish.
+        # Clients of the planner's container do not receive what its other interfaces publish.
         seen = await node.advertise(f"/fleet/poses/{robot}", POSE, latch=True)
 
         def take(message: Message) -> None:
@@ -135,10 +140,10 @@ class PlannerNode:
             seen.publish(message)
 
         await node.subscribe(f"/{robot}/amcl_pose", POSE, take)
-        node.log.info("%s is here", robot)
+        node.log.info("found robot %s", robot)
 
     async def _hear_apart(self, robot: str) -> None:
-        """Hear a move client and its robot on a topic for each."""
+        """Subscribe to the topics of a move client and its robot."""
         await self._node.subscribe(
             f"/{robot}/moveClient/status",
             "fleet/MoveStatus",
@@ -151,7 +156,7 @@ class PlannerNode:
         )
 
     def _take_answer(self, robot: str, message: Message) -> None:
-        """Take what a move client says; the planner's own lists come back here too."""
+        """Handle a move client's answer; the planner's own lists arrive here too."""
         dimensions = message.layout.dim
         labels = [dimension.label for dimension in dimensions]
         if not is_answer(labels):
@@ -168,9 +173,11 @@ class PlannerNode:
     async def _keep_time(self) -> None:
         while await self._node.sleep(TICK):
             self._handle(Tick())
-            if self._state_changed:
-                self._state_changed = False
-                self._publish_state()
+            self._state.update(time.monotonic())
+
+    async def _make_plans(self, worker: PlanWorker) -> None:
+        while True:
+            self._handle(PlanMade(await worker.compute(await self._requests.get())))
 
     def _set_goal(self, request: Message) -> dict[str, Any]:
         return self._ask(GoalSet(request.robot, None if request.cell < 0 else request.cell))
@@ -181,20 +188,20 @@ class PlannerNode:
     def _remove_robot(self, request: Message) -> dict[str, Any]:
         return self._ask(RobotRemoved(request.robot))
 
-    # -- what goes out ------------------------------------------------------------------------------
+    # What goes out
 
     def _ask(self, event: Event) -> dict[str, Any]:
-        """Give a request to the planner; the fields of the response."""
+        """Pass a request to the planner; return the fields of the response."""
         reply = next(done for done in self._handle(event) if isinstance(done, Reply))
         self._node.log.info("%s", reply.message)
         return {"ok": reply.ok, "message": reply.message}
 
     def _take(self, event: Event) -> None:
-        """Give an event to the planner."""
+        """Pass an event to the planner."""
         self._handle(event)
 
     def _handle(self, event: Event) -> list[Instruction]:
-        """Give an event to the planner and do what it says."""
+        """Pass an event to the planner and carry out its instructions."""
         instructions = self._planner.handle(event, time.monotonic())
         for instruction in instructions:
             match instruction:
@@ -204,13 +211,17 @@ class PlannerNode:
                     self._cancels[robot].publish(data=True)
                 case BlockedChanged(cells):
                     self._publish_blocked(cells)
-                case StateChanged():
-                    self._state_changed = True
+                case MakePlan(request):
+                    self._requests.put_nowait(request)
+                case Reply():
+                    pass  # for the caller
+                case _:
+                    assert_never(instruction)
         return instructions
 
     def _publish_blocked(self, cells: tuple[int, ...]) -> None:
         self._blocked.publish(data=list(cells))
-        picture = occupancy(self._planner.books.grid, cells)
+        picture = occupancy(self._planner.state.grid, cells)
         x, y = picture.origin
         stamp = Time.now()
         self._map.publish(
@@ -224,39 +235,6 @@ class PlannerNode:
             },
             data=picture.data.tolist(),
         )
-
-    def _publish_state(self) -> None:
-        grid, snapshot = self._planner.books.grid, self._planner.snapshot()
-        walls = sorted(grid.blocked)
-        self._state.publish(
-            started=self._started,
-            rows=grid.rows,
-            columns=grid.columns,
-            cell_size=grid.cell_size,
-            origin_x=grid.origin[0],
-            origin_y=grid.origin[1],
-            blocked=sorted({*walls, *snapshot.blocked}),
-            pending=list(snapshot.pending),
-            walls=walls,
-            robots=[
-                {
-                    "id": robot.id,
-                    "state": robot.state.value,
-                    "reason": robot.reason,
-                    "cell": _or_none(robot.cell),
-                    "goal": _or_none(robot.goal),
-                    "plan": list(robot.plan),
-                    "granted": list(robot.granted),
-                    "replans": robot.replans,
-                }
-                for robot in snapshot.robots
-            ],
-        )
-
-
-def _or_none(cell: int | None) -> int:
-    """A cell as messages say it: -1 for none."""
-    return -1 if cell is None else cell
 
 
 def _pose(robot: str, message: Message) -> PoseSeen:
@@ -276,7 +254,7 @@ def _report(message: Message) -> ClientReport:
 
 
 async def read_parameters(node: Node) -> dict[str, Any]:
-    """The parameters of the namespace ``/fleet``, and over them the node's private ones."""
+    """Return the parameters of the namespace ``/fleet``, overridden by the node's private ones."""
     values: dict[str, Any] = {}
     for namespace in ("/fleet", "~"):
         found = await node.get_param(namespace, {})
@@ -286,7 +264,7 @@ async def read_parameters(node: Node) -> dict[str, Any]:
 
 
 async def main() -> None:
-    """Steer a fleet until the node is told to stop."""
+    """Run the planner until the node is stopped."""
     async with Node("fleet_planner") as node:
         values = await read_parameters(node)
         settings = FleetSettings(

@@ -1,13 +1,13 @@
-"""Sends a robot along the cells that it was granted, goal by goal. Runs in the robot's namespace.
+"""Sends a robot along its granted cells, goal by goal. Runs in the robot's namespace.
 
-The work is done by :mod:`rce_fleet.coordination.move_client`; this node carries messages to it and from it.
+The work is done by :mod:`rce_fleet.coordination.move_client`; this node passes messages to it and from it.
 ``share/README.md`` lists the topics.
 """
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 from rce.ros.node import Node, run
 from rce.ros.types import Time
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rce.ros.types import Message
 
 TICK = 0.25
-"""Seconds between two looks at the clock."""
+"""Seconds between two timer events."""
 REPORT_EVERY = 0.5
 """Seconds after which the progress is published again."""
 MAP_FRAME = "map"
@@ -53,7 +53,7 @@ class MoveClientNode:
         self._answers = False
 
     async def run(self) -> None:
-        """Send the robot along until the node is told to stop."""
+        """Send the robot along until the node is stopped."""
         node = self._node
         self._goals = await node.advertise("move_base/goal", "move_base_msgs/MoveBaseActionGoal")
         self._stops = await node.advertise("move_base/cancel", "actionlib_msgs/GoalID")
@@ -80,10 +80,10 @@ class MoveClientNode:
             if now - self._reported_at >= REPORT_EVERY:
                 self._do([self._client.report])
 
-    # -- what comes in ------------------------------------------------------------------------------
+    # What comes in
 
     def _take_map(self, message: Message) -> None:
-        """Learn size and place of the cells: one pixel of the map is one cell."""
+        """Set size and position of the cells: one pixel of the map is one cell."""
         info = message.info
         grid = GridMap(
             rows=info.height,
@@ -109,7 +109,7 @@ class MoveClientNode:
         try:
             self._do(self._client.take_cells(revision, list(message.data), time.time()))
         except ValueError as error:
-            self._node.log.warning("refused a list of cells: %s", error)
+            self._node.log.warning("the list of cells was refused: %s", error)
 
     def _take_cancel(self, message: Message) -> None:
         if self._client is not None and message.data:
@@ -125,7 +125,7 @@ class MoveClientNode:
             status = message.status
             self._do(self._client.take_result(status.goal_id.id, GoalState(status.status), time.time()))
 
-    # -- what goes out ------------------------------------------------------------------------------
+    # What goes out
 
     def _do(self, instructions: list[Instruction]) -> None:
         for instruction in instructions:
@@ -136,6 +136,8 @@ class MoveClientNode:
                     self._stops.publish(stamp=Time.from_sec(stamp), id="")
                 case ClientReport():
                     self._report(instruction)
+                case _:
+                    assert_never(instruction)
 
     def _send_goal(self, goal: SendGoal) -> None:
         assert self._client is not None
@@ -169,7 +171,7 @@ class MoveClientNode:
 
 
 async def main() -> None:
-    """Send a robot along until the node is told to stop."""
+    """Run the node until it is stopped."""
     async with Node("move_client") as node:
         await MoveClientNode(node).run()
 

@@ -1,4 +1,4 @@
-"""The map that nodes of the fleet are told of by parameters."""
+"""The map that the fleet's nodes get by parameters."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 
 
 def make_grid(values: Mapping[str, Any]) -> GridMap:
-    """Make the map that parameters describe.
+    """Return the map that parameters describe.
 
     Args:
         values: ``map``, a file, or ``rows``, ``columns``, ``origin_x``, ``origin_y`` (metres) and ``walls``
             (cells); and ``cell_size`` (metres).
 
     Raises:
-        ValueError: They describe none.
+        ValueError: They do not describe a map.
         MapError: The map file cannot be read.
         OSError: The map file cannot be opened.
     """

@@ -13,39 +13,56 @@ if TYPE_CHECKING:
 
 
 def distances(grid: GridMap, goal: int, weights: Sequence[float] | None = None) -> list[float]:
-    """Cost of the cheapest way to ``goal``, for every cell.
+    """Return the cost of the cheapest path to ``goal``, for every cell.
 
     Args:
         grid: The map; blocked cells cannot be entered.
-        goal: Where the ways end.
+        goal: Cell where the paths end.
         weights: Cost of leaving each cell, positive; 1 for all by default.
 
     Returns:
-        One number a cell; ``inf`` where no way leads to the goal. A blocked goal is reached from nowhere.
+        One number per cell; ``inf`` if no path leads to the goal. A blocked goal cannot be reached.
     """
     cost = [inf] * len(grid)
     if goal in grid.blocked:
         return cost
     cost[goal] = 0.0
+    if weights is None:
+        _spread(grid, goal, cost)
+        return cost
     heap = [(0.0, goal)]
     while heap:
         reached, cell = heapq.heappop(heap)
         if reached > cost[cell]:
             continue
         for other in grid.neighbours[cell]:
-            through = reached + (1.0 if weights is None else weights[other])
+            through = reached + weights[other]
             if through < cost[other]:
                 cost[other] = through
                 heapq.heappush(heap, (through, other))
     return cost
 
 
+def _spread(grid: GridMap, goal: int, cost: list[float]) -> None:
+    """Return the steps from the goal, by breadth-first search: with equal weights no heap is needed."""
+    ring, steps = [goal], 0.0
+    while ring:
+        steps += 1.0
+        outer = []
+        for cell in ring:
+            for other in grid.neighbours[cell]:
+                if cost[other] > steps:
+                    cost[other] = steps
+                    outer.append(other)
+        ring = outer
+
+
 def shortest_path(
     grid: GridMap, start: int, goal: int, weights: Sequence[float] | None = None
 ) -> list[int] | None:
-    """The cheapest way from ``start`` to ``goal``, both included; ``None`` if there is none.
+    """Return the cheapest path from ``start`` to ``goal``, both included; ``None`` if there is none.
 
-    Among equal ways the one is taken that keeps its direction longest, because every turn costs a robot time.
+    Among equal paths it prefers the one that keeps its direction longest: every turn costs a robot time.
     """
     cost = distances(grid, goal, weights)
     if cost[start] == inf:

@@ -28,7 +28,7 @@ class GridMap:
         columns: Number of columns, along x.
         cell_size: Edge of a cell, metres.
         origin: Outer corner of cell 0, ``(x, y)`` in metres.
-        blocked: Cells that nothing can enter.
+        blocked: Cells that cannot be entered.
     """
 
     rows: int = 8
@@ -39,12 +39,12 @@ class GridMap:
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
-            raise ValueError(f"a map needs rows and columns, not {self.rows} x {self.columns}")
+            raise ValueError(f"a map needs at least one row and one column, not {self.rows} x {self.columns}")
         if not self.cell_size > 0:
             raise ValueError(f"cell_size must be positive, not {self.cell_size}")
         outside = [cell for cell in self.blocked if cell not in self]
         if outside:
-            raise ValueError(f"blocked cells outside of the map: {sorted(outside)}")
+            raise ValueError(f"blocked cells {sorted(outside)} are outside the map")
 
     def __len__(self) -> int:
         return self.rows * self.columns
@@ -58,21 +58,21 @@ class GridMap:
         return [cell for cell in range(len(self)) if cell not in self.blocked]
 
     def with_blocked(self, cells: Iterable[int]) -> GridMap:
-        """The same map with exactly these cells blocked."""
+        """Return the same map with exactly these cells blocked."""
         return replace(self, blocked=frozenset(cells))
 
-    # -- numbers, places, metres ----------------------------------------------------------------
+    # Numbers, places, metres
 
     def cell(self, row: int, column: int) -> int:
-        """Number of the cell at ``row`` and ``column``."""
+        """Return the number of the cell at ``row`` and ``column``."""
         return row * self.columns + column
 
     def place(self, cell: int) -> tuple[int, int]:
-        """``(row, column)`` of a cell."""
+        """Return ``(row, column)`` of a cell."""
         return divmod(cell, self.columns)
 
     def centre(self, cell: int) -> tuple[float, float]:
-        """Centre of a cell, ``(x, y)`` in metres."""
+        """Return the centre of a cell, ``(x, y)`` in metres."""
         row, column = self.place(cell)
         return (
             self.origin[0] + (column + 0.5) * self.cell_size,
@@ -80,7 +80,7 @@ class GridMap:
         )
 
     def cell_at(self, x: float, y: float) -> int | None:
-        """Number of the cell that holds a point in metres; ``None`` outside of the map."""
+        """Return the cell of a point in metres; ``None`` outside the map."""
         column = floor((x - self.origin[0]) / self.cell_size)
         row = floor((y - self.origin[1]) / self.cell_size)
         if 0 <= row < self.rows and 0 <= column < self.columns:
@@ -88,7 +88,7 @@ class GridMap:
         return None
 
     def cells_touched(self, x: float, y: float, radius: float) -> set[int]:
-        """Cells of the map that a disc overlaps; all in metres."""
+        """Return the cells of the map that a disc overlaps; all in metres."""
         left = floor((x - radius - self.origin[0]) / self.cell_size)
         right = floor((x + radius - self.origin[0]) / self.cell_size)
         low = floor((y - radius - self.origin[1]) / self.cell_size)
@@ -104,10 +104,10 @@ class GridMap:
                     touched.add(cell)
         return touched
 
-    # -- neighbourhood ----------------------------------------------------------------------------
+    # Neighbours
 
     def around(self, cell: int) -> Iterator[int]:
-        """Cells of the map that share an edge with ``cell``, blocked or not, ascending."""
+        """Return the cells that share an edge with ``cell``, blocked or not, ascending."""
         row, column = self.place(cell)
         if row > 0:
             yield cell - self.columns
@@ -127,18 +127,18 @@ class GridMap:
         )
 
     def adjacent(self, a: int, b: int) -> bool:
-        """Whether two cells share an edge."""
+        """Return whether two cells share an edge."""
         (row_a, column_a), (row_b, column_b) = self.place(a), self.place(b)
         return abs(row_a - row_b) + abs(column_a - column_b) == 1
 
     def is_path(self, cells: Iterable[int]) -> bool:
-        """Whether every cell shares an edge with the one before it."""
+        """Return whether every cell shares an edge with the one before it."""
         return all(self.adjacent(a, b) for a, b in pairwise(cells))
 
-    # -- connectivity -----------------------------------------------------------------------------
+    # Connectivity
 
     def reachable(self, start: int) -> set[int]:
-        """Free cells that can be reached from ``start``, with ``start`` itself."""
+        """Return the free cells that can be reached from ``start``, with ``start`` itself."""
         seen = {start}
         queue = deque(seen)
         while queue:
@@ -149,7 +149,7 @@ class GridMap:
         return seen
 
     def connected(self, cells: Collection[int] | None = None) -> bool:
-        """Whether these free cells (by default all) can be reached from one another over free cells."""
+        """Return whether these free cells (by default all) are connected over free cells."""
         wanted = set(self.free if cells is None else cells)
         if not wanted:
             return True

@@ -2,14 +2,13 @@
 
 After Okumura, "LaCAM: Search-Based Algorithm for Quick Multi-Agent Pathfinding" (2023): a depth-first
 search over configurations. Every configuration has a tree of constraints, read breadth first, that
-forces ever more robots to ever other cells, so that in the end all successors are tried. It finds a plan
-whenever one exists, given time; a limit on the work keeps it answering, and then the best it has seen
-is returned.
+forces more and more robots to other cells, so that in the end all successors are tried. Given time, it finds
+a plan whenever one exists; after a limit on the work it returns the best configuration found so far.
 """
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from dataclasses import dataclass, field
 from math import inf
 from random import Random
@@ -29,7 +28,7 @@ DEFAULT_EFFORT = 40_000
 
 @dataclass(frozen=True, slots=True)
 class JointPlan:
-    """Where every robot is at every step.
+    """The cell of every robot at every step.
 
     In a step a robot stays or goes to a neighbouring cell. It may enter the cell that another leaves in
     the same step, but robots never follow one another around in a circle.
@@ -71,21 +70,21 @@ def plan(
     seed: int = 0,
     effort: int = DEFAULT_EFFORT,
 ) -> JointPlan:
-    """Bring every robot from its start to its goal.
+    """Return a plan that brings every robot from its start to its goal.
 
     Args:
-        grid: The map. A robot may stand in a blocked cell and leave it; nobody enters one.
+        grid: The map. A robot may start in a blocked cell and leave it; none enters one.
         starts: Cells of the robots, all different.
-        goals: Where they shall be, all different.
+        goals: Goal cells of the robots, all different.
         seed: The same arguments with the same seed make the same plan.
         effort: Moves of single robots to try at most.
     """
     if len(set(starts)) != len(starts) or len(set(goals)) != len(goals) or len(starts) != len(goals):
-        raise ValueError("as many starts as goals are needed, each of them different from one another")
+        raise ValueError("each robot needs a start and a goal: all starts different, all goals different")
     if not starts:
         return JointPlan(((),), complete=True)
     fields = [_field(grid, start, goal) for start, goal in zip(starts, goals, strict=True)]
-    search = _Search(grid, fields, Random(seed))  # noqa: S311 - breaks ties, keeps no secret
+    search = _Search(grid, fields, Random(seed))  # noqa: S311 - for ties, not for secrets
     return search.run(tuple(starts), tuple(goals), effort // len(starts))
 
 
@@ -188,30 +187,43 @@ def _trace(node: _Node) -> list[Configuration]:
 
 
 def _straighten(steps: list[Configuration]) -> tuple[Configuration, ...]:
-    """Let robots wait where they would leave a cell and come back to it with nobody there meanwhile.
+    """Replace loops by waiting: a robot waits in a cell that it would leave and come back to.
 
-    PIBT moves robots about that could just as well stand still. Waiting in a cell that nobody else enters
-    is in nobody's way, so each such loop is cut out.
+    PIBT moves robots that could stand still. If no other robot enters the cell meanwhile, waiting in it
+    blocks none, so each such loop is cut out.
     """
     paths = [list(cells) for cells in zip(*steps, strict=True)]
+    occupants: dict[int, dict[int, int]] = defaultdict(dict)
+    for step, cells in enumerate(steps):
+        for robot, cell in enumerate(cells):
+            occupants[cell][step] = robot
     shortened = True
     while shortened:
         shortened = False
         for robot, path in enumerate(paths):
-            others = [other for index, other in enumerate(paths) if index != robot]
-            shortened |= _cut_loop(path, others)
+            shortened |= _cut_loop(robot, path, occupants)
     return tuple(zip(*paths, strict=True))
 
 
-def _cut_loop(path: list[int], others: list[list[int]]) -> bool:
-    """Cut the longest loop of ``path`` from its earliest cell that allows one."""
+def _cut_loop(robot: int, path: list[int], occupants: dict[int, dict[int, int]]) -> bool:
+    """Cut the longest loop of ``path`` from its earliest cell that allows one.
+
+    Args:
+        robot: Whose path it is.
+        path: Its cell at every step; changed.
+        occupants: For every cell the robot that is in it, by step; changed.
+    """
     last = {cell: step for step, cell in enumerate(path)}
     for step, cell in enumerate(path[:-1]):
         if path[step + 1] == cell:
             continue
         back = last[cell]
+        robots = occupants[cell]
         while back > step + 1:
-            if path[back] == cell and all(cell not in other[step + 1 : back] for other in others):
+            if path[back] == cell and all(robots.get(at, robot) == robot for at in range(step + 1, back)):
+                for at in range(step, back):
+                    del occupants[path[at]][at]
+                    robots[at] = robot
                 path[step:back] = [cell] * (back - step)
                 return True
             back -= 1

@@ -19,12 +19,12 @@ _FREE = frozenset(".GS")
 _BLOCKED = frozenset("@OTW")
 _SCEN_FIELDS = 9
 MAX_CELLS = 4_000_000
-"""Largest map that is read: a header must not make the reader fill the memory."""
+"""Maximum size of a map, so that a wrong header does not fill the memory."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScenarioRow:
-    """One row of a ``.scen`` file: where a robot starts and where it shall go, as cells."""
+    """One row of a ``.scen`` file: start and goal cell of a robot."""
 
     start: int
     goal: int
@@ -34,17 +34,17 @@ def parse_map(text: str, *, cell_size: float = 1.0) -> GridMap:
     """Read a ``.map`` file's text.
 
     Raises:
-        MapError: The text is no such map.
+        MapError: The text is not such a map.
     """
     lines = text.splitlines()
     rows, columns, first = _header(lines)
     body = lines[first : first + rows]
     if len(body) < rows:
-        raise MapError(f"the map has {len(body)} of {rows} rows", line=len(lines))
+        raise MapError(f"the map has {len(body)} rows; its header says {rows}", line=len(lines))
     blocked: set[int] = set()
     for row, line in enumerate(body):
         if len(line) != columns:
-            raise MapError(f"{len(line)} cells in a row of {columns}", line=first + row + 1)
+            raise MapError(f"the row has {len(line)} cells instead of {columns}", line=first + row + 1)
         for column, character in enumerate(line):
             if character in _BLOCKED:
                 blocked.add(row * columns + column)
@@ -62,12 +62,12 @@ def _header(lines: list[str]) -> tuple[int, int, int]:
             break
         if key in ("height", "width"):
             if not value.strip().isdecimal():
-                raise MapError(f"{key} is no number: {value!r}", line=index + 1)
+                raise MapError(f"{key} is not a number: {value!r}", line=index + 1)
             sizes[key] = int(value)
         elif key != "type":
             raise MapError(f"unknown header line {line!r}", line=index + 1)
     else:
-        raise MapError("no line 'map' before the cells")
+        raise MapError("the line 'map' before the cells is missing")
     rows, columns = sizes.get("height", 0), sizes.get("width", 0)
     if not 0 < rows * columns <= MAX_CELLS:
         raise MapError(f"the size {columns} x {rows} is not within 1 .. {MAX_CELLS} cells")
@@ -82,7 +82,7 @@ def parse_scenario(text: str, grid: GridMap, *, limit: int | None = None) -> lis
     """
     lines = text.splitlines()
     if not lines or not lines[0].startswith("version"):
-        raise MapError("no line 'version' at the beginning", line=1)
+        raise MapError("the line 'version' at the beginning is missing", line=1)
     rows: list[ScenarioRow] = []
     for number, line in enumerate(lines[1:], start=2):
         if limit is not None and len(rows) >= limit:
@@ -95,16 +95,18 @@ def parse_scenario(text: str, grid: GridMap, *, limit: int | None = None) -> lis
 def _scenario_row(line: str, number: int, grid: GridMap) -> ScenarioRow:
     fields = line.split()
     if len(fields) != _SCEN_FIELDS:
-        raise MapError(f"{len(fields)} fields in a row of {_SCEN_FIELDS}", line=number)
+        raise MapError(f"the row has {len(fields)} fields instead of {_SCEN_FIELDS}", line=number)
     try:
         width, height, start_x, start_y, goal_x, goal_y = (int(field) for field in fields[2:8])
     except ValueError as error:
         raise MapError(str(error), line=number) from error
     if (width, height) != (grid.columns, grid.rows):
-        raise MapError(f"the row is for a map of {width} x {height}", line=number)
+        raise MapError(
+            f"the row is for a map of {width} x {height} cells; use the .scen file of this map", line=number
+        )
     for x, y in ((start_x, start_y), (goal_x, goal_y)):
         if not (0 <= x < width and 0 <= y < height) or grid.cell(y, x) in grid.blocked:
-            raise MapError(f"({x}, {y}) is no free cell of the map", line=number)
+            raise MapError(f"({x}, {y}) is not a free cell of the map", line=number)
     return ScenarioRow(grid.cell(start_y, start_x), grid.cell(goal_y, goal_x))
 
 
@@ -112,8 +114,8 @@ def read_map(path: Path, *, cell_size: float = 1.0) -> GridMap:
     """Read a ``.map`` file.
 
     Raises:
-        MapError: It is no such map.
-        OSError: It cannot be opened.
+        MapError: The file is not such a map.
+        OSError: The file cannot be opened.
     """
     return parse_map(_text(path), cell_size=cell_size)
 
@@ -127,4 +129,4 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="ascii")
     except UnicodeDecodeError as error:
-        raise MapError(f"{path} is no ASCII text") from error
+        raise MapError(f"{path} is not ASCII text") from error

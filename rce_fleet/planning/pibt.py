@@ -2,8 +2,8 @@
 
 After Okumura et al., "Priority Inheritance with Backtracking for Iterative Multi-agent Path Finding"
 (2022), with one rule more: robots may follow one another, but never around in a circle. Execution is
-asynchronous, a robot enters a cell only once its predecessor has left it, and in a circle everybody
-would wait for everybody. An exchange of two robots is the smallest circle.
+asynchronous: a robot enters a cell only once its predecessor has left it, and in a circle all robots
+would wait for each other. An exchange of two robots is the smallest circle.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _OPEN = -1
 
 
 class ConfigurationGenerator:
-    """Makes one configuration from the one before it.
+    """Makes each configuration from the previous one.
 
     Args:
         neighbours: For every cell the cells that can be entered from it.
@@ -48,11 +48,11 @@ class ConfigurationGenerator:
     def generate(
         self, now: Configuration, before: Configuration, order: Sequence[int], fixed: Mapping[int, int]
     ) -> Configuration | None:
-        """Move every robot to a neighbouring cell, or let it wait.
+        """Return the next configuration: each robot moves to a neighbouring cell or waits.
 
         Args:
-            now: Where the robots are.
-            before: Where they were a step ago; among equal choices a robot keeps its direction.
+            now: Cells of the robots.
+            before: Their cells a step before; among equal choices a robot keeps its direction.
             order: Robots, the most urgent first.
             fixed: Robots whose next cell is given.
 
@@ -76,7 +76,7 @@ class ConfigurationGenerator:
         return tuple(self._next)
 
     def _move(self, robot: int) -> bool:
-        """Find a cell for ``robot``, pushing others on; if there is none it stays and ``False`` says so."""
+        """Find a cell for ``robot``, pushing others on; if there is none, it stays and False is returned."""
         self._chain.add(robot)
         try:
             choices = self._choices(robot)
@@ -113,7 +113,7 @@ class ConfigurationGenerator:
             self._taken[cell] = partner
 
     def _choices(self, robot: int) -> list[int]:
-        """Cells that ``robot`` can be in next, the best first."""
+        """Return the cells that ``robot`` can be in next, the best first."""
         here = self._now[robot]
         step = here - self._before[robot]
         field = self._fields[robot]
@@ -125,7 +125,7 @@ class ConfigurationGenerator:
         return choices
 
     def _follows_in_a_circle(self) -> bool:
-        """Whether some robots all wait for each other to leave. Fixed moves can bring that about."""
+        """Return whether some robots all wait for each other to leave; fixed moves can cause that."""
         cleared: set[int] = set()
         for first in range(len(self._now)):
             trail: set[int] = set()

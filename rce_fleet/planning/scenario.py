@@ -1,4 +1,4 @@
-"""Demo scenarios: who starts where, who goes where, and what is in the way. All drawn from a seed."""
+"""Demo scenarios: starts, goals and boxes, drawn from a seed."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
 _ATTEMPTS = 200
 _EFFORT = DEFAULT_EFFORT
 _EFFORT_PER_ROBOT = 4000
-"""Moves of robots that are tried to find out whether all can get to their goals."""
+"""Moves of robots to try before a scenario is taken as not solvable."""
 _HEADINGS = (0.0, pi / 2, pi, -pi / 2)
 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """What is to be driven.
+    """Starts, goals and boxes on a map.
 
     Attributes:
         grid: The map with its walls only.
         starts: Start cell of each robot, all different.
         headings: Direction of each robot at the start, radians.
         goals: Goal cell of each robot, all different, none of them a start of the same robot.
-        known_boxes: Cells with a box that the planner is told of at the beginning.
+        known_boxes: Cells with a box that the planner knows from the beginning.
         hidden_boxes: Cells with a box that a robot has to find.
     """
 
@@ -59,20 +59,22 @@ def make_scenario(
 ) -> Scenario:
     """Draw a scenario; the same arguments make the same one.
 
-    Robots and boxes are drawn from the largest part of the map whose cells can reach one another, and they
-    still can with all boxes in place. A hidden box stands on the shortest way of a robot if that is possible,
-    so that a robot finds it. On maps of narrow lanes there are fewer boxes than asked for, where more would
-    leave no room to pass: all robots can always get to their goals at once.
+    Robots and boxes are placed in the largest connected part of the map, which stays connected with all
+    boxes. A hidden box stands on the shortest path of a robot if possible, so that a robot finds it. A map
+    of narrow lanes gets fewer boxes than requested if more would leave no room to pass: all robots can
+    always reach their goals, at the same time.
 
     Raises:
-        ScenarioError: The map has no room for so many robots and boxes.
+        ScenarioError: The map is too small for the robots and boxes.
     """
-    rng = Random(seed)  # noqa: S311 - draws a scenario, keeps no secret
+    rng = Random(seed)  # noqa: S311 - for scenarios, not for secrets
     room = _largest_part(grid)
     boxes_wanted = known_boxes + hidden_boxes
-    # Robots need some cells to get around one another.
+    # Robots need free cells to pass each other.
     if robots < 1 or 2 * robots + boxes_wanted > len(room):
-        raise ScenarioError(f"{robots} robots and {boxes_wanted} boxes do not fit into {len(room)} cells")
+        raise ScenarioError(
+            f"{robots} robots and {boxes_wanted} boxes do not fit into {len(room)} cells; take fewer robots"
+        )
     best: Scenario | None = None
     for _ in range(_ATTEMPTS):
         found = _draw(grid, room, robots, (known_boxes, hidden_boxes), rng)
@@ -84,7 +86,7 @@ def make_scenario(
             break
     if best is None:
         raise ScenarioError(
-            f"no starts and goals were found for {robots} robots from which all can get to their goals; "
+            f"found no starts and goals from which all {robots} robots can reach their goals; "
             "take fewer robots or a map with wider lanes"
         )
     return best
@@ -114,15 +116,15 @@ def _draw(
 
 
 def solvable(grid: GridMap, starts: Sequence[int], goals: Sequence[int]) -> bool:
-    """Whether a plan was found that brings every robot from its start to its goal, all at the same time.
+    """Return whether a plan was found that brings all robots from their starts to their goals.
 
     Args:
-        grid: The map with everything blocked that stands there.
+        grid: The map, with all boxes as blocked cells.
         starts: Cells of the robots, all different.
-        goals: Where they are to be, all different.
+        goals: Goal cells of the robots, all different.
 
     Returns:
-        True only with a plan at hand; False also where the search gave up.
+        True if a plan was found; False also if the search reached its limit.
     """
     if not all(grid.connected((start, goal)) for start, goal in zip(starts, goals, strict=True)):
         return False
@@ -130,18 +132,18 @@ def solvable(grid: GridMap, starts: Sequence[int], goals: Sequence[int]) -> bool
 
 
 def given_scenario(grid: GridMap, pairs: Iterable[tuple[int, int]], *, seed: int = 0) -> Scenario:
-    """A scenario with given starts and goals and no boxes, as of a benchmark.
+    """Return a scenario with given starts and goals and without boxes, as in a benchmark.
 
     Raises:
         ScenarioError: Starts or goals are not all different, or a goal cannot be reached.
     """
-    rng = Random(seed)  # noqa: S311 - draws headings, keeps no secret
+    rng = Random(seed)  # noqa: S311 - for headings, not for secrets
     starts, goals = (tuple(cells) for cells in zip(*pairs, strict=True))
     if len(set(starts)) < len(starts) or len(set(goals)) < len(goals):
-        raise ScenarioError("two robots have the same start or the same goal")
+        raise ScenarioError("two robots have the same start or the same goal; make them different")
     for start, goal in zip(starts, goals, strict=True):
         if not grid.connected((start, goal)):
-            raise ScenarioError(f"no way leads from cell {start} to cell {goal}")
+            raise ScenarioError(f"no path leads from cell {start} to cell {goal}; choose another goal")
     headings = tuple(rng.choice(_HEADINGS) for _ in starts)
     return Scenario(grid, starts, headings, goals, (), ())
 
@@ -152,16 +154,16 @@ def midway_cell(
     goals: Mapping[str, int],
     avoid: Collection[int] = (),
 ) -> int | None:
-    """A cell to block while robots drive: as near as possible to the middle of the longest path left.
+    """Return a cell to block while robots drive: as near as possible to the middle of the longest path.
 
     Args:
-        grid: The map with everything blocked that stands there, hidden boxes included.
+        grid: The map, with all boxes as blocked cells, hidden boxes too.
         plans: Cells of each robot's path, its own first.
         goals: Goal of each robot.
-        avoid: Cells that shall not be taken, such as those that robots were granted.
+        avoid: Cells not to return, such as those that are granted to robots.
 
     Returns:
-        A cell whose blocking leaves all robots a way to their goals at once; ``None`` if there is none.
+        A cell around which all robots can still reach their goals at the same time; ``None`` without one.
     """
     bound = [robot for robot, path in plans.items() if path and robot in goals]
     starts, ends = [plans[robot][0] for robot in bound], [goals[robot] for robot in bound]
@@ -174,7 +176,7 @@ def midway_cell(
 
 
 def _from_the_middle(plans: Mapping[str, Sequence[int]], taken: Collection[int]) -> Iterator[int]:
-    """Each cell of the paths that no robot stands in, once: of the longest path first, its middle first."""
+    """Yield each cell of the paths without a robot once: those of the longest path first, from its middle."""
     seen = {*taken, *(path[0] for path in plans.values() if path)}
     for path in sorted(plans.values(), key=len, reverse=True):
         middle = len(path) / 2
@@ -185,7 +187,7 @@ def _from_the_middle(plans: Mapping[str, Sequence[int]], taken: Collection[int])
 
 
 def _place_boxes(grid: GridMap, candidates: Sequence[int], count: int) -> tuple[int, ...]:
-    """The first ``count`` cells that can be blocked without parting the cells around them, ascending."""
+    """Return the first ``count`` cells that can be blocked while the map stays connected, ascending."""
     placed: list[int] = []
     for cell in candidates:
         if len(placed) == count:
@@ -197,12 +199,12 @@ def _place_boxes(grid: GridMap, candidates: Sequence[int], count: int) -> tuple[
 
 
 def _way(grid: GridMap, start: int, goal: int) -> list[int]:
-    """Cells of the shortest way between two cells, without both."""
+    """Return the cells of the shortest path between two cells, without both."""
     return (shortest_path(grid, start, goal) or [])[1:-1]
 
 
 def _largest_part(grid: GridMap) -> list[int]:
-    """The largest set of free cells that can reach one another, ascending."""
+    """Return the largest connected set of free cells, ascending."""
     left = set(grid.free)
     best: set[int] = set()
     while left:

@@ -1,8 +1,8 @@
 """Finds robots that have to change places, which PIBT alone cannot do in narrow passages.
 
 After Okumura, "Improving LaCAM for Scalable Eventually Optimal Multi-Agent Pathfinding" (2023): two robots
-that face each other in a passage both go the way of one of them, until the passage has a side arm. Whether
-they must, and whether there is one, is found by thinking them on, cell by cell.
+that face each other in a passage both move in the direction of one of them, until the passage has a side arm.
+Whether they must, and whether there is one, is found by simulating their moves cell by cell.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class SwapFinder:
-    """Tells which robot another one has to change places with.
+    """Finds the robot that another one has to change places with.
 
     Args:
         neighbours: For every cell the cells that can be entered from it.
@@ -33,14 +33,14 @@ class SwapFinder:
         occupant: Mapping[int, int],
         undecided: Callable[[int], bool],
     ) -> int | None:
-        """The robot to change places with; ``None`` if that is not needed, or not possible.
+        """Return the robot to change places with; ``None`` if that is not needed, or not possible.
 
         Args:
-            robot: Who wants to move.
-            best: The cell that it would like best.
+            robot: The robot that moves.
+            best: Its best next cell.
             now: Cells of all robots.
-            occupant: Who is in each cell.
-            undecided: Tells whether a robot's next cell is still open.
+            occupant: The robot in each cell.
+            undecided: Returns whether a robot's next cell is not chosen yet.
         """
         here = now[robot]
         if best == here:
@@ -57,13 +57,13 @@ class SwapFinder:
             behind = occupant.get(cell)
             if behind is None or cell == best:
                 continue
-            # Somebody behind has to get past; the robot clears the way by going on ahead of it.
+            # A robot behind has to get past; this robot clears the way by moving on ahead of it.
             if self._required(behind, robot, here, best, occupant) and self._possible(best, here, occupant):
                 return behind
         return None
 
     def _required(self, pusher: int, pulled: int, back: int, front: int, occupant: Mapping[int, int]) -> bool:
-        """Whether ``pusher`` wants to go on where ``pulled`` is, and ``pulled`` wants to come back."""
+        """Return whether ``pusher`` moves to where ``pulled`` is, and ``pulled`` moves towards it."""
         push, pull = self._fields[pusher], self._fields[pulled]
         for before, cell, exits in self._passage(back, front, occupant):
             back, front = before, cell
@@ -74,7 +74,7 @@ class SwapFinder:
         return pull[back] < pull[front] and (push[back] == 0 or push[front] < push[back])
 
     def _possible(self, back: int, front: int, occupant: Mapping[int, int]) -> bool:
-        """Whether two robots that go on from ``back`` over ``front`` come to a cell with two ways on."""
+        """Return whether a passage from ``back`` over ``front`` leads to a cell with two exits."""
         for _, cell, exits in self._passage(back, front, occupant):
             if cell == back:
                 return False
@@ -83,7 +83,7 @@ class SwapFinder:
         return False
 
     def _passage(self, back: int, front: int, occupant: Mapping[int, int]) -> Iterator[tuple[int, int, int]]:
-        """Follow a passage: the cell before, the cell itself, and how many ways lead on from there."""
+        """Follow a passage; yield the previous cell, the cell, and the number of its exits."""
         for _ in range(len(self._neighbours)):
             ways = [
                 cell for cell in self._neighbours[front] if cell != back and not self._filled(cell, occupant)
@@ -94,6 +94,6 @@ class SwapFinder:
             back, front = front, ways[0]
 
     def _filled(self, cell: int, occupant: Mapping[int, int]) -> bool:
-        """Whether a cell is a dead end with a robot in it that belongs there."""
+        """Return whether a cell is a dead end with a robot in it whose goal it is."""
         robot = occupant.get(cell)
         return robot is not None and len(self._neighbours[cell]) == 1 and self._fields[robot][cell] == 0

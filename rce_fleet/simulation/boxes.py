@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 
 class BoxKeeper:
-    """Puts a box into every cell that becomes blocked, and takes it away when the cell is freed.
+    """Puts a box into every cell that becomes blocked, and removes it when the cell is freed.
 
-    Boxes that stand in cells that were never blocked, which nobody knows of yet, are left alone.
+    Boxes in cells that were never blocked (hidden boxes) are left alone.
 
     Args:
         world: Where the boxes are.
@@ -26,7 +26,7 @@ class BoxKeeper:
         self._blocked: frozenset[int] = frozenset()
 
     def follow(self, blocked: Iterable[int]) -> None:
-        """Take the cells that are blocked now, all of them."""
+        """Set the cells that are blocked now."""
         now = frozenset(cell for cell in blocked if cell in self._world.grid)
         for cell in self._blocked - now:
             self._world.remove_box(cell)
@@ -34,7 +34,7 @@ class BoxKeeper:
         self.update()
 
     def update(self) -> tuple[int, ...]:
-        """Put up the boxes that are still missing; returns cells that a robot is in the way of."""
+        """Add the missing boxes; return the cells in which a robot is in the way."""
         occupied = []
         for cell in sorted(self._blocked.difference(self._world.boxes, self._world.grid.blocked)):
             try:

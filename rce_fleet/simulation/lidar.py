@@ -1,8 +1,7 @@
-"""A planar lidar, exact and without a loop over beams.
+"""A planar lidar: exact ranges, computed in numpy without a loop over beams.
 
 *Angular binning*: each edge and circle is projected on the interval of beams that it covers, and only those
-pairs of beam and shape are intersected. Next to casting every beam on every shape this does little work, and
-all of it in numpy.
+pairs of beam and shape are intersected, instead of every beam with every shape.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class LidarSpec:
-    """What a lidar sees.
+    """Properties of a lidar.
 
     Attributes:
         beams: Number of beams, evenly over the full circle. Beam 0 points backwards (-pi), as angles of
@@ -44,7 +43,7 @@ class LidarSpec:
 def cast(
     spec: LidarSpec, origin: tuple[float, float], yaw: float, segments: Floats, circles: Floats
 ) -> Floats:
-    """Exact ranges of a scan.
+    """Return the exact ranges of a scan.
 
     Args:
         spec: The lidar; its noise is not applied.

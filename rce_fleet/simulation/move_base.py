@@ -1,7 +1,7 @@
-"""The simulated robot's ``move_base``: takes goals, drives to them, stops before obstacles.
+"""The simulated robot's ``move_base``: accepts goals, drives to them, stops in front of obstacles.
 
-It behaves like an actionlib server: a new goal replaces the current one, a cancellation names a goal or a
-time, and goals that were made before that time are recalled even if they arrive later.
+It behaves like an actionlib server: a new goal replaces the current one; a cancellation names a goal or a
+time, and goals with an earlier time stamp are recalled even if they arrive later.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from rce_fleet.simulation.lidar import Floats
 
 REMEMBER = 5.0
-"""Seconds for which a finished goal is still listed."""
+"""Seconds for which a finished goal stays in the status list."""
 SIGHT = 1.2
 """How far ahead a robot looks for blocked cells, metres."""
 MARGIN = 0.15
-"""Width of a cell's rim in which hits may belong to a neighbour, metres."""
-PATIENCE = 3.0
-"""Seconds that a robot waits before an obstacle that it cannot place before it gives up."""
+"""Width of a cell's border in which lidar hits may belong to the next cell, metres."""
+STUCK_TIMEOUT = 3.0
+"""Seconds after which a robot aborts its goal because of an obstacle that it cannot assign to a cell."""
 
 
 @dataclass(slots=True)
 class Goal:
-    """A navigation goal: its id, when it was made (seconds), where (metres), and how it stands."""
+    """A navigation goal: id, time stamp (seconds), place (metres) and state."""
 
     id: str
     stamp: float
@@ -41,12 +41,12 @@ class Goal:
 
 
 class SimulatedMoveBase:
-    """Drives one robot.
+    """Drives one robot to its goals.
 
     Args:
         grid: The map.
-        radius: Of the robot's hull, metres.
-        limits: What the robot can do.
+        radius: Radius of the robot's hull, metres.
+        limits: Speeds and accelerations of the robot.
 
     Attributes:
         blocked: Cells that the robot found blocked on the way to its last goal.
@@ -67,16 +67,16 @@ class SimulatedMoveBase:
 
     @property
     def goals(self) -> list[Goal]:
-        """The goals that are listed: the current one, and those ended lately."""
+        """The goals in the status list: the current one, and those that ended recently."""
         return list(self._goals.values())
 
     def take_ended(self) -> list[Goal]:
-        """Goals that have ended since the last call."""
+        """Return the goals that ended since the last call."""
         ended, self._ended = self._ended, []
         return ended
 
     def accept(self, goal_id: str, stamp: float, x: float, y: float) -> None:
-        """Take a goal; one that is known already changes nothing."""
+        """Accept a goal; do nothing if it is known already."""
         if goal_id in self._goals:
             return
         goal = self._goals[goal_id] = Goal(goal_id, stamp, (x, y))
@@ -91,7 +91,7 @@ class SimulatedMoveBase:
         self._navigator.follow([goal.place])
 
     def cancel(self, goal_id: str, stamp: float) -> None:
-        """Stop goals: the one named, those made up to ``stamp``, and all if neither is given."""
+        """Cancel the goal of this id and goals with a time up to ``stamp``; all if neither is given."""
         if stamp:
             self._recalled_until = max(self._recalled_until, stamp)
         goal = self._current
@@ -102,12 +102,12 @@ class SimulatedMoveBase:
             self._brake(GoalState.PREEMPTED)
 
     def update(self, now: float, pose: Pose, points: Floats) -> Twist:
-        """Decide the speeds until the next update.
+        """Return the speeds to drive until the next update.
 
         Args:
             now: Time, seconds.
-            pose: Where the robot takes itself to be.
-            points: What its lidar hit last, shape (N, 2), metres in the map.
+            pose: The robot's estimated pose.
+            points: Points of its last lidar scan, shape (N, 2), metres in the map.
         """
         dt, self._now = max(now - self._now, 0.0) if self._now else 0.0, now
         goal = self._current
@@ -123,7 +123,7 @@ class SimulatedMoveBase:
         return twist
 
     def _judge(self, dt: float) -> None:
-        """End the goal if it is time to."""
+        """End the goal if the robot reached it, or cannot go on."""
         goal = self._current
         if goal is None:
             return
@@ -131,7 +131,7 @@ class SimulatedMoveBase:
             self._end(goal, self._ending or GoalState.SUCCEEDED)
         elif self._navigator.standing:
             self._stuck_for += dt
-            if self._stuck_for > PATIENCE:
+            if self._stuck_for > STUCK_TIMEOUT:
                 self._brake(GoalState.ABORTED)
         else:
             self._stuck_for = 0.0

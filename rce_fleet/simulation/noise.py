@@ -1,4 +1,4 @@
-"""Errors of the simulated robots' senses. All seeded, so that a run can be repeated."""
+"""Noise of the simulated robots' sensors. All of it is seeded, so that a run can be repeated."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from rce_fleet.navigation.navigation import Pose
 
 @dataclass(frozen=True, slots=True)
 class NoiseSpec:
-    """How wrong a robot's senses are.
+    """Amount of a robot's sensor noise.
 
     Attributes:
         position: Standard deviation of the pose estimate, metres.
         heading: Standard deviation of the pose estimate, radians.
-        memory: Time over which errors of the estimate change, seconds; a filter's errors do not jump.
+        memory: Correlation time of the estimate's error, seconds; like a filter's, it changes smoothly.
         distance: Standard deviation of odometry, metres for one metre driven.
         turn: Standard deviation of odometry, radians for one radian turned.
     """
@@ -31,7 +31,7 @@ class NoiseSpec:
 
 
 class PoseEstimate:
-    """The true pose with a small error that wanders, in place of localization."""
+    """The true pose with a small, slowly changing error; stands for localization."""
 
     def __init__(self, spec: NoiseSpec, rng: np.random.Generator) -> None:
         self._sigma = np.array((spec.position, spec.position, spec.heading))
@@ -46,18 +46,18 @@ class PoseEstimate:
         return x, y, yaw
 
     def update(self, dt: float) -> None:
-        """Let the error wander for ``dt`` seconds: an Ornstein-Uhlenbeck process."""
+        """Advance the error by ``dt`` seconds: an Ornstein-Uhlenbeck process."""
         keep = exp(-dt / self._memory)
         self._error = keep * self._error + sqrt(1 - keep * keep) * self._sigma * self._rng.standard_normal(3)
 
     def of(self, truth: Pose) -> Pose:
-        """The estimate."""
+        """Return the estimate of a true pose."""
         x, y, yaw = (float(value) for value in self._error)
         return Pose(truth.x + x, truth.y + y, wrap(truth.yaw + yaw))
 
 
 class Odometry:
-    """Dead reckoning from wheels that slip a little. Starts at the origin, facing along x."""
+    """Dead reckoning from wheels that slip slightly. Starts at the origin, heading along x."""
 
     def __init__(self, spec: NoiseSpec, rng: np.random.Generator) -> None:
         self._spec = spec
@@ -65,10 +65,10 @@ class Odometry:
         self.pose = Pose(0.0, 0.0, 0.0)
 
     def update(self, before: Pose, after: Pose) -> None:
-        """Count the way between two true poses."""
+        """Add the motion between two true poses."""
         forward = (after.x - before.x) * cos(before.yaw) + (after.y - before.y) * sin(before.yaw)
         turn = wrap(after.yaw - before.yaw)
-        # Errors add up along the way: their variance, not their deviation, grows with the distance.
+        # Errors add up: their variance, not their standard deviation, grows with the distance.
         first, second = (float(value) for value in self._rng.standard_normal(2))
         forward += first * self._spec.distance * sqrt(abs(forward))
         turn += second * self._spec.turn * sqrt(abs(turn))

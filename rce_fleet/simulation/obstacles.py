@@ -1,4 +1,4 @@
-"""What a robot's lidar says about the way ahead."""
+"""Obstacles on a robot's way, from its lidar scans."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 
 
 def hit_points(spec: LidarSpec, ranges: Floats, pose: Pose) -> Floats:
-    """Places where beams hit something, shape (N, 2), metres in the map.
+    """Return the points that beams hit, shape (N, 2), metres in the map.
 
     Args:
         spec: The lidar.
         ranges: One scan, shape (beams,).
-        pose: Where the robot was.
+        pose: Pose of the robot at the time of the scan.
     """
     hit = ranges < spec.max_range
     angles = spec.angles()[hit] + pose.yaw
@@ -27,12 +27,12 @@ def hit_points(spec: LidarSpec, ranges: Floats, pose: Pose) -> Floats:
 
 
 def clear_ahead(points: Floats, pose: Pose, radius: float) -> float:
-    """Free distance ahead of a robot's hull, metres; ``inf`` if nothing lies ahead.
+    """Return the free distance ahead of a robot's hull, metres; ``inf`` if nothing is ahead.
 
     Args:
-        points: What the lidar hit, shape (N, 2), metres.
-        pose: Where the robot is.
-        radius: Of its hull.
+        points: Points of a lidar scan, shape (N, 2), metres.
+        pose: Pose of the robot.
+        radius: Radius of its hull, metres.
     """
     dx, dy = points[:, 0] - pose.x, points[:, 1] - pose.y
     along = dx * cos(pose.yaw) + dy * sin(pose.yaw)
@@ -42,7 +42,7 @@ def clear_ahead(points: Floats, pose: Pose, radius: float) -> float:
 
 
 def cells_ahead(grid: GridMap, pose: Pose, goal: tuple[float, float]) -> list[int]:
-    """Cells on the straight way to ``goal`` (metres), without the robot's own, in order."""
+    """Return the cells on the straight line to ``goal`` (metres) in order, without the robot's own."""
     away = hypot(goal[0] - pose.x, goal[1] - pose.y)
     count = max(1, ceil(away / (grid.cell_size / 8)))
     cells: list[int] = []
@@ -57,15 +57,15 @@ def cells_ahead(grid: GridMap, pose: Pose, goal: tuple[float, float]) -> list[in
 def blocked_cell(
     grid: GridMap, points: Floats, pose: Pose, goal: tuple[float, float], *, sight: float, margin: float
 ) -> int | None:
-    """The first cell on the way to ``goal`` with an obstacle well inside.
+    """Return the first cell on the line to ``goal`` that has an obstacle inside; None if there is none.
 
     Args:
         grid: The map.
-        points: What the lidar hit, shape (N, 2), metres.
-        pose: Where the robot is.
-        goal: Where it drives, metres.
-        sight: How far ahead it looks, metres.
-        margin: Hits nearer than this to a cell's edge, metres, may belong to what stands beside it.
+        points: Points of a lidar scan, shape (N, 2), metres.
+        pose: Pose of the robot.
+        goal: The point it drives to, metres.
+        sight: Maximum distance of the points to use, metres.
+        margin: Ignore points this close to a cell's edge, metres: they may belong to the next cell.
     """
     near = points[np.hypot(points[:, 0] - pose.x, points[:, 1] - pose.y) <= sight]
     reach = grid.cell_size / 2 - margin
@@ -78,4 +78,4 @@ def blocked_cell(
 
 
 _ENOUGH = 3
-"""Beams that have to agree."""
+"""Minimum number of lidar points in a cell."""

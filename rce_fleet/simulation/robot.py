@@ -18,15 +18,15 @@ _MASS = 20.0
 
 
 class SimulatedRobot:
-    """A disc that goes forward and turns. Made by :meth:`rce_fleet.simulation.world.World.add_robot`.
+    """A disc that drives forward and turns. Created by :meth:`rce_fleet.simulation.world.World.add_robot`.
 
     Attributes:
         id: Name of the robot.
         radius: Radius of the hull, metres.
-        distance: Way driven so far, metres.
-        rng: Source of its errors.
-        body: Its body in the space.
-        shape: Its hull in the space.
+        distance: Distance driven so far, metres.
+        rng: Source of its noise.
+        body: Its body in the physics engine.
+        shape: Its hull in the physics engine.
     """
 
     def __init__(
@@ -45,17 +45,17 @@ class SimulatedRobot:
         self._estimate = PoseEstimate(noise, rng)
         self._odometry = Odometry(noise, rng)
 
-    # -- senses -----------------------------------------------------------------------------------
+    # Senses
 
     @property
     def pose(self) -> Pose:
-        """Where it truly is."""
+        """The true pose."""
         x, y = self.body.position
         return Pose(x, y, wrap(self.body.angle))
 
     @property
     def estimate(self) -> Pose:
-        """Where it takes itself to be."""
+        """The estimated pose."""
         return self._estimate.of(self.pose)
 
     @property
@@ -65,31 +65,31 @@ class SimulatedRobot:
 
     @property
     def odometry(self) -> Pose:
-        """Where its wheels take it to be, from where it started."""
+        """The pose by odometry, relative to the start."""
         return self._odometry.pose
 
     @property
     def twist(self) -> Twist:
-        """How it truly moves."""
+        """The true velocity."""
         vx, vy = self.body.velocity
         yaw = self.body.angle
         return Twist(vx * cos(yaw) + vy * sin(yaw), self.body.angular_velocity)
 
-    # -- motion -----------------------------------------------------------------------------------
+    # Motion
 
     def drive(self, twist: Twist) -> None:
-        """Set the speeds that the wheels keep from now on."""
+        """Set the speeds of the wheels."""
         self._command = twist
 
     def push(self) -> None:
-        """Hand the wheels' speeds to the body, before a step of the world."""
+        """Apply the wheels' speeds to the body, before a step of the world."""
         yaw = self.body.angle
         self.body.velocity = (self._command.speed * cos(yaw), self._command.speed * sin(yaw))
         self.body.angular_velocity = self._command.turn_rate
         self._before = self.pose
 
     def settle(self, dt: float) -> None:
-        """Count what a step of the world of ``dt`` seconds did."""
+        """Update distance, odometry and estimate after a step of ``dt`` seconds."""
         after = self.pose
         self.distance += hypot(after.x - self._before.x, after.y - self._before.y)
         self._odometry.update(self._before, after)

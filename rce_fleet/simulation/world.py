@@ -1,7 +1,7 @@
 """The simulated world: walls, boxes and robots in a pymunk space.
 
-Time goes on in fixed steps, everything random is seeded, so a run with the same commands is the same run. A
-world belongs to one thread. How fast it runs is the caller's matter.
+Time advances in fixed steps and all noise is seeded, so the same commands give the same run. A world belongs
+to one thread. The caller decides how fast time advances.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _WALL_THICKNESS = 0.1
 
 @dataclass(slots=True)
 class Collisions:
-    """How often something touched something; each contact counts once, when it begins."""
+    """Number of collisions; each contact counts once, when it begins."""
 
     robot_robot: int = 0
     robot_box: int = 0
@@ -45,14 +45,14 @@ class Collisions:
 
 @dataclass(frozen=True, slots=True)
 class WorldSpec:
-    """What a world is like.
+    """Properties of a world.
 
     Attributes:
         time_step: Length of a step, seconds.
         robot_radius: Radius of the robots' hulls, metres.
         box_size: Edge of a box, metres.
-        lidar: The robots' lidars.
-        noise: The robots' errors.
+        lidar: Properties of the robots' lidars.
+        noise: The robots' sensor noise.
     """
 
     time_step: float = 0.02
@@ -67,12 +67,12 @@ class World:
 
     Args:
         grid: The map.
-        spec: What the world is like.
-        seed: Of all errors.
+        spec: Properties of the world.
+        seed: Seed of all noise.
 
     Attributes:
         time: Simulated time, seconds.
-        collisions: What touched what so far.
+        collisions: Collisions so far.
         min_separation: Smallest distance between the hulls of two robots so far, metres; ``inf`` while
             there are fewer than two.
     """
@@ -92,11 +92,11 @@ class World:
         self._wall_edges = self._build_walls()
         self._edges = self._wall_edges
 
-    # -- things in it -------------------------------------------------------------------------------
+    # Things in it
 
     @property
     def robots(self) -> dict[str, SimulatedRobot]:
-        """The robots by id. Not to be changed."""
+        """The robots by id. Read only."""
         return self._robots
 
     @property
@@ -108,16 +108,16 @@ class World:
         """Put a robot at the centre of a cell.
 
         Raises:
-            ValueError: There is a robot of this id.
+            ValueError: A robot of this id exists, or the cell is not on the map.
             OccupiedError: Another robot is there.
         """
         if robot in self._robots:
-            raise ValueError(f"there is a robot {robot} already")
+            raise ValueError(f"robot {robot} exists already")
         x, y = self.grid.centre(cell)
         others = self._robots_within(x, y, 2 * self.spec.robot_radius)
         if others:
             raise OccupiedError(cell, others)
-        # Each robot's errors depend on the seed and its own id only, not on who else is there.
+        # A robot's noise depends on the seed and its own id only, not on the other robots.
         rng = np.random.default_rng([self._seed, *robot.encode()])
         made = SimulatedRobot(robot, Pose(x, y, yaw), self.spec.robot_radius, self.spec.noise, rng)
         made.shape.collision_type = _ROBOT
@@ -126,15 +126,15 @@ class World:
         return made
 
     def remove_robot(self, robot: str) -> None:
-        """Take a robot off the floor."""
+        """Remove a robot."""
         gone = self._robots.pop(robot)
         self._space.remove(gone.shape, gone.body)
 
     def add_box(self, cell: int) -> None:
-        """Put a box into the middle of a cell; nothing happens if there is one.
+        """Put a box into the middle of a cell; do nothing if it has one.
 
         Raises:
-            OccupiedError: A robot is in its way.
+            OccupiedError: A robot is in the way.
         """
         if cell in self._boxes:
             return
@@ -153,18 +153,18 @@ class World:
         self._rebuild_edges()
 
     def remove_box(self, cell: int) -> None:
-        """Take the box out of a cell; nothing happens if there is none."""
+        """Remove the box from a cell; do nothing if it has none."""
         box = self._boxes.pop(cell, None)
         if box is not None:
             self._space.remove(box)
             self._rebuild_edges()
 
-    # -- time ---------------------------------------------------------------------------------------
+    # Time
 
     def step(self, dt: float | None = None) -> None:
-        """Let time go on by ``dt`` seconds, one time step by default.
+        """Advance time by ``dt`` seconds, one time step by default.
 
-        Only whole time steps are made; what is left over counts for the next call.
+        Only whole time steps are made; the remainder is added to the next call.
         """
         goal = self.time + (self.spec.time_step if dt is None else dt)
         while (self._steps + 1) * self.spec.time_step <= goal + 1e-9:
@@ -172,7 +172,7 @@ class World:
         self.time = max(goal, self._steps * self.spec.time_step)
 
     def scan(self, robot: str) -> Floats:
-        """What the robot's lidar sees, with noise: shape (beams,), metres.
+        """Return a scan of the robot's lidar, with noise: shape (beams,), metres.
 
         A range of ``lidar.max_range`` means that the beam hit nothing.
         """
@@ -195,7 +195,7 @@ class World:
 
     @property
     def space(self) -> pymunk.Space:
-        """The space behind it, for queries."""
+        """The physics engine's space, for queries."""
         return self._space
 
     def _one_step(self) -> None:
@@ -212,7 +212,7 @@ class World:
             nearest = float(apart[np.triu_indices(len(places), 1)].min())
             self.min_separation = min(self.min_separation, nearest - 2 * self.spec.robot_radius)
 
-    # -- making it ----------------------------------------------------------------------------------
+    # Making it
 
     def _watch_contacts(self) -> None:
         def count_robot(_arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: object) -> None:
@@ -229,7 +229,7 @@ class World:
         self._space.on_collision(_ROBOT, _WALL, begin=count_wall)
 
     def _build_walls(self) -> Floats:
-        """Put up the wall around the floor and the map's blocked cells; returns their edges."""
+        """Add the wall around the floor and the map's blocked cells; return their edges."""
         grid = self.grid
         (left, low), size = grid.origin, grid.cell_size
         right, high = left + grid.columns * size, low + grid.rows * size
@@ -270,7 +270,7 @@ class World:
 
 
 def _runs(grid: GridMap) -> Iterator[tuple[int, int, int]]:
-    """Blocked cells joined along rows: row, first and last column."""
+    """Yield blocked cells joined along rows: row, first and last column."""
     for row in range(grid.rows):
         first: int | None = None
         for column in range(grid.columns + 1):
@@ -288,7 +288,7 @@ def _edges_of(block: pymunk.Poly) -> list[tuple[float, float, float, float]]:
 
 
 def _overlaps(pose: Pose, radius: float, x: float, y: float, half: float) -> bool:
-    """Whether a disc and a square with centre ``(x, y)`` overlap."""
+    """Return whether a disc and a square with centre ``(x, y)`` overlap."""
     dx = max(abs(pose.x - x) - half, 0.0)
     dy = max(abs(pose.y - y) - half, 0.0)
     return dx * dx + dy * dy < radius * radius

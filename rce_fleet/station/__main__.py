@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
-import json
 import logging
 from collections.abc import Callable
 from contextlib import AsyncExitStack
@@ -15,11 +14,12 @@ from urllib.parse import urlsplit
 import typer
 import uvloop
 
+from rce.cli.options import Authority, CertificateName, Certificates, Tls, TlsCert, TlsKey, tls_of
 from rce.cli.program_files import from_file
-from rce.cli.tls_options import Authority, CertificateName, Certificates, Tls, TlsCert, TlsKey, tls_of
 from rce.config.client import ClientConfig, load
 from rce.config.exceptions import ConfigError, Fault
 from rce.config.logs import start_logging
+from rce.masters import split_addresses
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.supervision.signals import end_signals
@@ -29,14 +29,14 @@ from rce.tls.identity import Context, client_contexts
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_client.exceptions import RefusedError
-from rce_fleet.station.engine_entrance import EngineAccount, EngineEntrance
+from rce_fleet.station.authentication import Authenticator, TokenAuthenticator
+from rce_fleet.station.engine_authenticator import EngineAuthenticator, StationAccount
+from rce_fleet.station.engine_planner_client import EnginePlannerClient
 from rce_fleet.station.engine_watch import EngineWatch
-from rce_fleet.station.engine_wire import EngineWire
-from rce_fleet.station.fleet_link import FleetLink, PlannerWire
+from rce_fleet.station.feed import Feed
+from rce_fleet.station.fleet_link import FleetLink, PlannerClient
 from rce_fleet.station.graph_watch import GraphWatch
-from rce_fleet.station.live import Broadcast
-from rce_fleet.station.persons import Entrance, SharedToken
-from rce_fleet.station.ros_wire import RosWire
+from rce_fleet.station.ros_planner_client import RosPlannerClient
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 
@@ -46,29 +46,29 @@ PORT = 9080
 @from_file("ui", shared=tls_of)
 def ui(
     config: Annotated[
-        Path | None, typer.Argument(help="The operator's file: user, robotID, the planner's container.")
+        Path | None, typer.Argument(help="The operator's config: user, robotID, the planner's container.")
     ] = None,
     ros_master: Annotated[
         str,
-        typer.Option(help="In place of a file: the ROS master of a planner that runs without the engine."),
+        typer.Option(help="Instead of CONFIG: ROS master of a planner that runs without the engine."),
     ] = "",
-    port: Annotated[int, typer.Option(help="Port of the page and the API; 0 takes a free one.")] = PORT,
+    port: Annotated[int, typer.Option(help="Port of the page and the API; 0: any free port.")] = PORT,
     bind: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     public_name: Annotated[
         list[str] | None,
-        typer.Option(help="Further name by which the station may be asked for; may be repeated."),
+        typer.Option(help="Additional host name of the station; may be repeated."),
     ] = None,
     token: Annotated[
         str,
         typer.Option(
             envvar="RCE_STATION_TOKEN",
-            help="With --ros-master: callers must show it.",
+            help="With --ros-master: the token that requests must carry.",
         ),
     ] = "",
     login: Annotated[
         bool | None,
         typer.Option(
-            help="Ask people to log in as users of the engine"
+            help="Ask for a login as a user of the engine"
             " (default: unless station and engine are on loopback)",
             show_default=False,
         ),
@@ -80,12 +80,12 @@ def ui(
     tls_key: TlsKey = None,
     authority: Authority = None,
 ) -> None:
-    """Serve the page and the API that steer a fleet; CONFIG's planner is run in the cloud for that."""
+    """Serve the operator's page and API of a fleet; with CONFIG, the planner runs in the engine."""
     start_logging(logging.WARNING)
     if (config is None) == (not ros_master):
         raise typer.BadParameter("give either CONFIG or --ros-master")
     try:
-        way = RosWay(ros_master) if config is None else EngineWay(load(config), authority)
+        backend = RosBackend(ros_master) if config is None else EngineBackend(load(config), authority)
         chosen = TlsChoice(
             enabled=tls,
             folder=certificates or default_folder(),
@@ -99,10 +99,10 @@ def ui(
         raise typer.Exit(2) from None
     if identity is None and (text := plain_warning("the logins of the station travel", bind)):
         logging.getLogger(__name__).warning("%s", text)
-    entrance = _entrance(way, bind, token, login)
+    authenticator = _authenticator(backend, bind, token, login)
     try:
         names = ServerNames(bind, public_name or ())
-        uvloop.run(serve(way, bind, port, entrance, names, identity.server if identity else None))
+        uvloop.run(serve(backend, bind, port, authenticator, names, identity.server if identity else None))
     except* RefusedError as group:
         typer.echo(f"rce ui: {group.exceptions[0]}", err=True)
         raise typer.Exit(1) from None
@@ -111,32 +111,40 @@ def ui(
         raise typer.Exit(1) from None
 
 
-def _entrance(way: EngineWay | RosWay, bind: str, token: str, login: bool | None) -> Entrance:
-    """Choose how people come in.
+def _authenticator(
+    backend: EngineBackend | RosBackend, bind: str, token: str, login: bool | None
+) -> Authenticator:
+    """Choose how users are authenticated.
 
     Raises:
-        typer.BadParameter: What was chosen would let in anybody from elsewhere, or does not fit.
+        typer.BadParameter: The options would let every computer control the fleet, or contradict each other.
     """
-    if isinstance(way, RosWay):
+    if isinstance(backend, RosBackend):
         if login:
-            raise typer.BadParameter("--login needs the users of an engine; give a --token with --ros-master")
+            raise typer.BadParameter(
+                "--login needs the user accounts of an engine; with --ros-master, give a --token"
+            )
         if not token and not _is_loopback(bind):
-            raise typer.BadParameter(f"--bind {bind} opens the station to others: give it a --token")
-        return SharedToken(token)
+            raise typer.BadParameter(f"with --bind {bind} other computers reach the station; give a --token")
+        return TokenAuthenticator(token)
     if token:
         raise typer.BadParameter(
-            "--token is for --ros-master; at a station of the engine callers show tokens of the engine's"
-            " users (rce token), and people log in at the page"
+            "--token is for --ros-master; with CONFIG, programs send tokens of the engine's users (rce token)"
+            " and people log in at the page"
         )
-    account = way.account
-    asks = login if login is not None else not (_is_loopback(bind) and _is_loopback(_host(account.url)))
+    account = backend.account
+    asks = login if login is not None else not (_is_loopback(bind) and _is_here(account.url))
     if not asks and not _is_loopback(bind):
-        raise typer.BadParameter(f"--no-login with --bind {bind} would let anybody steer the fleet")
-    return EngineEntrance(account, open=not asks)
+        raise typer.BadParameter(
+            f"--no-login with --bind {bind} would let every computer in the network control the fleet;"
+            " leave out one of the two"
+        )
+    return EngineAuthenticator(account, allow_anonymous=not asks)
 
 
-def _host(url: str) -> str:
-    return urlsplit(url).hostname or ""
+def _is_here(urls: str) -> bool:
+    """Return whether all masters are on this machine."""
+    return all(_is_loopback(urlsplit(url).hostname or "") for url in split_addresses(urls))
 
 
 def _is_loopback(host: str) -> bool:
@@ -146,111 +154,84 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-class Feed:
-    """Turns changes of the view into messages for the pages."""
-
-    def __init__(self, view: FleetView, pages: Broadcast) -> None:
-        self._view = view
-        self._pages = pages
-
-    def on_change(self, what: str) -> None:
-        """Send what changed in the view: ``state`` or ``poses``."""
-        if what == "poses":
-            poses = {
-                robot: (round(p.x, 3), round(p.y, 3), round(p.theta, 3))
-                for robot, p in self._view.poses.items()
-            }
-            self._send("poses", {"poses": poses})
-            return
-        self._send("map", self._view.map() or {})
-        robots = [{key: value for key, value in r.items() if key != "pose"} for r in self._view.robots()]
-        self._send(
-            "state", {"robots": robots, "blocked": self._view.blocked(), "pending": self._view.pending()}
-        )
-
-    def on_engine(self, state: dict[str, Any]) -> None:
-        """Send the engine's state."""
-        self._send("engine", state)
-
-    def on_event(self, text: str, tone: str) -> None:
-        """Send an event."""
-        self._pages.send_event(json.dumps({"type": "event", "text": text, "tone": tone}))
-
-    def _send(self, topic: str, message: dict[str, Any]) -> None:
-        self._pages.send(topic, json.dumps({"type": topic, **message}))
-
-
-class Way(Protocol):
-    """How the station reaches the planner, and what carries the fleet."""
+class Backend(Protocol):
+    """Where the planner runs: in the engine, or in a ROS graph."""
 
     @property
-    def wire(self) -> PlannerWire:
-        """The wire to the planner."""
+    def client(self) -> PlannerClient:
+        """The client of the planner."""
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
-        """Tell the state of what carries the fleet until cancelled."""
+        """Call ``on_state`` with the state of engine or graph until cancelled."""
 
 
-class EngineWay:
-    """Through the engine, which runs the planner in a container."""
+class EngineBackend:
+    """The planner runs in a container of the engine."""
 
     def __init__(self, config: ClientConfig, authority: Path | None = None) -> None:
         self._tls = client_contexts(authority or config.authority_file)
         password = config.password.get_secret_value()
         if not password:
             raise ConfigError(
-                "station", [Fault("token", "is for robots; a station needs its user's password")]
+                "station", [Fault("token", "a token is for robots; the station needs the user's password")]
             )
-        self.account = EngineAccount(config.url, config.user, password, self._tls)
-        self.wire = EngineWire(config, self._tls)
+        self.account = StationAccount(config.url, config.user, password, self._tls)
+        self.client = EnginePlannerClient(config, self._tls)
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
-        """Tell the engine's state; the wire has ended nodes started again."""
+        """Call ``on_state`` with the engine's state until cancelled; restart nodes that ended."""
 
         def take(state: dict[str, Any]) -> None:
             on_state(state)
-            self.wire.on_engine(state)
+            self.client.on_engine(state)
 
         account = self.account
         await EngineWatch(account.url, account.user, account.password, tls=self._tls, on_state=take).run()
 
 
-class RosWay:
-    """In the ROS graph of the planner."""
+class RosBackend:
+    """The planner runs in a ROS graph without the engine."""
 
     def __init__(self, master_uri: str) -> None:
-        self.wire = RosWire(master_uri, TypeRegistry(PackageIndex.from_environ()))
+        self.client = RosPlannerClient(master_uri, TypeRegistry(PackageIndex.from_environ()))
         self._master_uri = master_uri
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
-        """Tell the nodes of the graph."""
+        """Call ``on_state`` with the graph's nodes until cancelled."""
         await GraphWatch(self._master_uri, on_state=on_state).run()
 
 
 async def serve(
-    way: Way, bind: str, port: int, entrance: Entrance, names: ServerNames, tls: Context | None = None
+    backend: Backend,
+    bind: str,
+    port: int,
+    authenticator: Authenticator,
+    names: ServerNames,
+    tls: Context | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM."""
-    view, pages = FleetView(), Broadcast()
-    feed = Feed(view, pages)
-    fleet = FleetLink(way.wire, view, on_change=feed.on_change, on_event=feed.on_event)
+    view = FleetView()
+    feed = Feed(view)
+    fleet = FleetLink(
+        backend.client, view, on_change=feed.on_change, on_pose=feed.on_pose, on_event=feed.on_event
+    )
     stop = asyncio.Event()
     for number in end_signals():
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    station = Station(view, fleet, pages, entrance=entrance, names=names)
+    station = Station(view, fleet, feed.pages, authenticator=authenticator, names=names)
     async with AsyncExitStack() as stack:
-        if isinstance(entrance, EngineEntrance):
-            await stack.enter_async_context(entrance)
+        if isinstance(authenticator, EngineAuthenticator):
+            await stack.enter_async_context(authenticator)
         server = await stack.enter_async_context(HttpServer(station.make_app(), bind, port, tls))
 
         async def announce() -> None:
             typer.echo(f"rce ui ready: {server.url}")
 
-        await _until(stop.wait, lambda: fleet.run(announce), lambda: way.watch(feed.on_engine))
+        await _until(stop.wait, lambda: fleet.run(announce), feed.run, lambda: backend.watch(feed.on_engine))
 
 
 async def _until(done: Callable[[], Any], *work: Callable[[], Any]) -> None:
-    """Run ``work`` until ``done`` returns, then cancel it and wait for its end."""
+    """Run ``work`` until ``done`` returns; then cancel it and wait for it to end."""
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(each()) for each in work]
         await done()

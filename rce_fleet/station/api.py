@@ -13,7 +13,7 @@ class _Model(BaseModel):
 
 
 class GoalRequest(_Model):
-    """Where a robot is to go."""
+    """The goal of a robot."""
 
     cell: int | None = Field(description="Number of the goal cell; null: stop and stay.", ge=0, le=MAX_CELL)
 
@@ -25,29 +25,29 @@ class CellRequest(_Model):
 
 
 class LoginRequest(_Model):
-    """Who wants to come in."""
+    """Name and password of a user of the engine."""
 
     userID: str = Field(max_length=256)  # noqa: N815 - its name everywhere in the protocol
     password: str = Field(max_length=1024, repr=False)
 
 
-class PersonModel(_Model):
-    """Who asks, and what they may do."""
+class UserModel(_Model):
+    """The user of this request, and what they may do."""
 
     name: str
     role: str = Field(description="viewer, user, operator or admin.")
-    steers: bool = Field(description="Whether robots may be sent and cells blocked.")
-    logged_in: bool = Field(description="Whether there is a login that can be ended.")
+    steers: bool = Field(description="Whether the user may send robots and block cells.")
+    logged_in: bool = Field(description="Whether the station has logins, so that the user can log out.")
 
 
 class Answer(_Model):
-    """What was done, in words."""
+    """The planner's answer."""
 
     message: str
 
 
 class Problem(_Model):
-    """What was wrong, in words."""
+    """Why the request failed."""
 
     error: str
 
@@ -68,10 +68,10 @@ class RobotModel(_Model):
         description="joining, stopping, silent, unreachable, driving, waiting, arrived or idle."
     )
     reason: str = Field(description="Why it is joining, stopping or silent; else empty.")
-    cell: int | None = Field(description="Where it stands, or what it is entering.")
+    cell: int | None = Field(description="The cell that it stands in or is entering.")
     goal: int | None
-    plan: list[int] = Field(description="All cells of its planned path, beginning with the present one.")
-    granted: list[int] = Field(description="The first cells of the plan, which it may drive now.")
+    plan: list[int] = Field(description="All cells of its planned path, from the current one.")
+    granted: list[int] = Field(description="The first cells of the plan, which it may enter now.")
     replans: int
     pose: PoseModel | None
 
@@ -93,4 +93,4 @@ class FleetModel(_Model):
     map: MapModel | None
     robots: list[RobotModel]
     blocked: list[int]
-    pending: list[int] = Field(description="Cells that will be blocked as soon as a robot has left them.")
+    pending: list[int] = Field(description="Cells that will be blocked once a robot has left them.")

@@ -1,4 +1,4 @@
-"""Watches the engine over the master's REST API, for the page."""
+"""Watches the engine through the master's REST API, for the page."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 import aiohttp
 from yarl import URL
 
+from rce.masters import Masters
 from rce.tls.faults import explain_to_client
 from rce.web.client import session_connector
-from rce_fleet.station.engine_entrance import Secure
+from rce_fleet.station.engine_authenticator import RequestOptions
 
 if TYPE_CHECKING:
     from rce.tls.identity import Context
@@ -25,14 +26,14 @@ TIMEOUT = aiohttp.ClientTimeout(total=5)
 
 
 class EngineWatch:
-    """Reads containers with what they use, nodes and connections of the operator's user again and again.
+    """Polls the containers with their usage, the nodes and the connections of the operator's user.
 
     Args:
         master: URL of the master.
         user: User ID.
         password: The user's password.
         tls: Gives the TLS settings for each connection; the system's if None.
-        on_state: Called with the engine's state whenever it changed; ``{"error": text}`` if out of reach.
+        on_state: Called with each new state of the engine; with ``{"error": text}`` if it cannot be read.
     """
 
     def __init__(
@@ -45,18 +46,22 @@ class EngineWatch:
         on_state: Callable[[dict[str, Any]], None],
     ) -> None:
         self._tls = tls
-        self._api = URL(master) / "api/v1"
+        self._masters = Masters(master)
         self._login = {"userID": user, "password": password, "label": "operator station"}
         self._on_state = on_state
         self._token = ""
         self._last: dict[str, Any] = {}
 
     @property
-    def _how(self) -> Secure:
-        return Secure(ssl=True if self._tls is None else self._tls(), allow_redirects=False)
+    def _api(self) -> URL:
+        return URL(self._masters.current) / "api/v1"
+
+    @property
+    def _request_options(self) -> RequestOptions:
+        return RequestOptions(ssl=True if self._tls is None else self._tls(), allow_redirects=False)
 
     async def run(self) -> None:
-        """Watch until cancelled; then give the token back."""
+        """Watch until cancelled; then revoke the token."""
         connector = session_connector(None)
         async with aiohttp.ClientSession(
             timeout=TIMEOUT, raise_for_status=True, connector=connector
@@ -68,13 +73,15 @@ class EngineWatch:
 
     async def _watch(self, session: aiohttp.ClientSession) -> None:
         while True:
+            master = self._masters.current
             try:
                 state = await self._read(session)
             except aiohttp.ClientResponseError as error:
                 if error.status == HTTPStatus.UNAUTHORIZED:
                     self._token = ""
-                state = {"error": f"the master says {error.status}: {error.message}"}
+                state = {"error": f"the master answered {error.status}: {error.message}"}
             except (aiohttp.ClientError, TimeoutError) as error:
+                self._masters.failed(master)
                 state = {"error": f"the master cannot be reached: {explain_to_client(error) or error}"}
             if state != self._last:
                 self._last = state
@@ -86,14 +93,14 @@ class EngineWatch:
             return
         headers = {"Authorization": f"Bearer {self._token}"}
         try:
-            async with session.delete(self._api / "login", headers=headers, **self._how):
+            async with session.delete(self._api / "login", headers=headers, **self._request_options):
                 self._token = ""
         except (aiohttp.ClientError, TimeoutError) as error:
-            _log.info("the token of this station was not given back, it expires by itself: %s", error)
+            _log.info("the station's token could not be revoked; it expires on its own: %s", error)
 
     async def _read(self, session: aiohttp.ClientSession) -> dict[str, Any]:
         if not self._token:
-            async with session.post(self._api / "login", json=self._login, **self._how) as reply:
+            async with session.post(self._api / "login", json=self._login, **self._request_options) as reply:
                 self._token = (await reply.json())["token"]
         containers, nodes, connections = [
             (await self._get(session, kind))[kind] for kind in ("containers", "nodes", "connections")
@@ -117,7 +124,7 @@ class EngineWatch:
                 {key: connection[key] for key in ("tag_a", "tag_b", "established")}
                 for connection in connections
             ],
-            # Administrators see these, others none.
+            # Only administrators get machines.
             "machines": [{key: machine[key] for key in _MACHINE} for machine in usage["machines"]],
         }
 
@@ -127,7 +134,7 @@ class EngineWatch:
             self._api / kind,
             headers=headers,
             params={"user": self._login["userID"]},
-            **self._how,
+            **self._request_options,
         ) as reply:
             found: dict[str, Any] = await reply.json()
             return found
@@ -141,7 +148,7 @@ _SHOWN = ("cpu", "cpu_limit", "memory", "memory_limit", "restarts", "oom_kills")
 
 
 def _used(usage: dict[str, Any] | None) -> dict[str, Any]:
-    """What a container uses, and what could be better; without either before the first report."""
+    """Return a container's usage and advice; neither before the first report."""
     if usage is None or not usage["memory"]:
         return {"usage": None, "advice": []}
     return {"usage": {key: usage[key] for key in _SHOWN}, "advice": usage["advice"]}

@@ -1,4 +1,4 @@
-"""The station's dealings with the planner: state and poses come in, wishes go out, over any wire."""
+"""The link between station and planner: receives state and poses, sends requests."""
 
 from __future__ import annotations
 
@@ -6,192 +6,253 @@ import asyncio
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias, assert_never
 
-from rce_fleet.station.view import FleetView
-from rce_fleet.station.wishes import CellWish, GoalWish, Wishes
+from rce_fleet.station.desired import Desired, DesiredCell, DesiredGoal
+from rce_fleet.station.following import ChangeFollower
+from rce_fleet.station.view import FleetView, ViewChange
 
 STATE = "fleet/FleetState"
 STATE_TOPIC = "/fleet/state"
+CHANGES = "fleet/FleetChanges"
+CHANGES_TOPIC = "/fleet/changes"
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 CALL_TIMEOUT_S = 10.0
-TELL_AGAIN_S = 20.0
-"""How long a planner that was restarted is told again what it does not know."""
-TELL_EVERY_S = 0.5
+RESEND_FOR_S = 20.0
+"""How long goals and blocked cells are sent again to a restarted planner."""
+RESEND_EVERY_S = 0.5
+ASK_AGAIN_S = 1.0
+"""Seconds after which the complete state is requested again without an answer."""
 
 
 class PlannerService(NamedTuple):
     """A service of the planner: its name in the planner's ROS graph, and its type."""
 
     name: str
-    cls: str
+    type_name: str
 
 
 SET_GOAL = PlannerService("/fleet/set_goal", "fleet/SetGoal")
 BLOCK_CELL = PlannerService("/fleet/block_cell", "fleet/BlockCell")
+GET_STATE = PlannerService("/fleet/get_state", "fleet/GetState")
 
 
 def pose_topic(robot: str) -> str:
-    """The topic on which the planner tells a robot's pose."""
+    """Return the topic on which the planner publishes a robot's pose."""
     return f"/fleet/poses/{robot}"
 
 
-class FleetError(Exception):
-    """The fleet does not do what was asked."""
+class PlannerError(Exception):
+    """The planner refused a request; the text says why."""
 
 
-class PlannerAwayError(FleetError):
-    """The planner cannot be reached at this moment."""
+class PlannerUnavailableError(PlannerError):
+    """The planner cannot be reached now; try again later."""
 
 
-class Listener(Protocol):
-    """Gets what comes in over a wire. Messages are in their JSON form."""
+class PlannerListener(Protocol):
+    """Gets the planner's messages, in their JSON form."""
 
     def take_state(self, message: dict[str, Any]) -> None:
-        """Take a ``fleet/FleetState``."""
+        """Handle a ``fleet/FleetState``."""
+
+    def take_changes(self, message: dict[str, Any]) -> None:
+        """Handle a ``fleet/FleetChanges``."""
+
+    def may_have_missed(self) -> None:
+        """Handle a new or restored subscription to changes: some may have been missed."""
 
     def take_pose(self, robot: str, message: dict[str, Any]) -> None:
-        """Take a robot's pose message."""
+        """Handle a robot's pose message."""
 
     def take_event(self, text: str, tone: str) -> None:
-        """Take words on what happened; the tone is ``good``, ``warn`` or ``bad``."""
+        """Handle an event; the tone is ``good``, ``warn`` or ``bad``."""
 
 
-Ask: TypeAlias = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
-"""Calls a service of the planner; raises :class:`PlannerAwayError` if there is no answer."""
+Call: TypeAlias = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
+"""Calls a service of the planner; raises :class:`PlannerUnavailableError` if there is no answer."""
 
 
-class PlannerWire(ABC):
-    """A way to the planner: through the engine, or in its own ROS graph.
+class PlannerClient(ABC):
+    """A client of the planner: through the engine, or in the planner's ROS graph.
 
     Args:
-        away: What is wrong as long as the planner's services are not joined.
+        away: Error text until the planner's services are connected.
     """
 
     def __init__(self, away: str) -> None:
         self._away = away
         self._new_robots: asyncio.Queue[str] = asyncio.Queue()
-        self._asks: dict[PlannerService, Ask] = {}
+        self._calls: dict[PlannerService, Call] = {}
+        self._changes_followed = asyncio.Event()
 
     @abstractmethod
-    async def run(self, listener: Listener, ready: Callable[[], Awaitable[None]]) -> None:
-        """Let state and poses come in until cancelled; call ``ready`` once the planner can be heard."""
+    async def run(self, listener: PlannerListener, ready: Callable[[], Awaitable[None]]) -> None:
+        """Receive state and poses until cancelled; call ``ready`` once the planner is connected."""
 
     def follow(self, robot: str) -> None:
-        """Let a robot's poses come in."""
+        """Subscribe to a robot's poses."""
         self._new_robots.put_nowait(robot)
 
+    def stop_states(self) -> None:
+        """Stop receiving complete states; changes are enough."""
+        self._changes_followed.set()
+
     async def call(self, service: PlannerService, request: dict[str, Any]) -> dict[str, Any]:
-        """Ask the planner.
+        """Call a service of the planner.
 
         Raises:
-            PlannerAwayError: There is no answer.
+            PlannerUnavailableError: There is no answer.
         """
-        ask = self._asks.get(service)
-        if ask is None:
-            raise PlannerAwayError(self._away)
-        return await ask(request)
+        call = self._calls.get(service)
+        if call is None:
+            raise PlannerUnavailableError(self._away)
+        return await call(request)
 
 
 class FleetLink:
-    """What the station knows and wants of the fleet.
+    """Keeps the station's view up to date, and sends requests to the planner.
 
     Args:
-        wire: The way to the planner.
-        view: Gets what comes in.
-        on_change: Called with ``state`` or ``poses`` after the view took something.
-        on_event: Called with words and a tone (``good``, ``warn``, ``bad`` or none) when something happens.
+        client: The client of the planner.
+        view: Updated with state and poses.
+        on_change: Called with the change after the view was updated with a state or changes.
+        on_pose: Called with a robot's id after its pose was updated.
+        on_event: Called with a text and a tone (``good``, ``warn``, ``bad`` or empty) for each event.
     """
 
     def __init__(
         self,
-        wire: PlannerWire,
+        client: PlannerClient,
         view: FleetView,
         *,
-        on_change: Callable[[str], None],
+        on_change: Callable[[ViewChange], None],
+        on_pose: Callable[[str], None],
         on_event: Callable[[str, str], None],
     ) -> None:
-        self._wire = wire
+        self._client = client
         self._view = view
         self._on_change = on_change
+        self._on_pose = on_pose
+        self._follower = ChangeFollower()
+        self._state_needed = asyncio.Event()
         self._on_event = on_event
-        self._wishes = Wishes()
-        self._planner_began: str | None = None
+        self._desired = Desired()
+        self._planner_started: str | None = None
         self._planner_restarted = asyncio.Event()
         self._known: set[str] = set()
 
     async def run(self, ready: Callable[[], Awaitable[None]]) -> None:
-        """Keep taking what comes until cancelled; ``ready`` is called once the planner can be heard."""
+        """Receive messages until cancelled; ``ready`` is called once the planner is connected."""
         async with asyncio.TaskGroup() as group:
-            group.create_task(self._wire.run(self, ready))
-            group.create_task(self._tell_again())
+            group.create_task(self._client.run(self, ready))
+            group.create_task(self._resend())
+            group.create_task(self._keep_up())
 
     async def set_goal(self, robot: str, cell: int | None) -> str:
-        """Send a robot to a cell, or let it stop (None); returns what the planner says.
+        """Send a robot to a cell, or stop it (None); return the planner's answer.
 
         Raises:
-            FleetError: The planner refuses, or is away.
+            PlannerError: The planner refused, or cannot be reached.
         """
-        said = await self._ask(SET_GOAL, {"robot": robot, "cell": -1 if cell is None else cell})
-        self._wishes.set_goal(robot, cell)
+        said = await self._call(SET_GOAL, {"robot": robot, "cell": -1 if cell is None else cell})
+        self._desired.set_goal(robot, cell)
         return said
 
     async def block_cell(self, cell: int, *, blocked: bool) -> str:
-        """Block or free a cell; returns what the planner says.
+        """Block or free a cell; return the planner's answer.
 
         Raises:
-            FleetError: The planner refuses, or is away.
+            PlannerError: The planner refused, or cannot be reached.
         """
-        said = await self._ask(BLOCK_CELL, {"cell": cell, "blocked": blocked})
-        self._wishes.set_cell(cell, blocked=blocked)
+        said = await self._call(BLOCK_CELL, {"cell": cell, "blocked": blocked})
+        self._desired.set_cell(cell, blocked=blocked)
         return said
 
-    async def _ask(self, service: PlannerService, request: dict[str, Any]) -> str:
-        answer = await self._wire.call(service, request)
+    async def _call(self, service: PlannerService, request: dict[str, Any]) -> str:
+        answer = await self._client.call(service, request)
         if not answer["ok"]:
-            raise FleetError(answer["message"])
+            raise PlannerError(answer["message"])
         return str(answer["message"])
 
-    async def _tell_again(self) -> None:
-        """Tell a planner that was restarted what it forgot, until it knows or it is time to give up."""
+    async def _resend(self) -> None:
+        """Send goals and blocked cells to a restarted planner again, for a while or until it reports them."""
         while True:
             await self._planner_restarted.wait()
             self._planner_restarted.clear()
-            self._on_event("the planner was restarted; telling it goals and blocked cells again", "warn")
+            self._on_event("the planner was restarted; sending goals and blocked cells again", "warn")
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(TELL_AGAIN_S):
+                async with asyncio.timeout(RESEND_FOR_S):
                     while not self._planner_restarted.is_set():
-                        await self._tell_unmet()
-                        await asyncio.sleep(TELL_EVERY_S)
+                        await self._send_unmet()
+                        await asyncio.sleep(RESEND_EVERY_S)
 
-    async def _tell_unmet(self) -> None:
-        for wish in self._wishes.unmet(self._view.state) if self._view.state else ():
-            with contextlib.suppress(FleetError):
-                match wish:
-                    case CellWish(cell, blocked):
+    async def _keep_up(self) -> None:
+        """Request the complete state whenever changes are missing."""
+        while True:
+            await self._state_needed.wait()
+            try:
+                answer = await self._client.call(GET_STATE, {})
+            except PlannerUnavailableError:
+                await asyncio.sleep(ASK_AGAIN_S)
+                continue
+            self._state_needed.clear()
+            early = self._follower.take_snapshot(answer)
+            self._client.stop_states()
+            self._take(answer["state"]["started"], self._view.on_state(answer["state"]))
+            for message in early:
+                self._take(message["started"], self._view.on_changes(message))
+            self._request_if_behind()
+
+    def _request_if_behind(self) -> None:
+        if self._follower.is_behind:
+            self._state_needed.set()
+
+    async def _send_unmet(self) -> None:
+        for desired in self._desired.unmet(self._view.state) if self._view.state else ():
+            with contextlib.suppress(PlannerError):
+                match desired:
+                    case DesiredCell(cell, blocked):
                         await self.block_cell(cell, blocked=blocked)
-                    case GoalWish(robot, cell):
+                    case DesiredGoal(robot, cell):
                         await self.set_goal(robot, cell)
+                    case _:
+                        assert_never(desired)
 
-    # -- what comes in ------------------------------------------------------------------------------
+    # What comes in
 
     def take_state(self, message: dict[str, Any]) -> None:
-        """Take a ``fleet/FleetState``."""
-        self._view.on_state(message)
-        if self._planner_began not in (None, message["started"]):
+        """Handle a ``fleet/FleetState``; ignore it if the planner publishes changes."""
+        if not self._follower.follows:
+            self._take(message["started"], self._view.on_state(message))
+
+    def take_changes(self, message: dict[str, Any]) -> None:
+        """Handle a ``fleet/FleetChanges``."""
+        if self._follower.take_changes(message):
+            self._take(message["started"], self._view.on_changes(message))
+        self._request_if_behind()
+
+    def may_have_missed(self) -> None:
+        """Request the complete state."""
+        self._follower.lose()
+        self._request_if_behind()
+
+    def _take(self, planner_started: str, change: ViewChange) -> None:
+        """Subscribe to new robots, and report the change."""
+        if self._planner_started not in (None, planner_started):
             self._planner_restarted.set()
-        self._planner_began = message["started"]
-        for robot in self._view.robot_ids():
+        self._planner_started = planner_started
+        for robot in change.robots:
             if robot not in self._known:
                 self._known.add(robot)
-                self._wire.follow(robot)
-        self._on_change("state")
+                self._client.follow(robot)
+        self._on_change(change)
 
     def take_pose(self, robot: str, message: dict[str, Any]) -> None:
-        """Take a robot's pose message."""
+        """Handle a robot's pose message."""
         self._view.on_pose(robot, message)
-        self._on_change("poses")
+        self._on_pose(robot)
 
     def take_event(self, text: str, tone: str) -> None:
-        """Take words on what happened."""
+        """Handle an event."""
         self._on_event(text, tone)

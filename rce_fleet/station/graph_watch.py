@@ -1,4 +1,4 @@
-"""Watches the nodes of a ROS graph, for the page: what the engine's state is where there is no engine."""
+"""Watches the nodes of a ROS graph, for the page of a station without an engine."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ CALLER = "/operator_station"
 
 
 class GraphWatch:
-    """Reads the nodes of a ROS graph again and again.
+    """Polls the nodes of a ROS graph.
 
     Args:
         master_uri: The graph's master.
-        on_state: Called with the graph's state whenever it changed; ``{"error": text}`` if out of reach.
+        on_state: Called with each new state of the graph; with ``{"error": text}`` if it cannot be read.
     """
 
     def __init__(self, master_uri: str, *, on_state: Callable[[dict[str, Any]], None]) -> None:
@@ -43,7 +43,7 @@ class GraphWatch:
 
 
 def graph_state(uri: str, system_state: Any) -> dict[str, Any]:
-    """A graph as the page shows it.
+    """Return a graph in the form that the page shows.
 
     Args:
         uri: The graph's master.

@@ -1,25 +1,48 @@
-"""Sends what changes to every open page, each at its own pace.
+"""Sends changes to every open page, each at its own pace.
 
-A message has a *topic*; a page that is slow gets only the newest message of each topic (events, which must
-not be lost, are kept in a short queue). So a page that stops reading costs some memory and nobody else.
+A page first gets the complete state, then changes. Changes that are not sent yet wait in a queue; if the page
+is too slow, its queue is emptied, and it gets the complete state again. Other messages have a *topic*, and a
+page gets the newest of each; events wait in a short queue. A page that stops reading costs some memory and
+slows no other page.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
+MAX_CHANGES = 50
+"""Maximum number of changes that wait for one page."""
 MAX_EVENTS = 100
 
 
 class Page:
-    """One open page: what it still has to get."""
+    """The messages that an open page still has to get.
 
-    def __init__(self) -> None:
+    Args:
+        whole: Returns the messages with the complete state.
+        takes_changes: Whether the page handles changes; otherwise it gets the complete state after each.
+    """
+
+    def __init__(self, whole: Callable[[], list[str]], *, takes_changes: bool) -> None:
+        self._whole = whole
+        self._takes_changes = takes_changes
+        self._is_behind = True
+        self._changes: deque[str] = deque()
         self._newest: dict[str, str] = {}
         self._events: deque[str] = deque(maxlen=MAX_EVENTS)
         self._wake = asyncio.Event()
+        self._wake.set()
+
+    def put_change(self, text: str) -> None:
+        """Queue a change; a page that handles none, or is too slow, gets the complete state instead."""
+        if not self._takes_changes or len(self._changes) >= MAX_CHANGES:
+            self._is_behind = True
+            self._changes.clear()
+        if not self._is_behind:
+            self._changes.append(text)
+        self._wake.set()
 
     def put(self, topic: str, text: str) -> None:
         """Queue a message; it replaces an older one of its topic."""
@@ -32,39 +55,58 @@ class Page:
         self._wake.set()
 
     async def take(self) -> list[str]:
-        """Wait until there is something to send, and return it."""
-        await self._wake.wait()
-        self._wake.clear()
-        texts = [*self._newest.values(), *self._events]
+        """Wait for messages, and return them."""
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            texts = self._take_now()
+            if texts:
+                return texts
+
+    def _take_now(self) -> list[str]:
+        state = self._whole() if self._is_behind else list(self._changes)
+        self._is_behind = self._is_behind and not state
+        texts = [*state, *self._newest.values(), *self._events]
+        self._changes.clear()
         self._newest.clear()
         self._events.clear()
         return texts
 
 
 class Broadcast:
-    """The open pages, and the newest message of each topic for a page that opens."""
+    """The open pages, and the newest message of each topic for a page that opens.
 
-    def __init__(self) -> None:
+    Args:
+        whole: Returns the messages with the complete state; none before the first state.
+    """
+
+    def __init__(self, whole: Callable[[], list[str]] = list) -> None:
+        self._whole = whole
         self._pages: set[Page] = set()
         self._newest: dict[str, str] = {}
 
     def __iter__(self) -> Iterator[Page]:
         return iter(self._pages)
 
-    def open(self) -> Page:
-        """Add a page; it gets the newest message of every topic first."""
-        page = Page()
+    def open(self, *, takes_changes: bool = True) -> Page:
+        """Add a page; it gets the complete state first, and the newest message of every topic."""
+        page = Page(self._whole, takes_changes=takes_changes)
         for topic, text in self._newest.items():
             page.put(topic, text)
         self._pages.add(page)
         return page
 
     def close(self, page: Page) -> None:
-        """Forget a page."""
+        """Remove a page."""
         self._pages.discard(page)
 
+    def send_change(self, text: str) -> None:
+        """Send a change to the pages that are open now."""
+        for page in self._pages:
+            page.put_change(text)
+
     def send(self, topic: str, text: str) -> None:
-        """Send a message to all pages and keep it for later ones."""
+        """Send a message to all pages, and keep it for pages that open later."""
         self._newest[topic] = text
         for page in self._pages:
             page.put(topic, text)

@@ -5,14 +5,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 
 from aiohttp import WSCloseCode, WSMsgType, hdrs, web
 from pydantic import BaseModel, ValidationError
 
+from rce.aio.tasks import cancel_and_wait
 from rce.web.bodies import read_whole
-from rce.web.openapi import PREFIX, Operation, build_document
+from rce.web.openapi import PREFIX, build_document
 from rce.web.origin import ServerNames
+from rce.web.routes import Route, RouteTable
+from rce_fleet.station.access import COOKIE, USER, AccessControl, problem, set_cookie, token_of
 from rce_fleet.station.api import (
     MAX_CELL,
     Answer,
@@ -21,44 +25,48 @@ from rce_fleet.station.api import (
     GoalRequest,
     LoginRequest,
     MapModel,
-    PersonModel,
     Problem,
     RobotModel,
+    UserModel,
 )
-from rce_fleet.station.door import COOKIE, PERSON, Door, problem, set_cookie, shown_token
-from rce_fleet.station.fleet_link import FleetError, FleetLink, PlannerAwayError
+from rce_fleet.station.authentication import AuthenticationError, Authenticator, TokenAuthenticator
+from rce_fleet.station.fleet_link import FleetLink, PlannerError, PlannerUnavailableError
 from rce_fleet.station.live import Broadcast, Page
-from rce_fleet.station.persons import Entrance, EntranceError, SharedToken
 from rce_fleet.station.view import FleetView
 
 STATIC = Path(__file__).parent / "static"
 MAX_BODY = 1 << 16
 MAX_DIGITS = 20
-"""Of a cell's number; Python reads no more than 4300."""
+"""Digits of a cell's number; Python parses at most 4300."""
 SHOWN = 80
-"""Characters of a wrong name that an answer repeats."""
+"""Characters of an invalid name that an error repeats."""
 MIN_FRAME_S = 0.05
-"""Least time between two batches of messages to one page."""
+"""Minimum time between two batches of messages to one page."""
 HEARTBEAT_S = 20.0
 CHECK_S = 5.0
-"""How often it is looked whether the login of an open page is still good."""
+"""How often the login of an open page is checked."""
 
-_LOOKING = (401, 403, 421, 503)
-"""How a request may be refused that only looks."""
-_STEERING = (*_LOOKING, 400, 404, 408, 409, 413)
+_VIEW_ERRORS = (401, 403, 421, 503)
+"""Error statuses of requests that read."""
+_CONTROL_ERRORS = (*_VIEW_ERRORS, 400, 404, 408, 409, 413)
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+Method = Callable[["Station", web.Request], Awaitable[web.StreamResponse]]
+"""A handler as it is written in :class:`Station`."""
+
+ROUTES: RouteTable[Route[Method]] = RouteTable("fleet", Route)
+"""The API for an ERP and the page."""
 
 
 class Station:
     """Handlers of all routes.
 
     Args:
-        view: What is known of the fleet.
-        fleet: Carries wishes to the planner.
+        view: The state of the fleet.
+        fleet: Sends goals and blocked cells to the planner.
         pages: The open pages.
-        entrance: Says who somebody is; anybody may do everything if None.
-        names: By which the station may be asked for.
+        authenticator: Finds the user of a token; if None, every request may do everything.
+        names: Host names under which the station may be requested.
     """
 
     def __init__(
@@ -67,24 +75,24 @@ class Station:
         fleet: FleetLink,
         pages: Broadcast,
         *,
-        entrance: Entrance | None = None,
+        authenticator: Authenticator | None = None,
         names: ServerNames | None = None,
     ) -> None:
         self._view = view
         self._fleet = fleet
         self._pages = pages
-        self._entrance = entrance or SharedToken()
-        self._door = Door(self._entrance, names or ServerNames())
+        self._authenticator = authenticator or TokenAuthenticator()
+        self._access = AccessControl(self._authenticator, names or ServerNames())
 
     def make_app(self) -> web.Application:
         """Build the application."""
-        app = web.Application(middlewares=[_problems, self._door.guard], client_max_size=MAX_BODY)
-        for known, handler in self._operations():
-            app.router.add_route(known.method, PREFIX + known.path, handler)
+        app = web.Application(middlewares=[_problems, self._access.check], client_max_size=MAX_BODY)
+        for route in ROUTES:
+            app.router.add_route(route.method, PREFIX + route.path, partial(route.handler, self))
         document = build_document(
-            [known for known, _ in self._operations()],
+            [route.operation for route in ROUTES],
             title="RCE operator station",
-            description="Steers a fleet of robots: goals and blocked cells. For an ERP and for the page.",
+            description="Control a fleet of robots: set goals, block cells. Used by the page and by an ERP.",
             error=Problem,
         )
 
@@ -99,139 +107,69 @@ class Station:
         app.router.add_static("/static", STATIC)
         return app
 
-    def _operations(self) -> list[tuple[Operation, Handler]]:
-        return [
-            (
-                Operation(
-                    name="get_fleet",
-                    method="GET",
-                    path="/fleet",
-                    summary="The whole fleet",
-                    group="fleet",
-                    reply=FleetModel,
-                    errors=_LOOKING,
-                ),
-                self.get_fleet,
-            ),
-            (
-                Operation(
-                    name="log_in",
-                    method="POST",
-                    path="/login",
-                    summary="Log in as a user of the engine; the token comes as a cookie",
-                    group="login",
-                    body=LoginRequest,
-                    status=204,
-                    open=True,
-                    errors=(400, 401, 403, 404, 408, 413, 421, 429, 503),
-                ),
-                self.log_in,
-            ),
-            (
-                Operation(
-                    name="log_out",
-                    method="DELETE",
-                    path="/login",
-                    summary="Make the token of this request worthless",
-                    group="login",
-                    status=204,
-                    errors=(403, 421),
-                ),
-                self.log_out,
-            ),
-            (
-                Operation(
-                    name="get_person",
-                    method="GET",
-                    path="/me",
-                    summary="Who you are, and what you may do",
-                    group="fleet",
-                    reply=PersonModel,
-                    errors=_LOOKING,
-                ),
-                self.get_person,
-            ),
-            (
-                Operation(
-                    name="get_robot",
-                    method="GET",
-                    path="/robots/{robot}",
-                    summary="One robot",
-                    group="fleet",
-                    reply=RobotModel,
-                    errors=(*_LOOKING, 404),
-                ),
-                self.get_robot,
-            ),
-            (
-                Operation(
-                    name="put_goal",
-                    method="PUT",
-                    path="/robots/{robot}/goal",
-                    summary="Send a robot to a cell",
-                    group="fleet",
-                    body=GoalRequest,
-                    reply=Answer,
-                    errors=_STEERING,
-                ),
-                self.put_goal,
-            ),
-            (
-                Operation(
-                    name="put_cell",
-                    method="PUT",
-                    path="/cells/{cell}",
-                    summary="Block or free a cell",
-                    group="fleet",
-                    body=CellRequest,
-                    reply=Answer,
-                    errors=_STEERING,
-                ),
-                self.put_cell,
-            ),
-        ]
-
     # Handlers
 
     async def page(self, request: web.Request) -> web.StreamResponse:
-        """The page itself."""
+        """Return the page."""
         del request
         return web.FileResponse(STATIC / "index.html", headers={hdrs.CACHE_CONTROL: "no-cache"})
 
     async def login_page(self, request: web.Request) -> web.StreamResponse:
-        """The page where people log in."""
+        """Return the login page."""
         del request
         return web.FileResponse(STATIC / "login.html", headers={hdrs.CACHE_CONTROL: "no-cache"})
 
+    @ROUTES.route(
+        "POST",
+        "/login",
+        "Log in as a user of the engine; the token comes as a cookie",
+        group="login",
+        body=LoginRequest,
+        status=204,
+        open=True,
+        errors=(400, 401, 403, 404, 408, 413, 421, 429, 503),
+    )
     async def log_in(self, request: web.Request) -> web.StreamResponse:
         """Check a password at the engine; the token goes into a cookie, never to the page."""
-        who = LoginRequest.model_validate_json(await read_whole(request))
-        token = await self._entrance.log_in(who.userID, who.password, request.remote or "")
+        login = LoginRequest.model_validate_json(await read_whole(request))
+        token = await self._authenticator.log_in(login.userID, login.password, request.remote or "")
         response = web.Response(status=204)
         set_cookie(response, token, secure=request.secure)
         return response
 
+    @ROUTES.route(
+        "DELETE", "/login", "Revoke the token of this request", group="login", status=204, errors=(403, 421)
+    )
     async def log_out(self, request: web.Request) -> web.StreamResponse:
-        """Make the token worthless that the request shows."""
-        await self._entrance.log_out(shown_token(request))
+        """Revoke the request's token and delete the cookie."""
+        await self._authenticator.log_out(token_of(request))
         response = web.Response(status=204)
         response.del_cookie(COOKIE)
         return response
 
-    async def get_person(self, request: web.Request) -> web.StreamResponse:
-        """Who asks."""
-        person = request[PERSON]
+    @ROUTES.route(
+        "GET",
+        "/me",
+        "The user of this request and their permissions",
+        name="get_person",
+        reply=UserModel,
+        errors=_VIEW_ERRORS,
+    )
+    async def get_user(self, request: web.Request) -> web.StreamResponse:
+        """Return the user of the request."""
+        user = request[USER]
         return _reply(
-            PersonModel(
-                name=person.name,
-                role=person.role,
-                steers=person.steers,
-                logged_in=self._entrance.has_logins,
+            UserModel(
+                name=user.name,
+                role=user.role,
+                steers=user.may_control,
+                logged_in=self._authenticator.has_logins,
             )
         )
 
+    @ROUTES.route("GET", "/fleet", "The whole fleet", reply=FleetModel, errors=_VIEW_ERRORS)
     async def get_fleet(self, request: web.Request) -> web.StreamResponse:
-        """Everything that is known of the fleet."""
+        """Return the state of the fleet."""
         del request
         grid = self._view.map()
         return _reply(
@@ -243,64 +181,82 @@ class Station:
             )
         )
 
+    @ROUTES.route("GET", "/robots/{robot}", "One robot", reply=RobotModel, errors=(*_VIEW_ERRORS, 404))
     async def get_robot(self, request: web.Request) -> web.StreamResponse:
-        """One robot."""
+        """Return one robot."""
         wanted = request.match_info["robot"]
         for robot in self._view.robots():
             if robot["id"] == wanted:
                 return _reply(RobotModel(**robot))
         known = ", ".join(self._view.robot_ids()) or "none yet"
-        return problem(404, f"there is no robot {wanted!r}; known are: {known}")
+        return problem(404, f"robot {wanted!r} is unknown; known robots: {known}")
 
+    @ROUTES.route(
+        "PUT",
+        "/robots/{robot}/goal",
+        "Send a robot to a cell",
+        body=GoalRequest,
+        reply=Answer,
+        errors=_CONTROL_ERRORS,
+    )
     async def put_goal(self, request: web.Request) -> web.StreamResponse:
         """Send a robot to a cell."""
         robot = request.match_info["robot"]
-        refusal = self._door.may_steer(request, "set_goal", robot)
+        refusal = self._access.control_refusal(request, "set_goal", robot)
         if refusal is not None:
             return refusal
-        wish = GoalRequest.model_validate_json(await read_whole(request))
-        message = await self._fleet.set_goal(robot, wish.cell)
-        self._door.note(request, "set_goal", robot, "stop" if wish.cell is None else f"cell {wish.cell}")
+        asked = GoalRequest.model_validate_json(await read_whole(request))
+        message = await self._fleet.set_goal(robot, asked.cell)
+        self._access.audit(request, "set_goal", robot, "stop" if asked.cell is None else f"cell {asked.cell}")
         return _reply(Answer(message=message))
 
+    @ROUTES.route(
+        "PUT",
+        "/cells/{cell}",
+        "Block or free a cell",
+        body=CellRequest,
+        reply=Answer,
+        errors=_CONTROL_ERRORS,
+    )
     async def put_cell(self, request: web.Request) -> web.StreamResponse:
         """Block or free a cell."""
         number = request.match_info["cell"]
         if not number.isdecimal() or len(number) > MAX_DIGITS or int(number) > MAX_CELL:
             return problem(404, f"{number[:SHOWN]!r} is not the number of a cell")
-        refusal = self._door.may_steer(request, "block_cell", number)
+        refusal = self._access.control_refusal(request, "block_cell", number)
         if refusal is not None:
             return refusal
-        wish = CellRequest.model_validate_json(await read_whole(request))
-        message = await self._fleet.block_cell(int(number), blocked=wish.blocked)
-        self._door.note(request, "block_cell" if wish.blocked else "free_cell", number)
+        asked = CellRequest.model_validate_json(await read_whole(request))
+        message = await self._fleet.block_cell(int(number), blocked=asked.blocked)
+        self._access.audit(request, "block_cell" if asked.blocked else "free_cell", number)
         return _reply(Answer(message=message))
 
     async def live(self, request: web.Request) -> web.StreamResponse:
-        """Send a page what changes, until it goes."""
+        """Send changes to a page until it disconnects.
+
+        Without ``?changes=1`` it gets everything whenever something changes, as pages of 0.1 expect.
+        """
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, compress=False)
         await socket.prepare(request)
-        page = self._pages.open()
+        page = self._pages.open(takes_changes=request.query.get("changes") == "1")
         writer = asyncio.create_task(_write(socket, page))
-        watcher = asyncio.create_task(self._close_when_out(socket, request))
+        watcher = asyncio.create_task(self._close_when_logged_out(socket, request))
         try:
             async for message in socket:
                 if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                     continue
         finally:
             self._pages.close(page)
-            writer.cancel()
-            watcher.cancel()
-            await asyncio.gather(writer, watcher, return_exceptions=True)
+            await cancel_and_wait(writer, watcher)
         return socket
 
-    async def _close_when_out(self, socket: web.WebSocketResponse, request: web.Request) -> None:
-        """End a page's socket when its person may not look any more."""
+    async def _close_when_logged_out(self, socket: web.WebSocketResponse, request: web.Request) -> None:
+        """Close a page's socket when its user may not see the fleet any more."""
         while True:
             await asyncio.sleep(CHECK_S)
-            if not await self._door.is_still_in(request):
+            if not await self._access.is_still_allowed(request):
                 break
-        await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=b"your login ended; log in again")
+        await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=b"your login has ended; log in again")
 
 
 async def _write(socket: web.WebSocketResponse, page: Page) -> None:
@@ -313,18 +269,18 @@ async def _write(socket: web.WebSocketResponse, page: Page) -> None:
 
 @web.middleware
 async def _problems(request: web.Request, handler: Handler) -> web.StreamResponse:
-    """Turn what goes wrong into an answer that says so."""
+    """Turn exceptions into error responses."""
     try:
         return await handler(request)
     except ValidationError as error:
         faults = [f"{'.'.join(map(str, fault['loc'])) or 'body'}: {fault['msg']}" for fault in error.errors()]
         return problem(400, "; ".join(faults))
-    except EntranceError as error:
+    except AuthenticationError as error:
         headers = {"Retry-After": str(error.retry_after)} if error.retry_after else None
         return problem(error.status, str(error), headers)
-    except PlannerAwayError as error:
+    except PlannerUnavailableError as error:
         return problem(503, str(error))
-    except FleetError as error:
+    except PlannerError as error:
         return problem(409, str(error))
     except web.HTTPException as error:
         kept = {"Allow": error.headers["Allow"]} if "Allow" in error.headers else None

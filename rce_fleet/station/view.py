@@ -1,18 +1,21 @@
-"""What the station knows of the fleet: a pure model, fed with messages in their JSON form."""
+"""The station's view of the fleet: a pure model, updated with messages in their JSON form."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from math import atan2
 from typing import Any
 
 ROBOT_RADIUS = 0.22
-"""Radius that the page draws robots with, metres."""
+"""Radius of the robots as the page draws them, metres."""
+
+_MAP = ("rows", "columns", "cell_size", "origin_x", "origin_y", "walls")
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where a robot is, in the map frame: metres, radians, counter-clockwise from x."""
+    """Pose of a robot in the map frame: metres, radians, counter-clockwise from x."""
 
     x: float
     y: float
@@ -30,45 +33,124 @@ class Pose:
         return cls(position["x"], position["y"], yaw)
 
 
+@dataclass(frozen=True, slots=True)
+class ViewChange:
+    """A change of the view by a message.
+
+    Attributes:
+        is_new_map: Whether the map changed.
+        robots: Ids of robots that are new or changed.
+        removed: Ids of removed robots.
+        blocked: Cells that became blocked, ascending.
+        pending: Cells that will be blocked once a robot has left them, ascending.
+        freed: Cells that are not blocked or pending any more, ascending.
+    """
+
+    is_new_map: bool = False
+    robots: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+    blocked: tuple[int, ...] = ()
+    pending: tuple[int, ...] = ()
+    freed: tuple[int, ...] = ()
+
+    def __bool__(self) -> bool:
+        return self != _NOTHING
+
+
+_NOTHING = ViewChange()
+
+
 @dataclass(slots=True)
 class FleetView:
     """The newest state of the fleet and the newest pose of each robot."""
 
-    state: dict[str, Any] | None = None
-    """The newest ``fleet/FleetState``, or None before the planner has spoken."""
     poses: dict[str, Pose] = field(default_factory=dict)
+    _map: dict[str, Any] | None = None
+    _robots: dict[str, dict[str, Any]] = field(default_factory=dict)
+    _blocked: set[int] = field(default_factory=set)
+    _pending: set[int] = field(default_factory=set)
 
-    def on_state(self, message: dict[str, Any]) -> None:
-        """Take a ``fleet/FleetState``; poses of robots that are no longer in it are dropped."""
-        self.state = message
-        present = set(self.robot_ids())
-        for robot in [robot for robot in self.poses if robot not in present]:
+    @property
+    def state(self) -> dict[str, Any] | None:
+        """Robots and cells as in a ``fleet/FleetState``; None before the first one."""
+        if self._map is None:
+            return None
+        return {
+            **self._map,
+            "robots": [self._robots[robot] for robot in self.robot_ids()],
+            "blocked": self.blocked(),
+            "pending": self.pending(),
+        }
+
+    def on_state(self, message: dict[str, Any]) -> ViewChange:
+        """Set the complete state; remove what is not in it."""
+        grid = {key: message[key] for key in _MAP}
+        robots = {robot["id"]: robot for robot in message["robots"]}
+        blocked, pending = set(message["blocked"]), set(message["pending"])
+        change = ViewChange(
+            is_new_map=grid != self._map,
+            robots=tuple(sorted(robot for robot in robots if robots[robot] != self._robots.get(robot))),
+            removed=tuple(sorted(self._robots.keys() - robots.keys())),
+            blocked=_ascending(blocked - self._blocked),
+            pending=_ascending(pending - self._pending),
+            freed=_ascending((self._blocked | self._pending) - blocked - pending),
+        )
+        self._map, self._robots, self._blocked, self._pending = grid, robots, blocked, pending
+        for robot in self.poses.keys() - robots.keys():
             del self.poses[robot]
+        return change
+
+    def on_changes(self, message: dict[str, Any]) -> ViewChange:
+        """Apply a ``fleet/FleetChanges`` that follows the known state."""
+        for robot in message["robots"]:
+            self._robots[robot["id"]] = robot
+        for name in message["removed"]:
+            self._robots.pop(name, None)
+            self.poses.pop(name, None)
+        blocked, pending, freed = (set(message[part]) for part in ("blocked", "pending", "freed"))
+        self._blocked = (self._blocked | blocked) - pending - freed
+        self._pending = (self._pending | pending) - blocked - freed
+        return ViewChange(
+            robots=tuple(sorted(robot["id"] for robot in message["robots"])),
+            removed=tuple(message["removed"]),
+            blocked=_ascending(blocked),
+            pending=_ascending(pending),
+            freed=_ascending(freed),
+        )
 
     def on_pose(self, robot: str, message: dict[str, Any]) -> None:
-        """Take a robot's pose message."""
+        """Set a robot's pose."""
         self.poses[robot] = Pose.of_message(message)
 
     def robot_ids(self) -> list[str]:
-        """The robots that the planner knows."""
-        return [] if self.state is None else [robot["id"] for robot in self.state["robots"]]
+        """Return the ids of the robots that the planner knows, ascending."""
+        return sorted(self._robots)
+
+    def knows(self, robot: str) -> bool:
+        """Return whether the planner knows a robot."""
+        return robot in self._robots
 
     def map(self) -> dict[str, Any] | None:
-        """The grid, as the page and the API show it."""
-        if self.state is None:
+        """Return the grid in the form of page and API."""
+        if self._map is None:
             return None
         return {
-            "rows": self.state["rows"],
-            "columns": self.state["columns"],
-            "cell_size": self.state["cell_size"],
-            "origin": [self.state["origin_x"], self.state["origin_y"]],
+            "rows": self._map["rows"],
+            "columns": self._map["columns"],
+            "cell_size": self._map["cell_size"],
+            "origin": [self._map["origin_x"], self._map["origin_y"]],
             "robot_radius": ROBOT_RADIUS,
-            "walls": list(self.state["walls"]),
+            "walls": list(self._map["walls"]),
         }
 
-    def robots(self) -> list[dict[str, Any]]:
-        """The robots, with pose where it is known."""
-        return [] if self.state is None else [self._robot(robot) for robot in self.state["robots"]]
+    def robots(self, names: Iterable[str] | None = None) -> list[dict[str, Any]]:
+        """Return robots, with their poses if known.
+
+        Args:
+            names: Ids of the robots; all, ascending, if None. Unknown ones are left out.
+        """
+        wanted = self.robot_ids() if names is None else names
+        return [self._robot(self._robots[robot]) for robot in wanted if robot in self._robots]
 
     def _robot(self, robot: dict[str, Any]) -> dict[str, Any]:
         pose = self.poses.get(robot["id"])
@@ -80,12 +162,16 @@ class FleetView:
         }
 
     def blocked(self) -> list[int]:
-        """Cells that nothing may enter."""
-        return [] if self.state is None else list(self.state["blocked"])
+        """Return the blocked cells, ascending."""
+        return sorted(self._blocked)
 
     def pending(self) -> list[int]:
-        """Cells that will be blocked once they are left."""
-        return [] if self.state is None else list(self.state["pending"])
+        """Return the cells that will be blocked once a robot has left them, ascending."""
+        return sorted(self._pending)
+
+
+def _ascending(cells: set[int]) -> tuple[int, ...]:
+    return tuple(sorted(cells))
 
 
 def _cell(number: int) -> int | None:

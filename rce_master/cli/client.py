@@ -11,6 +11,7 @@ import aiohttp
 import msgspec
 import typer
 
+from rce.masters import Masters
 from rce.tls.exceptions import CertificateError
 from rce.tls.faults import explain_to_client
 from rce.tls.identity import client_context
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 REQUEST_S = 30.0
 UPLOAD_S = 300.0
-"""For an answer to what was sent: the master looks through it first."""
+"""Seconds to wait for an answer to an upload, which the master checks first."""
 RETRY_S = 1.0
 _OK = 400
 _REDIRECTS = 300, 400
@@ -39,14 +40,14 @@ class ApiClient:
     """Talks to a master. Use it as an asynchronous context manager.
 
     Args:
-        url: Of the master's HTTP server.
+        url: URL of the master's HTTP server; of several, separated by commas, the first that answers is used.
         token: Bearer token; empty before the login.
         authority: File with the authority that issued the master's certificate; the system's if empty.
     """
 
     def __init__(self, url: str, token: str = "", *, authority: str = "") -> None:
         self._authority = authority
-        self._base = f"{url.rstrip('/')}/api/v1"
+        self._masters = Masters(url)
         self._headers = {"Authorization": f"Bearer {token}"} if token else {}
 
     @classmethod
@@ -69,6 +70,10 @@ class ApiClient:
     ) -> None:
         await self._session.close()
 
+    @property
+    def _base(self) -> str:
+        return f"{self._masters.current.rstrip('/')}/api/v1"
+
     async def call(
         self,
         method: str,
@@ -85,13 +90,20 @@ class ApiClient:
             ApiError: The master refused.
             CliError: The master could not be reached.
         """
-        try:
-            async with self._session.request(
-                method, self._base + path, json=body, params=query, allow_redirects=False
-            ) as reply:
-                return await _result(reply)
-        except (aiohttp.ClientError, TimeoutError, ValueError) as error:
-            raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
+        for number in range(len(self._masters.all), 0, -1):
+            url = self._masters.current
+            try:
+                async with self._session.request(
+                    method, self._base + path, json=body, params=query, allow_redirects=False
+                ) as reply:
+                    return await _result(reply)
+            except (aiohttp.ClientError, TimeoutError, ValueError) as error:
+                # Only without a connection it is certain that the request had no effect.
+                if number > 1 and isinstance(error, aiohttp.ClientConnectorError):
+                    self._masters.failed(url)
+                    continue
+                raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
+        raise AssertionError("there is a master at least")
 
     @contextlib.asynccontextmanager
     async def websocket(
@@ -145,7 +157,7 @@ class ApiClient:
             raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
 
     async def events(self, since: int | None = None) -> AsyncIterator[Event]:
-        """Follow events for ever; a stream that breaks is resumed where it broke.
+        """Follow events without end; resume a broken stream where it broke.
 
         Raises:
             ApiError: The master refused.
@@ -153,14 +165,18 @@ class ApiClient:
         """
         last = since
         reached = False
+        untried = len(self._masters.all)
         while True:
+            url = self._masters.current
             try:
                 async for event in self._stream(last):
                     reached, last = True, event.id
                     yield event
                 reached = True
             except (aiohttp.ClientError, TimeoutError) as error:
-                if not reached and last is None:
+                self._masters.failed(url)
+                untried -= 1
+                if not reached and last is None and untried <= 0:
                     raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
             await asyncio.sleep(RETRY_S)
 

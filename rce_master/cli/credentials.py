@@ -1,4 +1,4 @@
-"""Where ``rce login`` keeps its token."""
+"""The file in which ``rce login`` keeps its token."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import msgspec
 import platformdirs
 from msgspec import Struct
 
-from rce_master.cli.exceptions import CliError, NotLoggedIn
+from rce_master.cli.exceptions import CliError, NotLoggedInError
 
 FILE_VARIABLE = "RCE_LOGIN_FILE"
 
@@ -18,7 +18,7 @@ class Credentials(Struct, frozen=True, kw_only=True):
     """A login at a master."""
 
     url: str
-    """Of the master's HTTP server, with a slash at the end."""
+    """URL of the master's HTTP server, with a slash at the end."""
     user: str
     token: str
     expires: float
@@ -31,7 +31,7 @@ class Credentials(Struct, frozen=True, kw_only=True):
 
 
 def login_file() -> Path:
-    """Tell where the login is kept: ``$RCE_LOGIN_FILE``, or a file in the user's configuration folder."""
+    """Return the login's file: ``$RCE_LOGIN_FILE``, or a file in the user's configuration folder."""
     given = os.environ.get(FILE_VARIABLE)
     return Path(given) if given else platformdirs.user_config_path("rce") / "login.json"
 
@@ -40,14 +40,14 @@ def load() -> Credentials:
     """Read the login.
 
     Raises:
-        NotLoggedIn: There is none.
+        NotLoggedInError: The user is not logged in.
         CliError: It cannot be read.
     """
     file = login_file()
     try:
         return msgspec.json.decode(file.read_bytes(), type=Credentials)
     except FileNotFoundError:
-        raise NotLoggedIn from None
+        raise NotLoggedInError from None
     except (OSError, msgspec.MsgspecError) as error:
         raise CliError(f"cannot read the login in {file}: {error}; run: rce login") from error
 
@@ -75,5 +75,5 @@ def save(credentials: Credentials) -> Path:
 
 
 def forget() -> None:
-    """Remove the login if there is one."""
+    """Remove the login if it exists."""
     login_file().unlink(missing_ok=True)

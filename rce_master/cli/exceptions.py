@@ -1,10 +1,10 @@
-"""What can go wrong in the commands.
+"""The errors of the commands.
 
 ::
 
     CliError            printed as it is; the program ends with code 1
-    +-- ApiError        the master refused
-    +-- NotLoggedIn     there is no token
+    +-- ApiError          the master refused
+    +-- NotLoggedInError  there is no token
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class ApiError(CliError):
         super().__init__(text)
 
 
-class NotLoggedIn(CliError):  # noqa: N818
+class NotLoggedInError(CliError):
     """There is no token."""
 
     def __str__(self) -> str:

@@ -8,12 +8,13 @@ import os
 import shutil
 import signal
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, assert_never
 
 import aiohttp
 import msgspec
 import typer
 
+from rce.aio.tasks import cancel_and_wait
 from rce.cli.main import Plugged
 from rce.control.execution import (
     MAX_DATA,
@@ -65,7 +66,7 @@ def _execute(
 
 
 def run_command(container: str, command: Command, *, user: str = "", stdin: bool = True) -> int:
-    """Run a command with this program's standard streams; print why if that fails.
+    """Run a command with this program's standard streams; print the reason of a failure.
 
     Returns:
         The exit code.
@@ -102,12 +103,11 @@ async def _run(container: str, command: Command, user: str, stdin: bool) -> int:
             try:
                 return await _show(socket)
             finally:
-                typing.cancel()
-                await asyncio.gather(typing, return_exceptions=True)
+                await cancel_and_wait(typing)
 
 
 async def _show(socket: ClientWebSocketResponse) -> int:
-    """Write what the command writes, until it has ended; returns its exit code."""
+    """Write the command's output, until it has ended; return its exit code."""
     async for message in socket:
         if message.type is not aiohttp.WSMsgType.BINARY:
             continue
@@ -122,8 +122,12 @@ async def _show(socket: ClientWebSocketResponse) -> int:
                 if ended.reason:
                     _write(2, f"rce: {ended.reason}\n".encode())
                 return ended.code
+            case Part.STARTED:
+                pass  # no output
+            case Part.INPUT | Part.END_OF_INPUT | Part.SIZE | Part.SIGNAL:
+                raise CliError(f"the engine sent {frame.part.name}, which only a user sends")
             case _:
-                pass
+                assert_never(frame.part)
     raise CliError("the connection to the master was lost; the command has been ended")
 
 
@@ -134,7 +138,7 @@ def _write(fd: int, data: bytes) -> None:
 
 
 async def _send_input(socket: ClientWebSocketResponse, stdin: bool, terminal: bool) -> None:
-    """Send what is typed or piped in, and its end."""
+    """Send the typed or piped input, and its end."""
     if stdin:
         while data := await _read_input():
             await socket.send_bytes(Frame(Part.INPUT, data).encode())
@@ -164,7 +168,7 @@ def _wake(ready: asyncio.Future[None]) -> None:
 
 @contextlib.contextmanager
 def _raw_terminal(wanted: bool) -> Iterator[None]:
-    """Leave what is typed to the terminal in the container."""
+    """Pass keystrokes unprocessed to the terminal in the container."""
     if not wanted or not sys.stdin.isatty():
         yield
         return
@@ -172,7 +176,7 @@ def _raw_terminal(wanted: bool) -> Iterator[None]:
     import tty
 
     before = termios.tcgetattr(0)
-    tty.setraw(0, termios.TCSADRAIN)  # what was typed ahead is kept
+    tty.setraw(0, termios.TCSADRAIN)  # input typed ahead is kept
     try:
         yield
     finally:
@@ -181,7 +185,7 @@ def _raw_terminal(wanted: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _signals(socket: ClientWebSocketResponse, terminal: bool) -> Iterator[None]:
-    """Pass signals on to the command, and the terminal's size."""
+    """Pass signals and the terminal's size on to the command."""
     loop = asyncio.get_running_loop()
     tasks: set[asyncio.Task[None]] = set()
 

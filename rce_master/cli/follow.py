@@ -40,7 +40,7 @@ def logs(
         LogLevel | None, typer.Option(help="Of log records in ROS those from this level on; means --rosout.")
     ] = None,
     previous: Annotated[
-        bool, typer.Option("--previous", "-p", help="Of the container's last life that ended.")
+        bool, typer.Option("--previous", "-p", help="Of the container's last incarnation that ended.")
     ] = False,
     user: Annotated[str, typer.Option(help="Whose container; administrators only.")] = "",
 ) -> None:
@@ -61,30 +61,30 @@ def logs(
 async def _logs(path: str, follow: bool, offset: int, query: dict[str, str]) -> None:
     container, _, node = path.partition("/")
     url = f"/containers/{container}/nodes/{node}/log" if node else f"/containers/{container}/log"
-    life, told = "", ""
+    incarnation, told = "", ""
     async with ApiClient.of(credentials.load()) as client:
         while True:
             place = {"limit": CHUNK, "offset": offset}
-            of_life = {"life": life} if life else {}
-            chunk = await _read(client, url, {**query, **place, **of_life}, patient=follow)
+            of_incarnation = {"life": incarnation} if incarnation else {}
+            chunk = await _read(client, url, {**query, **place, **of_incarnation}, patient=follow)
             if chunk is not None:
                 if chunk["ended"] and told != chunk["life"]:
                     told = chunk["life"]
                     typer.echo(_obituary(chunk), err=True)
                 typer.echo(_shown(chunk["text"]), nl=False)
-                life, before, offset = chunk["life"], offset, chunk["offset"]
+                incarnation, before, offset = chunk["life"], offset, chunk["offset"]
                 if offset != before:
                     continue
             if not follow:
                 return
             await asyncio.sleep(POLL_S)
-            if chunk is not None and chunk["ended"] and await _lives_again(client, url, query, life):
-                life, offset = "", 0
+            if chunk is not None and chunk["ended"] and await _started_again(client, url, query, incarnation):
+                incarnation, offset = "", 0
                 query.pop("previous", None)
 
 
-async def _lives_again(client: ApiClient, url: str, query: dict[str, str], life: str) -> bool:
-    """Whether the container has another life than the one that was read to its end."""
+async def _started_again(client: ApiClient, url: str, query: dict[str, str], incarnation: str) -> bool:
+    """Whether the container has a newer incarnation than the one that was read to its end."""
     now = {name: value for name, value in query.items() if name == "user"}
     try:
         chunk = await _read(client, url, {**now, "limit": 1}, patient=True)
@@ -92,24 +92,24 @@ async def _lives_again(client: ApiClient, url: str, query: dict[str, str], life:
         if error.status == _NOT_FOUND:
             return False
         raise
-    return chunk is not None and chunk["life"] != life
+    return chunk is not None and chunk["life"] != incarnation
 
 
 def _shown(text: str) -> str:
-    """A log as it is; on a terminal without what that would obey."""
+    """Return a log's text; for a terminal, without control characters."""
     return for_terminal(text) if sys.stdout.isatty() else text
 
 
 def _obituary(chunk: dict[str, Any]) -> str:
     when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(chunk["ended"]))
     reason = one_line(chunk["reason"]) or "unknown reason"
-    return f"-- the container's life {chunk['life']} ended {when}: {reason} --"
+    return f"-- the container's incarnation {chunk['life']} ended {when}: {reason} --"
 
 
 async def _read(
     client: ApiClient, url: str, query: dict[str, str | int], *, patient: bool
 ) -> dict[str, Any] | None:
-    """Read a piece; None if the container is out of reach for now and we can wait."""
+    """Read a piece; return None if the container is unreachable for now and the program can wait."""
     try:
         chunk: dict[str, Any] = await client.call("GET", url, query=query)
     except ApiError as error:

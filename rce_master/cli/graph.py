@@ -15,17 +15,17 @@ _PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True, "help_opti
 
 
 class Target(NamedTuple):
-    """Where a tool is to run."""
+    """The target of a tool."""
 
     container: str
-    """Empty: here, for the graph that ROS_MASTER_URI names."""
+    """The container; empty: run here, for the graph that ROS_MASTER_URI names."""
     user: str
     arguments: tuple[str, ...]
-    """The tool's own."""
+    """The tool's arguments."""
 
 
 def split(arguments: list[str]) -> Target:
-    """Take out of a tool's arguments which container is meant.
+    """Separate the container option from a tool's arguments.
 
     Raises:
         typer.BadParameter: An option lacks its value.

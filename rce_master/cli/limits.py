@@ -10,11 +10,11 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from rce.protocol.quantities import write_memory
+from rce.model.quantities import write_memory
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import CliError
 from rce_master.cli.offline import StateDir, choose, open_state
-from rce_master.exceptions import NotFound
+from rce_master.exceptions import NotFoundError
 from rce_master.limit_values import read_limit
 from rce_master.state.commands import SetLimits
 from rce_master.state.limits import KINDS, limit_of, used_of
@@ -109,7 +109,7 @@ def _view(state: State, name: str) -> dict[str, Any]:
     """Show a user of a state as the API does."""
     user = state.tables.users.get(name)
     if user is None:
-        raise NotFound(f"there is no user {name!r}")
+        raise NotFoundError(f"there is no user {name!r}")
     used = used_of(state.tables, name)
     found = (limit_of(state.tables, state.settings, name, kind) for kind in KINDS)
     limits = {one.kind: {"limit": one.most, "used": used[one.kind], "source": one.source} for one in found}

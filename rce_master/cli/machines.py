@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from rce.protocol.quantities import about, write_cores
+from rce.model.quantities import about, write_cores
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import CliError
@@ -42,7 +42,7 @@ async def _machines(as_json: bool) -> None:
 
 
 def overview(found: list[Machine]) -> Table:
-    """Lay out machines."""
+    """Format machines as a table."""
     names = ("task set", "machine", "state", "containers", "slots", "cores", "memory")
     table = Table(*names, "limits", "runtime", "labels", box=None)
     for machine in sorted(found, key=lambda m: (m["kind"], m["machine"], m["process"])):
@@ -132,17 +132,17 @@ def _tell_changes(found: list[Machine], said: dict[str, str]) -> None:
 
 def resize(
     container: Annotated[str, typer.Argument(help="The container's tag.")],
-    cpu: Annotated[str | None, typer.Option(help="Cores: 0.5 or 50%; 0: no wish.")] = None,
-    memory: Annotated[str | None, typer.Option(help="256 (MB), 256M, 1G; 0: no wish.")] = None,
+    cpu: Annotated[str | None, typer.Option(help="Cores: 0.5 or 50%; 0: no request.")] = None,
+    memory: Annotated[str | None, typer.Option(help="256 (MB), 256M, 1G; 0: no request.")] = None,
     size: Annotated[int | None, typer.Option(help="Slots.", min=1)] = None,
     bandwidth: Annotated[
-        str | None, typer.Option(help="Of its links: 5M (bytes per second), 10Mbit; 0: no wish.")
+        str | None, typer.Option(help="Of its links: 5M (bytes per second), 10Mbit; 0: no request.")
     ] = None,
     user: Annotated[str, typer.Option(help="Whose container; administrators only.")] = "",
 ) -> None:
     """Change what a container may use, while it runs."""
-    wishes: dict[str, Any] = {"cpu": cpu, "memory": memory, "size": size, "bandwidth": bandwidth}
-    body = {key: value for key, value in wishes.items() if value is not None}
+    requested: dict[str, Any] = {"cpu": cpu, "memory": memory, "size": size, "bandwidth": bandwidth}
+    body = {key: value for key, value in requested.items() if value is not None}
     if not body:
         raise typer.BadParameter("give one or more of --cpu, --memory, --size, --bandwidth")
     run(_resize(container, body, user))

@@ -1,7 +1,7 @@
 """Work on a master's state folder while no master runs on it.
 
-What is changed is in the audit log, as what is changed over the API: who is the user of the operating system,
-and the place is ``offline``.
+Changes are in the audit log, as changes over the API: the user is that of the operating system, and the
+address is ``offline``.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from rce.config.folders import default_state_dir
 from rce.config.loading import load_settings
 from rce_master.audit import AuditLog
 from rce_master.cli import credentials
-from rce_master.cli.exceptions import CliError, NotLoggedIn
-from rce_master.exceptions import StoreBusy
+from rce_master.cli.exceptions import CliError, NotLoggedInError
+from rce_master.exceptions import StoreBusyError
 from rce_master.settings import state_settings
 from rce_master.state.core import State
+from rce_master.state_service import load_converted
 from rce_master.store import SqliteStore
 
 if TYPE_CHECKING:
@@ -43,31 +44,32 @@ StateDir = Annotated[
 
 
 def choose(state_dir: Path | None) -> Path | Credentials:
-    """Choose: the folder that was named, else the master where one is logged in, else the default folder."""
+    """Choose the named folder, else the master of the login, else the default folder."""
     if state_dir is not None:
         return state_dir
     try:
         return credentials.load()
-    except NotLoggedIn:
+    except NotLoggedInError:
         return default_state_dir()
 
 
 class OfflineState:
-    """The state of a master that does not run. Its store is locked meanwhile.
+    """The state of a master that does not run. Its store is locked.
 
     Attributes:
-        state: What the store held, with what was changed since.
+        state: The state of the store, with the changes since.
         folder: Where it is.
     """
 
-    def __init__(self, state: State, store: Store, audit: AuditLog, folder: Path) -> None:
+    def __init__(self, state: State, store: Store, term: int, audit: AuditLog, folder: Path) -> None:
         self.state = state
         self.folder = folder
         self._store = store
+        self._term = term
         self._audit = audit
 
     async def do(self, command: Command, action: str, subject: str) -> None:
-        """Change something, keep it, and write it to the audit log.
+        """Apply a change, store it, and write it to the audit log.
 
         Args:
             command: The change.
@@ -75,15 +77,16 @@ class OfflineState:
             subject: What it is about.
 
         Raises:
-            MasterError: The state does not allow it, or it cannot be kept.
+            MasterError: The state does not allow it, or it cannot be stored.
         """
-        await self._store.save(self.state.apply(command, time.monotonic()).rows())
+        rows = self.state.apply(command, time.monotonic()).rows()
+        await self._store.save(rows, self._term)
         self._audit.add(_caller(), action, subject, address=OFFLINE)
 
 
 @asynccontextmanager
 async def open_state(state_dir: Path) -> AsyncIterator[OfflineState]:
-    """Open the state in a folder: the master's own, or the engine's, in which that is a folder.
+    """Open the state in a folder: the master's own, or the engine's, which contains the master's.
 
     Raises:
         CliError: A master runs on it, or the settings cannot be read.
@@ -96,19 +99,20 @@ async def open_state(state_dir: Path) -> AsyncIterator[OfflineState]:
         raise CliError(str(error)) from error
     try:
         store = await SqliteStore.open(folder)
-    except StoreBusy as error:
+    except StoreBusyError as error:
         raise CliError(f"{error}; to work over its API, log in there: rce login") from error
     audit = AuditLog(folder / "audit", time.time)
     try:
-        state = State.load(await store.load(), time.monotonic(), settings=settings)
-        yield OfflineState(state, store, audit, folder)
+        term = await store.begin_term()
+        state = State.load(await load_converted(store, term), time.monotonic(), settings=settings)
+        yield OfflineState(state, store, term, audit, folder)
     finally:
         audit.close()
         await store.close()
 
 
 def _caller() -> str:
-    """Return who runs this program, also through sudo."""
+    """Return the user who runs this program, also through sudo."""
     number = os.getuid()
     through = os.environ.get("SUDO_UID", "") if number == 0 else ""
     if through.isdecimal():

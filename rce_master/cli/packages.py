@@ -14,9 +14,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from rce.bundles.exceptions import BadBundle
-from rce.bundles.folder import Source, look_into
-from rce.bundles.signing import SigningKey, key_id, statement
+from rce.packages.exceptions import BadArchiveError
+from rce.packages.folder import Source, look_into
+from rce.packages.signing import SigningKey, key_id, statement
 from rce_master.cli import credentials, signing_key
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import CliError
@@ -57,7 +57,7 @@ async def _push(folder: Path, version: str, *, every: bool, dry_run: bool) -> No
             source.pack(archive)
             async with ApiClient.of(login) as client:
                 reply = await _send(client, login, source, archive)
-    except BadBundle as error:
+    except BadArchiveError as error:
         faults = "".join(f"\n  {fault}" for fault in error.faults)
         raise CliError(f"{folder} cannot be pushed:{faults}") from error
     for warning in reply["warnings"]:

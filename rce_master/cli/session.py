@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from rce.cli.tls_options import Authority
+from rce.cli.options import Authority
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import ApiError, CliError
@@ -17,7 +17,7 @@ DEFAULT_URL = "http://127.0.0.1:9000/"
 
 
 def login(
-    url: Annotated[str, typer.Argument(help="The master's address.")] = DEFAULT_URL,
+    url: Annotated[str, typer.Argument(help="The master's address; several by commas.")] = DEFAULT_URL,
     *,
     user: Annotated[str, typer.Option("--user", "-u", prompt=True, help="User name.")],
     password_stdin: Annotated[bool, typer.Option(help="Read the password from standard input.")] = False,
@@ -43,8 +43,8 @@ async def _login(url: str, user: str, password: str, authority: str) -> None:
 
 
 async def _give_back(url: str) -> None:
-    """Give the token of the login until now back, if it is one at the same master."""
-    with contextlib.suppress(CliError, ApiError):  # none, unreadable or expired: nothing to give back
+    """Revoke the token of the former login, if it is at the same master."""
+    with contextlib.suppress(CliError, ApiError):  # missing, unreadable or expired: nothing to revoke
         former = credentials.load()
         if former.url == url:
             async with ApiClient.of(former) as client:
@@ -64,7 +64,7 @@ async def _logout() -> None:
 
 
 def read_password(*, from_stdin: bool, confirm: bool = False, what: str = "Password") -> str:
-    """Read a password: asked for at a terminal, or the next line of standard input."""
+    """Read a password: ask for it at a terminal, else read the next line of standard input."""
     if from_stdin:
         return sys.stdin.readline().rstrip("\n")
     return str(typer.prompt(what, hide_input=True, confirmation_prompt=confirm))

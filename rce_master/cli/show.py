@@ -40,7 +40,7 @@ _PIPED_WIDTH = 200
 
 
 def console() -> Console:
-    """Make a console that does not squeeze tables where nobody looks at them on a screen."""
+    """Make a console that does not shrink tables if the output is not a terminal."""
     return Console(width=None if sys.stdout.isatty() else _PIPED_WIDTH)
 
 
@@ -64,7 +64,7 @@ async def fetch(client: ApiClient, *names: str) -> Everything:
     """Get several lists at once; one that this user may not see is empty.
 
     Raises:
-        CliError: One cannot be had.
+        CliError: A list cannot be read.
     """
     failure: Exception | None = None
     try:
@@ -107,7 +107,7 @@ def _overview(found: Everything) -> Group:
 
 
 def _place(container: dict[str, Any], found: Everything) -> str:
-    """Where a container is, and where to it goes if its machine is being emptied."""
+    """Return a container's machine, and its next one if its machine is being drained."""
     place = str(container["machine"])
     draining = {machine["process"] for machine in found["machines"] if machine["draining"]}
     if container["moving_to"]:
@@ -116,5 +116,5 @@ def _place(container: dict[str, Any], found: Everything) -> str:
 
 
 def coloured(state: str) -> str:
-    """Write a state in the colour of how well it is."""
+    """Return a state in a colour that shows its severity."""
     return f"[{_COLOURS.get(state, 'default')}]{state}[/]"

@@ -1,4 +1,4 @@
-"""The key by which ``rce package push`` signs; beside the login."""
+"""The key with which ``rce package push`` signs; beside the login."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import os
 import stat
 from pathlib import Path
 
-from rce.bundles.exceptions import BadKey
-from rce.bundles.signing import SigningKey
+from rce.packages.exceptions import BadKeyError
+from rce.packages.signing import SigningKey
 from rce_master.cli.credentials import login_file
 from rce_master.cli.exceptions import CliError
 
@@ -16,13 +16,13 @@ FILE_NAME = "package-key.pem"
 
 
 def key_file() -> Path:
-    """Tell where the key is kept: ``$RCE_PACKAGE_KEY_FILE``, or a file beside the login."""
+    """Return the key's file: ``$RCE_PACKAGE_KEY_FILE``, or a file beside the login."""
     given = os.environ.get(FILE_VARIABLE)
     return Path(given) if given else login_file().with_name(FILE_NAME)
 
 
 def load() -> SigningKey | None:
-    """Read the key; None if there is none yet.
+    """Read the key; return None if it does not exist yet.
 
     Raises:
         CliError: It cannot be read, or others can read it.
@@ -36,10 +36,10 @@ def load() -> SigningKey | None:
     except OSError as error:
         raise CliError(f"cannot read the key {file}: {error.strerror}") from error
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise CliError(f"the key {file} can be read by others; if nobody has, run: chmod 600 {file}")
+        raise CliError(f"the key {file} can be read by others; if it was not copied, run: chmod 600 {file}")
     try:
         return SigningKey.from_pem(text)
-    except BadKey as error:
+    except BadKeyError as error:
         raise CliError(f"{file}: {error}") from error
 
 
@@ -63,7 +63,7 @@ def load_or_make() -> tuple[SigningKey, bool]:
         try:
             with os.fdopen(descriptor, "wb") as output:
                 output.write(key.to_pem())
-            file.hardlink_to(aside)  # of two programs the first one's key counts
+            file.hardlink_to(aside)  # another program may have made the key first; that one counts
         finally:
             aside.unlink()
     except FileExistsError:

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
-from rce_master.cli.exceptions import NotLoggedIn
+from rce_master.cli.exceptions import NotLoggedInError
 
 tokens = typer.Typer(invoke_without_command=True, help="Print, list, make and revoke tokens.")
 robots = typer.Typer(no_args_is_help=True, help="Give robots credentials of their own, and take them back.")
@@ -31,7 +31,7 @@ def token(context: typer.Context) -> None:
 async def _print() -> None:
     found = credentials.load()
     if found.expires <= time.time():
-        raise NotLoggedIn
+        raise NotLoggedInError
     typer.echo(found.token)
 
 

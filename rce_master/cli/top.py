@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from rce.protocol.quantities import about
+from rce.model.quantities import about
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.show import coloured, console, fetch
@@ -47,22 +47,22 @@ def top(
 
 
 class Look:
-    """How it is laid out, and what was seen before."""
+    """The layout, and the previous observations."""
 
     def __init__(self, sort: Order, *, nodes: bool = False, interfaces: bool = False, user: str = "") -> None:
         self.sort = sort
         self.nodes = nodes
         self.interfaces = interfaces
         self.user = user
-        """Who looks; commands for containers of others name their user."""
+        """The user of this program; commands for containers of others name their user."""
         self._before: list[Usage] = []
 
     async def take(self, client: ApiClient, interval: float) -> RenderableType:
-        """Look once.
+        """Read and show the usage once.
 
         Args:
-            client: Asks the master.
-            interval: Seconds since the last look.
+            client: Connects to the master.
+            interval: Seconds since the last reading.
         """
         usage = await client.call("GET", "/usage")
         parts: list[RenderableType] = [layout(usage, self)]
@@ -87,7 +87,7 @@ async def _top(interval: float, look: Look, *, once: bool) -> None:
 
 
 def layout(usage: Usage, look: Look) -> Group:
-    """Lay out what ``GET /usage`` gave."""
+    """Format the answer of ``GET /usage``."""
     parts: list[RenderableType] = []
     if usage["machines"]:
         parts += [_machines(usage["machines"]), ""]

@@ -78,7 +78,7 @@ def passwd(name: str, password_stdin: PasswordStdin = False, state_dir: StateDir
 
 
 def _is_own(name: str, state_dir: Path | None) -> bool:
-    """Whether it is the password of the user who is logged in, and is changed over the API."""
+    """Whether it is the logged-in user's own password, changed over the API."""
     try:
         return state_dir is None and credentials.load().user == name
     except CliError:
@@ -118,7 +118,7 @@ async def _set_role(name: str, role: str, state_dir: Path | None) -> None:
 class _Directory(Protocol):
     @property
     def place(self) -> str:
-        """Where it is, for messages."""
+        """The place of the users, for messages."""
 
     async def add(self, name: str, role: str, password: str) -> None: ...
     async def list(self) -> list[dict[str, Any]]: ...
@@ -152,7 +152,7 @@ class _ApiDirectory:
 
 
 class _StoreDirectory:
-    """Users right in the store, which is locked meanwhile."""
+    """Users directly in the store, which is locked meanwhile."""
 
     def __init__(self, offline: OfflineState) -> None:
         self.place = f"in {offline.folder}"
@@ -171,7 +171,7 @@ class _StoreDirectory:
         ]
 
     async def set_password(self, name: str, password: str, old: str) -> None:
-        del old  # whoever may write the folder may do everything
+        del old  # a user who may write the folder may do everything
         hashed = await self._authenticator.hash(client_digest(password))
         await self._offline.do(commands.SetPassword(name=name, password=hashed), "set_password", name)
 
@@ -188,7 +188,7 @@ class _StoreDirectory:
 
 @asynccontextmanager
 async def _directory(state_dir: Path | None) -> AsyncIterator[_Directory]:
-    """Choose: the folder that was named, else the master where one is logged in, else the default folder."""
+    """Choose the named folder, else the master of the login, else the default folder."""
     place = choose(state_dir)
     if not isinstance(place, Path):
         async with ApiClient.of(place) as client:

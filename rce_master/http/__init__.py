@@ -1,1 +1,1 @@
-"""The master's HTTP server: the clients' entry, REST API, events and metrics."""
+"""The master's HTTP server: the entry point of clients, REST API, events and metrics."""

@@ -1,4 +1,4 @@
-"""Who a request is of, and from where."""
+"""Identifies the user and the address of a request."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from aiohttp import hdrs, web
 
-from rce_master.exceptions import Forbidden, WrongCredentials
+from rce_master.exceptions import ForbiddenError, WrongCredentialsError
 from rce_master.state.records import METRICS_SCOPE, UserRole
 
 if TYPE_CHECKING:
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 def bearer(request: web.Request, services: Services) -> tuple[str, User | None]:
-    """Return the token that a request carries, and whose it is; without one, nothing and None.
+    """Return the token of a request and its user; without one, an empty text and None.
 
     Raises:
-        WrongCredentials: It is unknown or expired.
-        Forbidden: It is not for the API.
+        WrongCredentialsError: The token is unknown or expired.
+        ForbiddenError: The token is not for the API.
     """
     token = _token(request)
     if not token:
@@ -28,7 +28,7 @@ def bearer(request: web.Request, services: Services) -> tuple[str, User | None]:
     user, record = services.tokens.find(token)
     if record.scope:
         what = f"robot {record.robot!r}" if record.robot else record.scope
-        raise Forbidden(f"this token is good for {what} only; log in for one for the API: rce login")
+        raise ForbiddenError(f"this token is good for {what} only; log in for one for the API: rce login")
     return token, user
 
 
@@ -36,39 +36,41 @@ def admit(route: Route, user: User | None) -> None:
     """Check that a user may use a route.
 
     Raises:
-        WrongCredentials: Nobody is known, and the route is not open to everybody.
-        Forbidden: The user's role is not enough.
+        WrongCredentialsError: The request is not authenticated, and the route is not public.
+        ForbiddenError: The user's role is not enough.
     """
     if user is None and not route.open:
-        raise WrongCredentials("a bearer token is needed; get one at /api/v1/login")
+        raise WrongCredentialsError("a bearer token is needed; get one at /api/v1/login")
     if route.admin and (user is None or user.role is not UserRole.ADMIN):
-        raise Forbidden("only an administrator may do this")
+        raise ForbiddenError("only an administrator may do this")
     looks = (route.method == "GET" and not route.acts) or route.everybody or route.open
     if user is not None and not user.role.changes and not looks:
-        raise Forbidden(f"the role {user.role.value} changes nothing; ask an administrator for another one")
+        raise ForbiddenError(
+            f"the role {user.role.value} changes nothing; ask an administrator for another one"
+        )
 
 
 def check_metrics(request: web.Request, services: Services) -> None:
-    """Check that a request may read the metrics, whose labels name everybody's robots and containers.
+    """Check that a request may read the metrics, whose labels name the robots and containers of all users.
 
-    A token is needed everywhere, because a request that a proxy on this machine passes on need not look
-    different from one of a program here. In development mode, programs of this machine need none.
+    A token is always needed, because requests that a proxy on this machine forwards may look like those of
+    local programs. In development mode, programs of this machine do not need a token.
 
     Raises:
-        WrongCredentials: There is no token, or it is unknown or expired.
-        Forbidden: It is not one for this.
+        WrongCredentialsError: The token is missing, unknown or expired.
+        ForbiddenError: The token is not for the metrics.
     """
     token = _token(request)
     if not token:
         if services.dev and _is_local(request):
             return
-        raise WrongCredentials(
+        raise WrongCredentialsError(
             "metrics need a bearer token: of an administrator, or one that is good for nothing else"
             " (rce token new --metrics)"
         )
     user, record = services.tokens.find(token)
     if not _may_read_metrics(user, record):
-        raise Forbidden("metrics are for administrators, and for tokens of: rce token new --metrics")
+        raise ForbiddenError("metrics are for administrators, and for tokens of: rce token new --metrics")
 
 
 def _may_read_metrics(user: User, record: Token) -> bool:

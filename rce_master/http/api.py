@@ -1,4 +1,4 @@
-"""The REST API: its routes, what they read and answer, and the document that describes them.
+"""The REST API: its routes, their requests and answers, and the OpenAPI document.
 
 It is loaded with the first request for it: see :mod:`rce_master.http.late`.
 """
@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, build_document
-from rce_master.exceptions import Invalid, MasterError
+from rce_master.exceptions import InvalidRequestError, MasterError
 from rce_master.http import (
     api_account,
     api_audit,
@@ -58,7 +58,7 @@ class Api:
     """Answers all requests for paths of the API.
 
     Args:
-        services: What the handlers work with.
+        services: The services of the handlers.
     """
 
     def __init__(self, services: Services) -> None:
@@ -76,8 +76,8 @@ class Api:
         """Answer a request.
 
         Raises:
-            HTTPException: There is no such path, or not with this method.
-            MasterError: It was not done.
+            HTTPException: The path does not exist, or does not have this method.
+            MasterError: The request failed.
         """
         found = await self._router.resolve(request)
         if found.http_exception is not None:
@@ -106,7 +106,9 @@ def _adapt(route: Route, services: Services) -> Answer:
         if reply is None:
             return web.Response(status=route.status)
         return web.Response(
-            body=reply.model_dump_json().encode(), status=route.status, content_type="application/json"
+            body=reply.model_dump_json(by_alias=True).encode(),
+            status=route.status,
+            content_type="application/json",
         )
 
     return answer
@@ -131,13 +133,13 @@ def read_body(model: type[BaseModel], text: bytes) -> BaseModel:
     """Read a request's body.
 
     Raises:
-        Invalid: It does not fit; the text names each fault with its path.
+        InvalidRequestError: It does not fit the model; the text names each fault with its path.
     """
     try:
         return model.model_validate_json(text or b"{}")
     except ValidationError as error:
         faults = "; ".join(f"{_place(fault['loc'])}: {fault['msg']}" for fault in error.errors())
-        raise Invalid(faults) from None
+        raise InvalidRequestError(faults) from None
 
 
 def _place(location: tuple[int | str, ...]) -> str:

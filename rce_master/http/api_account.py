@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from rce_master.auth import client_digest
-from rce_master.exceptions import Forbidden, Invalid, NotFound, WrongCredentials
+from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError, WrongCredentialsError
 from rce_master.http import models
-from rce_master.http.routes import Call, RouteTable
+from rce_master.http.routes import Call, route_table
 from rce_master.http.views import Views
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
 from rce_master.tokens import new_token, token_digest
 
-routes = RouteTable("account")
+routes = route_table("account")
 
 
 @routes.route("POST", "/login", "Get a bearer token", body=models.LoginIn, reply=models.TokenOut, open=True)
@@ -22,9 +22,9 @@ async def log_in(call: Call) -> models.TokenOut:
     user = await services.authenticator.verify(body.userID, client_digest(body.password), call.address)
     lifetime = min(body.lifetime or services.token_lifetime, services.token_lifetime)
     token, record = new_token(user.name, body.label, services.clock(), lifetime)
-    # What was used lately must not make room for this one.
+    # A recently used token must not be dropped for this one.
     uses = services.tokens.uses()
-    _, outcome = await services.realm.submit_all(
+    _, outcome = await services.state_service.submit_all(
         [uses, commands.AddToken(token=record, password=user.password)]
     )
     if outcome is not None:
@@ -37,7 +37,7 @@ async def log_in(call: Call) -> models.TokenOut:
 @routes.route("DELETE", "/login", "Forget the token that this request carries", status=204, everybody=True)
 async def log_out(call: Call) -> None:
     """Forget the token."""
-    await call.services.realm.submit(commands.RemoveToken(digest=token_digest(call.token)))
+    await call.services.state_service.submit(commands.RemoveToken(digest=token_digest(call.token)))
 
 
 @routes.route("GET", "/user", "Show who you are", reply=models.UserOut)
@@ -50,7 +50,7 @@ async def show_caller(call: Call) -> models.UserOut:
 async def list_users(call: Call) -> models.UsersOut:
     """List all users."""
     views = _views(call)
-    return models.UsersOut(users=[views.user(user) for user in call.services.realm.tables.users])
+    return models.UsersOut(users=[views.user(user) for user in call.services.state_service.tables.users])
 
 
 @routes.route(
@@ -67,15 +67,15 @@ async def add_user(call: Call) -> models.UserOut:
         password=await services.authenticator.hash(digest, call.caller.name),
         created=services.clock(),
     )
-    await services.realm.submit(commands.AddUser(user=user))
+    await services.state_service.submit(commands.AddUser(user=user))
     await services.authenticator.know(user.name, user.password, digest)
     return _views(call).user(user)
 
 
-@routes.route("DELETE", "/users/{name}", "Remove a user with all that is theirs", status=204, admin=True)
+@routes.route("DELETE", "/users/{name}", "Remove a user and everything it owns", status=204, admin=True)
 async def remove_user(call: Call) -> None:
     """Remove a user."""
-    await call.services.realm.submit(commands.RemoveUser(name=call.path("name")))
+    await call.services.state_service.submit(commands.RemoveUser(name=call.path("name")))
 
 
 @routes.route(
@@ -91,15 +91,15 @@ async def set_password(call: Call) -> None:
     name = call.path("name")
     services = call.services
     if name != call.caller.name and not call.is_admin:
-        raise Forbidden("only an administrator changes another user's password")
-    if name not in services.realm.tables.users:
-        raise NotFound(f"there is no user {name!r}")
+        raise ForbiddenError("only an administrator changes another user's password")
+    if name not in services.state_service.tables.users:
+        raise NotFoundError(f"there is no user {name!r}")
     body = call.read(models.PasswordIn)
     if name == call.caller.name:
         await _check_old(call, body.old_password)
     digest = client_digest(body.password)
     hashed = await services.authenticator.hash(digest, call.caller.name)
-    await services.realm.submit(commands.SetPassword(name=name, password=hashed))
+    await services.state_service.submit(commands.SetPassword(name=name, password=hashed))
     await services.authenticator.know(name, hashed, digest)
 
 
@@ -109,18 +109,20 @@ async def set_password(call: Call) -> None:
 async def set_role(call: Call) -> None:
     """Change a role."""
     role = UserRole(call.read(models.RoleIn).role)
-    await call.services.realm.submit(commands.SetRole(name=call.path("name"), role=role))
+    await call.services.state_service.submit(commands.SetRole(name=call.path("name"), role=role))
 
 
 async def _check_old(call: Call, password: str) -> None:
-    """Whoever found a token must not be able to lock its owner out."""
+    """Check the old password: the finder of a token must not be able to lock its owner out."""
     if not password:
-        raise Invalid("old_password: is missing; to change your own password, give the one until now")
+        raise InvalidRequestError(
+            "old_password: is missing; to change your own password, give the one until now"
+        )
     try:
         await call.services.authenticator.verify(call.caller.name, client_digest(password), call.address)
-    except WrongCredentials:
-        raise Forbidden("old_password: is wrong") from None
+    except WrongCredentialsError:
+        raise ForbiddenError("old_password: is wrong") from None
 
 
 def _views(call: Call) -> Views:
-    return Views(call.services.realm.tables, call.services.reconciler.usage)
+    return Views(call.services.state_service.tables, call.services.reconciler.usage)

@@ -1,16 +1,16 @@
-"""REST: who came in, who was refused, and who changed what."""
+"""REST: the audit log of logins, refusals and changes."""
 
 from __future__ import annotations
 
 from msgspec.structs import asdict
 
 from rce.web.openapi import Query
-from rce_master.exceptions import Forbidden
+from rce_master.exceptions import ForbiddenError
 from rce_master.http import models
-from rce_master.http.routes import Call, RouteTable
+from rce_master.http.routes import Call, route_table
 from rce_master.state.records import UserRole
 
-routes = RouteTable("audit")
+routes = route_table("audit")
 
 MAX_RECORDS = 1000
 
@@ -46,10 +46,10 @@ async def read_audit(call: Call) -> models.AuditOut:
     everybody=True,
 )
 async def note_action(call: Call) -> None:
-    """Note what somebody steered; a station does it with the token of who steered."""
+    """Record a control action; a station sends it with the token of the acting user."""
     body = call.read(models.AuditIn)
     if call.caller.role is UserRole.VIEWER and body.outcome == "done":
-        raise Forbidden("role viewer steers nothing, so there is nothing to note")
+        raise ForbiddenError("role viewer steers nothing, so there is nothing to note")
     call.services.audit.add(
         call.caller.name,
         body.action,

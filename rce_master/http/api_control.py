@@ -2,51 +2,74 @@
 
 from __future__ import annotations
 
-import re
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from rce.model.faults import SpecError
+from rce.model.requests import (
+    AddInterface,
+    AddNode,
+    ConfigureConnections,
+    Connection,
+    CreateContainer,
+    DeleteParameter,
+    DestroyContainer,
+    RemoveInterface,
+    RemoveNode,
+    ResizeContainer,
+    SetParameter,
+)
 from rce.web.openapi import Query
-from rce_master import requests
-from rce_master.exceptions import Invalid
-from rce_master.http import models
-from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.exceptions import InvalidRequestError
+from rce_master.http import spec_models as models
+from rce_master.http.routes import OF_USER, Call, route_table
+from rce_master.http.spec_models import SPELLING
+from rce_master.requests import commands_of
 
-routes = RouteTable("control")
+if TYPE_CHECKING:
+    from rce.model.requests import Component, Item, Request
+    from rce_master.http.model import Model
+
+T = TypeVar("T", bound="Request | Item")
+
+routes = route_table("control")
 
 _QUERY = (OF_USER,)
-_FAULT = re.compile(r"^([A-Z]{2}): data\.(?:\w+\[\d+\]\.|containerData\.)?(\w+)")
-"""A fault in a client's message, up to the key that is wrong."""
-_NAMES = {
-    "nodeTag": "tag",
-    "interfaceTag": "tag",
-    "endpointTag": "endpoint",
-    "interfaceType": "type",
-    "className": "cls",
-}
-"""What keys of the messages are called here, if it is not only written another way."""
 
 
-async def _request(call: Call, kind: str, data: dict[str, Any]) -> None:
-    """Do a client request.
+async def _do(call: Call, request: Request | Component) -> None:
+    """Carry out a request.
 
     Raises:
-        Refused: It was not done.
+        Refused: The state does not allow it.
         StoreError: It could not be stored.
     """
-    wanted, faults = requests.read(call.owner, kind, data)
-    if faults:
-        raise Invalid("; ".join(_FAULT.sub(_place, fault) for fault in faults))
-    for outcome in await call.services.realm.submit_all(wanted):
+    commands = list(commands_of(request, call.owner))
+    for outcome in await call.services.state_service.submit_all(commands):
         if outcome is not None:
             raise outcome
+
+
+def _read(request: type[T], data: dict[str, Any]) -> T:
+    """Read a request in the spelling of this API.
+
+    Raises:
+        InvalidRequestError: It is not valid.
+    """
+    try:
+        return SPELLING.read(request, data)
+    except SpecError as error:
+        raise InvalidRequestError(str(error)) from error
+
+
+def _sent(body: Model) -> dict[str, Any]:
+    """Return the fields that a body contains, without those that it leaves out."""
+    return body.model_dump(exclude_unset=True)
 
 
 @routes.route("POST", "/containers", "Make a container", body=models.ContainerIn, status=204, query=_QUERY)
 async def create_container(call: Call) -> None:
     """Make a container."""
-    body = call.read(models.ContainerIn)
-    data = {_camel(key): value for key, value in body.model_dump(exclude={"tag"}).items()}
-    await _request(call, "CC", {"containerTag": body.tag, "containerData": data})
+    await _do(call, _read(CreateContainer, _sent(call.read(models.ContainerIn))))
 
 
 @routes.route(
@@ -59,14 +82,14 @@ async def create_container(call: Call) -> None:
 )
 async def resize_container(call: Call) -> None:
     """Resize a container."""
-    data = call.read(models.ResizeIn).model_dump(exclude_none=True)
-    await _request(call, "RC", {"containerTag": call.path("container"), "containerData": data})
+    data = _sent(call.read(models.ResizeIn))
+    await _do(call, _read(ResizeContainer, {"container": call.path("container"), **data}))
 
 
 @routes.route("DELETE", "/containers/{container}", "Destroy a container", status=204, query=_QUERY)
 async def destroy_container(call: Call) -> None:
     """Destroy a container."""
-    await _request(call, "DC", {"containerTag": call.path("container")})
+    await _do(call, _read(DestroyContainer, {"container": call.path("container")}))
 
 
 @routes.route(
@@ -74,17 +97,15 @@ async def destroy_container(call: Call) -> None:
 )
 async def add_node(call: Call) -> None:
     """Start a node."""
-    body = call.read(models.NodeIn)
-    rest = {_camel(key): value for key, value in body.model_dump(exclude={"tag"}).items()}
-    item = {"containerTag": call.path("container"), "nodeTag": body.tag, **rest}
-    await _request(call, "CN", {"addNodes": [item]})
+    data = _sent(call.read(models.NodeIn))
+    await _do(call, _read(AddNode, {"container": call.path("container"), **data}))
 
 
 @routes.route("DELETE", "/containers/{container}/nodes/{node}", "Stop a node", status=204, query=_QUERY)
 async def remove_node(call: Call) -> None:
     """Stop a node."""
-    item = {"containerTag": call.path("container"), "nodeTag": call.path("node")}
-    await _request(call, "CN", {"removeNodes": [item]})
+    data = {"container": call.path("container"), "tag": call.path("node")}
+    await _do(call, _read(RemoveNode, data))
 
 
 @routes.route(
@@ -97,9 +118,8 @@ async def remove_node(call: Call) -> None:
 )
 async def set_parameter(call: Call) -> None:
     """Set a parameter."""
-    body = call.read(models.ParameterIn)
-    item = {"containerTag": call.path("container"), "name": body.name, "value": body.value}
-    await _request(call, "CN", {"setParam": [item]})
+    data = _sent(call.read(models.ParameterIn))
+    await _do(call, _read(SetParameter, {"container": call.path("container"), **data}))
 
 
 @routes.route(
@@ -111,8 +131,8 @@ async def set_parameter(call: Call) -> None:
 )
 async def delete_parameter(call: Call) -> None:
     """Delete a parameter."""
-    item = {"containerTag": call.path("container"), "name": call.query("name")}
-    await _request(call, "CN", {"deleteParam": [item]})
+    data = {"container": call.path("container"), "name": call.query("name")}
+    await _do(call, _read(DeleteParameter, data))
 
 
 @routes.route(
@@ -125,15 +145,8 @@ async def delete_parameter(call: Call) -> None:
 )
 async def add_interface(call: Call) -> None:
     """Make an interface."""
-    body = call.read(models.InterfaceIn)
-    item = {
-        "endpointTag": call.path("endpoint"),
-        "interfaceTag": body.tag,
-        "interfaceType": body.type,
-        "className": body.cls,
-        "addr": body.addr,
-    }
-    await _request(call, "CN", {"addInterfaces": [item]})
+    data = _sent(call.read(models.InterfaceIn))
+    await _do(call, _read(AddInterface, {"endpoint": call.path("endpoint"), **data}))
 
 
 @routes.route(
@@ -145,8 +158,8 @@ async def add_interface(call: Call) -> None:
 )
 async def remove_interface(call: Call) -> None:
     """Remove an interface."""
-    item = {"endpointTag": call.path("endpoint"), "interfaceTag": call.path("interface")}
-    await _request(call, "CN", {"removeInterfaces": [item]})
+    data = {"endpoint": call.path("endpoint"), "tag": call.path("interface")}
+    await _do(call, _read(RemoveInterface, data))
 
 
 @routes.route(
@@ -154,8 +167,8 @@ async def remove_interface(call: Call) -> None:
 )
 async def connect(call: Call) -> None:
     """Join two interfaces."""
-    body = call.read(models.ConnectionIn)
-    await _request(call, "CX", {"connect": [{"tagA": body.tag_a, "tagB": body.tag_b}]})
+    pair = _sent(call.read(models.ConnectionIn))
+    await _do(call, ConfigureConnections(connect=(_read(Connection, pair),)))
 
 
 @routes.route(
@@ -171,18 +184,5 @@ async def connect(call: Call) -> None:
 )
 async def disconnect(call: Call) -> None:
     """Part two interfaces."""
-    pair = {"tagA": call.query("tag_a"), "tagB": call.query("tag_b")}
-    await _request(call, "CX", {"disconnect": [pair]})
-
-
-def _place(fault: re.Match[str]) -> str:
-    """Say where a fault is in words of this API."""
-    kind, key = fault.groups()
-    if key == "containerTag":
-        return "tag" if kind == "CC" else "container"
-    return _NAMES.get(key) or re.sub(r"(?=[A-Z])", "_", key).lower()
-
-
-def _camel(key: str) -> str:
-    first, *rest = key.split("_")
-    return first + "".join(part.capitalize() for part in rest)
+    pair = {"tag_a": call.query("tag_a"), "tag_b": call.query("tag_b")}
+    await _do(call, ConfigureConnections(disconnect=(_read(Connection, pair),)))

@@ -10,21 +10,22 @@ import msgspec
 from aiohttp import WSMsgType, web
 from websockets.exceptions import ConnectionClosed
 
+from rce.aio.tasks import run_until_first
 from rce.control.execution import MAX_COMMAND, NOT_RUN, ended_frame, read_command
-from rce_master.exceptions import Invalid, MasterError
-from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.exceptions import InvalidRequestError, MasterError
+from rce_master.http.routes import OF_USER, Call, route_table
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
     from rce.control.execution import Command
 
-routes = RouteTable("exec")
+routes = route_table("exec")
 
 FIRST_MESSAGE_S = 10.0
 HEARTBEAT_S = 15.0
 CHECK_S = 60.0
-"""How long it is waited for the end of the login before it is looked at anew."""
+"""Interval of checks whether the login has ended."""
 
 
 @routes.route(
@@ -42,7 +43,7 @@ async def execute(call: Call) -> web.StreamResponse:
     peer = call.services.reconciler.task_set_of(id_)
     user = web.WebSocketResponse(compress=False, heartbeat=HEARTBEAT_S, max_msg_size=MAX_COMMAND + 1)
     if not user.can_prepare(call.request):
-        raise Invalid("this path is for WebSockets; 'rce exec' uses it")
+        raise InvalidRequestError("this path is for WebSockets; 'rce exec' uses it")
     await user.prepare(call.request)
     try:
         command = await _first(user)
@@ -64,8 +65,8 @@ async def _first(user: web.WebSocketResponse) -> Command:
     """Receive the command.
 
     Raises:
-        ValueError: Something else came.
-        TimeoutError: Nothing came.
+        ValueError: The message is not a command.
+        TimeoutError: No message was received.
     """
     async with asyncio.timeout(FIRST_MESSAGE_S):
         message = await user.receive()
@@ -78,18 +79,9 @@ async def _first(user: web.WebSocketResponse) -> Command:
 
 
 async def _relay(call: Call, user: web.WebSocketResponse, machine: ServerConnection) -> None:
-    """Pass frames on until either side has gone, or the user may not do this any more."""
-    work = (_to_machine(user, machine), _to_user(machine, user), _watch(call))
-    tasks = [asyncio.create_task(one) for one in work]
-    try:
-        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        for task in done:
-            with contextlib.suppress(ConnectionClosed, ConnectionResetError):  # either side may just go
-                task.result()
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+    """Pass frames on until either side disconnects, or the user loses the permission."""
+    with contextlib.suppress(ConnectionClosed, ConnectionResetError):  # either side may disconnect
+        await run_until_first(_to_machine(user, machine), _to_user(machine, user), _watch(call))
 
 
 async def _to_machine(user: web.WebSocketResponse, machine: ServerConnection) -> None:
@@ -109,10 +101,10 @@ async def _to_user(machine: ServerConnection, user: web.WebSocketResponse) -> No
 
 
 async def _watch(call: Call) -> None:
-    """Return never; raise when the login has ended.
+    """Never return; raise when the login has ended.
 
     Raises:
-        ValueError: It has.
+        ValueError: The login has ended.
     """
     while await call.lasts(CHECK_S):
         pass

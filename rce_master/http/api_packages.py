@@ -5,22 +5,22 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING
 
-from rce.bundles.exceptions import BadKey
-from rce.bundles.signing import key_id
+from rce.packages.exceptions import BadKeyError
+from rce.packages.signing import key_id
 from rce.web.bodies import read_pieces
 from rce.web.openapi import Query
-from rce_master.bundles.office import Wish
-from rce_master.exceptions import Invalid, NotFound
+from rce_master.exceptions import InvalidRequestError, NotFoundError
 from rce_master.http import package_models as models
-from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.http.routes import OF_USER, Call, route_table
+from rce_master.packages.service import PushRequest
 from rce_master.state import commands
 from rce_master.state.packages import find, uses
-from rce_master.state.records import Bundle, PackageKey, bundle_key
+from rce_master.state.records import PackageKey, UserPackage, user_package_key
 
 if TYPE_CHECKING:
     from rce_master.state.tables import Tables
 
-routes = RouteTable("packages")
+routes = route_table("packages")
 
 _QUERY = (OF_USER,)
 
@@ -28,18 +28,18 @@ _QUERY = (OF_USER,)
 @routes.route("GET", "/packages", "List packages that users brought", reply=models.PackagesOut, query=_QUERY)
 async def list_packages(call: Call) -> models.PackagesOut:
     """List all versions of all packages."""
-    tables = call.services.realm.tables
+    tables = call.services.state_service.tables
     scope = call.scope
-    found = tables.bundles if scope is None else tables.bundles.by("user", scope)
-    users = {bundle.user for bundle in found}
+    found = tables.packages if scope is None else tables.packages.by("user", scope)
+    users = {package.user for package in found}
     used = {id_: nodes for user in users for id_, nodes in uses(tables, user).items()}
     newest = cache(lambda user, name: find(tables, user, name))
     return models.PackagesOut(
         packages=[
             _package_out(
-                bundle, is_newest=newest(bundle.user, bundle.name) == bundle, nodes=used.get(bundle.id)
+                package, is_newest=newest(package.user, package.name) == package, nodes=used.get(package.id)
             )
-            for bundle in sorted(found, key=lambda bundle: bundle.id)
+            for package in sorted(found, key=lambda package: package.id)
         ]
     )
 
@@ -47,11 +47,11 @@ async def list_packages(call: Call) -> models.PackagesOut:
 @routes.route("GET", "/packages/{name}/{version}", "Show a package", reply=models.PackageOut, query=_QUERY)
 async def show_package(call: Call) -> models.PackageOut:
     """Show a version of a package."""
-    tables = call.services.realm.tables
+    tables = call.services.state_service.tables
     name, version = call.path("name"), call.path("version")
-    found = tables.bundles.get(bundle_key(call.owner, name, version))
+    found = tables.packages.get(user_package_key(call.owner, name, version))
     if found is None:
-        raise NotFound(f"there is no package {name!r} of version {version!r}")
+        raise NotFoundError(f"there is no package {name!r} of version {version!r}")
     return _shown(tables, found)
 
 
@@ -69,8 +69,8 @@ async def show_package(call: Call) -> models.PackageOut:
     ),
 )
 async def push_package(call: Call) -> models.PackageOut:
-    """Take a version of a package; the same one again changes nothing."""
-    wish = Wish(
+    """Accept a version of a package; an identical one changes nothing."""
+    request = PushRequest(
         user=call.caller.name,
         name=call.path("name"),
         version=call.path("version"),
@@ -78,8 +78,8 @@ async def push_package(call: Call) -> models.PackageOut:
         signature=call.query("signature"),
     )
     size = call.request.content_length or 0
-    bundle, warnings = await call.services.packages.push(wish, size, read_pieces(call.request))
-    return _shown(call.services.realm.tables, bundle, warnings)
+    package, warnings = await call.services.packages.push(request, size, read_pieces(call.request))
+    return _shown(call.services.state_service.tables, package, warnings)
 
 
 @routes.route(
@@ -87,8 +87,8 @@ async def push_package(call: Call) -> models.PackageOut:
 )
 async def remove_package(call: Call) -> None:
     """Remove a version that no node needs."""
-    command = commands.RemoveBundle(user=call.owner, name=call.path("name"), version=call.path("version"))
-    await call.services.realm.submit(command)
+    command = commands.RemovePackage(user=call.owner, name=call.path("name"), version=call.path("version"))
+    await call.services.state_service.submit(command)
 
 
 @routes.route(
@@ -96,7 +96,7 @@ async def remove_package(call: Call) -> None:
 )
 async def list_package_keys(call: Call) -> models.PackageKeysOut:
     """List a user's keys."""
-    found = call.services.realm.tables.package_keys.by("user", call.owner)
+    found = call.services.state_service.tables.package_keys.by("user", call.owner)
     return models.PackageKeysOut(keys=[_key_out(key) for key in found])
 
 
@@ -113,43 +113,43 @@ async def register_package_key(call: Call) -> models.PackageKeyOut:
     body = call.read(models.PackageKeyIn)
     try:
         key_id(body.key)
-    except BadKey as error:
-        raise Invalid(str(error)) from error
+    except BadKeyError as error:
+        raise InvalidRequestError(str(error)) from error
     key = PackageKey(user=call.caller.name, key=body.key, label=body.label, created=call.services.clock())
-    await call.services.realm.submit(commands.AddPackageKey(key=key))
+    await call.services.state_service.submit(commands.AddPackageKey(key=key))
     return _key_out(key)
 
 
 @routes.route("DELETE", "/package-keys/{id}", "Trust a key no more", status=204, query=_QUERY)
 async def revoke_package_key(call: Call) -> None:
-    """Trust a key no more."""
-    await call.services.realm.submit(commands.RemovePackageKey(user=call.owner, id=call.path("id")))
+    """Stop trusting a key."""
+    await call.services.state_service.submit(commands.RemovePackageKey(user=call.owner, id=call.path("id")))
 
 
-def _shown(tables: Tables, bundle: Bundle, warnings: tuple[str, ...] = ()) -> models.PackageOut:
-    is_newest = find(tables, bundle.user, bundle.name) == bundle
-    nodes = uses(tables, bundle.user).get(bundle.id)
-    return _package_out(bundle, is_newest=is_newest, nodes=nodes, warnings=warnings)
+def _shown(tables: Tables, package: UserPackage, warnings: tuple[str, ...] = ()) -> models.PackageOut:
+    is_newest = find(tables, package.user, package.name) == package
+    nodes = uses(tables, package.user).get(package.id)
+    return _package_out(package, is_newest=is_newest, nodes=nodes, warnings=warnings)
 
 
 def _package_out(
-    bundle: Bundle, *, is_newest: bool, nodes: list[str] | None, warnings: tuple[str, ...] = ()
+    package: UserPackage, *, is_newest: bool, nodes: list[str] | None, warnings: tuple[str, ...] = ()
 ) -> models.PackageOut:
     return models.PackageOut(
-        user=bundle.user,
-        name=bundle.name,
-        version=bundle.version,
+        user=package.user,
+        name=package.name,
+        version=package.version,
         newest=is_newest,
-        description=bundle.description,
-        executables=list(bundle.executables),
-        requirements=bundle.requirements,
-        files=bundle.files,
-        size=bundle.size,
-        packed=bundle.packed,
-        sha256=bundle.sha256,
-        digest=bundle.digest,
-        key=key_id(bundle.key),
-        created=bundle.created,
+        description=package.description,
+        executables=list(package.executables),
+        requirements=package.requirements,
+        files=package.files,
+        size=package.size,
+        packed=package.packed,
+        sha256=package.sha256,
+        digest=package.digest,
+        key=key_id(package.key),
+        created=package.created,
         nodes=nodes or [],
         warnings=list(warnings),
     )

@@ -1,84 +1,91 @@
-"""REST: what is there."""
+"""REST: lists of robots, containers and other objects."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce_master.http import models
-from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.http import models, spec_models
+from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.http.views import Views
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rce_master.state.records import Endpoint, Link
+    from rce_master.state.records import Endpoint
+    from rce_master.state.wiring_records import Link
 
-routes = RouteTable("fleet")
+routes = route_table("fleet")
 
 
 @routes.route("GET", "/robots", "List robots", reply=models.RobotsOut, query=(OF_USER,))
 async def list_robots(call: Call) -> models.RobotsOut:
     """List robots."""
     views = _views(call)
-    return models.RobotsOut(robots=[views.robot(r) for r in call.services.realm.tables.robots(call.scope)])
+    return models.RobotsOut(
+        robots=[views.robot(r) for r in call.services.state_service.tables.robots(call.scope)]
+    )
 
 
-@routes.route("GET", "/containers", "List containers", reply=models.ContainersOut, query=(OF_USER,))
-async def list_containers(call: Call) -> models.ContainersOut:
+@routes.route("GET", "/containers", "List containers", reply=spec_models.ContainersOut, query=(OF_USER,))
+async def list_containers(call: Call) -> spec_models.ContainersOut:
     """List containers."""
     views = _views(call)
-    found = call.services.realm.tables.containers(call.scope)
-    return models.ContainersOut(containers=[views.container(c) for c in found])
+    found = call.services.state_service.tables.containers(call.scope)
+    return spec_models.ContainersOut(containers=[views.container(c) for c in found])
 
 
-@routes.route("GET", "/nodes", "List nodes", reply=models.NodesOut, query=(OF_USER,))
-async def list_nodes(call: Call) -> models.NodesOut:
+@routes.route("GET", "/nodes", "List nodes", reply=spec_models.NodesOut, query=(OF_USER,))
+async def list_nodes(call: Call) -> spec_models.NodesOut:
     """List nodes."""
     views = _views(call)
-    found = call.services.realm.tables.containers(call.scope)
-    return models.NodesOut(nodes=[node for c in found for node in views.nodes(c)])
+    found = call.services.state_service.tables.containers(call.scope)
+    return spec_models.NodesOut(nodes=[node for c in found for node in views.nodes(c)])
 
 
-@routes.route("GET", "/parameters", "List parameters", reply=models.ParametersOut, query=(OF_USER,))
-async def list_parameters(call: Call) -> models.ParametersOut:
+@routes.route("GET", "/parameters", "List parameters", reply=spec_models.ParametersOut, query=(OF_USER,))
+async def list_parameters(call: Call) -> spec_models.ParametersOut:
     """List parameters."""
     views = _views(call)
-    found = call.services.realm.tables.containers(call.scope)
-    return models.ParametersOut(parameters=[p for c in found for p in views.parameters(c)])
+    found = call.services.state_service.tables.containers(call.scope)
+    return spec_models.ParametersOut(parameters=[p for c in found for p in views.parameters(c)])
 
 
-@routes.route("GET", "/interfaces", "List interfaces", reply=models.InterfacesOut, query=(OF_USER,))
-async def list_interfaces(call: Call) -> models.InterfacesOut:
+@routes.route("GET", "/interfaces", "List interfaces", reply=spec_models.InterfacesOut, query=(OF_USER,))
+async def list_interfaces(call: Call) -> spec_models.InterfacesOut:
     """List interfaces."""
     views = _views(call)
-    return models.InterfacesOut(interfaces=[i for e in _endpoints(call) for i in views.interfaces(e)])
+    return spec_models.InterfacesOut(interfaces=[i for e in _endpoints(call) for i in views.interfaces(e)])
 
 
-@routes.route("GET", "/connections", "List connections", reply=models.ConnectionsOut, query=(OF_USER,))
-async def list_connections(call: Call) -> models.ConnectionsOut:
+@routes.route("GET", "/connections", "List connections", reply=spec_models.ConnectionsOut, query=(OF_USER,))
+async def list_connections(call: Call) -> spec_models.ConnectionsOut:
     """List connections."""
     views = _views(call)
-    return models.ConnectionsOut(connections=[c for link in _links(call) for c in views.connections(link)])
+    return spec_models.ConnectionsOut(
+        connections=[c for link in _links(call) for c in views.connections(link)]
+    )
 
 
 @routes.route("GET", "/machines", "List task sets and machines", reply=models.MachinesOut, admin=True)
 async def list_machines(call: Call) -> models.MachinesOut:
     """List task sets."""
     views = _views(call)
-    return models.MachinesOut(machines=[views.machine(s) for s in call.services.realm.tables.task_sets])
+    return models.MachinesOut(
+        machines=[views.machine(s) for s in call.services.state_service.tables.task_sets]
+    )
 
 
 def _views(call: Call) -> Views:
-    return Views(call.services.realm.tables, call.services.reconciler.usage)
+    return Views(call.services.state_service.tables, call.services.reconciler.usage)
 
 
 def _endpoints(call: Call) -> Iterable[Endpoint]:
-    tables = call.services.realm.tables
+    tables = call.services.state_service.tables
     return tables.endpoints if call.scope is None else tables.endpoints.by("user", call.scope)
 
 
 def _links(call: Call) -> Iterable[Link]:
-    tables = call.services.realm.tables
+    tables = call.services.state_service.tables
     if call.scope is None:
         return tables.links
     found = (

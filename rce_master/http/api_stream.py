@@ -11,14 +11,14 @@ from typing import TypeVar
 import msgspec
 from aiohttp import web
 
-from rce.control.logs import LogLevel, LogStream, LogWish
+from rce.control.logs import LogLevel, LogQuery, LogStream
 from rce.web.openapi import Query
 from rce_master.events import Event
-from rce_master.exceptions import Invalid
+from rce_master.exceptions import InvalidRequestError
 from rce_master.http import models
-from rce_master.http.routes import ENDED, OF_USER, Call, RouteTable
+from rce_master.http.routes import ENDED, OF_USER, Call, route_table
 
-routes = RouteTable("stream")
+routes = route_table("stream")
 
 MAX_LOG = 1 << 20
 HEARTBEAT_S = 15.0
@@ -36,8 +36,8 @@ _LOG_QUERY = (
     Query(name="limit", description=f"At most so many bytes, up to {MAX_LOG}.", type="integer"),
     Query(name="stream", description=f"Only these, with commas: {_words(LogStream)}."),
     Query(name="level", description=f"Only log records in ROS from this level on: {_words(LogLevel)}."),
-    Query(name="previous", description="true: of the last life of the container that ended."),
-    Query(name="life", description="Of that life of the container, as an answer named it."),
+    Query(name="previous", description="true: of the last incarnation of the container that ended."),
+    Query(name="life", description="Of that incarnation of the container, as an answer named it."),
 )
 
 
@@ -70,27 +70,27 @@ async def read_container_log(call: Call) -> models.LogOut:
 async def _read_log(call: Call, node: str) -> models.LogOut:
     offset, limit = call.number("offset", 0), call.number("limit", 65536)
     if not 0 < limit <= MAX_LOG:
-        raise Invalid(f"query parameter 'limit' must be 1 to {MAX_LOG}")
+        raise InvalidRequestError(f"query parameter 'limit' must be 1 to {MAX_LOG}")
     id_ = f"{call.owner}/{call.path('container')}"
-    wish = _wish(call.request.query)
+    query = _log_query(call.request.query)
     async with call.services.quotas.log_read(call.caller):
-        chunk = await call.services.reconciler.read_log(id_, node, offset, limit, wish)
+        chunk = await call.services.reconciler.read_log(id_, node, offset, limit, query)
     return models.LogOut(
         text=chunk.text,
         offset=chunk.offset,
-        life=chunk.life,
+        life=chunk.incarnation,
         ended=chunk.ended or None,
         reason=chunk.reason,
     )
 
 
-def _wish(query: Mapping[str, str]) -> LogWish:
+def _log_query(query: Mapping[str, str]) -> LogQuery:
     streams = [word for word in query.get("stream", "").split(",") if word]
-    return LogWish(
+    return LogQuery(
         streams=tuple(_one_of(LogStream, "stream", word) for word in streams),
         level=_one_of(LogLevel, "level", query.get("level", LogLevel.DEBUG.value)),
         previous=query.get("previous") == "true",
-        life=query.get("life", ""),
+        incarnation=query.get("life", ""),
     )
 
 
@@ -98,7 +98,7 @@ def _one_of(words: type[E], name: str, word: str) -> E:
     try:
         return words(word)
     except ValueError:
-        raise Invalid(f"query parameter {name!r} must be one of {_words(words)}") from None
+        raise InvalidRequestError(f"query parameter {name!r} must be one of {_words(words)}") from None
 
 
 @routes.route(
@@ -112,14 +112,14 @@ def _one_of(words: type[E], name: str, word: str) -> E:
     ),
 )
 async def stream_events(call: Call) -> web.StreamResponse:
-    """Stream events until the client or the server ends it, or the token is worth nothing any more."""
+    """Stream events until the client or the server ends it, or the token becomes invalid."""
     with call.services.quotas.stream(call.caller):
         return await _stream(call, call.scope, _start(call))
 
 
 async def _stream(call: Call, scope: str | None, last: int) -> web.StreamResponse:
-    owner = call.services.realm.tables.users.get(scope or "")
-    born = owner.created if owner is not None else 0.0  # what happened before was another one's of that name
+    owner = call.services.state_service.tables.users.get(scope or "")
+    born = owner.created if owner is not None else 0.0  # earlier events belong to a former user of that name
     response = web.StreamResponse(
         headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     )
@@ -134,14 +134,14 @@ async def _stream(call: Call, scope: str | None, last: int) -> web.StreamRespons
             if not call.is_still_valid:
                 await response.write(_frame(_farewell(call, last)))
                 return response
-            # A comment now and then keeps proxies from giving up, and finds out that a client is gone.
+            # Periodic comments prevent timeouts of proxies, and detect that a client has disconnected.
             frames = [_frame(event) for event in news if event.time >= born and _concerns(call, event)]
             if frames or clock() >= written + HEARTBEAT_S:
                 await response.write(b"".join(frames) or b":\n\n")
                 written = clock()
             last = news[-1].id if news else last
     except ConnectionResetError:
-        # The client went away: the only way in which a stream ends from its side.
+        # The client disconnected: a stream does not end in another way from its side.
         return response
 
 
@@ -153,12 +153,12 @@ def _start(call: Call) -> int:
 
 
 def _concerns(call: Call, event: Event) -> bool:
-    """Return whether an event is for a caller's eyes: what is of no user is for administrators."""
+    """Return whether a caller may see an event; events without a user are for administrators."""
     return bool(event.user) or call.is_admin
 
 
 def _farewell(call: Call, last: int) -> Event:
-    """Return the last event of a stream whose caller may not follow it any more."""
+    """Return the last event of a stream whose caller has lost the permission."""
     return Event(
         id=last,
         time=call.services.clock(),

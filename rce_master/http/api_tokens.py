@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from rce.protocol.names import is_name
-from rce_master.exceptions import Forbidden, Invalid
+from rce.model.names import is_name
+from rce_master.exceptions import ForbiddenError, InvalidRequestError
 from rce_master.http import models
-from rce_master.http.routes import OF_USER, Call, RouteTable
+from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.state import commands
 from rce_master.state.records import METRICS_SCOPE, ROBOT_SCOPE, Token
 from rce_master.tokens import new_token, token_digest
 
-routes = RouteTable("tokens")
+routes = route_table("tokens")
 
 _DAY_S = 24 * 3600.0
 
 
 @routes.route("GET", "/tokens", "List a user's tokens", reply=models.TokensOut, query=(OF_USER,))
 async def list_tokens(call: Call) -> models.TokensOut:
-    """List tokens, never the texts that they are used by."""
+    """List tokens, without their secrets."""
     return models.TokensOut(tokens=[_show(call, token) for token in _of(call)])
 
 
@@ -46,7 +46,7 @@ async def add_token(call: Call) -> models.TokenOut:
 )
 async def revoke_token(call: Call) -> None:
     """Revoke a token."""
-    await call.services.realm.submit(commands.RevokeToken(user=call.owner, id=call.path("id")))
+    await call.services.state_service.submit(commands.RevokeToken(user=call.owner, id=call.path("id")))
 
 
 @routes.route(
@@ -70,7 +70,7 @@ async def add_robot_token(call: Call) -> models.TokenOut:
     """Make a robot's token."""
     body = call.read(models.RobotTokenIn)
     if not is_name(body.robot):
-        raise Invalid(
+        raise InvalidRequestError(
             f"robot: {body.robot!r} is not a robot ID: use letters, digits and '_', beginning with a letter"
         )
     scope = ROBOT_SCOPE + body.robot
@@ -87,18 +87,18 @@ async def add_robot_token(call: Call) -> models.TokenOut:
 async def revoke_robot_token(call: Call) -> None:
     """Revoke a robot's token."""
     wanted = commands.RevokeRobotToken(user=call.owner, robot=call.path("robot"))
-    await call.services.realm.submit(wanted)
+    await call.services.state_service.submit(wanted)
 
 
 async def _make(
     call: Call, user: str, label: str, scope: str, days: float, *, replaces: bool = False
 ) -> models.TokenOut:
     services = call.services
-    owner = services.realm.tables.users.get(user)
+    owner = services.state_service.tables.users.get(user)
     if owner is None:
-        raise Forbidden(f"user {user!r} was removed meanwhile")
+        raise ForbiddenError(f"user {user!r} was removed meanwhile")
     token, record = new_token(user, label, services.clock(), days * _DAY_S, scope=scope)
-    await services.realm.submit(commands.AddToken(token=record, replaces=replaces))
+    await services.state_service.submit(commands.AddToken(token=record, replaces=replaces))
     return models.TokenOut(
         token=token, userID=user, role=owner.role.value, expires=record.expires, id=record.id, scope=scope
     )
@@ -106,9 +106,9 @@ async def _make(
 
 def _of(call: Call) -> list[Token]:
     if call.owner != call.caller.name and not call.is_admin:
-        raise Forbidden("only an administrator sees the tokens of others")
+        raise ForbiddenError("only an administrator sees the tokens of others")
     now = call.services.clock()
-    found = call.services.realm.tables.tokens.by("user", call.owner)
+    found = call.services.state_service.tables.tokens.by("user", call.owner)
     return sorted((token for token in found if not token.is_expired(now)), key=lambda token: token.created)
 
 

@@ -1,16 +1,16 @@
-"""REST: what is consumed, once or as a stream."""
+"""REST: the usage, once or as a stream."""
 
 from __future__ import annotations
 
 from aiohttp import web
 
 from rce.web.openapi import Query
-from rce_master.exceptions import Invalid
-from rce_master.http.routes import ENDED, OF_USER, Call, RouteTable
+from rce_master.exceptions import InvalidRequestError
+from rce_master.http.routes import ENDED, OF_USER, Call, route_table
 from rce_master.http.usage_models import UsageOut
 from rce_master.http.usage_views import UsageViews
 
-routes = RouteTable("usage")
+routes = route_table("usage")
 
 LEAST_INTERVAL_S, MOST_INTERVAL_S = 1, 3600
 
@@ -23,7 +23,7 @@ LEAST_INTERVAL_S, MOST_INTERVAL_S = 1, 3600
     query=(OF_USER,),
 )
 async def show_usage(call: Call) -> UsageOut:
-    """Show what is consumed."""
+    """Show the usage."""
     return _usage(call, call.scope)
 
 
@@ -38,10 +38,12 @@ async def show_usage(call: Call) -> UsageOut:
     ),
 )
 async def stream_usage(call: Call) -> web.StreamResponse:
-    """Stream what is consumed until an end is made of it, or the token is worth nothing any more."""
+    """Stream the usage until the client or the server ends it, or the token becomes invalid."""
     interval = call.number("interval", 2)
     if not LEAST_INTERVAL_S <= interval <= MOST_INTERVAL_S:
-        raise Invalid(f"query parameter 'interval' must be {LEAST_INTERVAL_S} to {MOST_INTERVAL_S}")
+        raise InvalidRequestError(
+            f"query parameter 'interval' must be {LEAST_INTERVAL_S} to {MOST_INTERVAL_S}"
+        )
     with call.services.quotas.stream(call.caller):
         return await _stream(call, call.scope, interval)
 
@@ -59,13 +61,13 @@ async def _stream(call: Call, scope: str | None, interval: int) -> web.StreamRes
                 return response
             await response.write(_frame(_usage(call, scope)))
     except ConnectionResetError:
-        # The client went away: the only way in which a stream ends from its side.
+        # The client disconnected: a stream does not end in another way from its side.
         return response
 
 
 def _usage(call: Call, scope: str | None) -> UsageOut:
     services = call.services
-    views = UsageViews(services.realm.tables, services.reconciler.book)
+    views = UsageViews(services.state_service.tables, services.reconciler.book)
     return UsageOut(
         time=services.clock(),
         containers=views.containers(scope),

@@ -1,21 +1,21 @@
-"""Writes what requests changed, and what was refused to whom, into the audit log."""
+"""Writes the changes by requests, and refusals, to the audit log."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce_master.exceptions import AuthError, Forbidden
+from rce_master.exceptions import AuthError, ForbiddenError
 
 if TYPE_CHECKING:
     from rce_master.exceptions import MasterError
     from rce_master.http.routes import Call, Route
 
 _NAMES = ("userID", "tag", "tag_a", "tag_b", "name", "robot", "role", "scope", "draining")
-"""Keys of bodies that name things; all others are left out, because they may hold secrets."""
+"""Keys of bodies that name objects; all others are left out, because they may hold secrets."""
 
 
 def note_done(route: Route, call: Call) -> None:
-    """Note a request that changed something."""
+    """Record a request that made a change."""
     if route.method == "GET" or not _is_noted(route):
         return
     audit = call.services.audit
@@ -24,10 +24,11 @@ def note_done(route: Route, call: Call) -> None:
 
 
 def note_refused(route: Route, call: Call, error: MasterError) -> None:
-    """Note a request that was refused for who asked. What was wrong in itself is not noted."""
-    if isinstance(error, AuthError | Forbidden) and _is_noted(route):
+    """Record a request that was refused because of its user. Invalid requests are not recorded."""
+    if isinstance(error, AuthError | ForbiddenError) and _is_noted(route):
         user = call.user.name if call.user is not None else _claimed(call)
-        detail = f"{type(error).__name__} {route.method} {_subject(call)}".rstrip()
+        what = type(error).__name__.removesuffix("Error")
+        detail = f"{what} {route.method} {_subject(call)}".rstrip()
         call.services.audit.refuse(user, _action(route), detail=detail, address=call.address)
 
 
@@ -40,9 +41,9 @@ def _action(route: Route) -> str:
 
 
 def _claimed(call: Call) -> str:
-    """Return the name that a login is for, if there is such a user: else it may be a password."""
+    """Return the name of a login if this user exists: an unknown name may be a mistyped password."""
     name = str(getattr(call.body, "userID", ""))
-    return name if name in call.services.realm.tables.users else ""
+    return name if name in call.services.state_service.tables.users else ""
 
 
 def _subject(call: Call) -> str:

@@ -1,4 +1,4 @@
-"""``GET /``: where a client of the robot protocol comes in."""
+"""``GET /``: the entry point of clients of the robot protocol."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
     from rce_master.state.tables import Tables
 
 EXPECTED_S = 5.0
-"""How long a robot that was sent somewhere counts there before it has logged in."""
+"""How long a redirected robot counts at its task set before it has logged in."""
 
 
 MAX_EXPECTED = 10_000
-"""How many are expected at most: anybody may ask, and need not come."""
+"""Maximum number of expected robots: the entry is public, and a client need not connect afterwards."""
 
 
 class Entry:
     """Hands out the least loaded robot task set.
 
-    Clients that were sent to one a moment ago and have not logged in yet count as its load, else a fleet
-    that comes at once would go to the same one.
+    Clients that were just sent to one and have not logged in yet count as its load; else a fleet that
+    connects at once would go to the same one.
 
     Args:
         tables: The state's tables.
@@ -43,7 +43,7 @@ class Entry:
         self._expected: Counter[str] = Counter()
 
     async def handle(self, request: web.Request) -> web.Response:
-        """Answer a client with the WebSocket URL that it is to use."""
+        """Answer a client with its WebSocket URL."""
         try:
             wanted = read_master_request(request.url.raw_query_string)
         except HandshakeError as error:

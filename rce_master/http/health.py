@@ -1,4 +1,4 @@
-"""``GET /healthz``: whether the master works. Open to everybody; many who ask cost one look at the store."""
+"""``GET /healthz``: whether the master works. Public; concurrent requests share one check of the store."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ from aiohttp import web
 from rce_master.exceptions import StoreError
 
 if TYPE_CHECKING:
-    from rce_master.realm import Realm
+    from rce_master.state_service import StateService
 
 
 class Health:
-    """Answers whether the store can be used, and how many task sets are connected.
+    """Reports whether the store is usable, and how many task sets are connected.
 
     Args:
-        realm: Whose store it is.
+        state_service: The owner of the store.
     """
 
-    def __init__(self, realm: Realm) -> None:
-        self._realm = realm
+    def __init__(self, state_service: StateService) -> None:
+        self._state_service = state_service
         self._look: asyncio.Task[str] | None = None
-        """Whoever asks while it runs waits for the same answer."""
+        """The running check; concurrent requests wait for its result."""
 
     async def handle(self, _: web.Request) -> web.Response:
-        """Answer 200, or 503 with what is wrong."""
+        """Answer 200, or 503 with the fault."""
         if self._look is None:
             self._look = asyncio.create_task(self._check())
         fault = await asyncio.shield(self._look)
-        tables = self._realm.tables
+        tables = self._state_service.tables
         connected = sum(tables.is_connected(task_set.process) for task_set in tables.task_sets)
         body = {"status": fault or "ok", "task_sets": connected}
         return web.json_response(body, status=503 if fault else 200)
 
     async def _check(self) -> str:
         try:
-            await self._realm.check_store()
+            await self._state_service.check_store()
         except StoreError as error:
             return str(error)
         finally:

@@ -1,6 +1,6 @@
 """The REST API, loaded with the first request for it.
 
-Its models take 10 MB, and robots need none of it.
+Its models take 10 MB, and robots do not need them.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class LateApi:
         """Answer a request.
 
         Raises:
-            HTTPException: There is no such path, or not with this method.
-            MasterError: It was not done.
+            HTTPException: The path does not exist, or does not have this method.
+            MasterError: The request failed.
         """
         async with self._loading:
             if self._api is None:  # in a thread, so that robots and task sets do not wait for it

@@ -1,4 +1,4 @@
-"""``GET /metrics``: what Prometheus scrapes, made of the state at the moment of the request."""
+"""``GET /metrics``: metrics for Prometheus, from the state at the time of the request."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ if TYPE_CHECKING:
 _NO_USAGE = EndpointUsage()
 
 MAX_SERIES = 50_000
-"""Series of containers, nodes and interfaces in one answer; what is beyond it is counted, not listed."""
+"""Series of containers, nodes and interfaces in one answer; further ones are counted, not listed."""
 
 
 def make_answer(
     tables: Tables, book: UsageBook, password_checks: Callable[[], int]
 ) -> Callable[[], web.Response]:
-    """Return what makes an answer to a scrape."""
+    """Return the function that answers a scrape."""
     registry = make_registry(tables, book)
     registry.register(_LoginCollector(password_checks))
     headers = {"Content-Type": CONTENT_TYPE_LATEST}
@@ -51,7 +51,7 @@ def make_answer(
 
 
 def make_registry(tables: Tables, book: UsageBook) -> CollectorRegistry:
-    """Make a registry of our own; the library's global one belongs to whoever embeds us."""
+    """Make a separate registry; the library's global one belongs to the embedding program."""
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
     PlatformCollector(registry=registry)
@@ -62,7 +62,7 @@ def make_registry(tables: Tables, book: UsageBook) -> CollectorRegistry:
 
 
 class _LoginCollector(Collector):
-    """What logins cost."""
+    """Metrics of the cost of logins."""
 
     def __init__(self, password_checks: Callable[[], int]) -> None:
         self._password_checks = password_checks
@@ -111,9 +111,9 @@ class EngineCollector(Collector):
         )
 
     def _connections(self) -> Iterator[Metric]:
-        shown = [c for link in self._tables.links for c in self._views.connections(link)]
-        established = sum(c.established for c in shown)
-        values = {"established": established, "waiting": len(shown) - established}
+        connections = self._tables.connections
+        established = sum(map(self._views.is_established, connections))
+        values = {"established": established, "waiting": len(connections) - established}
         yield _gauge("rce_connections", "Connections by state.", "state", values)
 
     def _task_sets(self) -> Iterator[Metric]:
@@ -148,10 +148,10 @@ class EngineCollector(Collector):
 
 
 class ConsumptionCollector(Collector):
-    """Traffic of interfaces, consumption of containers and nodes, promises of machines.
+    """Metrics of the traffic of interfaces, the usage of containers and nodes, and the promises of machines.
 
-    The labels are names that are desired now and nothing else, so that what a task set tells cannot make
-    more of them, and so that a counter ends with what it counts.
+    The labels are only names in the present desired state, so that reports of task sets cannot add labels,
+    and a counter ends with the object that it counts.
     """
 
     def __init__(self, tables: Tables, book: UsageBook) -> None:
@@ -165,7 +165,8 @@ class ConsumptionCollector(Collector):
             usage = self._usage_of(endpoint)
             if isinstance(endpoint, Container):
                 self._container(families, endpoint, usage)
-            for tag in endpoint.interfaces:
+            for interface in self._tables.interfaces.by("endpoint", endpoint.id):
+                tag = interface.spec.tag
                 _interface(families, endpoint.id, tag, usage.interfaces.get(tag))
         for room in capacity.rooms(self._tables, away=True).values():
             _machine(families, room)
@@ -200,7 +201,7 @@ class ConsumptionCollector(Collector):
 
 
 class _Families:
-    """Metric families by name, with a limit on the series of all of them together."""
+    """Metric families by name, with a limit on their total number of series."""
 
     def __init__(self, most: int) -> None:
         self.omitted = 0
@@ -211,11 +212,11 @@ class _Families:
         return iter(self._found.values())
 
     def gauge(self, name: str, help_: str, labels: dict[str, str], value: float) -> None:
-        """Add a value that goes up and down."""
+        """Add a gauge."""
         self._add(GaugeMetricFamily, name, help_, labels, value)
 
     def counter(self, name: str, help_: str, labels: dict[str, str], value: float) -> None:
-        """Add a value that only grows; ``_total`` is put after its name."""
+        """Add a counter; ``_total`` is appended to its name."""
         self._add(CounterMetricFamily, name, help_, labels, value)
 
     def _add(

@@ -4,21 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
-from rce_master.http.model import Model
+from rce_master.http.model import Body, Model
 
-Scalar = bool | int | float | str
-Value = Scalar | list[Scalar]
 ROLES = "^(viewer|user|operator|admin)$"
 Amount = int | float | str
-"""An amount as :mod:`rce.protocol.quantities` reads it."""
-
-
-class _In(Model):
-    """Base of what is sent to the API; an unknown key is a mistake."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
+"""An amount as :mod:`rce.model.quantities` reads it."""
 
 
 class Error(Model):
@@ -30,7 +22,7 @@ class Error(Model):
 # In
 
 
-class LoginIn(_In):
+class LoginIn(Body):
     """Who wants a token."""
 
     userID: str  # noqa: N815 - its name everywhere in the protocol
@@ -41,7 +33,7 @@ class LoginIn(_In):
     """Seconds for which the token is to be good, at most as long as the master gives; 0: so long."""
 
 
-class RobotTokenIn(_In):
+class RobotTokenIn(Body):
     """A robot that is to have a token of its own."""
 
     robot: Annotated[str, Field(max_length=256)]
@@ -52,7 +44,7 @@ class RobotTokenIn(_In):
     """Take the place of the token that the robot has."""
 
 
-class ScopedTokenIn(_In):
+class ScopedTokenIn(Body):
     """A token for a program that may do one thing."""
 
     scope: Annotated[str, Field(pattern="^metrics$")]
@@ -61,7 +53,7 @@ class ScopedTokenIn(_In):
     """For how long it is good; 0: until it is revoked."""
 
 
-class UserIn(_In):
+class UserIn(Body):
     """A user to make."""
 
     name: str
@@ -69,13 +61,13 @@ class UserIn(_In):
     role: Annotated[str, Field(pattern=ROLES)] = "user"
 
 
-class RoleIn(_In):
+class RoleIn(Body):
     """What a user may do from now on."""
 
     role: Annotated[str, Field(pattern=ROLES)]
 
 
-class AuditIn(_In):
+class AuditIn(Body):
     """What somebody did at a station."""
 
     action: Annotated[str, Field(pattern="^[a-z_]{1,64}$")]
@@ -86,7 +78,7 @@ class AuditIn(_In):
     outcome: Annotated[str, Field(pattern="^(done|refused)$")] = "done"
 
 
-class PasswordIn(_In):
+class PasswordIn(Body):
     """A new password."""
 
     password: Annotated[str, Field(repr=False, min_length=1)]
@@ -94,7 +86,7 @@ class PasswordIn(_In):
     """The password until now; needed to change one's own."""
 
 
-class LimitsIn(_In):
+class LimitsIn(Body):
     """What a user may have from now on; left out: as before. 0: no limit; ``default``: as all users."""
 
     containers: Amount | None = None
@@ -107,82 +99,6 @@ class LimitsIn(_In):
     """Versions."""
     disk: Amount | None = None
     """Of the packages' files; MB, or a text such as ``2G``."""
-
-
-class ContainerIn(_In):
-    """A container to make. Zero or empty means: no wish."""
-
-    tag: str
-    group: str = ""
-    group_ip: str = ""
-    network: str = ""
-    """``none``, ``group`` or ``host``."""
-    image: str = ""
-    size: int = 1
-    """Slots."""
-    cpu: Amount = 0.0
-    """Cores, or a text such as ``50%``."""
-    memory: Amount = 0
-    """MB, or a text such as ``256M``."""
-    bandwidth: Amount = 0
-    """Bytes per second, or a text such as ``10Mbit``."""
-    special_features: list[str] = Field(default=[])
-    """Labels that the machine must have."""
-    wait: bool = False
-    """Wait for room if no machine has any."""
-
-
-class ResizeIn(_In):
-    """What a container may use from now on; null or left out: as before. Zero takes a wish back."""
-
-    size: int | None = None
-    cpu: Amount | None = None
-    memory: Amount | None = None
-    bandwidth: Amount | None = None
-
-
-class NodeIn(_In):
-    """A node to start."""
-
-    tag: str
-    pkg: str
-    exe: str
-    args: str = ""
-    name: str = ""
-    namespace: str = ""
-    restart: str = "never"
-    """``never``, ``on-failure`` or ``always``."""
-    max_restarts: int = 5
-    """In a row; 0 for no limit."""
-    after: list[str] = Field(default=[])
-    """Tags of nodes that must be ready before it starts."""
-    heartbeat: str = ""
-    """A topic that it publishes as long as it is well."""
-    heartbeat_timeout: float = 5.0
-    """Seconds."""
-
-
-class ParameterIn(_In):
-    """A parameter to set."""
-
-    name: str
-    value: Value
-
-
-class InterfaceIn(_In):
-    """An interface to make."""
-
-    tag: str
-    type: str
-    cls: str
-    addr: str = ""
-
-
-class ConnectionIn(_In):
-    """Two interfaces to join, each ``ENDPOINT/INTERFACE``."""
-
-    tag_a: str
-    tag_b: str
 
 
 # Out
@@ -294,112 +210,6 @@ class RobotOut(Model):
     interfaces: int
 
 
-class WishOut(Model):
-    """What a container asked for; zero or empty: nothing."""
-
-    size: int
-    """Slots."""
-    cpu: float
-    """Cores."""
-    memory: int
-    """Bytes."""
-    bandwidth: int
-    """Bytes per second."""
-    network: str
-    group: str
-    group_ip: str
-    image: str
-    special_features: list[str]
-
-
-class ContainerOut(Model):
-    """A container."""
-
-    id: str
-    user: str
-    tag: str
-    state: str
-    """``requested``, ``placed``, ``starting``, ``running``, ``degraded``, ``failed``, ``stopping``,
-    ``stopped`` or ``lost``."""
-    detail: str
-    task_set: str
-    machine: str
-    revision: int
-    incarnation: str
-    nodes: int
-    interfaces: int
-    cpu_s: float
-    """CPU seconds since its start."""
-    memory: int
-    """Bytes in use."""
-    wish: WishOut
-    moving_to: str
-    """Task set where its copy is being made, while its machine is drained; else empty."""
-
-
-class NodeOut(Model):
-    """A node."""
-
-    user: str
-    container: str
-    tag: str
-    pkg: str
-    exe: str
-    args: str
-    name: str
-    namespace: str
-    state: str
-    """``waiting``, ``starting``, ``running``, ``stuck``, ``stopping``, ``exited``, ``failed``; ``unknown``
-    until reported."""
-    pid: int
-    exit_code: int | None
-    detail: str
-    restart: str
-    max_restarts: int
-    after: list[str]
-    heartbeat: str
-    restarts: int
-    """How often it was started again by itself."""
-
-
-class ParameterOut(Model):
-    """A parameter."""
-
-    user: str
-    container: str
-    name: str
-    value: Value
-
-
-class InterfaceOut(Model):
-    """An interface."""
-
-    user: str
-    endpoint: str
-    tag: str
-    type: str
-    cls: str
-    addr: str
-    active: bool
-    """Whether it has an established connection."""
-    messages_in: int
-    messages_out: int
-    bytes_in: int
-    bytes_out: int
-    dropped: int
-
-
-class ConnectionOut(Model):
-    """A connection."""
-
-    id: int
-    user: str
-    tag_a: str
-    tag_b: str
-    established: bool
-    """Whether both ends report it as open."""
-
-
 class StayingOut(Model):
     """A container that a draining machine still has."""
 
@@ -428,7 +238,7 @@ class MachineOut(Model):
     memory_used: int
     """Resident bytes of the task set."""
     slots: int
-    """0 if nobody counts."""
+    """0 if it is not counted."""
     limits: str
     networks: list[str]
     runtimes: list[str]
@@ -453,36 +263,6 @@ class RobotsOut(Model):
     robots: list[RobotOut]
 
 
-class ContainersOut(Model):
-    """Containers."""
-
-    containers: list[ContainerOut]
-
-
-class NodesOut(Model):
-    """Nodes."""
-
-    nodes: list[NodeOut]
-
-
-class ParametersOut(Model):
-    """Parameters."""
-
-    parameters: list[ParameterOut]
-
-
-class InterfacesOut(Model):
-    """Interfaces."""
-
-    interfaces: list[InterfaceOut]
-
-
-class ConnectionsOut(Model):
-    """Connections."""
-
-    connections: list[ConnectionOut]
-
-
 class MachinesOut(Model):
     """Task sets and their machines."""
 
@@ -494,10 +274,10 @@ class LogOut(Model):
 
     text: str
     offset: int
-    """Where the next read goes on."""
-    life: str = ""
-    """The container's life of which this is the log; reads of the same log name it."""
+    """Where the next read continues."""
+    incarnation: str = Field(default="", alias="life")
+    """The container's incarnation of which this is the log; reads of the same log name it."""
     ended: float | None = None
-    """When that life ended, in seconds since 1970; null if it goes on."""
+    """When that incarnation ended, in seconds since 1970; null if it continues."""
     reason: str = ""
     """Why it ended."""

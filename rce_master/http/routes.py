@@ -1,4 +1,4 @@
-"""A table of REST routes: each says what it takes and gives, so that server and document are made of one."""
+"""The routes of the REST API: their permissions, and the arguments of their handlers."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rce.guard.proxies import TrustedProxies
-from rce.web.openapi import Operation, Query
-from rce_master.exceptions import Forbidden, Invalid, NotFound, WrongCredentials
+from rce.web import routes
+from rce.web.openapi import Query
+from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError, WrongCredentialsError
 from rce_master.state.records import UserRole
 
 if TYPE_CHECKING:
@@ -20,30 +21,30 @@ if TYPE_CHECKING:
 
     from rce_master.audit import AuditLog
     from rce_master.auth import Authenticator
-    from rce_master.bundles.office import PackageOffice
     from rce_master.events import EventLog
     from rce_master.executions import Executions
+    from rce_master.packages.service import PackageService
     from rce_master.quotas import Quotas
-    from rce_master.realm import Realm
     from rce_master.reconciler import Reconciler
     from rce_master.state.records import User
+    from rce_master.state_service import StateService
     from rce_master.tokens import Tokens
 
 M = TypeVar("M", bound="BaseModel")
 
 ACCESS_CHECK_S = 15.0
-"""How long after its expiry a token may still keep a stream open."""
+"""Seconds after its expiry during which a token may still keep a stream open."""
 ENDED = "your access ended: the token was revoked or expired, or the user was changed; log in again"
-"""What streams say last when they end for that."""
+"""The last message of streams that end because of an expired token."""
 
 _NUMBER = re.compile(r"-?[0-9]{1,18}")
 
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """What the handlers work with."""
+    """The services of the handlers."""
 
-    realm: Realm
+    state_service: StateService
     reconciler: Reconciler
     authenticator: Authenticator
     events: EventLog
@@ -51,7 +52,7 @@ class Services:
     """Seconds since 1970."""
     token_lifetime: float
     """Seconds."""
-    packages: PackageOffice
+    packages: PackageService
     executions: Executions
     tokens: Tokens
     quotas: Quotas
@@ -63,12 +64,12 @@ class Services:
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One request of somebody who proved who they are."""
+    """An authenticated request."""
 
     request: web.Request
     services: Services
     user: User | None
-    """None only on routes that are open to everybody."""
+    """None only on public routes."""
     token: str
     body: BaseModel | None
     parts: Mapping[str, str]
@@ -76,33 +77,33 @@ class Call:
 
     @property
     def address(self) -> str:
-        """Where the request comes from, as far as proxies that are trusted tell."""
+        """The address of the request, as reported by trusted proxies."""
         transport = self.request.transport
         peer = None if transport is None else transport.get_extra_info("peername")
         return self.services.proxies.origin(peer, self.request.headers.getall("X-Forwarded-For", ()))
 
     @property
     def caller(self) -> User:
-        """Who asks."""
+        """The calling user."""
         assert self.user is not None
         return self.user
 
     @property
     def is_admin(self) -> bool:
-        """Whether an administrator asks."""
+        """Whether the caller is an administrator."""
         return self.user is not None and self.user.role is UserRole.ADMIN
 
     @property
     def is_still_valid(self) -> bool:
-        """Whether the caller could ask for the same now; for answers that go on for long."""
+        """Whether the caller still has the permission; for long answers."""
         try:
             user, _ = self.services.tokens.find(self.token)
-        except WrongCredentials:
+        except WrongCredentialsError:
             return False
         return user == self.user
 
     async def lasts(self, seconds: float) -> bool:
-        """Wait; return False as soon as the caller could not ask for the same any more."""
+        """Wait; return False as soon as the caller has lost the permission."""
         loop = asyncio.get_running_loop()
         end = loop.time() + seconds
         while self.is_still_valid:
@@ -114,11 +115,11 @@ class Call:
 
     @property
     def owner(self) -> str:
-        """Whose robots and containers are meant: the caller's, or those of ``?user=`` for an administrator.
+        """The user of the robots and containers: the caller, or ``?user=`` for an administrator.
 
         Raises:
-            Forbidden: Somebody else's are asked for.
-            NotFound: There is no such user.
+            ForbiddenError: The caller may not name another user.
+            NotFoundError: The user does not exist.
         """
         return self._owner(looks=self.request.method == "GET")
 
@@ -131,14 +132,16 @@ class Call:
         name = self.request.query.get("user", self.caller.name)
         looks = looks and self.caller.role.sees_all
         if name != self.caller.name and not self.is_admin and not looks:
-            raise Forbidden("only an administrator controls, and only roles above user see, what others have")
-        if name not in self.services.realm.tables.users:
-            raise NotFound(f"there is no user {name!r}")
+            raise ForbiddenError(
+                "only an administrator controls, and only roles above user see, what others have"
+            )
+        if name not in self.services.state_service.tables.users:
+            raise NotFoundError(f"there is no user {name!r}")
         return name
 
     @property
     def scope(self) -> str | None:
-        """Whose things are to be listed; None: everybody's, the default of those who may see them."""
+        """The user whose objects to list; None: all users, the default of callers who may see them."""
         return None if self.caller.role.sees_all and "user" not in self.request.query else self.owner
 
     def path(self, name: str) -> str:
@@ -146,29 +149,29 @@ class Call:
         return self.parts[name]
 
     def query(self, name: str) -> str:
-        """A query parameter that must be there.
+        """Return a required query parameter.
 
         Raises:
-            Invalid: It is not.
+            InvalidRequestError: It is missing.
         """
         try:
             return self.request.query[name]
         except KeyError:
-            raise Invalid(f"query parameter {name!r} is missing") from None
+            raise InvalidRequestError(f"query parameter {name!r} is missing") from None
 
     def number(self, name: str, default: int) -> int:
-        """A query parameter that is a whole number.
+        """Return a query parameter that is an integer.
 
         Raises:
-            Invalid: It is none, or one that no counter reaches.
+            InvalidRequestError: It is not an integer, or is out of range.
         """
         text = self.request.query.get(name, str(default))
         if not _NUMBER.fullmatch(text):
-            raise Invalid(f"query parameter {name!r} must be a whole number of at most 18 digits")
+            raise InvalidRequestError(f"query parameter {name!r} must be a whole number of at most 18 digits")
         return int(text)
 
     def read(self, model: type[M]) -> M:
-        """The body, which the route declared to be of this model."""
+        """Return the body, which the route declared to be of this model."""
         assert isinstance(self.body, model)
         return self.body
 
@@ -177,54 +180,24 @@ Handler = Callable[[Call], Awaitable["BaseModel | StreamResponse | None"]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Route:
-    """A method of a path."""
+class Route(routes.Route[Handler]):
+    """A method of a path, and its permissions."""
 
-    method: str
-    path: str
-    """Below ``/api/v1``, with ``{name}`` for its parts."""
-    handler: Handler
-    summary: str
-    group: str
-    body: type[BaseModel] | None = None
-    reply: type[BaseModel] | None = None
-    """None: no content, unless ``media`` says that the handler streams something."""
-    media: str = "application/json"
-    status: int = 200
     admin: bool = False
     everybody: bool = False
-    """Whether who may only look may use it all the same."""
-    open: bool = False
-    """Whether it can be used without a token."""
+    """Whether read-only users may use it too."""
     acts: bool = False
-    """Whether it changes something though it is a GET."""
-    query: tuple[Query, ...] = ()
-    upload: str = ""
-    """Media type of a body that the handler reads itself."""
-    errors: tuple[int, ...] = ()
-    """Statuses beside those that follow from the rest."""
+    """Whether it makes a change although it is a GET."""
 
-    @property
-    def operation(self) -> Operation:
-        """What the OpenAPI document tells of it."""
-        return Operation(
-            name=getattr(self.handler, "__name__", self.summary),
-            method=self.method,
-            path=self.path,
-            summary=self.summary + (" (administrators only)" if self.admin else ""),
-            group=self.group,
-            body=self.body,
-            reply=self.reply,
-            media=self.media,
-            status=self.status,
-            open=self.open,
-            query=self.query,
-            upload=self.upload,
-            errors=tuple(set(self._errors())),
-        )
+    def told(self) -> dict[str, Any]:
+        """Return its OpenAPI description: permissions and possible errors."""
+        return {
+            "summary": self.summary + (" (administrators only)" if self.admin else ""),
+            "errors": tuple(set(self._errors())),
+        }
 
     def _errors(self) -> Iterator[int]:
-        """The statuses of what may go wrong."""
+        """Return the statuses of its possible errors."""
         yield from (401, 403, 421, 429)
         if "{" in self.path or OF_USER in self.query:
             yield 404
@@ -237,26 +210,9 @@ class Route:
         yield from self.errors
 
 
-@dataclass(slots=True)
-class RouteTable:
-    """Routes of one group."""
-
-    group: str
-    routes: list[Route] = field(default_factory=list)
-
-    def __iter__(self) -> Iterator[Route]:
-        return iter(self.routes)
-
-    def route(self, method: str, path: str, summary: str, **options: Any) -> Callable[[Handler], Handler]:
-        """Decorate a handler."""
-
-        def add(handler: Handler) -> Handler:
-            self.routes.append(
-                Route(method=method, path=path, handler=handler, summary=summary, group=self.group, **options)
-            )
-            return handler
-
-        return add
+def route_table(group: str) -> routes.RouteTable[Route]:
+    """Return an empty table of routes of the master."""
+    return routes.RouteTable(group, Route)
 
 
-OF_USER = Query(name="user", description="Whose; administrators only. Default: own, in lists everybody's.")
+OF_USER = Query(name="user", description="Whose; administrators only. Default: own, in lists all users'.")

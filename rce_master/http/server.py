@@ -1,4 +1,4 @@
-"""Puts the HTTP application together: routes, who may use them, and how errors look."""
+"""Builds the HTTP application: routes, permissions and error answers."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from rce.web.origin import ServerNames, is_foreign
 from rce_master.exceptions import (
     AuthError,
     MasterError,
-    Refused,
+    RefusedError,
     StoreError,
-    TaskSetAway,
-    TooManyFailures,
-    TooManyLogins,
-    TooMuch,
+    TaskSetAwayError,
+    TooManyFailuresError,
+    TooManyLoginsError,
+    TooMuchError,
 )
 from rce_master.http.access import check_metrics
 from rce_master.http.entry import Entry
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
-logger = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 MAX_BODY = 1 << 20
 
@@ -45,16 +45,16 @@ def make_app(
     """Make the application.
 
     Args:
-        services: What the handlers work with.
+        services: The services of the handlers.
         allowed_origins: Origins whose pages may use the server from a browser, such as
             ``https://fleet.example.org``; pages of the server itself always may.
-        names: By which the server may be asked for.
+        names: The allowed host names of the server.
     """
     guard = _origin_guard(frozenset(allowed_origins), names or ServerNames())
     app = web.Application(middlewares=[guard, _errors], client_max_size=MAX_BODY)
-    entry = Entry(services.realm.tables, asyncio.get_running_loop().time)
+    entry = Entry(services.state_service.tables, asyncio.get_running_loop().time)
     app.router.add_get("/", entry.handle)
-    app.router.add_get("/healthz", Health(services.realm).handle)
+    app.router.add_get("/healthz", Health(services.state_service).handle)
     app.router.add_get("/metrics", _metrics(services))
     app.router.add_route("*", PREFIX + "/{rest:.*}", LateApi(services).handle)
     return app
@@ -66,10 +66,10 @@ def make_app(
 def _metrics(services: Services) -> Handler:
     @cache
     def scraped() -> Callable[[], web.Response]:
-        from rce_master.http.metrics import make_answer  # takes memory that only scraped masters spend
+        from rce_master.http.metrics import make_answer  # only scraped masters spend this memory
 
         checks = services.authenticator
-        return make_answer(services.realm.tables, services.reconciler.book, lambda: checks.checks)
+        return make_answer(services.state_service.tables, services.reconciler.book, lambda: checks.checks)
 
     async def handle(request: web.Request) -> web.Response:
         check_metrics(request, services)
@@ -78,15 +78,15 @@ def _metrics(services: Services) -> Handler:
     return handle
 
 
-# What applies to all
+# Middleware of all routes
 
 
 def _origin_guard(allowed: frozenset[str], names: ServerNames) -> Any:
     @web.middleware
     async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse pages of other sites: a browser would send them with the user's network position."""
+        """Refuse requests of other sites' pages, which a browser would send from the user's network."""
         origin, host = request.headers.get(hdrs.ORIGIN), request.headers.get(hdrs.HOST, "")
-        # Robots ask for their endpoint by any name that leads here: the answer is no secret.
+        # Robots ask for their endpoint by any name of this server: the answer is not secret.
         refusal = None if origin is None and request.path == "/" else names.refusal(host)
         if refusal is not None and origin not in allowed:
             return _error(421, refusal)
@@ -112,11 +112,11 @@ async def _errors(request: web.Request, handler: Handler) -> web.StreamResponse:
 
 def _status(error: MasterError) -> int:
     match error:
-        case Refused():
+        case RefusedError():
             return error.status
-        case TooManyFailures():
+        case TooManyFailuresError():
             return 429
-        case TooManyLogins() | StoreError() | TaskSetAway():
+        case TooManyLoginsError() | StoreError() | TaskSetAwayError():
             return 503
         case AuthError():
             return 401
@@ -126,9 +126,9 @@ def _status(error: MasterError) -> int:
 
 def _headers(error: MasterError) -> dict[str, str]:
     match error:
-        case TooManyFailures() | TooMuch():
+        case TooManyFailuresError() | TooMuchError():
             return {hdrs.RETRY_AFTER: str(math.ceil(error.retry_after))}
-        case TooManyLogins():
+        case TooManyLoginsError():
             return {hdrs.RETRY_AFTER: "1"}
         case AuthError():
             return {hdrs.WWW_AUTHENTICATE: "Bearer"}

@@ -72,7 +72,7 @@ class MachineUsageOut(Model):
     draining: bool
     containers: int
     slots: int
-    """0 if nobody counts."""
+    """0 if it is not counted."""
     promised_slots: int
     cores: int
     promised_cores: float

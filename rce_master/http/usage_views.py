@@ -1,4 +1,4 @@
-"""Makes what the API tells of consumption."""
+"""Builds the API's answers about usage."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _NO_NODE_USAGE = NodeUsage()
 
 
 class UsageViews:
-    """Shows what containers and machines consume, at one moment.
+    """Shows the usage of containers and machines at one moment.
 
     Args:
         tables: The state's tables.
-        book: What the task sets told.
+        book: The reports of the task sets.
     """
 
     def __init__(self, tables: Tables, book: UsageBook) -> None:

@@ -1,32 +1,34 @@
-"""Makes what the API gives of the state's tables."""
+"""Builds the API's answers from the state's tables."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from rce.control.model import EndpointUsage, InterfaceUsage, NodeStatus
-from rce_master.http import models
+from rce_master.http import models, spec_models
+from rce_master.http.spec_models import shown
 from rce_master.state import capacity
 from rce_master.state.records import Container
+from rce_master.state.wiring_records import open_end_key
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rce.control.messages import Usage
-    from rce.control.model import Resources
-    from rce_master.state.records import Endpoint, Link, Robot, TaskSet, User
+    from rce_master.state.records import Endpoint, Robot, TaskSet, User
     from rce_master.state.tables import Tables
+    from rce_master.state.wiring_records import Connection, Link
 
 _NO_USAGE = EndpointUsage()
 _NO_INTERFACE_USAGE = InterfaceUsage()
 
 
 class Views:
-    """Shows users, robots, containers and what belongs to them.
+    """Shows users, robots, containers and their parts.
 
     Args:
         tables: The state's tables.
-        usage: What each task set last told of what it consumes.
+        usage: The last usage report of each task set.
     """
 
     def __init__(self, tables: Tables, usage: Mapping[str, Usage]) -> None:
@@ -52,15 +54,15 @@ class Views:
             state=self._tables.robot_live(robot.id).session.value,
             task_set=robot.task_set,
             revision=robot.revision,
-            interfaces=len(robot.interfaces),
+            interfaces=self._tables.interfaces.count("endpoint", robot.id),
         )
 
-    def container(self, container: Container) -> models.ContainerOut:
+    def container(self, container: Container) -> spec_models.ContainerOut:
         """Show a container."""
         live = self._tables.container_live(container.id)
         task_set = self._tables.task_sets.get(container.task_set)
         usage = self.usage_of(container)
-        return models.ContainerOut(
+        return spec_models.ContainerOut(
             id=container.id,
             user=container.user,
             tag=container.tag,
@@ -71,81 +73,65 @@ class Views:
             revision=container.revision,
             incarnation=live.status.incarnation if live.status else "",
             nodes=len(container.nodes),
-            interfaces=len(container.interfaces),
+            interfaces=self._tables.interfaces.count("endpoint", container.id),
             cpu_s=usage.cpu_s,
             memory=usage.memory,
-            wish=_wish(container.resources),
+            wish=spec_models.RequestedOut(**shown(container.resources)),
             moving_to=move.to if (move := self._tables.moves.get(container.id)) else "",
         )
 
-    def nodes(self, container: Container) -> list[models.NodeOut]:
+    def nodes(self, container: Container) -> list[spec_models.NodeOut]:
         """Show the nodes of a container."""
         status = self._tables.container_live(container.id).status
         reported = {node.tag: node for node in status.nodes} if status else {}
         return [self._node(container, tag, reported.get(tag)) for tag in container.nodes]
 
-    def _node(self, container: Container, tag: str, status: NodeStatus | None) -> models.NodeOut:
-        node = container.nodes[tag]
-        return models.NodeOut(
+    def _node(self, container: Container, tag: str, status: NodeStatus | None) -> spec_models.NodeOut:
+        return spec_models.NodeOut(
+            **shown(container.nodes[tag]),
             user=container.user,
             container=container.tag,
-            tag=tag,
-            pkg=node.pkg,
-            exe=node.exe,
-            args=node.args,
-            name=node.name,
-            namespace=node.namespace,
             state=status.state.value if status else "unknown",
             pid=status.pid if status else 0,
             exit_code=status.exit_code if status else None,
             detail=status.detail if status else "",
-            restart=node.restart.value,
-            max_restarts=node.max_restarts,
-            after=list(node.after),
-            heartbeat=node.heartbeat,
             restarts=status.restarts if status else 0,
         )
 
-    def parameters(self, container: Container) -> list[models.ParameterOut]:
+    def parameters(self, container: Container) -> list[spec_models.ParameterOut]:
         """Show the parameters of a container."""
         return [
-            models.ParameterOut(user=container.user, container=container.tag, name=name, value=value)
+            spec_models.ParameterOut(user=container.user, container=container.tag, name=name, value=value)
             for name, value in container.parameters.items()
         ]
 
-    def interfaces(self, endpoint: Endpoint) -> list[models.InterfaceOut]:
+    def interfaces(self, endpoint: Endpoint) -> list[spec_models.InterfaceOut]:
         """Show the interfaces of a robot or container."""
-        status = self._tables.live[endpoint.id].status
-        active = status.interfaces if status else {}
         usage = self.usage_of(endpoint).interfaces
         return [
-            models.InterfaceOut(
+            spec_models.InterfaceOut(
+                **shown(interface.spec),
                 user=endpoint.user,
                 endpoint=endpoint.tag,
-                tag=tag,
-                type=interface.type,
-                cls=interface.cls,
-                addr=interface.addr,
-                active=active.get(tag, False),
-                **_counters(usage.get(tag, _NO_INTERFACE_USAGE)),
+                active=interface.id in self._tables.active,
+                **_counters(usage.get(interface.spec.tag, _NO_INTERFACE_USAGE)),
             )
-            for tag, interface in endpoint.interfaces.items()
+            for interface in self._tables.interfaces.by("endpoint", endpoint.id)
         ]
 
-    def connections(self, link: Link) -> list[models.ConnectionOut]:
+    def connections(self, link: Link) -> list[spec_models.ConnectionOut]:
         """Show the connections of a link."""
         user, _, tag_a = link.a.partition("/")
         tag_b = link.b.partition("/")[2]
-        open_ = self._open(link.a) & self._open(link.b)
         return [
-            models.ConnectionOut(
+            spec_models.ConnectionOut(
                 id=c.id,
                 user=user,
                 tag_a=f"{tag_a}/{c.interface_a}",
                 tag_b=f"{tag_b}/{c.interface_b}",
-                established=c.id in open_,
+                established=self.is_established(c),
             )
-            for c in link.connections.values()
+            for c in self._tables.connections.by("link", link.id)
         ]
 
     def machine(self, task_set: TaskSet) -> models.MachineOut:
@@ -179,7 +165,7 @@ class Views:
         )
 
     def staying(self, task_set: TaskSet) -> list[models.StayingOut]:
-        """Show what a draining machine still has, and why."""
+        """Show the containers that a draining machine still has, and why."""
         return [
             models.StayingOut(container=container.id, why=self._why_it_stays(container))
             for container in self._tables.endpoints.by("task_set", task_set.process)
@@ -194,27 +180,14 @@ class Views:
         return live.stays or "its turn comes"
 
     def usage_of(self, endpoint: Endpoint) -> EndpointUsage:
-        """Tell what an endpoint consumes."""
+        """Return the usage of an endpoint."""
         usage = self._usage.get(endpoint.task_set)
         return usage.endpoints.get(endpoint.id, _NO_USAGE) if usage else _NO_USAGE
 
-    def _open(self, endpoint: str) -> set[int]:
-        status = self._tables.live[endpoint].status
-        return set(status.connections) if status else set()
-
-
-def _wish(wish: Resources) -> models.WishOut:
-    return models.WishOut(
-        size=wish.size,
-        cpu=wish.cpu,
-        memory=wish.memory,
-        bandwidth=wish.bandwidth,
-        network=wish.network.value,
-        group=wish.group,
-        group_ip=wish.group_ip,
-        image=wish.image,
-        special_features=list(wish.special_features),
-    )
+    def is_established(self, connection: Connection) -> bool:
+        """Return whether both ends report a connection as established."""
+        ends = (open_end_key(endpoint, connection.id) for endpoint in (connection.a, connection.b))
+        return all(key in self._tables.open_ends for key in ends)
 
 
 def _counters(usage: InterfaceUsage) -> dict[str, int]:

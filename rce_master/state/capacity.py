@@ -1,4 +1,4 @@
-"""What the machines have and what was promised of it, out of the tables; and what one user may ask for."""
+"""The capacity and the promises of machines, from the tables; and the limits of one user's requests."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import ipaddress
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from rce.control.limits import MEGABYTE, MIN_MEMORY
+from rce.control.machine import MEGABYTE, MIN_MEMORY
 from rce.control.messages import TaskSetKind
-from rce.control.model import Network, Resources
-from rce.protocol.wishes import DEFAULT_PREFIX
-from rce_master.exceptions import Conflict, Forbidden, Invalid
+from rce.model.checks import DEFAULT_PREFIX
+from rce.model.specs import Network, Resources
+from rce_master.exceptions import ConflictError, ForbiddenError, InvalidRequestError
 from rce_master.state import limits
 from rce_master.state.placement import Room
 from rce_master.state.records import Container, TaskSet, UserRole, tombstone_key
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 
 def is_draining(tables: Tables, task_set: TaskSet) -> bool:
-    """Whether a machine takes no new containers and hands over those that it has."""
+    """Whether a machine is being drained."""
     return task_set.machine.draining or task_set.process in tables.drains
 
 
 def room_at(tables: Tables, task_set: TaskSet) -> Room:
-    """Count what is promised at a machine: to the containers there and to those that are on their way."""
+    """Sum up the promises of a machine: to its containers and to those that move there."""
     placed = [e for e in tables.endpoints.by("task_set", task_set.process) if isinstance(e, Container)]
     coming = [tables.container(move.id) for move in tables.moves.by("to", task_set.process)]
     room = Room(
@@ -39,7 +39,7 @@ def room_at(tables: Tables, task_set: TaskSet) -> Room:
 
 
 def _alias(tables: Tables, task_set: TaskSet) -> str:
-    """Tell one task set from others on the same machine: by its process."""
+    """Return a name that distinguishes task sets on the same machine."""
     namesakes = sum(
         s.machine.name == task_set.machine.name and s.kind is TaskSetKind.CONTAINER for s in tables.task_sets
     )
@@ -47,7 +47,7 @@ def _alias(tables: Tables, task_set: TaskSet) -> str:
 
 
 def rooms(tables: Tables, *, away: bool = False) -> dict[str, Room]:
-    """Count all container machines that are connected, or also those that may still come back, by process."""
+    """Return all connected container machines, or also those that may still come back, by process."""
     return {
         task_set.process: room_at(tables, task_set)
         for task_set in tables.task_sets
@@ -56,20 +56,20 @@ def rooms(tables: Tables, *, away: bool = False) -> dict[str, Room]:
 
 
 def group_mates(tables: Tables, container: Container) -> list[Container]:
-    """List the other containers that must be on the same machine: those of its group's network."""
-    wish = container.resources
-    if wish.network is not Network.GROUP:
+    """Return the other containers that must be on the same machine: those of its group's network."""
+    requested = container.resources
+    if requested.network is not Network.GROUP:
         return []
     return [
         other
         for other in tables.containers(container.user)
         if other.id != container.id
-        and (other.resources.network, other.resources.group) == (Network.GROUP, wish.group)
+        and (other.resources.network, other.resources.group) == (Network.GROUP, requested.group)
     ]
 
 
 def open_to(tables: Tables, container: Container, found: dict[str, Room]) -> list[Room]:
-    """Choose, of machines, those where a container may be: with its group, not where it still ends."""
+    """Return the machines where a container may be: with its group, and not where it is still ending."""
     tied = {mate.task_set for mate in group_mates(tables, container) if mate.task_set}
     return [
         room
@@ -80,7 +80,7 @@ def open_to(tables: Tables, container: Container, found: dict[str, Room]) -> lis
 
 
 def company(tables: Tables, container: Container) -> Counter[str]:
-    """Count, by process, what a container belongs together with: its peers, and others of its group.
+    """Count, by process, the related endpoints of a container: its peers, and others of its group.
 
     A robot counts for the container machines on the same machine as its task set.
     """
@@ -116,57 +116,58 @@ def own(tables: Tables, container: Container) -> Counter[str]:
     return Counter(c.task_set for c in tables.containers(container.user) if c.id != container.id)
 
 
-# What a user may ask for
+# Limits of users' requests
 
 
-def check_wish(tx: Transaction, user: str, id_: str, wish: Resources) -> None:
-    """Check that a user may ask for this.
+def check_resources(tx: Transaction, user: str, id_: str, requested: Resources) -> None:
+    """Check that a user may request these resources.
 
     Args:
         tx: The transaction.
-        user: Whose container it is.
-        id_: The container; what it was promised before does not count.
-        wish: What it is to get.
+        user: The container's user.
+        id_: The container; its former promise does not count.
+        requested: The requested resources.
 
     Raises:
-        Refused: They may not; the text says why and how to mend it.
+        Refused: The request exceeds a limit; the text says why and how to fix it.
     """
-    if 0 < wish.memory < MIN_MEMORY:
-        raise Invalid(
-            f"memory: {wish.memory / MEGABYTE:.3g} MB are too little; a container itself needs "
+    if 0 < requested.memory < MIN_MEMORY:
+        raise InvalidRequestError(
+            f"memory: {requested.memory / MEGABYTE:.3g} MB are too little; a container itself needs "
             f"{MIN_MEMORY // MEGABYTE} MB (a plain number is MB)"
         )
     others = [c for c in tx.tables.containers(user) if c.id != id_]
-    _check_group(wish, others)
+    _check_group(requested, others)
     if tx.tables.users[user].role is not UserRole.ADMIN:
-        _check_privileges(wish)
-    limits.check_wishes(tx, user, [wish, *(c.resources for c in others)])
+        _check_privileges(requested)
+    limits.check_all_resources(tx, user, [requested, *(c.resources for c in others)])
 
 
-def _check_privileges(wish: Resources) -> None:
-    if wish.network is Network.HOST:
-        raise Forbidden("network: host is for containers of administrators; use none or group")
-    if wish.image.startswith("/"):
-        raise Forbidden("image: folders of the machine are for administrators; use an OCI image's name")
+def _check_privileges(requested: Resources) -> None:
+    if requested.network is Network.HOST:
+        raise ForbiddenError("network: host is for containers of administrators; use none or group")
+    if requested.image.startswith("/"):
+        raise ForbiddenError("image: folders of the machine are for administrators; use an OCI image's name")
 
 
-def _check_group(wish: Resources, others: list[Container]) -> None:
-    if wish.network is not Network.GROUP or not wish.group_ip:
+def _check_group(requested: Resources, others: list[Container]) -> None:
+    if requested.network is not Network.GROUP or not requested.group_ip:
         return
-    address = _address(wish.group_ip)
+    address = _address(requested.group_ip)
     for other in others:
         theirs = other.resources
-        if (theirs.network, theirs.group) != (Network.GROUP, wish.group) or not theirs.group_ip:
+        if (theirs.network, theirs.group) != (Network.GROUP, requested.group) or not theirs.group_ip:
             continue
         there = _address(theirs.group_ip)
         if there.ip == address.ip:
-            raise Conflict(
-                f"groupIp: {address.ip} is the address of container {other.tag!r} of the group {wish.group!r}"
+            raise ConflictError(
+                f"groupIp: {address.ip} is the address of container {other.tag!r} of the group "
+                f"{requested.group!r}"
             )
         if there.network != address.network:
-            raise Conflict(
+            raise ConflictError(
                 f"groupIp: {address} is not in {there.network}, where container {other.tag!r} of the group "
-                f"{wish.group!r} is; give all of them addresses of one network"
+                f"{requested.group!r} is; give all of them addresses of one network"
             )
 
 

@@ -1,4 +1,4 @@
-"""What a command did: the journal of one transaction and all that follows from it outside the core."""
+"""The changes of a command: the journal of one transaction and its effects outside the core."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from msgspec.structs import replace
 
 from rce_master.state.records import (
-    Bundle,
     Container,
     ContainerLive,
     Counter,
     Drain,
     Endpoint,
     KnownLogin,
-    Link,
     Move,
     PackageKey,
     Presence,
@@ -26,7 +24,9 @@ from rce_master.state.records import (
     Tombstone,
     User,
     UserLimits,
+    UserPackage,
 )
+from rce_master.state.wiring_records import ActiveInterface, Connection, Interface, Link, OpenEnd
 from rce_master.store.base import Row
 
 if TYPE_CHECKING:
@@ -58,15 +58,39 @@ class Notice:
 
 
 @dataclass(frozen=True, slots=True)
-class Happening:
-    """Something that people want to know of; becomes an event of the API."""
+class StateEvent:
+    """A message for users; becomes an event of the API."""
 
     kind: str
     user: str
     """Empty: of interest to administrators only."""
     subject: str
-    """What it is about, such as an endpoint id."""
+    """The object of the event, such as an endpoint id."""
     text: str
+
+
+@dataclass(slots=True)
+class Touched:
+    """The changed parts of an endpoint's spec; the tables hold those that still exist."""
+
+    since: int = 0
+    """The endpoint's revision before."""
+    contents: bool = False
+    """Whether parts other than interfaces, links and connections changed (too)."""
+    interfaces: dict[str, None] = field(default_factory=dict)
+    """By tag."""
+    links: dict[str, None] = field(default_factory=dict)
+    """By id."""
+    connections: dict[int, None] = field(default_factory=dict)
+    """By id."""
+
+    def include(self, earlier: Touched) -> None:
+        """Include the changes before this one."""
+        self.since = earlier.since
+        self.contents |= earlier.contents
+        self.interfaces = {**earlier.interfaces, **self.interfaces}
+        self.links = {**earlier.links, **self.links}
+        self.connections = {**earlier.connections, **self.connections}
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,25 +102,29 @@ class _Write:
 
 @dataclass(slots=True)
 class Changes:
-    """All that one command changed and that has to follow."""
+    """The changes of one command and their effects."""
 
-    touched: dict[str, None] = field(default_factory=dict)
-    """Ids of the endpoints whose spec changed and that are still desired."""
+    touched: dict[str, Touched] = field(default_factory=dict)
+    """The changes in the specs of endpoints that are still desired, by their ids."""
     withdrawals: list[Withdrawal] = field(default_factory=list)
     notices: list[Notice] = field(default_factory=list)
-    happenings: list[Happening] = field(default_factory=list)
+    events: list[StateEvent] = field(default_factory=list)
     arrived: str = ""
     """Process name of the task set that is to be synchronised."""
     answered: str = ""
     """Id of an endpoint whose spec goes out with the answer to the command, so that it needs no ``Put``."""
+    wanted_specs: list[tuple[str, str]] = field(default_factory=list)
+    """Process names and endpoint ids: which task sets are to get which whole specs again."""
+    wanted_statuses: list[tuple[str, str]] = field(default_factory=list)
+    """Process names and endpoint ids: which task sets are to report which endpoints as a whole."""
     _writes: list[_Write] = field(default_factory=list)
 
     def written(self) -> dict[tuple[str, str], Table[Any]]:
-        """Tell which records the store has to keep: name of the table and key, to the table."""
+        """Return the records that the store has to keep: name of the table and key, to the table."""
         return {(w.table.name, w.key): w.table for w in self._writes if w.table.persistent}
 
     def rows(self) -> list[Row]:
-        """Write what the store has to keep, each key once."""
+        """Return the rows for the store, each key once."""
         return [make_row(table, key) for (_, key), table in self.written().items()]
 
     def revert(self) -> None:
@@ -106,22 +134,22 @@ class Changes:
         self._writes.clear()
 
     def record(self, table: Table[Any], key: str, before: Any) -> None:
-        """Note what was there before a write."""
+        """Note the former record before a write."""
         self._writes.append(_Write(table, key, before))
 
 
 def make_row(table: Table[Any], key: str) -> Row:
-    """Write a record as the store keeps it; one that is gone as its removal."""
+    """Return a record as a row of the store; for a removed one, its removal."""
     record = table.get(key)
     return Row(table.name, key, None if record is None else table.encode(record))
 
 
 class Transaction:
-    """Access to the tables for one command; whatever is written through it can be undone.
+    """Access to the tables for one command; all its writes can be undone.
 
     Args:
         tables: The tables.
-        now: Seconds of a clock that never goes back.
+        now: Seconds of a monotonic clock.
         settings: Limits and grace times.
         make_token: Makes a secret for a link.
     """
@@ -142,8 +170,13 @@ class Transaction:
         | KnownLogin
         | UserLimits
         | PackageKey
-        | Bundle
+        | UserPackage
         | Endpoint
+        | Interface
+        | Link
+        | Connection
+        | ActiveInterface
+        | OpenEnd
         | TaskSet
         | RobotLive
         | ContainerLive
@@ -155,24 +188,31 @@ class Transaction:
         """Write a record into its table."""
         self._assign(self._table_of(record), record)
 
-    def put_link(self, link: Link) -> None:
-        """Write a link; one without connections is removed. Both ends are touched."""
-        if link.connections:
-            self._assign(self.tables.links, link)
-        else:
-            self.delete(self.tables.links, link.id)
-        self.touch(link.a)
-        self.touch(link.b)
-
     def delete(self, table: Table[Any], key: str) -> None:
-        """Remove a record if it is there."""
+        """Remove a record if it exists."""
         if key in table:
             self.changes.record(table, key, table[key])
             table.assign(key, None)
 
     def touch(self, endpoint: str) -> None:
-        """Note that an endpoint's spec changed."""
-        self.changes.touched[endpoint] = None
+        """Note that an endpoint's spec changed in parts other than interfaces, links and connections."""
+        self._touched(endpoint).contents = True
+
+    def touch_interface(self, endpoint: str, tag: str) -> None:
+        """Note that an endpoint got or lost an interface."""
+        self._touched(endpoint).interfaces[tag] = None
+
+    def touch_link(self, endpoint: str, link: str) -> None:
+        """Note that an endpoint's end of a link changed."""
+        self._touched(endpoint).links[link] = None
+
+    def touch_connection(self, connection: Connection) -> None:
+        """Note that two endpoints got or lost a connection."""
+        for endpoint in (connection.a, connection.b):
+            self._touched(endpoint).connections[connection.id] = None
+
+    def _touched(self, endpoint: str) -> Touched:
+        return self.changes.touched.setdefault(endpoint, Touched())
 
     def next_number(self, counter: str) -> int:
         """Take the next number of a counter."""
@@ -182,12 +222,12 @@ class Transaction:
         return value
 
     def newest(self, counter: str) -> int:
-        """Tell the number of a counter that was taken last."""
+        """Return the last number that was taken from a counter."""
         found = self.tables.counters.get(counter)
         return found.value if found else 0
 
     def raise_counter(self, counter: str, value: int) -> None:
-        """Make a counter go on above a value."""
+        """Make a counter continue above a value."""
         found = self.tables.counters.get(counter)
         if value > (found.value if found else 0):
             self._assign(self.tables.counters, Counter(name=counter, value=value))
@@ -205,19 +245,20 @@ class Transaction:
         self.changes.notices.append(Notice(to, text))
 
     def happen(self, kind: str, subject: str, text: str = "", *, user: str | None = None) -> None:
-        """Note an event. Without ``user``, the subject is an endpoint id that tells it."""
+        """Note an event. Without ``user``, the subject is an endpoint id that contains it."""
         owner = subject.partition("/")[0] if user is None else user
-        self.changes.happenings.append(Happening(kind, owner, subject, text))
+        self.changes.events.append(StateEvent(kind, owner, subject, text))
 
     def seal(self) -> Changes:
-        """Give every touched endpoint its new revision and hand out what was done."""
+        """Give every touched endpoint its new revision and return the changes."""
         touched = self.changes.touched
         self.changes.touched = {}
-        for id_ in touched:
+        for id_, parts in touched.items():
             endpoint = self.tables.endpoints.get(id_)
             if endpoint is not None:
+                parts.since = endpoint.revision
                 self.put(replace(endpoint, revision=self.next_number("revision")))
-                self.changes.touched[id_] = None
+                self.changes.touched[id_] = parts
         return self.changes
 
     def connected_task_sets(self, kind: TaskSetKind) -> Iterable[TaskSet]:
@@ -239,9 +280,14 @@ class Transaction:
             KnownLogin: tables.known_logins,
             UserLimits: tables.user_limits,
             PackageKey: tables.package_keys,
-            Bundle: tables.bundles,
+            UserPackage: tables.packages,
             Robot: tables.endpoints,
             Container: tables.endpoints,
+            Interface: tables.interfaces,
+            Link: tables.links,
+            Connection: tables.connections,
+            ActiveInterface: tables.active,
+            OpenEnd: tables.open_ends,
             TaskSet: tables.task_sets,
             RobotLive: tables.live,
             ContainerLive: tables.live,

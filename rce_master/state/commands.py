@@ -1,6 +1,6 @@
-"""Everything that can be asked of the state or happen to it.
+"""The commands on the state: requests and events.
 
-Commands are values: what they mean is in the module that handles them (``users``, ``task_sets``, ``robots``,
+Commands are values: the modules that handle them define their meaning (``users``, ``task_sets``, ``robots``,
 ``containers``, ``wiring``).
 """
 
@@ -9,22 +9,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
-from rce.control.model import Resources
+from rce.model.specs import Resources
 
 if TYPE_CHECKING:
     from rce.control.messages import Hello
-    from rce.control.model import EndpointStatus, InterfaceSpec, NodeSpec, ParameterValue
-    from rce_master.state.records import Bundle, KnownLogin, PackageKey, Token, User, UserRole
+    from rce.control.model import EndpointStatus, StatusPatch
+    from rce.model.specs import InterfaceSpec, NodeSpec, ParameterValue, ResourceChanges
+    from rce_master.state.records import KnownLogin, PackageKey, Token, User, UserPackage, UserRole
 
 
-_NO_WISHES = Resources()
+_NOTHING_REQUESTED = Resources()
 
 # Users
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AddUser:
-    """Make a user; refused if there is one of the name."""
+    """Make a user; refused if the name exists."""
 
     user: User
 
@@ -40,7 +41,7 @@ class SetPassword:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetRole:
-    """Change what a user may do."""
+    """Change a user's role."""
 
     name: str
     role: UserRole
@@ -59,9 +60,9 @@ class AddToken:
 
     token: Token
     password: str = ""
-    """Stored hash of the password that was shown for it; refused if the user has another one by now."""
+    """Stored hash of the password that the login used; refused if the password has changed since."""
     replaces: bool = False
-    """Of a robot's token: whether it takes the place of the one that is there."""
+    """For a robot's token: whether it replaces the existing one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +75,7 @@ class NoteTokenUses:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RevokeToken:
-    """Forget a bearer token of a user; ends what was opened by it."""
+    """Remove a bearer token of a user; ends the sessions that use it."""
 
     user: str
     id: str
@@ -98,7 +99,7 @@ class RemoveToken:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetLimits:
-    """Change what a user may have."""
+    """Change a user's limits."""
 
     user: str
     limits: dict[str, float | None]
@@ -107,7 +108,7 @@ class SetLimits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RememberLogin:
-    """Keep the mark of a password that was right."""
+    """Keep the mark of a correct password."""
 
     login: KnownLogin
 
@@ -124,22 +125,22 @@ class AddPackageKey:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemovePackageKey:
-    """Trust a user's key no more."""
+    """Stop trusting a user's key."""
 
     user: str
     id: str
-    """As :func:`rce.bundles.signing.key_id` names it."""
+    """As :func:`rce.packages.signing.key_id` names it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AddBundle:
-    """Take a version of a package; whoever sends this has verified it."""
+class AddPackage:
+    """Store a version of a package; the sender of this command has verified it."""
 
-    bundle: Bundle
+    package: UserPackage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RemoveBundle:
+class RemovePackage:
     """Remove a version of a package; refused while a node needs it."""
 
     user: str
@@ -173,6 +174,22 @@ class StatusReported:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StatusPatched:
+    """A task set reported what changed of an endpoint."""
+
+    process: str
+    patch: StatusPatch
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpecRequested:
+    """A task set asked for the whole spec of an endpoint, because a patch did not fit its revision."""
+
+    process: str
+    id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class EndpointGone:
     """A task set ended an endpoint."""
 
@@ -187,19 +204,19 @@ class FaultReported:
     id: str
     text: str
     robot: str = ""
-    """Endpoint id of the robot to tell; all of the user if empty."""
+    """Endpoint id of the robot to notify; empty: all robots of the user."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotLogin:
-    """A robot that proved who it is wants to connect at a task set."""
+    """An authenticated robot wants to connect at a task set."""
 
     process: str
     id: str
     credential: str = ""
-    """Digest of the token that it came with; empty: its user's password. Refused if it was revoked."""
+    """Digest of the token that it used; empty: its user's password. Refused if it was revoked."""
     password: str = ""
-    """Stored hash of the password that it came with; refused if the user has another one by now."""
+    """Stored hash of the password that it used; refused if the password has changed since."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,7 +230,7 @@ class RobotLeft:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetDraining:
-    """An operator wants a machine to be emptied, or not any more."""
+    """An operator starts or cancels the drain of a machine."""
 
     machine: str
     """Its name, or that of its container task set."""
@@ -225,7 +242,7 @@ class Tick:
     """Time passed: grace times end, waiting containers are placed."""
 
 
-# What users ask for. ``user`` is who owns the endpoints; tags are the user's.
+# Requests of users. ``user`` owns the endpoints; tags are the user's.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -234,25 +251,18 @@ class CreateContainer:
 
     user: str
     tag: str
-    resources: Resources = _NO_WISHES
+    resources: Resources = _NOTHING_REQUESTED
     wait: bool = False
-    """Whether to wait for room if no machine has any now; else that is refused."""
+    """Whether to wait for room if no machine has room now; else the request is refused."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResizeContainer:
-    """``RC``; None leaves a wish as it is, zero takes it back."""
+    """``RC``."""
 
     user: str
     tag: str
-    size: int | None = None
-    """Slots."""
-    cpu: float | None = None
-    """Cores."""
-    memory: int | None = None
-    """Bytes."""
-    bandwidth: int | None = None
-    """Bytes per second."""
+    changes: ResourceChanges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -283,7 +293,7 @@ class RemoveNode:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetParameter:
-    """Set a parameter of a container; a value that is there is replaced."""
+    """Set a parameter of a container; replaces an existing value."""
 
     user: str
     container: str
@@ -320,7 +330,7 @@ class RemoveInterface:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Connect:
-    """Join two interfaces, each written ``ENDPOINT/INTERFACE``."""
+    """Connect two interfaces, each written ``ENDPOINT/INTERFACE``."""
 
     user: str
     tag_a: str
@@ -329,7 +339,7 @@ class Connect:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disconnect:
-    """Part two interfaces, each written ``ENDPOINT/INTERFACE``."""
+    """Disconnect two interfaces, each written ``ENDPOINT/INTERFACE``."""
 
     user: str
     tag_a: str
@@ -365,11 +375,13 @@ Command: TypeAlias = (
     | SetLimits
     | AddPackageKey
     | RemovePackageKey
-    | AddBundle
-    | RemoveBundle
+    | AddPackage
+    | RemovePackage
     | TaskSetArrived
     | TaskSetLeft
     | StatusReported
+    | StatusPatched
+    | SpecRequested
     | EndpointGone
     | FaultReported
     | RobotLogin

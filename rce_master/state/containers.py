@@ -1,4 +1,4 @@
-"""Containers: what users ask of them, where they are placed, what is reported of them."""
+"""Containers: requests of users, placement, and reports."""
 
 from __future__ import annotations
 
@@ -7,19 +7,12 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.control.model import (
-    EndpointState,
-    EndpointStatus,
-    LinkAddress,
-    NodeSpec,
-    NodeState,
-    NodeStatus,
-    ParameterValue,
-)
-from rce.protocol.wishes import find_circle
-from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
-from rce_master.state import capacity, draining, endpoints, limits, packages, placing
-from rce_master.state.lifecycle import ContainerEvent, ContainerPhase, next_phase
+from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
+from rce.model.checks import find_circle
+from rce.model.specs import NodeSpec, ParameterValue
+from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
+from rce_master.state import activity, capacity, draining, endpoints, limits, packages, placing
+from rce_master.state.lifecycle import ContainerEvent, ContainerPhase
 from rce_master.state.records import Container, ContainerLive
 
 if TYPE_CHECKING:
@@ -45,23 +38,23 @@ _EVENTS = {
 }
 
 
-# What users ask for
+# Requests of users
 
 
 def create_container(tx: Transaction, command: CreateContainer) -> None:
-    """Make a container; the same one again is accepted silently."""
+    """Make a container; an identical one is accepted silently."""
     id_ = f"{command.user}/{command.tag}"
     there = tx.tables.endpoints.get(id_)
     if isinstance(there, Container):
         if command.resources not in (there.resources, there.made):
-            raise Conflict(
+            raise ConflictError(
                 f"container {command.tag!r} exists with other settings; resize or destroy it first"
             )
         return
     if there is not None:
-        raise Conflict(f"{command.tag!r} is a robot already; a container needs another tag")
+        raise ConflictError(f"{command.tag!r} is a robot already; a container needs another tag")
     limits.check_containers(tx, command.user)
-    capacity.check_wish(tx, command.user, id_, command.resources)
+    capacity.check_resources(tx, command.user, id_, command.resources)
     made = Container(
         id=id_,
         resources=command.resources,
@@ -76,45 +69,47 @@ def create_container(tx: Transaction, command: CreateContainer) -> None:
 
 
 def destroy_container(tx: Transaction, command: DestroyContainer) -> None:
-    """Remove a container with all that is in it and connected to it."""
+    """Remove a container with its parts and connections."""
     container = find(tx, command.user, command.tag)
     endpoints.remove(tx, container.id, "destroyed by its user")
     tx.happen("container_destroyed", container.id)
 
 
 def add_node(tx: Transaction, command: AddNode) -> None:
-    """Add a node; the same one again is accepted silently."""
+    """Add a node; an identical one is accepted silently."""
     container = find(tx, command.user, command.container)
     node = command.node
     there = container.nodes.get(node.tag)
     if there == node:
         return
     if there is not None:
-        raise Conflict(
+        raise ConflictError(
             f"node {node.tag!r} of container {container.tag!r} exists with other settings; remove it first"
         )
     packages.check_node(tx.tables, command.user, node)
     _check_order(container, node)
     if len(container.nodes) >= tx.settings.max_nodes:
-        raise LimitReached(f"container {container.tag!r} has {tx.settings.max_nodes} nodes already")
+        raise LimitReachedError(f"container {container.tag!r} has {tx.settings.max_nodes} nodes already")
     size = endpoints.grown(tx, container, node)
     tx.put(replace(container, nodes={**container.nodes, node.tag: node}, size=size))
     tx.touch(container.id)
 
 
 def _check_order(container: Container, node: NodeSpec) -> None:
-    """Refuse nodes that would wait for one another for ever; what a node comes after may be yet to come."""
+    """Refuse nodes that would wait for one another; a predecessor may be added later."""
     after = {other.tag: other.after for other in (*container.nodes.values(), node)}
     circle = find_circle(node.tag, after)
     if circle:
-        raise Invalid(f"node {node.tag!r}: after goes round in a circle: {' after '.join(circle)}")
+        raise InvalidRequestError(
+            f"node {node.tag!r}: after goes round in a circle: {' after '.join(circle)}"
+        )
 
 
 def remove_node(tx: Transaction, command: RemoveNode) -> None:
     """Remove a node."""
     container = find(tx, command.user, command.container)
     if command.tag not in container.nodes:
-        raise NotFound(f"container {container.tag!r} has no node {command.tag!r}")
+        raise NotFoundError(f"container {container.tag!r} has no node {command.tag!r}")
     kept = {t: n for t, n in container.nodes.items() if t != command.tag}
     size = container.size - endpoints.size_of(container.nodes[command.tag])
     tx.put(replace(container, nodes=kept, size=size))
@@ -122,17 +117,19 @@ def remove_node(tx: Transaction, command: RemoveNode) -> None:
 
 
 def set_parameter(tx: Transaction, command: SetParameter) -> None:
-    """Set a parameter, whatever it was before."""
+    """Set a parameter; replaces an existing value."""
     container = find(tx, command.user, command.container)
     _check_value(command.name, command.value)
     there = container.parameters.get(command.name)
     if there == command.value and type(there) is type(command.value):
         return
     if there is None and len(container.parameters) >= tx.settings.max_parameters:
-        raise LimitReached(f"container {container.tag!r} has {tx.settings.max_parameters} parameters already")
+        raise LimitReachedError(
+            f"container {container.tag!r} has {tx.settings.max_parameters} parameters already"
+        )
     before = None if there is None else (command.name, there)
     size = endpoints.grown(tx, container, (command.name, command.value), before)
-    # Taken out first: 1 and True are equal, and an equal value must still replace the old one.
+    # Removed first: 1 and True are equal, and an equal value must still replace the old one.
     kept = {n: v for n, v in container.parameters.items() if n != command.name}
     tx.put(replace(container, parameters=kept))
     tx.put(replace(container, parameters={**kept, command.name: command.value}, size=size))
@@ -143,7 +140,7 @@ def delete_parameter(tx: Transaction, command: DeleteParameter) -> None:
     """Delete a parameter."""
     container = find(tx, command.user, command.container)
     if command.name not in container.parameters:
-        raise NotFound(f"container {container.tag!r} has no parameter {command.name!r}")
+        raise NotFoundError(f"container {container.tag!r} has no parameter {command.name!r}")
     kept = {n: v for n, v in container.parameters.items() if n != command.name}
     size = container.size - endpoints.size_of((command.name, container.parameters[command.name]))
     tx.put(replace(container, parameters=kept, size=size))
@@ -153,30 +150,32 @@ def delete_parameter(tx: Transaction, command: DeleteParameter) -> None:
 def _check_value(name: str, value: ParameterValue) -> None:
     for item in value if isinstance(value, list) else [value]:
         if isinstance(item, int) and not -_INT32 <= item < _INT32:
-            raise Invalid(f"parameter {name!r}: {item} does not fit into 32 bits, which is all that ROS has")
+            raise InvalidRequestError(
+                f"parameter {name!r}: {item} does not fit into 32 bits, the size of ROS's integers"
+            )
         if isinstance(item, float) and not math.isfinite(item):
-            raise Invalid(f"parameter {name!r}: {item} is not a finite number")
+            raise InvalidRequestError(f"parameter {name!r}: {item} is not a finite number")
 
 
 def find(tx: Transaction, user: str, tag: str) -> Container:
     """Find a container of a user.
 
     Raises:
-        Refused: There is none; the text says what there is.
+        Refused: It does not exist; the text lists the existing ones.
     """
     found = tx.tables.endpoints.get(f"{user}/{tag}")
     if isinstance(found, Container):
         return found
     if found is not None:
-        raise Invalid(f"{tag!r} is a robot, not a container")
-    raise NotFound(f"there is no container {tag!r}; create it first")
+        raise InvalidRequestError(f"{tag!r} is a robot, not a container")
+    raise NotFoundError(f"there is no container {tag!r}; create it first")
 
 
-# What task sets report
+# Reports of task sets
 
 
 def lose(tx: Transaction, container: Container) -> None:
-    """Give a container up at a task set that stayed away."""
+    """Give up a container at a task set that stayed away."""
     if draining.promote(tx, container):
         return
     text = f"container {container.tag!r} was lost with its machine {container.task_set!r}"
@@ -186,18 +185,18 @@ def lose(tx: Transaction, container: Container) -> None:
 
 
 def ended(tx: Transaction, container: Container) -> None:
-    """Note that a container's task set ended it though it is desired; it is placed anew."""
+    """Note that a container's task set ended it although it is desired; it is placed again."""
     if draining.promote(tx, container):
         return
     _unbind(tx, container, ContainerEvent.WITHDRAW)
-    tx.happen("container_gone", container.id, "its task set ended it; it is placed anew")
+    tx.happen("container_gone", container.id, "its task set ended it; it is placed again")
 
 
 def _unbind(tx: Transaction, container: Container, event: ContainerEvent) -> None:
     _move(tx, container, LinkAddress())
     tx.put(replace(tx.tables.endpoints[container.id], task_set=""))
     placing.happened(tx, container.id, event)
-    tx.put(replace(tx.tables.container_live(container.id), status=None))
+    _forget_status(tx, container)
 
 
 def missing(tx: Transaction, container: Container) -> None:
@@ -205,15 +204,20 @@ def missing(tx: Transaction, container: Container) -> None:
     live = tx.tables.container_live(container.id)
     if live.phase is not ContainerPhase.PLACED:
         placing.happened(tx, container.id, ContainerEvent.PLACE)
-    tx.put(replace(tx.tables.container_live(container.id), status=None))
+    _forget_status(tx, container)
     _move(tx, container, LinkAddress())
 
 
+def _forget_status(tx: Transaction, container: Container) -> None:
+    tx.put(replace(tx.tables.container_live(container.id), status=None))
+    activity.forget(tx, container.id)
+
+
 def reported(tx: Transaction, container: Container, status: EndpointStatus) -> None:
-    """Note what its task set reports of a container."""
+    """Apply a task set's report about a container, except its interfaces and connections."""
     before = tx.tables.container_live(container.id)
     event = _EVENTS[status.state]
-    if next_phase(before.phase, event) is not before.phase:
+    if before.after(event, tx.now).phase is not before.phase:
         placing.happened(tx, container.id, event)
         tx.happen(f"container_{event.value}", container.id, status.detail)
     elif before.status and before.status.incarnation != status.incarnation:

@@ -1,4 +1,4 @@
-"""The state: applies commands, one after the other, each wholly or not at all."""
+"""The state: applies commands one after the other, each atomically."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import secrets
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-from msgspec.structs import replace
 
 from rce_master.exceptions import StoreError
 from rce_master.state import (
@@ -25,14 +24,16 @@ from rce_master.state import (
 )
 from rce_master.state.changes import Changes, Transaction
 from rce_master.state.invariants import validate
+from rce_master.state.migration import converted
 from rce_master.state.settings import StateSettings
-from rce_master.state.specs import build_spec
+from rce_master.state.specs import build_patch, build_spec
 from rce_master.state.tables import Tables
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.control.model import EndpointSpec
+    from rce.control.model import EndpointSpec, SpecPatch
+    from rce_master.state.changes import Touched
     from rce_master.store.base import Snapshot
 
 _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
@@ -49,11 +50,13 @@ _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
     commands.RevokeRobotToken: tokens.revoke_robot,
     commands.AddPackageKey: packages.add_key,
     commands.RemovePackageKey: packages.remove_key,
-    commands.AddBundle: packages.add_bundle,
-    commands.RemoveBundle: packages.remove_bundle,
+    commands.AddPackage: packages.add_package,
+    commands.RemovePackage: packages.remove_package,
     commands.TaskSetArrived: task_sets.arrived,
     commands.TaskSetLeft: task_sets.left,
     commands.StatusReported: task_sets.status_reported,
+    commands.StatusPatched: task_sets.status_patched,
+    commands.SpecRequested: task_sets.spec_requested,
     commands.EndpointGone: task_sets.gone,
     commands.FaultReported: task_sets.fault,
     commands.RobotLogin: robots.login,
@@ -86,7 +89,7 @@ def _new_token() -> str:
 
 
 class State:
-    """Users, task sets, robots, containers and how they are wired, desired and observed.
+    """Users, task sets, robots, containers and their wiring, desired and observed.
 
     No I/O, no clock, no task: the time comes with every command.
 
@@ -106,13 +109,14 @@ class State:
     def load(
         cls, snapshot: Snapshot, now: float, settings: StateSettings | None = None, *, revision: int = 0
     ) -> State:
-        """Go on from what the store holds.
+        """Load the state from the store.
 
         Args:
-            snapshot: What the store holds.
+            snapshot: The contents of the store, of this release or the previous one; a store that is written
+                to must be converted first (:func:`rce_master.state.migration.conversion`).
             now: Seconds of a clock that never goes back.
             settings: Limits and times.
-            revision: Revisions go on above this, also if the store is an old copy. It must grow from one
+            revision: Revisions continue above this, also if the store is an old copy. It must grow from one
                 start of the master to the next more than there were changes between them: the time of day
                 in milliseconds does.
 
@@ -121,6 +125,7 @@ class State:
         """
         state = cls(settings)
         try:
+            snapshot = converted(snapshot)
             for table in state.tables.all:
                 table.load(snapshot.get(table.name, {}))
         except msgspec.MsgspecError as error:
@@ -132,14 +137,14 @@ class State:
         """Apply a command.
 
         Args:
-            command: What is asked or happened.
+            command: The command.
             now: Seconds of a clock that never goes back.
 
         Returns:
-            What changed and what has to follow.
+            The changes and their effects.
 
         Raises:
-            Refused: It cannot be done; nothing changed.
+            Refused: The state does not allow it; nothing changed.
         """
         tx = self._begin(now)
         try:
@@ -150,7 +155,7 @@ class State:
             raise
 
     def spec(self, endpoint: str) -> EndpointSpec:
-        """Tell what is desired of an endpoint.
+        """Return the desired state of an endpoint.
 
         Raises:
             KeyError: There is no such endpoint.
@@ -158,23 +163,30 @@ class State:
         return build_spec(self.tables, endpoint)
 
     def copy_spec(self, endpoint: str) -> tuple[str, EndpointSpec] | None:
-        """Tell what is desired of a container's copy at the machine that it moves to; None if there is none.
+        """Return the desired state of a container's copy at its next machine; None without a copy.
 
         Returns:
-            The process name of the task set, and what it is to make: all that is in the container, but
-            nothing that joins it with others.
+            The process name of the task set, and the spec to make: the contents of the container, without
+            interfaces and connections.
         """
         move = self.tables.moves.get(endpoint)
         if move is None:
             return None
-        whole = self.spec(endpoint)
-        return move.to, replace(whole, interfaces=(), links=(), connections=())
+        return move.to, build_spec(self.tables, endpoint, with_wiring=False)
+
+    def patch(self, endpoint: str, touched: Touched) -> SpecPatch:
+        """Return the desired state of the changed parts of an endpoint.
+
+        Raises:
+            KeyError: There is no such endpoint.
+        """
+        return build_patch(self.tables, endpoint, touched)
 
     def validate(self) -> None:
         """Check all invariants.
 
         Raises:
-            AssertionError: One does not hold; the text says which.
+            AssertionError: An invariant does not hold; the text says which.
         """
         validate(self.tables)
 

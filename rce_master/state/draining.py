@@ -1,13 +1,13 @@
-"""Machines that are to be emptied: they take no new containers, and those they have are handed over.
+"""Draining of machines: they take no new containers, and their containers are handed over.
 
 A container is *handed over* by a move: a copy of it, with its nodes and parameters but without interfaces and
-connections, is made at another machine while the container goes on; once the copy's nodes are up, the copy
+connections, is made at another machine while the container continues; once the copy's nodes are up, the copy
 becomes the container, gets the interfaces and connections, and the former one is dropped. A node that is not
-up in the container need not be up in the copy: one that is none of ROS never registers. One container at a
-time moves away from a machine; those in the network of one group move together. What finds room nowhere
-stays where it is, and is looked at again at every tick.
+up in the container need not be up in the copy: a node without ROS never registers. One container at a time
+moves away from a machine; those in the network of one group move together. A container without room elsewhere
+stays where it is, and is tried again at every tick.
 
-A drain outlives a restart of the master. A move does not: the copy is dropped, and the move begins anew.
+A drain outlives a restart of the master. A move does not: the copy is dropped, and the move starts again.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from msgspec.structs import replace
 
 from rce.control.messages import TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus, NodeState
-from rce_master.exceptions import NotFound
-from rce_master.state import capacity, endpoints, placing
+from rce.control.observed import without_wiring
+from rce_master.exceptions import NotFoundError
+from rce_master.state import activity, capacity, endpoints, placing
 from rce_master.state.lifecycle import ContainerEvent
 from rce_master.state.placement import Room, choose, refusals
 from rce_master.state.records import Container, Drain, Move, TaskSet, tombstone_key
@@ -34,7 +35,7 @@ _UP = frozenset({NodeState.RUNNING, NodeState.EXITED})
 
 
 def set_draining(tx: Transaction, command: SetDraining) -> None:
-    """Drain a machine, or take that back; what is so already is accepted silently."""
+    """Drain a machine, or cancel that; without effect if it is already so."""
     for process in _processes(tx.tables, command.machine):
         if command.draining == (process in tx.tables.drains):
             continue
@@ -59,15 +60,15 @@ def _processes(tables: Tables, name: str) -> list[str]:
     if name in tables.drains and name not in found:
         found.append(name)
     if not found:
-        raise NotFound(f"there is no container machine {name!r}; rce machines lists them")
+        raise NotFoundError(f"there is no container machine {name!r}; rce machines lists them")
     return found
 
 
 def advance(tx: Transaction) -> None:
     """Begin the next move from each machine that is draining, and give up moves that take too long."""
     for move in list(tx.tables.moves):
-        if tx.now - move.since >= tx.settings.move_patience:
-            give_up(tx, move, f"did not come up there within {tx.settings.move_patience:.0f} s")
+        if tx.now - move.since >= tx.settings.move_timeout:
+            give_up(tx, move, f"did not come up there within {tx.settings.move_timeout:.0f} s")
     for task_set in list(tx.connected_task_sets(TaskSetKind.CONTAINER)):
         if capacity.is_draining(tx.tables, task_set):
             _advance(tx, task_set)
@@ -91,13 +92,13 @@ def _advance(tx: Transaction, task_set: TaskSet) -> None:
 
 
 def _unit(tables: Tables, container: Container) -> list[Container]:
-    """List what moves together with a container, itself first."""
+    """Return the containers that move together with a container, itself first."""
     mates = capacity.group_mates(tables, container)
     return [container, *(mate for mate in mates if mate.task_set == container.task_set)]
 
 
 def _target(tx: Transaction, unit: list[Container]) -> str:
-    """Find a machine that takes all of some containers; empty if there is none."""
+    """Return a machine that takes all of some containers; empty if none does."""
     rooms = capacity.rooms(tx.tables)
     first = unit[0]
     company, own = capacity.company(tx.tables, first), capacity.own(tx.tables, first)
@@ -125,7 +126,7 @@ def _open(tx: Transaction, unit: list[Container], process: str) -> bool:
 
 
 def obstacle(tables: Tables, container: Container) -> str:
-    """Say why a container cannot be handed over."""
+    """Report why a container cannot be handed over."""
     rooms = [r for r in capacity.rooms(tables).values() if r.process != container.task_set]
     mates = len(_unit(tables, container)) - 1
     whole = f"it moves with {mates} others of its group; " if mates else ""
@@ -154,11 +155,11 @@ def _stay(tx: Transaction, container: Container, why: str) -> None:
         )
 
 
-# What becomes of moves
+# Progress of moves
 
 
 def reported(tx: Transaction, move: Move, status: EndpointStatus) -> None:
-    """Note what is reported of a container's copy."""
+    """Apply a report about a container's copy."""
     container = tx.tables.container(move.id)
     assert container is not None
     if status.state is EndpointState.FAILED:
@@ -173,7 +174,7 @@ def reported(tx: Transaction, move: Move, status: EndpointStatus) -> None:
 
 
 def _is_ready(tx: Transaction, move: Move) -> bool:
-    """Whether the copy does as well as the container does."""
+    """Whether the copy's nodes are up, as far as those of the container are."""
     status, former = move.status, tx.tables.container_live(move.id).status
     if status is None:
         return False
@@ -192,7 +193,8 @@ def _switch(tx: Transaction, move: Move) -> None:
     tx.delete(tx.tables.moves, move.id)
     endpoints.withdraw(tx, container, "it was handed over to another machine")
     _settle(tx, container, move)
-    tx.put(replace(tx.tables.container_live(move.id), status=move.status))
+    tx.put(replace(tx.tables.container_live(move.id), status=without_wiring(move.status)))
+    activity.note(tx, move.status)
     placing.happened(tx, move.id, _PHASES[move.status.state])
     tx.put(replace(tx.tables.endpoints[move.id], address=move.status.address))
     tx.happen("container_moved", move.id, f"from {container.task_set} to {move.to}")
@@ -209,10 +211,10 @@ def _settle(tx: Transaction, container: Container, move: Move) -> None:
 
 
 def promote(tx: Transaction, container: Container) -> bool:
-    """Let a container's copy take over at once, because the container itself is gone.
+    """Let a container's copy take over at once, because the container itself has ended.
 
     Returns:
-        Whether there is a copy.
+        Whether a copy exists.
     """
     move = tx.tables.moves.get(container.id)
     if move is None:
@@ -220,6 +222,7 @@ def promote(tx: Transaction, container: Container) -> bool:
     tx.delete(tx.tables.moves, move.id)
     _settle(tx, container, move)
     tx.put(replace(tx.tables.container_live(move.id), status=None))
+    activity.forget(tx, move.id)
     tx.happen("container_moved", move.id, f"to {move.to}, before it was up there")
     return True
 
@@ -235,7 +238,7 @@ def give_up(tx: Transaction, move: Move, why: str) -> None:
 
 
 def left(tx: Transaction, process: str) -> None:
-    """End the moves to a task set that went away; what it has of them it drops when it comes back."""
+    """End the moves to a task set that disconnected; it drops its copies when it comes back."""
     for move in list(tx.tables.moves.by("to", process)):
         give_up(tx, move, "went away")
 

@@ -1,43 +1,45 @@
-"""What robots and containers have in common: removal, addresses, who dials whom."""
+"""Functions for robots and containers: removal, addresses, and which end dials."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import msgspec
-from msgspec.structs import replace
 
 from rce.control.model import EndpointKind, LinkAddress
-from rce_master.exceptions import LimitReached
-from rce_master.state.records import Container, Endpoint, Link, Robot, Tombstone
+from rce_master.exceptions import LimitReachedError
+from rce_master.state import activity
+from rce_master.state.records import Container, Endpoint, Robot, Tombstone
 
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
     from rce_master.state.tables import Tables
+    from rce_master.state.wiring_records import Connection, Link
 
 _SMALL = 32 * 2**10
-"""Endpoints up to this size are so small that their number limits them well enough."""
+"""Endpoints up to this size are not checked: their number limits them sufficiently."""
 
 
 def size_of(part: object) -> int:
-    """Tell how many bytes a node, a parameter or an interface takes when it is written down."""
+    """Return how many bytes a node, a parameter or an interface takes when it is encoded."""
     return len(msgspec.json.encode(part))
 
 
 def grown(tx: Transaction, endpoint: Endpoint, part: object, instead_of: object = None) -> int:
-    """Tell an endpoint's size when a part is put into it.
+    """Return an endpoint's size with a new part.
 
     Raises:
-        LimitReached: It, or all endpoints of its user, would be too large.
+        LimitReachedError: It, or all endpoints of its user, would be too large.
     """
     settings = tx.settings
     size = endpoint.size + size_of(part) - (0 if instead_of is None else size_of(instead_of))
     if size > settings.max_endpoint_bytes:
-        raise LimitReached(f"{endpoint.tag!r} would hold more than {settings.max_endpoint_bytes} bytes")
+        raise LimitReachedError(f"{endpoint.tag!r} would hold more than {settings.max_endpoint_bytes} bytes")
     if size > _SMALL:
-        others = sum(e.size for e in tx.tables.endpoints.by("user", endpoint.user) if e.id != endpoint.id)
+        there = tx.tables.endpoints.get(endpoint.id)
+        others = tx.tables.endpoints.total(endpoint.user) - (there.size if there is not None else 0)
         if others + size > settings.max_user_bytes:
-            raise LimitReached(
+            raise LimitReachedError(
                 f"your robots and containers would hold more than {settings.max_user_bytes} bytes"
             )
     return size
@@ -47,12 +49,25 @@ def remove(tx: Transaction, id_: str, reason: str) -> None:
     """Remove an endpoint with its links and have its task set drop it."""
     endpoint = tx.tables.endpoints[id_]
     drop_copy(tx, id_, reason)
-    for link in tx.tables.links.by("endpoint", id_):
-        tx.put_link(replace(link, connections={}))
+    for connection in tx.tables.connections.by("endpoint", id_):
+        remove_connection(tx, connection)
+    for interface in tx.tables.interfaces.by("endpoint", id_):
+        tx.delete(tx.tables.interfaces, interface.id)
+    activity.forget(tx, id_)
     tx.delete(tx.tables.endpoints, id_)
     tx.delete(tx.tables.live, id_)
     if endpoint.task_set:
         withdraw(tx, endpoint, reason)
+
+
+def remove_connection(tx: Transaction, connection: Connection) -> None:
+    """Remove a connection, and its link with the last one."""
+    tx.delete(tx.tables.connections, str(connection.id))
+    tx.touch_connection(connection)
+    if not tx.tables.connections.count("link", connection.link):
+        tx.delete(tx.tables.links, connection.link)
+        for endpoint in (connection.a, connection.b):
+            tx.touch_link(endpoint, connection.link)
 
 
 def withdraw(tx: Transaction, endpoint: Endpoint, reason: str) -> None:
@@ -68,7 +83,7 @@ def withdraw(tx: Transaction, endpoint: Endpoint, reason: str) -> None:
 
 
 def drop_copy(tx: Transaction, id_: str, reason: str) -> None:
-    """Have the copy of a container that is being handed over dropped, if there is one."""
+    """Drop the copy of a container that is being handed over, if it exists."""
     move = tx.tables.moves.get(id_)
     if move is None:
         return
@@ -97,7 +112,7 @@ def address(tables: Tables, id_: str) -> LinkAddress:
 
 
 def touch_dialers(tx: Transaction, id_: str) -> None:
-    """Touch all endpoints that dial this one: its address changed."""
+    """Touch the links of all endpoints that dial this one: its address changed."""
     for link in tx.tables.links.by("endpoint", id_):
         if not dials(tx.tables, link, id_):
-            tx.touch(link.peer(id_))
+            tx.touch_link(link.peer(id_), link.id)

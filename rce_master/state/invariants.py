@@ -1,4 +1,4 @@
-"""What always holds between two commands."""
+"""The invariants of the state between two commands."""
 
 from __future__ import annotations
 
@@ -6,20 +6,21 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from rce.control.messages import TaskSetKind
-from rce.protocol.names import EndpointId, Form, InterfaceType, Role
+from rce.model.names import EndpointId, Form, InterfaceType, Role
 from rce_master.state import endpoints
 from rce_master.state.lifecycle import RobotSession
-from rce_master.state.records import Container, ContainerLive, Endpoint, Link, Robot, RobotLive
+from rce_master.state.records import Container, ContainerLive, Endpoint, Robot, RobotLive
 
 if TYPE_CHECKING:
     from rce_master.state.tables import Tables
+    from rce_master.state.wiring_records import Link
 
 
 def validate(tables: Tables) -> None:
     """Check all invariants.
 
     Raises:
-        AssertionError: One does not hold; the text says which.
+        AssertionError: An invariant does not hold; the text says which.
     """
     _check_indexes(tables)
     for endpoint in tables.endpoints:
@@ -29,7 +30,7 @@ def validate(tables: Tables) -> None:
     _check_connections(tables)
     _check_observed(tables)
     _check_moves(tables)
-    for record in (*tables.bundles, *tables.package_keys, *tables.known_logins, *tables.user_limits):
+    for record in (*tables.packages, *tables.package_keys, *tables.known_logins, *tables.user_limits):
         assert record.user in tables.users, f"{record}: its user is unknown"
 
 
@@ -41,27 +42,29 @@ def _check_indexes(tables: Tables) -> None:
             kept = {value: sorted(keys) for value, keys in table.index_entries(index).items()}
             computed = {value: sorted(keys) for value, keys in table.computed_entries(index).items()}
             assert kept == computed, f"{table.name}: index {index} is out of date"
+        assert table.totals == table.computed_totals, f"{table.name}: totals are out of date"
 
 
 def _check_endpoint(tables: Tables, endpoint: Endpoint) -> None:
     id_ = endpoint.id
     assert EndpointId.parse(id_).user in tables.users, f"{id_}: its user is unknown"
     assert 0 < endpoint.revision <= _counter(tables, "revision"), f"{id_}: revision {endpoint.revision}"
-    for tag, interface in endpoint.interfaces.items():
-        assert tag == interface.tag, f"{id_}/{tag}: stored under another tag"
+    for interface in (one.spec for one in tables.interfaces.by("endpoint", id_)):
+        tag = interface.tag
         form = InterfaceType.parse(interface.type).form
         in_container = isinstance(endpoint, Container)
         assert (form is Form.INTERFACE) == in_container, f"{id_}/{tag}: {interface.type} is of the wrong form"
         assert bool(interface.addr) == in_container, f"{id_}/{tag}: addr {interface.addr!r}"
-    assert endpoint.size == _size(endpoint), f"{id_}: size {endpoint.size}, not {_size(endpoint)}"
+    size = _size(tables, endpoint)
+    assert endpoint.size == size, f"{id_}: size {endpoint.size}, not {size}"
     if endpoint.task_set:
         task_set = tables.task_sets.get(endpoint.task_set)
         assert task_set is not None, f"{id_}: placed at an unknown task set"
         assert task_set.kind.value == endpoint.kind.value, f"{id_}: placed at a task set of the wrong kind"
 
 
-def _size(endpoint: Endpoint) -> int:
-    parts: list[object] = [*endpoint.interfaces.values()]
+def _size(tables: Tables, endpoint: Endpoint) -> int:
+    parts: list[object] = [one.spec for one in tables.interfaces.by("endpoint", endpoint.id)]
     if isinstance(endpoint, Container):
         parts += [endpoint.resources, *endpoint.nodes.values(), *endpoint.parameters.items()]
     return sum(map(endpoints.size_of, parts))
@@ -70,7 +73,7 @@ def _size(endpoint: Endpoint) -> int:
 def _check_link(tables: Tables, link: Link) -> None:
     assert link.a <= link.b, f"{link.id}: ends out of order"
     assert link.token, f"{link.id}: no token"
-    assert link.connections, f"{link.id}: no connection"
+    assert tables.connections.count("link", link.id), f"{link.id}: no connection"
     a, b = tables.endpoints.get(link.a), tables.endpoints.get(link.b)
     assert a is not None, f"{link.id}: {link.a} is not there"
     assert b is not None, f"{link.id}: {link.b} is not there"
@@ -78,27 +81,30 @@ def _check_link(tables: Tables, link: Link) -> None:
     assert [x for x in tables.links.by("endpoint", link.a) if x.peer(link.a) == link.b] == [link], (
         f"{link.id}: a second link of the same endpoints"
     )
-    for id_, connection in link.connections.items():
-        assert id_ == connection.id, f"{link.id}: connection under the wrong id"
-        one, other = a.interfaces[connection.interface_a], b.interfaces[connection.interface_b]
+    for connection in tables.connections.by("link", link.id):
+        id_ = connection.id
+        assert (connection.a, connection.b) == (link.a, link.b), f"{link.id}/{id_}: other endpoints"
+        one, other = (tables.interfaces[key].spec for key in connection.ends)
         roles = InterfaceType.parse(one.type).role, InterfaceType.parse(other.type).role
         assert roles[0].complement is roles[1], f"{link.id}/{id_}: roles do not complete each other"
-        assert one.cls == other.cls, f"{link.id}/{id_}: classes differ"
+        assert one.message_type == other.message_type, f"{link.id}/{id_}: classes differ"
 
 
 def _check_connections(tables: Tables) -> None:
-    ids = Counter(id_ for link in tables.links for id_ in link.connections)
-    assert all(count == 1 for count in ids.values()), "a connection id is used twice"
+    ids = [connection.id for connection in tables.connections]
     assert max(ids, default=0) <= _counter(tables, "connection"), "a connection id was not counted"
-    ends = Counter(
-        end
-        for link in tables.links
-        for c in link.connections.values()
-        for end in ((link.a, c.interface_a), (link.b, c.interface_b))
-    )
-    for (endpoint, tag), count in ends.items():
-        role = InterfaceType.parse(tables.endpoints[endpoint].interfaces[tag].type).role
-        assert role is not Role.SERVICE_PROVIDER or count == 1, f"{endpoint}/{tag}: {count} connections"
+    numbers = [interface.number for interface in tables.interfaces]
+    assert max(numbers, default=0) <= _counter(tables, "interface"), "an interface was not counted"
+    for interface in tables.interfaces:
+        assert interface.endpoint in tables.endpoints, f"{interface.id}: its endpoint is gone"
+    for connection in tables.connections:
+        assert connection.link in tables.links, f"connection {connection.id}: its link is gone"
+    pairs = Counter(connection.ends for connection in tables.connections)
+    assert all(count == 1 for count in pairs.values()), "two interfaces are connected twice"
+    ends = Counter(end for connection in tables.connections for end in connection.ends)
+    for end, count in ends.items():
+        role = InterfaceType.parse(tables.interfaces[end].spec.type).role
+        assert role is not Role.SERVICE_PROVIDER or count == 1, f"{end}: {count} connections"
 
 
 def _check_observed(tables: Tables) -> None:
@@ -106,6 +112,8 @@ def _check_observed(tables: Tables) -> None:
     assert {p.process for p in tables.presence} == {s.process for s in tables.task_sets}, (
         "presence and task sets differ"
     )
+    for part in (*tables.active, *tables.open_ends):
+        assert tables.live[part.endpoint].status is not None, f"{part.id}: known without a status"
     for live in tables.live:
         endpoint = tables.endpoints[live.id]
         if isinstance(live, RobotLive):
@@ -138,7 +146,7 @@ def _check_container(tables: Tables, live: ContainerLive) -> None:
 def _check_moves(tables: Tables) -> None:
     for move in tables.moves:
         container = tables.container(move.id)
-        assert container is not None, f"{move.id}: moves and is no container"
+        assert container is not None, f"{move.id}: moves and is not a container"
         assert container.task_set, f"{move.id}: moves and is placed nowhere"
         assert move.to != container.task_set, f"{move.id}: moves to where it is"
         assert tables.is_connected(move.to), f"{move.id}: moves to {move.to}, which is away"

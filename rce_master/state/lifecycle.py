@@ -1,36 +1,22 @@
-"""The life cycles of a robot's session and of a container, each a literal transition table.
-
-Robot session:
-
-- *offline*: The robot is unknown; it has no endpoint.
-- *connected*: A task set holds its WebSocket connection.
-- *absent*: Its connection dropped, or its task set is away. The endpoint, with all interfaces and
-  connections, is kept for the grace time.
-
-Container:
-
-- *requested*: Desired, and placed nowhere yet.
-- *placed*: A task set was told to make it, and has not reported it since.
-- *starting*, *running*, *degraded*, *failed*, *stopping*: What its task set reports. A degraded one runs, but
-  a node of it failed, is stuck, or pauses after a failure; a failed one is made again.
-- *stopped*: Its task set ended it, as when it is shut down. Placed anew as soon as there is somewhere to go.
-- *lost*: Its task set stayed away beyond the grace time. Placed anew as soon as there is somewhere to go;
-  bound again if the task set comes back with it first.
-"""
+"""The life cycles of a robot's session and of a container, each a transition table."""
 
 from __future__ import annotations
 
 from enum import Enum
 
-from rce_master.exceptions import InvalidTransition
+from rce.lifecycle import LifeCycle
+from rce_master.exceptions import TransitionError
 
 
 class RobotSession(Enum):
     """Where a robot is in its life."""
 
     OFFLINE = "offline"
+    """The robot is unknown; it has no endpoint."""
     CONNECTED = "connected"
+    """A task set holds its WebSocket connection."""
     ABSENT = "absent"
+    """Its connection dropped, or its task set is away; its endpoint is kept for the grace time."""
 
 
 class RobotEvent(Enum):
@@ -48,14 +34,24 @@ class ContainerPhase(Enum):
     """Where a container is in its life."""
 
     REQUESTED = "requested"
+    """Desired, and placed nowhere yet."""
     PLACED = "placed"
+    """A task set was told to make it, and has not reported it since."""
     STARTING = "starting"
+    """Its task set is making it."""
     RUNNING = "running"
+    """Its task set reports that all is well."""
     DEGRADED = "degraded"
+    """It runs, but a node of it failed, is stuck, or pauses after a failure."""
     FAILED = "failed"
+    """It ended, or could not be made; its task set makes it again."""
     STOPPING = "stopping"
+    """Its task set is ending it."""
     STOPPED = "stopped"
+    """Its task set ended it, as when that is shut down; placed anew as soon as there is a machine."""
     LOST = "lost"
+    """Its task set stayed away beyond the grace time; placed anew as soon as there is a machine, or
+    bound again if the task set comes back with it first."""
 
     @property
     def is_placed(self) -> bool:
@@ -69,28 +65,37 @@ class ContainerEvent(Enum):
     PLACE = "place"
     """A task set is told to make it."""
     STARTING = "starting"
+    """Its task set reports that it starts."""
     RUNNING = "running"
+    """Its task set reports that it runs."""
     DEGRADED = "degraded"
+    """Its task set reports that not all of its nodes are well."""
     FAILED = "failed"
+    """Its task set reports that it ended, or could not be made."""
     STOPPING = "stopping"
+    """Its task set reports that it is being ended."""
     WITHDRAW = "withdraw"
     """Its task set ended it though it is desired."""
     LOSE = "lose"
     """Its task set stayed away beyond the grace time."""
 
 
-_ROBOT: dict[RobotSession, dict[RobotEvent, RobotSession]] = {
-    RobotSession.OFFLINE: {
-        RobotEvent.LOGIN: RobotSession.CONNECTED,
+ROBOT_LIFE: LifeCycle[RobotSession, RobotEvent] = LifeCycle(
+    "robot",
+    {
+        RobotSession.OFFLINE: {
+            RobotEvent.LOGIN: RobotSession.CONNECTED,
+        },
+        RobotSession.CONNECTED: {
+            RobotEvent.LEAVE: RobotSession.ABSENT,
+        },
+        RobotSession.ABSENT: {
+            RobotEvent.LOGIN: RobotSession.CONNECTED,
+            RobotEvent.EXPIRE: RobotSession.OFFLINE,
+        },
     },
-    RobotSession.CONNECTED: {
-        RobotEvent.LEAVE: RobotSession.ABSENT,
-    },
-    RobotSession.ABSENT: {
-        RobotEvent.LOGIN: RobotSession.CONNECTED,
-        RobotEvent.EXPIRE: RobotSession.OFFLINE,
-    },
-}
+    error=TransitionError,
+)
 
 _REPORTED: dict[ContainerEvent, ContainerPhase] = {
     ContainerEvent.PLACE: ContainerPhase.PLACED,
@@ -103,38 +108,18 @@ _REPORTED: dict[ContainerEvent, ContainerPhase] = {
     ContainerEvent.LOSE: ContainerPhase.LOST,
 }
 
-_CONTAINER: dict[ContainerPhase, dict[ContainerEvent, ContainerPhase]] = {
-    ContainerPhase.REQUESTED: {ContainerEvent.PLACE: ContainerPhase.PLACED},
-    ContainerPhase.PLACED: _REPORTED,
-    ContainerPhase.STARTING: _REPORTED,
-    ContainerPhase.RUNNING: _REPORTED,
-    ContainerPhase.DEGRADED: _REPORTED,
-    ContainerPhase.FAILED: _REPORTED,
-    ContainerPhase.STOPPING: _REPORTED,
-    ContainerPhase.STOPPED: {ContainerEvent.PLACE: ContainerPhase.PLACED},
-    ContainerPhase.LOST: {ContainerEvent.PLACE: ContainerPhase.PLACED},
-}
-
-
-def next_session(session: RobotSession, event: RobotEvent) -> RobotSession:
-    """Tell a robot's session after an event.
-
-    Raises:
-        InvalidTransition: The event cannot happen now.
-    """
-    try:
-        return _ROBOT[session][event]
-    except KeyError:
-        raise InvalidTransition(session.value, event.value) from None
-
-
-def next_phase(phase: ContainerPhase, event: ContainerEvent) -> ContainerPhase:
-    """Tell a container's phase after an event.
-
-    Raises:
-        InvalidTransition: The event cannot happen now.
-    """
-    try:
-        return _CONTAINER[phase][event]
-    except KeyError:
-        raise InvalidTransition(phase.value, event.value) from None
+CONTAINER_LIFE: LifeCycle[ContainerPhase, ContainerEvent] = LifeCycle(
+    "container",
+    {
+        ContainerPhase.REQUESTED: {ContainerEvent.PLACE: ContainerPhase.PLACED},
+        ContainerPhase.PLACED: _REPORTED,
+        ContainerPhase.STARTING: _REPORTED,
+        ContainerPhase.RUNNING: _REPORTED,
+        ContainerPhase.DEGRADED: _REPORTED,
+        ContainerPhase.FAILED: _REPORTED,
+        ContainerPhase.STOPPING: _REPORTED,
+        ContainerPhase.STOPPED: {ContainerEvent.PLACE: ContainerPhase.PLACED},
+        ContainerPhase.LOST: {ContainerEvent.PLACE: ContainerPhase.PLACED},
+    },
+    error=TransitionError,
+)

@@ -1,4 +1,4 @@
-"""What one user may have, and what they have: containers, what these ask for, packages."""
+"""The limits of one user, and their usage: containers, requested resources, packages."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec.structs import asdict, replace
 
-from rce.control.limits import MEGABYTE
+from rce.control.machine import MEGABYTE
 from rce.control.messages import TaskSetKind
-from rce.protocol.quantities import write_cores
-from rce_master.exceptions import LimitReached, NotFound
+from rce.model.quantities import write_cores
+from rce_master.exceptions import LimitReachedError, NotFoundError
 from rce_master.state.records import UserLimits, UserRole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rce.control.model import Resources
+    from rce.model.specs import Resources
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import SetLimits
     from rce_master.state.settings import StateSettings
@@ -38,9 +38,9 @@ class Limit(NamedTuple):
 
 
 def set_limits(tx: Transaction, command: SetLimits) -> None:
-    """Change what a user may have; what is there already stays."""
+    """Change a user's limits; existing objects stay."""
     if command.user not in tx.tables.users:
-        raise NotFound(f"there is no user {command.user!r}")
+        raise NotFoundError(f"there is no user {command.user!r}")
     there = tx.tables.user_limits.get(command.user) or UserLimits(user=command.user)
     tx.put(replace(there, **command.limits))
     told = ", ".join(
@@ -50,13 +50,13 @@ def set_limits(tx: Transaction, command: SetLimits) -> None:
 
 
 def forget(tx: Transaction, user: str) -> None:
-    """Forget what was set for a user."""
+    """Remove the limits that were set for a user."""
     if user in tx.tables.user_limits:
         tx.delete(tx.tables.user_limits, user)
 
 
 def limit_of(tables: Tables, settings: StateSettings, user: str, kind: str) -> Limit:
-    """Tell how much of a kind a user may have."""
+    """Return a user's limit of a kind."""
     own = tables.user_limits.get(user)
     if own is not None and (most := asdict(own)[kind]) is not None:
         return Limit(kind, most, "user")
@@ -70,14 +70,14 @@ def limit_of(tables: Tables, settings: StateSettings, user: str, kind: str) -> L
 
 
 def used_of(tables: Tables, user: str) -> dict[str, float]:
-    """Tell how much of each kind a user has."""
-    wishes = [container.resources for container in tables.containers(user)]
-    bundles = tables.bundles.by("user", user)
+    """Return a user's usage of each kind."""
+    all_requested = [container.resources for container in tables.containers(user)]
+    packages = tables.packages.by("user", user)
     return {
-        "containers": len(wishes),
-        **{kind: _asked(wishes, kind) for kind in _OF_MACHINES},
-        "packages": len(bundles),
-        "disk": sum(bundle.size for bundle in bundles),
+        "containers": len(all_requested),
+        **{kind: _asked(all_requested, kind) for kind in _OF_MACHINES},
+        "packages": len(packages),
+        "disk": sum(package.size for package in packages),
     }
 
 
@@ -85,31 +85,31 @@ def check_containers(tx: Transaction, user: str) -> None:
     """Check that a user may have one more container.
 
     Raises:
-        LimitReached: There are as many as they may have.
+        LimitReachedError: The limit is reached.
     """
     limit = limit_of(tx.tables, tx.settings, user, "containers")
     if limit.most and len(tx.tables.containers(user)) >= limit.most:
-        raise LimitReached(
+        raise LimitReachedError(
             f"you have {limit.most:g} containers already; destroy one first, or {_advice(user, 'containers')}"
         )
 
 
-def check_wishes(tx: Transaction, user: str, wishes: list[Resources]) -> None:
-    """Check what a user's containers ask for together.
+def check_all_resources(tx: Transaction, user: str, all_requested: list[Resources]) -> None:
+    """Check the total of the requests of a user's containers.
 
     Raises:
-        LimitReached: It is more than they may have.
+        LimitReachedError: It exceeds a limit.
     """
     for kind in _OF_MACHINES:
         limit = limit_of(tx.tables, tx.settings, user, kind)
-        asked = _asked(wishes, kind)
+        asked = _asked(all_requested, kind)
         if limit.most and asked > limit.most + _EPSILON:
             share = (
                 f", {tx.settings.user_share:.0%} of what the machines have"
                 if limit.source == "machines"
                 else ""
             )
-            raise LimitReached(
+            raise LimitReachedError(
                 f"your containers would have {_plain(kind, asked)} {_UNITS.get(kind, kind)} in all, and you "
                 f"may have {_plain(kind, limit.most)}{share}; make others smaller (rce resize) or destroy "
                 f"them, or {_advice(user, kind)}"
@@ -126,18 +126,18 @@ def check_packages(tables: Tables, settings: StateSettings, user: str, size: int
         size: Bytes of its files, as far as they are known.
 
     Raises:
-        LimitReached: There are too many, or they are too large.
+        LimitReachedError: There are too many, or they are too large.
     """
     used = used_of(tables, user)
     limit = limit_of(tables, settings, user, "packages")
     if limit.most and used["packages"] >= limit.most:
-        raise LimitReached(
+        raise LimitReachedError(
             f"you have {used['packages']:g} versions of packages already; remove one first, "
             f"or {_advice(user, 'packages')}"
         )
     limit = limit_of(tables, settings, user, "disk")
     if limit.most and used["disk"] + size > limit.most:
-        raise LimitReached(
+        raise LimitReachedError(
             f"the files of your packages would have {used['disk'] + size:.0f} bytes, {limit.most:.0f} are "
             f"allowed; remove a version first, or {_advice(user, 'disk')}"
         )
@@ -154,15 +154,15 @@ _SETTINGS = {
 
 
 def _offered(tables: Tables, kind: str) -> float:
-    """Count what all machines have that are known, also of those that are away."""
+    """Sum up the resources of all known machines, including those that are away."""
     machines = [s.machine for s in tables.task_sets if s.kind is TaskSetKind.CONTAINER]
     return sum({"slots": m.slots, "cpu": m.cores, "memory": m.memory}[kind] for m in machines)
 
 
-def _asked(wishes: Iterable[Resources], kind: str) -> float:
+def _asked(all_requested: Iterable[Resources], kind: str) -> float:
     if kind == "slots":
-        return sum(max(1, wish.size) for wish in wishes)
-    return sum(wish.cpu if kind == "cpu" else wish.memory for wish in wishes)
+        return sum(max(1, requested.size) for requested in all_requested)
+    return sum(requested.cpu if kind == "cpu" else requested.memory for requested in all_requested)
 
 
 def _plain(kind: str, amount: float) -> str:

@@ -1,6 +1,6 @@
 """Packages that users bring: their versions, and the keys by which these are signed.
 
-What a version holds is kept elsewhere, under its hash; here is what is known of it.
+The contents of a version are kept elsewhere, under its hash; this module keeps its record.
 """
 
 from __future__ import annotations
@@ -8,81 +8,83 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING
 
-from rce.bundles.signing import key_id
-from rce.bundles.versions import newest, split_package
-from rce.control.model import BundleSpec
-from rce.protocol.names import is_name, is_version
-from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound
+from rce.control.model import PackageSpec
+from rce.model.names import is_name, is_version
+from rce.packages.signing import key_id
+from rce.packages.versions import newest, split_package
+from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
 from rce_master.state import limits
-from rce_master.state.records import Bundle, Container, bundle_key, package_key_key
+from rce_master.state.records import Container, UserPackage, package_key_key, user_package_key
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rce.control.model import NodeSpec
+    from rce.model.specs import NodeSpec
     from rce_master.state.changes import Transaction
-    from rce_master.state.commands import AddBundle, AddPackageKey, RemoveBundle, RemovePackageKey
+    from rce_master.state.commands import AddPackage, AddPackageKey, RemovePackage, RemovePackageKey
     from rce_master.state.settings import StateSettings
     from rce_master.state.tables import Tables
 
 
 def add_key(tx: Transaction, command: AddPackageKey) -> None:
-    """Trust a key; the same one again is accepted silently."""
+    """Trust a key; a trusted one is accepted silently."""
     key = command.key
     if key.user not in tx.tables.users:
-        raise NotFound(f"there is no user {key.user!r}")
+        raise NotFoundError(f"there is no user {key.user!r}")
     if key.id in tx.tables.package_keys:
         return
     if tx.tables.package_keys.count("user", key.user) >= tx.settings.max_package_keys:
-        raise LimitReached(f"you have {tx.settings.max_package_keys} keys already; revoke one first")
+        raise LimitReachedError(f"you have {tx.settings.max_package_keys} keys already; revoke one first")
     tx.put(key)
     tx.happen("package_key_registered", f"{key.user}/{key_id(key.key)}", key.label)
 
 
 def remove_key(tx: Transaction, command: RemovePackageKey) -> None:
-    """Trust a key no more. What it signed before stays until it is removed."""
+    """Stop trusting a key. Packages that it signed before stay until they are removed."""
     found = [key for key in tx.tables.package_keys.by("user", command.user) if key_id(key.key) == command.id]
     if not found:
-        raise NotFound(f"you have no key {command.id!r}")
+        raise NotFoundError(f"you have no key {command.id!r}")
     tx.delete(tx.tables.package_keys, found[0].id)
     tx.happen("package_key_revoked", f"{command.user}/{command.id}")
 
 
-def check_new(tables: Tables, bundle: Bundle) -> bool:
-    """Tell whether a version is new; the same one again is not.
+def check_new(tables: Tables, package: UserPackage) -> bool:
+    """Return whether a version is new; an identical one is not.
 
     Raises:
-        Invalid: Its name or version cannot be one.
-        NotFound: Its key is not registered.
-        Conflict: There is another one of the same version.
+        InvalidRequestError: Its name or version cannot be one.
+        NotFoundError: Its key is not registered.
+        ConflictError: The same version exists with other contents.
     """
-    if not is_name(bundle.name) or not is_version(bundle.version):
-        raise Invalid(f"{bundle.name}@{bundle.version} cannot be the name and the version of a package")
-    if package_key_key(bundle.user, bundle.key) not in tables.package_keys:
-        raise NotFound(
-            f"the key {key_id(bundle.key)} is not registered with your account, or was revoked;"
+    if not is_name(package.name) or not is_version(package.version):
+        raise InvalidRequestError(
+            f"{package.name}@{package.version} cannot be the name and the version of a package"
+        )
+    if package_key_key(package.user, package.key) not in tables.package_keys:
+        raise NotFoundError(
+            f"the key {key_id(package.key)} is not registered with your account, or was revoked;"
             " run: rce package key register"
         )
-    there = tables.bundles.get(bundle.id)
-    if there is not None and there.digest != bundle.digest:
-        raise Conflict(
-            f"{bundle.name} {bundle.version} is there with other contents, and a version never changes; give"
-            " this one another version, or remove that one first"
+    there = tables.packages.get(package.id)
+    if there is not None and there.digest != package.digest:
+        raise ConflictError(
+            f"{package.name} {package.version} is there with other contents, and a version never"
+            " changes; give this one another version, or remove that one first"
         )
     return there is None
 
 
-def add_bundle(tx: Transaction, command: AddBundle) -> None:
-    """Take a version; the same one again is accepted silently. What names the package is told of it."""
-    bundle = command.bundle
-    if bundle.user not in tx.tables.users:
-        raise NotFound(f"there is no user {bundle.user!r}")
-    if not check_new(tx.tables, bundle):
+def add_package(tx: Transaction, command: AddPackage) -> None:
+    """Store a version; an identical one is accepted silently. Containers that name the package get it."""
+    package = command.package
+    if package.user not in tx.tables.users:
+        raise NotFoundError(f"there is no user {package.user!r}")
+    if not check_new(tx.tables, package):
         return
-    check_room(tx.tables, tx.settings, bundle.user, bundle.packed, bundle.size)
-    tx.put(bundle)
-    _touch_users_of(tx, bundle)
-    tx.happen("package_pushed", bundle.id)
+    check_room(tx.tables, tx.settings, package.user, package.packed, package.size)
+    tx.put(package)
+    _touch_users_of(tx, package)
+    tx.happen("package_pushed", package.id)
 
 
 def check_room(tables: Tables, settings: StateSettings, user: str, packed: int, size: int = 0) -> None:
@@ -96,98 +98,98 @@ def check_room(tables: Tables, settings: StateSettings, user: str, packed: int, 
         size: Bytes of its files, as far as they are known.
 
     Raises:
-        LimitReached: There are too many, or they are too large.
+        LimitReachedError: There are too many, or they are too large.
     """
     limits.check_packages(tables, settings, user, size)
-    held = packed + sum(bundle.packed for bundle in tables.bundles.by("user", user))
+    held = packed + sum(package.packed for package in tables.packages.by("user", user))
     if held > settings.max_package_bytes:
-        raise LimitReached(
+        raise LimitReachedError(
             f"the archives of your packages would have {held} bytes, {settings.max_package_bytes} are"
             " allowed; remove a version first"
         )
 
 
-def remove_bundle(tx: Transaction, command: RemoveBundle) -> None:
+def remove_package(tx: Transaction, command: RemovePackage) -> None:
     """Remove a version that no node needs."""
-    found = tx.tables.bundles.get(bundle_key(command.user, command.name, command.version))
+    found = tx.tables.packages.get(user_package_key(command.user, command.name, command.version))
     if found is None:
-        raise NotFound(f"there is no package {command.name!r} of version {command.version!r}")
+        raise NotFoundError(f"there is no package {command.name!r} of version {command.version!r}")
     users = uses(tx.tables, found.user).get(found.id)
     if users:
-        raise Conflict(
+        raise ConflictError(
             f"{found.name} {found.version} is used by {', '.join(users)}; remove the nodes first, or let them"
             " name another version"
         )
-    tx.delete(tx.tables.bundles, found.id)
+    tx.delete(tx.tables.packages, found.id)
     tx.happen("package_removed", found.id)
 
 
 def forget_user(tx: Transaction, user: str) -> None:
     """Remove a user's packages and keys."""
-    for bundle in tx.tables.bundles.by("user", user):
-        tx.delete(tx.tables.bundles, bundle.id)
+    for package in tx.tables.packages.by("user", user):
+        tx.delete(tx.tables.packages, package.id)
     for key in tx.tables.package_keys.by("user", user):
         tx.delete(tx.tables.package_keys, key.id)
 
 
-def find(tables: Tables, user: str, pkg: str) -> Bundle | None:
-    """Find what a node names: the version that it says, or the newest; None if the user brought none."""
+def find(tables: Tables, user: str, pkg: str) -> UserPackage | None:
+    """Return the version that a node names, or the newest; None if the user brought none."""
     name, version = split_package(pkg)
     if version:
-        return tables.bundles.get(bundle_key(user, name, version))
-    return newest(tables.bundles.by("package", f"{user}/{name}"), lambda bundle: bundle.version)
+        return tables.packages.get(user_package_key(user, name, version))
+    return newest(tables.packages.by("package", f"{user}/{name}"), lambda package: package.version)
 
 
-def _finder(tables: Tables, user: str) -> Callable[[str], Bundle | None]:
-    """Make a :func:`find` that looks once for each text: many nodes name the same, and versions are many."""
+def _finder(tables: Tables, user: str) -> Callable[[str], UserPackage | None]:
+    """Return a cached :func:`find`: many nodes name the same package, and there may be many versions."""
     return cache(lambda pkg: find(tables, user, pkg))
 
 
 def uses(tables: Tables, user: str) -> dict[str, list[str]]:
-    """Tell which nodes of a user need which version: ``CONTAINER/NODE`` by the versions' ids."""
+    """Return the nodes of a user that need each version: ``CONTAINER/NODE`` by the versions' ids."""
     found: dict[str, list[str]] = {}
     lookup = _finder(tables, user)
     for container in tables.containers(user):
         for node in container.nodes.values():
-            bundle = lookup(node.pkg)
-            if bundle is not None:
-                found.setdefault(bundle.id, []).append(f"{container.tag}/{node.tag}")
+            package = lookup(node.pkg)
+            if package is not None:
+                found.setdefault(package.id, []).append(f"{container.tag}/{node.tag}")
     return found
 
 
 def check_node(tables: Tables, user: str, node: NodeSpec) -> None:
-    """Check that there is the version which a node names.
+    """Check that the version which a node names exists.
 
     Raises:
-        NotFound: There is not.
+        NotFoundError: It does not exist.
     """
     name, version = split_package(node.pkg)
     if version and find(tables, user, node.pkg) is None:
-        raise NotFound(
+        raise NotFoundError(
             f"node {node.tag!r}: you have no package {name!r} of version {version!r}; see: rce package list"
         )
 
 
-def bundle_specs(tables: Tables, container: Container) -> tuple[BundleSpec, ...]:
-    """Tell what the nodes of a container need, in the order of names and versions."""
+def package_specs(tables: Tables, container: Container) -> tuple[PackageSpec, ...]:
+    """Return the packages that the nodes of a container need, in the order of names and versions."""
     found = map(_finder(tables, container.user), [node.pkg for node in container.nodes.values()])
-    needed = {bundle.id: bundle for bundle in found if bundle is not None}
+    needed = {package.id: package for package in found if package is not None}
     return tuple(_spec(needed[id_]) for id_ in sorted(needed))
 
 
-def _spec(bundle: Bundle) -> BundleSpec:
-    return BundleSpec(
-        name=bundle.name,
-        version=bundle.version,
-        sha256=bundle.sha256,
-        signature=bundle.signature,
-        key=bundle.key,
+def _spec(package: UserPackage) -> PackageSpec:
+    return PackageSpec(
+        name=package.name,
+        version=package.version,
+        sha256=package.sha256,
+        signature=package.signature,
+        key=package.key,
     )
 
 
-def _touch_users_of(tx: Transaction, bundle: Bundle) -> None:
-    for container in tx.tables.containers(bundle.user):
-        if _names(container.nodes.values(), bundle.name):
+def _touch_users_of(tx: Transaction, package: UserPackage) -> None:
+    for container in tx.tables.containers(package.user):
+        if _names(container.nodes.values(), package.name):
             tx.touch(container.id)
 
 

@@ -15,9 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from rce.control.limits import MEGABYTE
-from rce.control.model import Network, Resources
-from rce.protocol.quantities import write_cores
+from rce.control.machine import MEGABYTE
+from rce.model.quantities import write_cores
+from rce.model.specs import Network, Resources
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 DETOUR = 0.2
 """So much more of a machine may be in use, as a share of it, for the sake of a container's company."""
 CROWD = 16
-"""Where nobody counts slots, so many containers for each core count as a full load (but are no limit)."""
+"""Where slots are not counted, so many containers for each core count as a full load (but are no limit)."""
 PODMAN = "podman"
 _TINY = 1e-6
 
@@ -63,15 +63,15 @@ class Room:
         """What people call it."""
         return self.alias or self.machine.name
 
-    def filled(self, wishes: Iterable[Resources]) -> Room:
+    def filled(self, all_requested: Iterable[Resources]) -> Room:
         """Tell what it is like with more containers; as :meth:`with_` for each, but quick for many."""
         slots = memory = containers = 0
         cpu, share = 0.0, self._share
-        for wish in wishes:
-            size = max(1, wish.size)
+        for requested in all_requested:
+            size = max(1, requested.size)
             slots += size
-            cpu += wish.cpu
-            memory += wish.memory or size * share
+            cpu += requested.cpu
+            memory += requested.memory or size * share
             containers += 1
         return replace(
             self,
@@ -86,21 +86,21 @@ class Room:
         """A slot's share of the memory, in bytes."""
         return self.machine.memory // self.machine.slots if self.machine.slots else 0
 
-    def need(self, wish: Resources) -> Need:
+    def need(self, requested: Resources) -> Need:
         """Tell what a container takes here."""
-        slots = max(1, wish.size)
-        return Need(slots=slots, cpu=wish.cpu, memory=wish.memory or slots * self._share)
+        slots = max(1, requested.size)
+        return Need(slots=slots, cpu=requested.cpu, memory=requested.memory or slots * self._share)
 
-    def with_(self, wish: Resources) -> Room:
+    def with_(self, requested: Resources) -> Room:
         """Tell what it is like with one more container."""
-        return self._changed(wish, 1)
+        return self._changed(requested, 1)
 
-    def without(self, wish: Resources) -> Room:
+    def without(self, requested: Resources) -> Room:
         """Tell what it is like with one container less."""
-        return self._changed(wish, -1)
+        return self._changed(requested, -1)
 
-    def _changed(self, wish: Resources, sign: int) -> Room:
-        need = self.need(wish)
+    def _changed(self, requested: Resources, sign: int) -> Room:
+        need = self.need(requested)
         return replace(
             self,
             slots=self.slots + sign * need.slots,
@@ -109,27 +109,29 @@ class Room:
             containers=self.containers + sign,
         )
 
-    def obstacles(self, wish: Resources) -> list[str]:
+    def obstacles(self, requested: Resources) -> list[str]:
         """Tell why it would not take a container even if it were empty; nothing if it would."""
         machine = self.machine
-        found = [f"lacks the label {label}" for label in wish.special_features if label not in machine.labels]
-        if wish.network is not Network.NONE and wish.network.value not in machine.networks:
-            found.append(f"has no network {wish.network.value}")
-        if wish.image and PODMAN not in (machine.runtime, *machine.runtimes):
-            found.append(f"has no {PODMAN} for the image {wish.image}")
+        found = [
+            f"lacks the label {label}" for label in requested.special_features if label not in machine.labels
+        ]
+        if requested.network is not Network.NONE and requested.network.value not in machine.networks:
+            found.append(f"has no network {requested.network.value}")
+        if requested.image and PODMAN not in (machine.runtime, *machine.runtimes):
+            found.append(f"has no {PODMAN} for the image {requested.image}")
         if self.draining:
             found.append("is draining")
         return found
 
-    def shortages(self, wish: Resources, had: Resources | None = None) -> list[str]:
+    def shortages(self, requested: Resources, had: Resources | None = None) -> list[str]:
         """Tell what it has too little of for a container; nothing if it has enough.
 
         Args:
-            wish: What the container asks for.
+            requested: What the container asks for.
             had: What it has been promised before, and is not counted here: of what it asks for no more of
                 than that, there is enough in any case.
         """
-        need, before = self.need(wish), self.need(had) if had is not None else None
+        need, before = self.need(requested), self.need(had) if had is not None else None
         machine, found = self.machine, []
         if machine.slots and (before is None or need.slots > before.slots):
             free = machine.slots - self.slots
@@ -148,13 +150,13 @@ class Room:
                 found.append("has {} of {} MB memory free, {} MB needed".format(*texts, needed))
         return found
 
-    def fits(self, wish: Resources) -> bool:
+    def fits(self, requested: Resources) -> bool:
         """Whether it takes a container now."""
-        return not self.obstacles(wish) and not self.shortages(wish)
+        return not self.obstacles(requested) and not self.shortages(requested)
 
-    def why_not(self, wish: Resources) -> str:
+    def why_not(self, requested: Resources) -> str:
         """Say why it does not take a container now; empty if it does."""
-        reasons = self.obstacles(wish) or self.shortages(wish)
+        reasons = self.obstacles(requested) or self.shortages(requested)
         return f"{self.name} {' and '.join(reasons)}" if reasons else ""
 
     @property
@@ -177,7 +179,7 @@ class Room:
 
 def choose(
     rooms: Iterable[Room],
-    wish: Resources,
+    requested: Resources,
     *,
     company: Mapping[str, int] | None = None,
     own: Mapping[str, int] | None = None,
@@ -186,17 +188,17 @@ def choose(
 
     Args:
         rooms: The machines that may be taken.
-        wish: What the container asks for.
+        requested: What the container asks for.
         company: How much of what belongs together with it is where, by process.
         own: How many other containers of its user are where, by process.
 
     Returns:
         The best, or None if it fits nowhere.
     """
-    fitting = [room for room in rooms if room.fits(wish)]
+    fitting = [room for room in rooms if room.fits(requested)]
     if not fitting:
         return None
-    loads = {room.process: room.with_(wish).load for room in fitting}
+    loads = {room.process: room.with_(requested).load for room in fitting}
     near = min(loads.values()) + DETOUR + _TINY
     company, own = company or {}, own or {}
 
@@ -208,8 +210,8 @@ def choose(
     return min(fitting, key=rank)
 
 
-def refusals(rooms: Iterable[Room], wish: Resources, *, most: int = 8) -> str:
+def refusals(rooms: Iterable[Room], requested: Resources, *, most: int = 8) -> str:
     """Say of each machine why it does not take a container."""
-    found = [text for room in rooms if (text := room.why_not(wish))]
+    found = [text for room in rooms if (text := room.why_not(requested))]
     more = f"; and {len(found) - most} more machines" if len(found) > most else ""
     return "; ".join(found[:most]) + more

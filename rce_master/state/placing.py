@@ -1,4 +1,4 @@
-"""Gives containers their machines: those that are asked for, those that wait, those that lost theirs.
+"""Places containers: new ones, waiting ones, and those that lost their machine.
 
 - A container that is asked for while no container machine is connected waits for one: robots may start
   before their cloud.
@@ -6,7 +6,7 @@
   for with ``wait``.
 - Whenever there may be room, those that wait are looked at in the order in which they were asked for, and
   each that fits is placed: one passes another only while that one fits nowhere. No room is kept free for
-  large ones, because nobody knows when a container ends; an operator makes room by ``rce drain`` or
+  large ones, because the end of a container cannot be predicted; an operator makes room by ``rce drain`` or
   ``rce resize``.
 """
 
@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce_master.exceptions import NoRoom
+from rce_master.exceptions import NoRoomError
 from rce_master.state import capacity
-from rce_master.state.lifecycle import ContainerEvent, next_phase
+from rce_master.state.lifecycle import ContainerEvent
 from rce_master.state.placement import Room, choose, refusals
 from rce_master.state.records import Container, ContainerLive
 
 if TYPE_CHECKING:
-    from rce.control.model import Resources
+    from rce.model.specs import Resources
     from rce_master.state.changes import Transaction
 
 
@@ -31,7 +31,7 @@ def admit(tx: Transaction, container: Container, *, wait: bool) -> None:
     """Refuse a new container that no machine takes, or tell its user that it waits.
 
     Raises:
-        NoRoom: No machine takes it, and its user does not want to wait.
+        NoRoomError: No machine takes it, and its user does not want to wait.
     """
     known = capacity.rooms(tx.tables, away=True)
     if not any(tx.tables.is_connected(process) for process in known):
@@ -40,25 +40,25 @@ def admit(tx: Transaction, container: Container, *, wait: bool) -> None:
         return
     why = _why_nowhere(tx, container, capacity.rooms(tx.tables))
     if not wait:
-        raise NoRoom(
+        raise NoRoomError(
             f"no machine takes container {container.tag!r} now: {why}; to wait for room, ask with wait"
         )
     _tell(tx, container, why)
 
 
 def place_waiting(tx: Transaction) -> None:
-    """Place every container that is placed nowhere and for which there is a machine."""
+    """Place every unplaced container that fits on a machine."""
     waiting = [e for e in tx.tables.endpoints.by("task_set", "") if isinstance(e, Container)]
     if not waiting:
         return
     rooms = capacity.rooms(tx.tables)
     too_much: set[Resources] = set()  # rooms only fill up here: what found none finds none later
     for container in sorted(waiting, key=lambda c: c.number):
-        wish = container.resources
-        if wish in too_much:
+        requested = container.resources
+        if requested in too_much:
             continue
-        if not any(room.fits(wish) for room in rooms.values()):
-            too_much.add(wish)
+        if not any(room.fits(requested) for room in rooms.values()):
+            too_much.add(requested)
             continue
         room = best(tx, container, rooms)
         if room is not None:
@@ -90,8 +90,7 @@ def bind(tx: Transaction, container: Container, process: str) -> None:
 def happened(tx: Transaction, id_: str, event: ContainerEvent) -> None:
     """Note a step in a container's life."""
     live = tx.tables.container_live(id_)
-    phase = next_phase(live.phase, event)
-    tx.put(replace(live, phase=phase, since=tx.now, told=False, stays=""))
+    tx.put(replace(live.after(event, tx.now), told=False, stays=""))
 
 
 def tell_waiting(tx: Transaction) -> None:
@@ -101,7 +100,7 @@ def tell_waiting(tx: Transaction) -> None:
         live = tx.tables.live[endpoint.id]
         if not isinstance(endpoint, Container) or not isinstance(live, ContainerLive) or live.told:
             continue
-        if tx.now - live.since >= tx.settings.placement_patience:
+        if tx.now - live.since >= tx.settings.placement_timeout:
             rooms = capacity.rooms(tx.tables) if rooms is None else rooms
             _tell(tx, endpoint, _why_nowhere(tx, endpoint, rooms))
 

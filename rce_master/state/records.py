@@ -1,4 +1,4 @@
-"""The records that the state is made of. All are immutable: a change replaces a record.
+"""The records of the state. All are immutable: a change replaces a record.
 
 Persistent records go to the store; the others (what is observed now) are made anew after a restart.
 """
@@ -9,31 +9,33 @@ from enum import Enum
 from typing import TypeAlias
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from rce.control.messages import MachineInfo, TaskSetKind
-from rce.control.model import (
-    EndpointKind,
-    EndpointStatus,
-    InterfaceSpec,
-    LinkAddress,
-    NodeSpec,
-    ParameterValue,
-    Resources,
+from rce.control.model import EndpointKind, EndpointStatus, LinkAddress
+from rce.lifecycle import remember
+from rce.model.specs import NodeSpec, ParameterValue, Resources
+from rce_master.state.lifecycle import (
+    CONTAINER_LIFE,
+    ROBOT_LIFE,
+    ContainerEvent,
+    ContainerPhase,
+    RobotEvent,
+    RobotSession,
 )
-from rce_master.state.lifecycle import ContainerPhase, RobotSession
 
 
 class UserRole(Enum):
     """What a user may do."""
 
     VIEWER = "viewer"
-    """Sees everything of everybody, and changes nothing."""
+    """Sees the objects of all users, and cannot change any."""
     USER = "user"
     """Their own robots and containers."""
     OPERATOR = "operator"
-    """The same; sees everything of everybody, and steers every fleet at its station."""
+    """The same; also sees the objects of all users, and controls every fleet at its station."""
     ADMIN = "admin"
-    """Everything of everybody."""
+    """All objects of all users."""
 
     @property
     def sees_all(self) -> bool:
@@ -47,7 +49,7 @@ class UserRole(Enum):
 
 
 class User(Struct, frozen=True, kw_only=True):
-    """Somebody who may log in."""
+    """A user who may log in."""
 
     name: str
     role: UserRole
@@ -75,11 +77,11 @@ class Token(Struct, frozen=True, kw_only=True):
     used: float = 0.0
     """When it was last used, to the minute; 0: never."""
     scope: str = ""
-    """What it is good for: all that its user may do (empty), or one of ``robot:ID`` and ``metrics``."""
+    """Its scope: all permissions of its user (empty), or one of ``robot:ID`` and ``metrics``."""
 
     @property
     def id(self) -> str:
-        """What people call it by; it is no secret."""
+        """What people call it by; it is not secret."""
         return self.digest[:TOKEN_ID_LENGTH]
 
     @property
@@ -88,7 +90,7 @@ class Token(Struct, frozen=True, kw_only=True):
         return self.scope.removeprefix(ROBOT_SCOPE) if self.scope.startswith(ROBOT_SCOPE) else ""
 
     def is_expired(self, now: float) -> bool:
-        """Return whether it is worth nothing any more."""
+        """Return whether it has expired."""
         return bool(self.expires) and self.expires <= now
 
 
@@ -136,7 +138,7 @@ def package_key_key(user: str, key: str) -> str:
     return f"{user}/{key}"
 
 
-class Bundle(Struct, frozen=True, kw_only=True):
+class UserPackage(Struct, frozen=True, kw_only=True):
     """A version of a package that a user brought. It never changes."""
 
     user: str
@@ -165,26 +167,24 @@ class Bundle(Struct, frozen=True, kw_only=True):
     @property
     def id(self) -> str:
         """``user/name@version``."""
-        return bundle_key(self.user, self.name, self.version)
+        return user_package_key(self.user, self.name, self.version)
 
 
-def bundle_key(user: str, name: str, version: str) -> str:
-    """Tell the key of a bundle."""
+def user_package_key(user: str, name: str, version: str) -> str:
+    """Tell the key of a package."""
     return f"{user}/{name}@{version}"
 
 
 class _Endpoint(Struct, frozen=True, kw_only=True):
-    """What robots and containers have in common."""
+    """The base of robots and containers."""
 
     id: str
     """``user/tag``."""
     revision: int = 0
     task_set: str = ""
     """Process name of the task set that is responsible; empty: none."""
-    interfaces: dict[str, InterfaceSpec] = {}
-    """By tag."""
     size: int = 0
-    """Bytes of all that its user put into it, as :func:`rce_master.state.endpoints.size_of` counts them."""
+    """Bytes of its contents, as :func:`rce_master.state.endpoints.size_of` counts them."""
 
     @property
     def user(self) -> str:
@@ -235,32 +235,8 @@ class Container(_Endpoint, frozen=True, kw_only=True, tag=True):
 Endpoint: TypeAlias = Robot | Container
 
 
-class Connection(Struct, frozen=True, kw_only=True):
-    """A connection of an interface of a link's endpoint ``a`` with one of its endpoint ``b``."""
-
-    id: int
-    interface_a: str
-    interface_b: str
-
-
-class Link(Struct, frozen=True, kw_only=True):
-    """What joins two endpoints of a user, or two interfaces of one; it is there while it has a connection."""
-
-    id: str
-    a: str
-    """Endpoint id; never the greater one of the two."""
-    b: str
-    token: str
-    connections: dict[int, Connection] = {}
-    """By id, which is the channel number."""
-
-    def peer(self, endpoint: str) -> str:
-        """Tell the other endpoint's id."""
-        return self.b if endpoint == self.a else self.a
-
-
 class TaskSet(Struct, frozen=True, kw_only=True):
-    """A task set that is there, or was there a short while ago."""
+    """A task set that is connected, or was recently."""
 
     process: str
     kind: TaskSetKind
@@ -272,14 +248,14 @@ class TaskSet(Struct, frozen=True, kw_only=True):
 
 
 class Drain(Struct, frozen=True, kw_only=True):
-    """A machine that an operator wants to be emptied; kept until that is taken back."""
+    """A machine that is drained; kept until the operator cancels the drain."""
 
     process: str
     """Of its container task set."""
 
 
 class Counter(Struct, frozen=True, kw_only=True):
-    """A number that only grows: what it gave out is never given out again."""
+    """A number that only increases: its values are never reused."""
 
     name: str
     value: int
@@ -293,6 +269,17 @@ class RobotLive(Struct, frozen=True, kw_only=True):
     since: float
     """When the session became so; seconds of the clock that commands are applied with."""
     status: EndpointStatus | None = None
+    recent: tuple[RobotEvent, ...] = ()
+    """What happened to it last."""
+
+    def after(self, event: RobotEvent, now: float) -> RobotLive:
+        """Return this record after an event.
+
+        Raises:
+            TransitionError: The event cannot happen now.
+        """
+        session = ROBOT_LIFE.advance(self.session, event, self.id, self.recent)
+        return replace(self, session=session, since=now, recent=remember(self.recent, event))
 
 
 class ContainerLive(Struct, frozen=True, kw_only=True):
@@ -310,6 +297,17 @@ class ContainerLive(Struct, frozen=True, kw_only=True):
     were."""
     rest_until: float = 0.0
     """When a move of it that failed may be tried again."""
+    recent: tuple[ContainerEvent, ...] = ()
+    """What happened to it last."""
+
+    def after(self, event: ContainerEvent, now: float) -> ContainerLive:
+        """Return this record after an event.
+
+        Raises:
+            TransitionError: The event cannot happen now.
+        """
+        phase = CONTAINER_LIFE.advance(self.phase, event, self.id, self.recent)
+        return replace(self, phase=phase, since=now, recent=remember(self.recent, event))
 
 
 class Move(Struct, frozen=True, kw_only=True):

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.control.limits import MEGABYTE
-from rce.control.model import Resources
-from rce.protocol.quantities import write_bandwidth, write_cores
-from rce_master.exceptions import NoRoom
+from rce.control.machine import MEGABYTE
+from rce.model.quantities import write_bandwidth, write_cores
+from rce.model.specs import Resources
+from rce_master.exceptions import NoRoomError
 from rce_master.state import capacity, endpoints, placing
 from rce_master.state.containers import find
 
@@ -18,26 +18,23 @@ if TYPE_CHECKING:
     from rce_master.state.commands import ResizeContainer
     from rce_master.state.records import Container
 
-_SIZES = ("size", "cpu", "memory", "bandwidth")
-
 
 def resize_container(tx: Transaction, command: ResizeContainer) -> None:
-    """Change a container's wishes; the same ones again are accepted silently."""
+    """Change a container's resources; the same ones again are accepted silently."""
     container = find(tx, command.user, command.tag)
-    given = {key: value for key in _SIZES if (value := getattr(command, key)) is not None}
-    had, wish = container.resources, replace(container.resources, **given)
-    if wish == had:
+    had, requested = container.resources, replace(container.resources, **command.changes.given())
+    if requested == had:
         return
-    capacity.check_wish(tx, command.user, container.id, wish)
-    _check_room(tx, container, wish)
-    size = endpoints.grown(tx, container, wish, had)
-    tx.put(replace(container, resources=wish, made=container.made or had, size=size))
+    capacity.check_resources(tx, command.user, container.id, requested)
+    _check_room(tx, container, requested)
+    size = endpoints.grown(tx, container, requested, had)
+    tx.put(replace(container, resources=requested, made=container.made or had, size=size))
     tx.touch(container.id)
-    tx.happen("container_resized", container.id, describe(wish))
+    tx.happen("container_resized", container.id, describe(requested))
     placing.place_waiting(tx)
 
 
-def _check_room(tx: Transaction, container: Container, wish: Resources) -> None:
+def _check_room(tx: Transaction, container: Container, requested: Resources) -> None:
     """Check the machine where it is, and the one that it is on its way to."""
     had = container.resources
     move = tx.tables.moves.get(container.id)
@@ -46,18 +43,18 @@ def _check_room(tx: Transaction, container: Container, wish: Resources) -> None:
         if task_set is None:
             continue
         room = capacity.room_at(tx.tables, task_set)
-        lacks = room.without(had).shortages(wish, had)
+        lacks = room.without(had).shortages(requested, had)
         if lacks:
-            raise NoRoom(
+            raise NoRoomError(
                 f"container {container.tag!r} cannot grow so far: {room.name} {' and '.join(lacks)}; "
                 "nothing was changed"
             )
 
 
-def describe(wish: Resources) -> str:
+def describe(requested: Resources) -> str:
     """Write what a container may use, as people write it."""
-    parts = [f"size {wish.size}"]
-    parts += [f"cpu {write_cores(wish.cpu)}"] if wish.cpu else []
-    parts += [f"memory {wish.memory / MEGABYTE:g} MB"] if wish.memory else []
-    parts += [f"bandwidth {write_bandwidth(wish.bandwidth)}/s"] if wish.bandwidth else []
+    parts = [f"size {requested.size}"]
+    parts += [f"cpu {write_cores(requested.cpu)}"] if requested.cpu else []
+    parts += [f"memory {requested.memory / MEGABYTE:g} MB"] if requested.memory else []
+    parts += [f"bandwidth {write_bandwidth(requested.bandwidth)}/s"] if requested.bandwidth else []
     return ", ".join(parts)

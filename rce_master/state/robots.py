@@ -8,10 +8,16 @@ from msgspec.structs import replace
 
 from rce.control.messages import TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus
-from rce.protocol.names import EndpointId
-from rce_master.exceptions import Conflict, Forbidden, Invalid, LimitReached, NotFound
-from rce_master.state import endpoints
-from rce_master.state.lifecycle import RobotEvent, RobotSession, next_session
+from rce.model.names import EndpointId
+from rce_master.exceptions import (
+    ConflictError,
+    ForbiddenError,
+    InvalidRequestError,
+    LimitReachedError,
+    NotFoundError,
+)
+from rce_master.state import activity, endpoints
+from rce_master.state.lifecycle import RobotEvent, RobotSession
 from rce_master.state.records import Robot, RobotLive
 
 if TYPE_CHECKING:
@@ -24,36 +30,38 @@ def login(tx: Transaction, command: RobotLogin) -> None:
     try:
         name = EndpointId.parse(command.id)
     except ValueError as error:
-        raise Invalid(str(error)) from None
+        raise InvalidRequestError(str(error)) from None
     user = tx.tables.users.get(name.user)
     if user is None:
-        raise NotFound(f"there is no user {name.user!r}")
+        raise NotFoundError(f"there is no user {name.user!r}")
     if not user.role.changes:
-        raise Forbidden(f"user {user.name!r} has the role {user.role.value}, which connects no robots")
+        raise ForbiddenError(f"user {user.name!r} has the role {user.role.value}, which connects no robots")
     if command.credential and command.credential not in tx.tables.tokens:
-        raise Forbidden("the robot's token was revoked")
+        raise ForbiddenError("the robot's token was revoked")
     if command.password and command.password != user.password:
-        raise Forbidden("the password was changed")
+        raise ForbiddenError("the password was changed")
     task_set = tx.tables.task_sets.get(command.process)
     if (
         task_set is None
         or task_set.kind is not TaskSetKind.ROBOT
         or not tx.tables.is_connected(command.process)
     ):
-        raise Conflict(f"{command.process!r} is no connected robot task set")
+        raise ConflictError(f"{command.process!r} is not a connected robot task set")
     there = tx.tables.endpoints.get(command.id)
     if there is None:
         _new(tx, name)
     elif not isinstance(there, Robot):
-        raise Conflict(f"{name.tag!r} is a container of user {name.user!r}; a robot needs another robotID")
+        raise ConflictError(
+            f"{name.tag!r} is a container of user {name.user!r}; a robot needs another robotID"
+        )
     _enter(tx, command)
     tx.changes.answered = command.id
     tx.happen("robot_connected", command.id, f"at {command.process}")
 
 
 def _new(tx: Transaction, name: EndpointId) -> None:
-    if len(tx.tables.robots(name.user)) >= tx.settings.max_robots:
-        raise LimitReached(f"user {name.user!r} has {tx.settings.max_robots} robots already")
+    if tx.tables.endpoints.count("robots_of", name.user) >= tx.settings.max_robots:
+        raise LimitReachedError(f"user {name.user!r} has {tx.settings.max_robots} robots already")
     tx.put(Robot(id=str(name)))
     tx.put(RobotLive(id=str(name), session=RobotSession.OFFLINE, since=tx.now))
     tx.touch(str(name))
@@ -67,7 +75,7 @@ def _enter(tx: Transaction, command: RobotLogin) -> None:
     if live.session is RobotSession.CONNECTED:
         client = live.status.client if live.status is not None else ""
         where = f", from {client}" if client else ""
-        raise Conflict(
+        raise ConflictError(
             f"robot {robot.tag!r} is connected already{where}; a robotID can be used once at a time"
         )
     if robot.task_set != process:
@@ -77,7 +85,8 @@ def _enter(tx: Transaction, command: RobotLogin) -> None:
         tx.touch(id_)
         endpoints.touch_dialers(tx, id_)
     tx.put(replace(robot, credential=command.credential))
-    tx.put(replace(live, session=next_session(live.session, RobotEvent.LOGIN), since=tx.now, status=None))
+    tx.put(replace(live.after(RobotEvent.LOGIN, tx.now), status=None))
+    activity.forget(tx, id_)
 
 
 def left(tx: Transaction, command: RobotLeft) -> None:
@@ -91,7 +100,8 @@ def leave(tx: Transaction, robot: Robot, reason: str) -> None:
     """Begin a robot's grace time."""
     live = tx.tables.robot_live(robot.id)
     if live.session is RobotSession.CONNECTED:
-        tx.put(replace(live, session=next_session(live.session, RobotEvent.LEAVE), since=tx.now, status=None))
+        tx.put(replace(live.after(RobotEvent.LEAVE, tx.now), status=None))
+        activity.forget(tx, robot.id)
         tx.happen("robot_left", robot.id, reason)
 
 
@@ -106,10 +116,10 @@ def send_away(tx: Transaction, robot: Robot, reason: str) -> None:
 
 
 def reported(tx: Transaction, robot: Robot, status: EndpointStatus) -> None:
-    """Note what its task set reports of a robot."""
+    """Note what its task set reports of a robot beside its interfaces and connections."""
     live = tx.tables.robot_live(robot.id)
     if status.state is EndpointState.RUNNING and live.session is RobotSession.ABSENT:
-        live = replace(live, session=next_session(live.session, RobotEvent.LOGIN), since=tx.now)
+        live = live.after(RobotEvent.LOGIN, tx.now)
         tx.happen("robot_connected", robot.id, f"still at {robot.task_set}")
     elif status.state is EndpointState.ABSENT and live.session is RobotSession.CONNECTED:
         if live.status is None:
@@ -126,8 +136,8 @@ def expire(tx: Transaction) -> None:
         live = tx.tables.robot_live(robot.id)
         waited = tx.now - live.since
         if live.session is RobotSession.ABSENT and waited >= tx.settings.robot_grace:
-            next_session(live.session, RobotEvent.EXPIRE)
+            live.after(RobotEvent.EXPIRE, tx.now)  # it is checked, and nothing is left to record
             endpoints.remove(tx, robot.id, "the robot stayed away")
             tx.happen("robot_gone", robot.id, "its interfaces and connections were removed")
-        elif live.status is None and waited >= tx.settings.login_patience:
+        elif live.status is None and waited >= tx.settings.login_timeout:
             leave(tx, robot, "it was let in and never came")

@@ -13,11 +13,11 @@ class StateSettings:
     """How long a robot's interfaces and connections are kept after its connection dropped."""
     container_grace: float = 30.0
     """How long a container task set may be away until its containers are placed elsewhere."""
-    placement_patience: float = 10.0
+    placement_timeout: float = 10.0
     """How long a container waits for a machine until its user is told."""
-    login_patience: float = 15.0
+    login_timeout: float = 15.0
     """How long a robot that was let in may take until its task set reports it; then it counts as away."""
-    move_patience: float = 60.0
+    move_timeout: float = 60.0
     """How long a container's copy at another machine may take to come up, when its machine is drained."""
     move_rest: float = 30.0
     """How long a container stays after a move of it failed, until the next is tried."""
@@ -39,10 +39,16 @@ class StateSettings:
     """In one container."""
     max_parameters: int = 5000
     """In one container."""
-    max_interfaces: int = 1000
+    max_interfaces: int = 12_000
+    """Of one endpoint: a container that serves a fleet has six or so for each of ``max_robots`` robots. Each
+    has a record of its own, and a change costs what it changes: the limit bounds memory only."""
+    max_connections: int = 24_000
     """Of one endpoint."""
-    max_connections: int = 4000
-    """Of one endpoint."""
+    max_user_interfaces: int = 50_000
+    """Of all endpoints of one user. The master keeps about 2 kB for each; what they take where they are in
+    use counts there, for the container or for the user's robots."""
+    max_user_connections: int = 50_000
+    """Of all links of one user."""
     max_tokens: int = 100
     """Logins of one user; the one that was not used for longest makes room for a new one."""
     max_package_keys: int = 20
@@ -54,7 +60,8 @@ class StateSettings:
     max_package_size: int = 8 * 2**30
     """All files of one user's packages together, on the machines where they are unpacked."""
     max_endpoint_bytes: int = 2 * 2**20
-    """What the nodes, parameters and interfaces of one endpoint take when they are written down. A change of
-    any of them is stored and sent with all the others."""
+    """What the nodes, parameters and interfaces of one endpoint take when they are written down. All are sent
+    when a task set or a container starts anew; a change of a node or a parameter is stored and sent with all
+    other nodes and parameters."""
     max_user_bytes: int = 32 * 2**20
     """The same of all of a user's endpoints together."""

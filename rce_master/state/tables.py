@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import msgspec
 
 from rce_master.state.records import (
-    Bundle,
     Container,
     ContainerLive,
     Counter,
     Drain,
     Endpoint,
     KnownLogin,
-    Link,
     Live,
     Move,
     PackageKey,
@@ -26,10 +24,21 @@ from rce_master.state.records import (
     Tombstone,
     User,
     UserLimits,
+    UserPackage,
+)
+from rce_master.state.wiring_records import (
+    ActiveInterface,
+    Connection,
+    Interface,
+    Link,
+    OpenEnd,
+    interface_key,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
+
+    from rce.model.specs import InterfaceSpec
 
 R = TypeVar("R")
 
@@ -42,6 +51,8 @@ class Table(Generic[R]):
         persistent: Whether the records go to the store.
         type_: What records are decoded as.
         key: Tells a record's key.
+        order: Tells a record's place among those that are loaded; without it they come as the store has them.
+        amount: Tells what a record adds to the total of which key.
         indexes: By name.
     """
 
@@ -52,6 +63,8 @@ class Table(Generic[R]):
         type_: Any,
         key: Callable[[R], str],
         persistent: bool = True,
+        order: Callable[[R], int] | None = None,
+        amount: Callable[[R], tuple[str, int]] | None = None,
         **indexes: Callable[[R], Iterable[str]],
     ) -> None:
         self.name = name
@@ -59,6 +72,9 @@ class Table(Generic[R]):
         self.key = key
         self._decoder = msgspec.json.Decoder(type_)
         self._rows: dict[str, R] = {}
+        self._order = order
+        self._amount = amount
+        self._totals: dict[str, int] = {}
         self._indexes = indexes
         # Inner dicts instead of sets keep the order of arrival, so that everything stays reproducible.
         self._found: dict[str, dict[str, dict[str, None]]] = {name: {} for name in indexes}
@@ -87,6 +103,10 @@ class Table(Generic[R]):
         """Tell how many records an index finds for a value."""
         return len(self._found[index].get(value, ()))
 
+    def total(self, key: str) -> int:
+        """Return the sum of what the records add to a key."""
+        return self._totals.get(key, 0)
+
     def assign(self, key: str, record: R | None) -> None:
         """Put a record in place of what was there; None removes it."""
         before = self._rows.pop(key, None) if record is None else self._rows.get(key)
@@ -94,6 +114,8 @@ class Table(Generic[R]):
             old = () if before is None else of(before)
             new = () if record is None else of(record)
             self._reindex(self._found[name], key, list(old), list(new))
+        self._count(before, -1)
+        self._count(record, 1)
         if record is not None:
             self._rows[key] = record
 
@@ -107,8 +129,11 @@ class Table(Generic[R]):
         Raises:
             msgspec.ValidationError: A record cannot be read.
         """
-        for key, body in rows.items():
-            self.assign(key, self._decoder.decode(body))
+        records = [(key, self._decoder.decode(body)) for key, body in rows.items()]
+        if (order := self._order) is not None:
+            records.sort(key=lambda item: order(item[1]))
+        for key, record in records:
+            self.assign(key, record)
 
     def index_entries(self, index: str) -> dict[str, list[str]]:
         """Show an index: value to keys."""
@@ -127,6 +152,31 @@ class Table(Generic[R]):
         """Names of the indexes."""
         return tuple(self._indexes)
 
+    @property
+    def totals(self) -> dict[str, int]:
+        """What :meth:`total` returns, by key."""
+        return dict(self._totals)
+
+    @property
+    def computed_totals(self) -> dict[str, int]:
+        """Compute anew what :attr:`totals` must hold."""
+        totals: dict[str, int] = {}
+        for record in self._rows.values():
+            if self._amount is not None:
+                key, amount = self._amount(record)
+                totals[key] = totals.get(key, 0) + amount
+        return {key: total for key, total in totals.items() if total}
+
+    def _count(self, record: R | None, sign: int) -> None:
+        if record is None or self._amount is None:
+            return
+        key, amount = self._amount(record)
+        total = self._totals.get(key, 0) + sign * amount
+        if total:
+            self._totals[key] = total
+        else:
+            self._totals.pop(key, None)
+
     @staticmethod
     def _reindex(entries: dict[str, dict[str, None]], key: str, before: list[str], after: list[str]) -> None:
         if before == after:
@@ -144,8 +194,11 @@ class Tables:
 
     - ``known_logins``, ``user_limits``: at most one for each user.
     - ``endpoints``: robots and containers; both in one table, because a tag is unique among both.
+    - ``interfaces``: only of endpoints that are there.
     - ``links``: one for each pair of endpoints that has a connection.
+    - ``connections``: only on links that are there, between interfaces that are there.
     - ``live``: exactly one record for each endpoint.
+    - ``active``, ``open_ends``: only of endpoints of which a status is known.
     - ``presence``: exactly one record for each task set.
     - ``tombstones``: only of connected task sets.
     - ``drains``: also of task sets that are gone: they may come back.
@@ -160,9 +213,9 @@ class Tables:
         self.package_keys = Table[PackageKey](
             "package_keys", type_=PackageKey, key=lambda k: k.id, user=lambda k: [k.user]
         )
-        self.bundles = Table[Bundle](
+        self.packages = Table[UserPackage](
             "bundles",
-            type_=Bundle,
+            type_=UserPackage,
             key=lambda b: b.id,
             user=lambda b: [b.user],
             package=lambda b: [f"{b.user}/{b.name}"],
@@ -172,16 +225,47 @@ class Tables:
             "endpoints",
             type_=Robot | Container,
             key=lambda e: e.id,
+            amount=lambda e: (e.user, e.size),
             user=lambda e: [e.user],
+            robots_of=lambda e: [e.user] if isinstance(e, Robot) else [],
             task_set=lambda e: [e.task_set],
         )
+        self.interfaces = Table[Interface](
+            "interfaces",
+            type_=Interface,
+            key=lambda i: i.id,
+            order=lambda i: i.number,
+            endpoint=lambda i: [i.endpoint],
+            user=lambda i: [i.endpoint.partition("/")[0]],
+        )
         self.links = Table[Link](
-            "links", type_=Link, key=lambda k: k.id, endpoint=lambda k: dict.fromkeys((k.a, k.b))
+            "links",
+            type_=Link,
+            key=lambda k: k.id,
+            endpoint=lambda k: dict.fromkeys((k.a, k.b)),
+            pair=lambda k: [f"{k.a} {k.b}"],
+        )
+        self.connections = Table[Connection](
+            "connections",
+            type_=Connection,
+            key=lambda c: str(c.id),
+            order=lambda c: c.id,
+            user=lambda c: [c.a.partition("/")[0]],
+            link=lambda c: [c.link],
+            endpoint=lambda c: dict.fromkeys((c.a, c.b)),
+            end=lambda c: dict.fromkeys(c.ends),
+            ends=lambda c: [" ".join(c.ends)],
         )
         self.task_sets = Table[TaskSet]("task_sets", type_=TaskSet, key=lambda s: s.process)
         self.counters = Table[Counter]("counters", type_=Counter, key=lambda c: c.name)
         self.drains = Table[Drain]("drains", type_=Drain, key=lambda d: d.process)
         self.live = Table[Live]("live", type_=Any, key=lambda o: o.id, persistent=False)
+        self.active = Table[ActiveInterface](
+            "active", type_=Any, key=lambda a: a.id, persistent=False, endpoint=lambda a: [a.endpoint]
+        )
+        self.open_ends = Table[OpenEnd](
+            "open_ends", type_=Any, key=lambda o: o.id, persistent=False, endpoint=lambda o: [o.endpoint]
+        )
         self.presence = Table[Presence]("presence", type_=Any, key=lambda p: p.process, persistent=False)
         self.tombstones = Table[Tombstone](
             "tombstones", type_=Any, key=lambda t: t.key, persistent=False, process=lambda t: [t.process]
@@ -190,7 +274,7 @@ class Tables:
             "moves", type_=Any, key=lambda m: m.id, persistent=False, to=lambda m: [m.to]
         )
         self.first_revision = 0
-        """Revisions that this life of the master gives are above this."""
+        """Revisions that this run of the master gives are above this."""
 
     @property
     def all(self) -> tuple[Table[Any], ...]:
@@ -201,13 +285,17 @@ class Tables:
             self.known_logins,
             self.user_limits,
             self.package_keys,
-            self.bundles,
+            self.packages,
             self.endpoints,
+            self.interfaces,
             self.links,
+            self.connections,
             self.task_sets,
             self.counters,
             self.drains,
             self.live,
+            self.active,
+            self.open_ends,
             self.presence,
             self.tombstones,
             self.moves,
@@ -250,7 +338,12 @@ class Tables:
 
     def link_between(self, one: str, other: str) -> Link | None:
         """Find the link of two endpoints."""
-        return next((link for link in self.links.by("endpoint", one) if link.peer(one) == other), None)
+        return next(iter(self.links.by("pair", " ".join(sorted((one, other))))), None)
+
+    def interface(self, endpoint: str, tag: str) -> InterfaceSpec | None:
+        """Find an interface of an endpoint."""
+        found = self.interfaces.get(interface_key(endpoint, tag))
+        return None if found is None else found.spec
 
     def _of(self, user: str | None) -> Iterable[Endpoint]:
         return self.endpoints if user is None else self.endpoints.by("user", user)

@@ -6,9 +6,10 @@ import re
 from typing import TYPE_CHECKING
 
 from rce.control.messages import Hello, TaskSetKind
-from rce.control.model import EndpointState, EndpointStatus
-from rce_master.exceptions import Conflict, Invalid, NotFound
-from rce_master.state import capacity, containers, draining, endpoints, placing, robots
+from rce.control.model import EndpointState, EndpointStatus, StatusPatch
+from rce.control.observed import without_wiring
+from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError
+from rce_master.state import activity, capacity, containers, draining, endpoints, placing, robots
 from rce_master.state.lifecycle import ContainerPhase, RobotSession
 from rce_master.state.records import (
     Container,
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from rce_master.state.commands import (
         EndpointGone,
         FaultReported,
+        SpecRequested,
+        StatusPatched,
         StatusReported,
         TaskSetArrived,
         TaskSetLeft,
@@ -59,10 +62,12 @@ def arrived(tx: Transaction, command: TaskSetArrived) -> None:
 
 def _check_name(tx: Transaction, hello: Hello) -> None:
     if not _PROCESS.fullmatch(hello.process):
-        raise Invalid(f"{hello.process!r:.60} names no task set: it takes 1 to 255 characters and no blanks")
+        raise InvalidRequestError(
+            f"{hello.process!r:.60} names no task set: it takes 1 to 255 characters and no blanks"
+        )
     before = tx.tables.task_sets.get(hello.process)
     if before is not None and before.kind is not hello.kind:
-        raise Conflict(f"there is a {before.kind.value} task set {hello.process!r} already")
+        raise ConflictError(f"there is a {before.kind.value} task set {hello.process!r} already")
 
 
 def _register(tx: Transaction, hello: Hello) -> None:
@@ -98,7 +103,7 @@ def _adopt(tx: Transaction, process: str, status: EndpointStatus) -> None:
 
 
 def _find_again(tx: Transaction, process: str, container: Container, status: EndpointStatus) -> None:
-    """Let a container that is placed nowhere go on where it is, unless it grew too much meanwhile.
+    """Let a container that is placed nowhere continue where it is, unless it grew too much meanwhile.
 
     One of the same name that was there before it is none of its lives: ``Sync`` has it dropped, and the
     container may be placed there when it is gone.
@@ -135,7 +140,7 @@ def _miss(tx: Transaction, endpoint: Container | Robot) -> None:
 
 
 def left(tx: Transaction, command: TaskSetLeft) -> None:
-    """Note that a task set's channel ended: its robots become absent, its containers go on unseen."""
+    """Note that a task set's channel ended: its robots become absent, its containers continue unseen."""
     process = command.process
     if not tx.tables.is_connected(process):
         return
@@ -151,7 +156,7 @@ def left(tx: Transaction, command: TaskSetLeft) -> None:
 
 
 def status_reported(tx: Transaction, command: StatusReported) -> None:
-    """Note what a task set reports of one endpoint; of one that is not placed there it is ignored.
+    """Apply a task set's report about one endpoint; ignore it if the endpoint is not placed there.
 
     So is what comes from a task set after its channel ended.
     """
@@ -165,11 +170,50 @@ def status_reported(tx: Transaction, command: StatusReported) -> None:
         draining.reported(tx, move, command.status)
 
 
-def _note(tx: Transaction, endpoint: Container | Robot, status: EndpointStatus) -> None:
+def status_patched(tx: Transaction, command: StatusPatched) -> None:
+    """Note what a task set reports as changed; if it does not fit what is known, ask for the whole."""
+    process, patch = command.process, command.patch
+    if not tx.tables.is_connected(process):
+        return
+    id_ = patch.status.id
+    endpoint, move = tx.tables.endpoints.get(id_), tx.tables.moves.get(id_)
+    if endpoint is not None and endpoint.task_set == process:
+        if _follows(patch, tx.tables.live[id_].status):
+            _note(tx, endpoint, patch.status, patch)
+        else:
+            tx.changes.wanted_statuses.append((process, id_))
+    elif move is not None and move.to == process:
+        if _follows(patch, move.status):
+            draining.reported(tx, move, without_wiring(patch.status))
+        else:
+            tx.changes.wanted_statuses.append((process, id_))
+
+
+def _follows(patch: StatusPatch, known: EndpointStatus | None) -> bool:
+    return known is not None and patch.status.number == known.number + 1
+
+
+def spec_requested(tx: Transaction, command: SpecRequested) -> None:
+    """Send the whole spec of an endpoint to its task set again."""
+    endpoint = tx.tables.endpoints.get(command.id)
+    if endpoint is not None and endpoint.task_set == command.process:
+        tx.changes.wanted_specs.append((command.process, command.id))
+
+
+def _note(
+    tx: Transaction, endpoint: Container | Robot, status: EndpointStatus, patch: StatusPatch | None = None
+) -> None:
+    header = without_wiring(status)
     if isinstance(endpoint, Container):
-        containers.reported(tx, endpoint, status)
+        containers.reported(tx, endpoint, header)
     else:
-        robots.reported(tx, endpoint, status)
+        robots.reported(tx, endpoint, header)
+    if tx.tables.live[endpoint.id].status is None:
+        return
+    if patch is None:
+        activity.note(tx, status)
+    else:
+        activity.amend(tx, patch)
 
 
 def gone(tx: Transaction, command: EndpointGone) -> None:
@@ -186,7 +230,7 @@ def gone(tx: Transaction, command: EndpointGone) -> None:
 
 
 def _ended(tx: Transaction, command: EndpointGone) -> None:
-    """Note that a task set ended by itself what it was told to make."""
+    """Note that a task set ended what it was told to make."""
     endpoint = tx.tables.endpoints.get(command.id)
     move = tx.tables.moves.get(command.id)
     if isinstance(endpoint, Container) and endpoint.task_set == command.process:
@@ -196,16 +240,16 @@ def _ended(tx: Transaction, command: EndpointGone) -> None:
 
 
 def fault(tx: Transaction, command: FaultReported) -> None:
-    """Tell the user of an endpoint of a fault."""
+    """Report a fault to the user of an endpoint."""
     user = command.id.partition("/")[0]
     if user not in tx.tables.users:
-        raise NotFound(f"there is no user {user!r}")
+        raise NotFoundError(f"there is no user {user!r}")
     tx.notify(command.robot or user, command.text)
     tx.happen("fault", command.id, command.text)
 
 
 def tick(tx: Transaction, _: Tick) -> None:
-    """End grace times that are over, place what waits, tell users who have waited for long."""
+    """End expired grace times, place waiting containers, and notify users who have waited for long."""
     robots.expire(tx)
     for presence in list(tx.tables.presence):
         if not presence.connected:
@@ -230,10 +274,10 @@ def _expire(tx: Transaction, presence: Presence) -> None:
 
 
 def restart(tx: Transaction, revision: int) -> None:
-    """Begin with what the store held: nobody is connected, and every grace time starts now.
+    """Start with the store's contents: no task set is connected, and every grace time starts now.
 
-    Revisions go on above ``revision``. What task sets report has no say in it: a revision that nobody gave
-    would be in force as long as the store is.
+    Revisions continue above ``revision``. Reports of task sets do not affect this: a revision that no master
+    gave would stay in force as long as the store exists.
     """
     tx.raise_counter("revision", revision)
     tx.tables.first_revision = tx.newest("revision")

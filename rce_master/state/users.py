@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.protocol.names import is_name
-from rce_master.exceptions import Conflict, Invalid, NotFound
+from rce.model.names import is_name
+from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError
 from rce_master.state import endpoints, limits, packages, robots, tokens
 from rce_master.state.records import User, UserRole
 
@@ -20,9 +20,11 @@ def add_user(tx: Transaction, command: AddUser) -> None:
     """Make a user."""
     user = command.user
     if not is_name(user.name):
-        raise Invalid(f"{user.name!r} is no user name: use letters, digits and '_', a letter first")
+        raise InvalidRequestError(
+            f"{user.name!r} is not a user name: use letters, digits and '_', a letter first"
+        )
     if user.name in tx.tables.users:
-        raise Conflict(f"there is a user {user.name!r} already")
+        raise ConflictError(f"there is a user {user.name!r} already")
     tx.put(user)
     tx.happen("user_added", user.name, user.role.value, user="")
 
@@ -30,7 +32,7 @@ def add_user(tx: Transaction, command: AddUser) -> None:
 def set_password(tx: Transaction, command: SetPassword) -> None:
     """Change a password; end the user's logins, and the sessions of robots that came in by the password.
 
-    Tokens of robots and of programs stay: they were made so that the fleet does not hang on a password.
+    Tokens of robots and of programs stay: they make the fleet independent of the password.
     """
     user = _find(tx, command.name)
     tx.put(replace(user, password=command.password))
@@ -45,7 +47,7 @@ def set_password(tx: Transaction, command: SetPassword) -> None:
 
 
 def set_role(tx: Transaction, command: SetRole) -> None:
-    """Change what a user may do. Robots of one who may change nothing any more are sent away."""
+    """Change a user's role. Robots of a user who becomes read-only are disconnected."""
     user = _find(tx, command.name)
     if user.role is command.role:
         return
@@ -58,7 +60,7 @@ def set_role(tx: Transaction, command: SetRole) -> None:
 
 
 def remove_user(tx: Transaction, command: RemoveUser) -> None:
-    """Remove a user with all that is theirs."""
+    """Remove a user with all robots, containers, packages and tokens."""
     user = _find(tx, command.name)
     _keep_an_admin(tx, user)
     for endpoint in tx.tables.endpoints.by("user", user.name):
@@ -73,7 +75,7 @@ def remove_user(tx: Transaction, command: RemoveUser) -> None:
 
 
 def remember_login(tx: Transaction, command: RememberLogin) -> None:
-    """Keep the mark of a password that was right, for a user who is still there."""
+    """Keep the mark of a correct password, if the user still exists."""
     login = command.login
     if login.user in tx.tables.users and tx.tables.known_logins.get(login.user) != login:
         tx.put(login)
@@ -82,7 +84,7 @@ def remember_login(tx: Transaction, command: RememberLogin) -> None:
 def _find(tx: Transaction, name: str) -> User:
     user = tx.tables.users.get(name)
     if user is None:
-        raise NotFound(f"there is no user {name!r}")
+        raise NotFoundError(f"there is no user {name!r}")
     return user
 
 
@@ -93,4 +95,4 @@ def _forget_login(tx: Transaction, user: str) -> None:
 
 def _keep_an_admin(tx: Transaction, user: User) -> None:
     if [u for u in tx.tables.users if u.role is UserRole.ADMIN] == [user]:
-        raise Conflict(f"{user.name!r} is the last administrator; make another one first")
+        raise ConflictError(f"{user.name!r} is the last administrator; make another one first")

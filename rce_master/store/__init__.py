@@ -1,4 +1,4 @@
-"""Where the desired state is kept: one narrow interface, SQLite behind it by default."""
+"""The store of the desired state: a narrow interface, with SQLite by default."""
 
 from rce_master.store.base import Row, Snapshot, Store
 from rce_master.store.memory import MemoryStore

@@ -1,7 +1,7 @@
 """The interface of a store.
 
-A store knows nothing of robots or users: it keeps bytes under a table's name and a key. That is all a
-replicated store would have to do, too.
+A store does not know robots or users: it keeps bytes under a table's name and a key. A replicated store would
+need only the same functions.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 Snapshot = Mapping[str, Mapping[str, bytes]]
-"""All that a store holds: table name to key to encoded record."""
+"""The contents of a store: table name to key to encoded record."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +34,25 @@ class Store(Protocol):
             StoreError: It cannot be read.
         """
 
-    async def save(self, rows: Sequence[Row]) -> None:
-        """Write rows, all or none; when this returns, they survive a crash.
+    async def begin_term(self) -> int:
+        """Take over: begin a new term, and end the term of the former writer.
+
+        Returns:
+            The term, greater than all before; it survives a crash.
 
         Raises:
+            StoreError: None was begun.
+        """
+
+    async def save(self, rows: Sequence[Row], term: int = 0) -> None:
+        """Write rows, all or none; when this returns, they survive a crash.
+
+        Args:
+            rows: What to write.
+            term: The writer's own, as :meth:`begin_term` returned it; 0 if no term was begun yet.
+
+        Raises:
+            StaleTermError: A newer term was begun; nothing was written.
             StoreError: Nothing was written.
         """
 
@@ -49,4 +64,4 @@ class Store(Protocol):
         """
 
     async def close(self) -> None:
-        """Let go of everything; may be called twice."""
+        """Close the store; may be called twice."""

@@ -6,20 +6,20 @@ import fcntl
 import os
 from typing import TYPE_CHECKING
 
-from rce_master.exceptions import StoreBusy, StoreError
+from rce_master.exceptions import StoreBusyError, StoreError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 
 class FolderLock:
-    """Held while it is open; the kernel gives it back however the process ends.
+    """Held while it is open; the kernel releases it when the process ends for any reason.
 
     Args:
         folder: Made if it is not there, readable by its owner only.
 
     Raises:
-        StoreBusy: Another process holds it.
+        StoreBusyError: Another process holds it.
         StoreError: The folder cannot be used.
     """
 
@@ -34,10 +34,12 @@ class FolderLock:
         except OSError as error:
             os.close(self._fd)
             self._fd = -1
-            raise StoreBusy(f"a master is running on the state folder {folder}; stop it first") from error
+            raise StoreBusyError(
+                f"a master is running on the state folder {folder}; stop it first"
+            ) from error
 
     def close(self) -> None:
-        """Give it back."""
+        """Release it."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1

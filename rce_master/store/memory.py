@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rce_master.exceptions import StaleTermError
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -15,13 +17,25 @@ class MemoryStore:
 
     def __init__(self) -> None:
         self.tables: dict[str, dict[str, bytes]] = {}
+        self._term = 0
 
     async def load(self) -> Snapshot:
         """Read everything."""
         return {name: dict(rows) for name, rows in self.tables.items()}
 
-    async def save(self, rows: Sequence[Row]) -> None:
-        """Write rows."""
+    async def begin_term(self) -> int:
+        """Begin a new term."""
+        self._term += 1
+        return self._term
+
+    async def save(self, rows: Sequence[Row], term: int = 0) -> None:
+        """Write rows.
+
+        Raises:
+            StaleTermError: A newer term was begun.
+        """
+        if term < self._term:
+            raise StaleTermError(term, self._term)
         for row in rows:
             table = self.tables.setdefault(row.table, {})
             if row.body is None:

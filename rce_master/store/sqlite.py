@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import aiosqlite
 
-from rce_master.exceptions import StoreError
+from rce_master.exceptions import StaleTermError, StoreError
 from rce_master.store.lock import FolderLock
 
 if TYPE_CHECKING:
@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
     from rce_master.store.base import Row, Snapshot
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+"""1: interfaces were stored in their endpoints and connections in their links. The form of the table is the
+same: what the rows hold is converted by who reads them (:mod:`rce_master.state.migration`)."""
+_CONVERTIBLE = 1
 FILE_NAME = "rce.sqlite"
 
 _SCHEMA = """
@@ -25,6 +28,10 @@ CREATE TABLE record (
     kind TEXT NOT NULL, key TEXT NOT NULL, body BLOB NOT NULL, PRIMARY KEY (kind, key)
 ) WITHOUT ROWID
 """
+_LEASE = """
+CREATE TABLE IF NOT EXISTS lease (one INTEGER PRIMARY KEY CHECK (one = 1), term INTEGER NOT NULL)
+"""
+_NEXT_TERM = "INSERT INTO lease VALUES (1, 1) ON CONFLICT DO UPDATE SET term = term + 1"
 _PUT = "INSERT INTO record (kind, key, body) VALUES (?, ?, ?) ON CONFLICT DO UPDATE SET body = excluded.body"
 _DELETE = "DELETE FROM record WHERE kind = ? AND key = ?"
 
@@ -46,7 +53,7 @@ class SqliteStore:
         """Open the store of a folder; made if it is not there.
 
         Raises:
-            StoreBusy: Another process has it open.
+            StoreBusyError: Another process has it open.
             StoreError: It cannot be opened, or a newer version of this program wrote it.
         """
         lock = FolderLock(folder)
@@ -72,16 +79,42 @@ class SqliteStore:
             raise StoreError(f"cannot read the store: {error}") from error
         return snapshot
 
-    async def save(self, rows: Sequence[Row]) -> None:
+    async def begin_term(self) -> int:
+        """Begin a new term.
+
+        Raises:
+            StoreError: None was begun.
+        """
+        self._check_that_it_is_there()
+        try:
+            await self._database.execute(_NEXT_TERM)
+            await self._database.commit()
+            return await self._newest_term()
+        except sqlite3.Error as error:
+            await self._roll_back()
+            raise StoreError(f"cannot write the store: {error}") from error
+
+    async def _newest_term(self) -> int:
+        async with self._database.execute("SELECT term FROM lease") as cursor:
+            row = await cursor.fetchone()
+        return int(row[0]) if row else 0
+
+    async def save(self, rows: Sequence[Row], term: int = 0) -> None:
         """Write rows in one transaction.
 
         Raises:
+            StaleTermError: A newer term was begun; nothing was written.
             StoreError: Nothing was written.
         """
         self._check_that_it_is_there()
         puts = [(row.table, row.key, row.body) for row in rows if row.body is not None]
         deletes = [(row.table, row.key) for row in rows if row.body is None]
         try:
+            await self._database.execute("BEGIN IMMEDIATE")
+            newest = await self._newest_term()
+            if term < newest:
+                await self._roll_back()
+                raise StaleTermError(term, newest)
             await self._database.executemany(_DELETE, deletes)
             await self._database.executemany(_PUT, puts)
             await self._database.commit()
@@ -151,7 +184,13 @@ async def _prepare(database: aiosqlite.Connection, path: Path) -> None:
         await database.execute(_SCHEMA)
         await database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         await database.commit()
+    elif version == _CONVERTIBLE:
+        # Set before anything is converted: the release that wrote it must not open what is half converted.
+        await database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        await database.commit()
     elif version != SCHEMA_VERSION:
         raise StoreError(
             f"the store {path} has version {version}, this program reads version {SCHEMA_VERSION}"
         )
+    await database.execute(_LEASE)
+    await database.commit()

@@ -1,8 +1,16 @@
-"""Conversions that would hold the event loop for too long: queues of them, and processes that do them."""
+"""Conversions that would block the event loop for too long: their queues and worker processes."""
 
-from rce_robot.conversion.exceptions import ConversionFailed
 from rce_robot.conversion.jobs import ReadText, ReadValue, Result, Show
 from rce_robot.conversion.pool import ConversionPool
 from rce_robot.conversion.queue import ConversionQueue
+from rce_robot.exceptions import ConversionFailedError
 
-__all__ = ["ConversionFailed", "ConversionPool", "ConversionQueue", "ReadText", "ReadValue", "Result", "Show"]
+__all__ = [
+    "ConversionFailedError",
+    "ConversionPool",
+    "ConversionQueue",
+    "ReadText",
+    "ReadValue",
+    "Result",
+    "Show",
+]

@@ -1,7 +1,7 @@
-"""What a worker process is asked and what it answers, as bytes.
+"""The requests and answers of a worker process, as bytes.
 
-A packet is a header, the lengths of its parts, a part of MessagePack that describes it, and parts that are
-passed on as they are: texts, payloads, binary values.
+A packet is a header, the lengths of its parts, a part of MessagePack that describes it, and raw parts: texts,
+payloads, binary values.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ MAX_PARTS = 8192
 
 
 class ReadText(msgspec.Struct, frozen=True, kw_only=True, tag_field="job", tag="text"):
-    """Parse a data message and serialize what it carries. Parts: the text, then its binary values."""
+    """Parse a data message and serialize its content. Parts: the text, then its binary values."""
 
     i_tag: str
-    type: str
-    """As they were found in the text; ``type`` may be empty."""
-    cls: str
+    stated_type: str
+    """As they were found in the text; ``stated_type`` may be empty."""
+    message_type: str
     interface_type: str
     ids: tuple[str, ...] = ()
     """Of the binary values."""
 
 
 class ReadValue(msgspec.Struct, frozen=True, kw_only=True, tag_field="job", tag="value"):
-    """Serialize a message that was parsed already. Part: the value in MessagePack."""
+    """Serialize a parsed message. Part: the value in MessagePack."""
 
-    cls: str
+    message_type: str
     interface_type: str
 
 
@@ -44,7 +44,7 @@ class Show(msgspec.Struct, frozen=True, kw_only=True, tag_field="job", tag="show
     """Make the data message that carries a payload to the robot. Part: the payload."""
 
     i_tag: str
-    cls: str
+    message_type: str
     interface_type: str
     msg_id: str
 
@@ -53,20 +53,20 @@ Job: TypeAlias = ReadText | ReadValue | Show
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
-    """What became of a job.
+    """The result of a job.
 
     Parts: of a read, the serialized message; of :class:`Show`, the text and its binary frames, ids included;
     none if there is a fault.
     """
 
     fault: str = ""
-    """Why there is no result, for the robot."""
+    """Why the job failed, for the robot."""
     warnings: tuple[str, ...] = ()
     ids: tuple[str, ...] = ()
-    """Binary values that the text refers to and that must come first."""
+    """Binary values that the text refers to and that are still missing."""
     msg_id: str = ""
     text: str | None = None
-    """The message was a string: a service's word for why it failed."""
+    """The message was a string: a service's error text."""
 
 
 encode_meta = msgspec.msgpack.Encoder().encode

@@ -1,7 +1,7 @@
 """Shares a few worker processes among users: in turn, one job of a user at a time while others wait.
 
-There is no process before the first job, and none is left when there was no job for a while. A process that
-takes too long for a job is killed, and so ends what a message made it do.
+Processes start with the first job, and end after a time without jobs. A process that takes too long for a job
+is killed.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rce_robot.conversion.exceptions import ConversionFailed
+from rce.aio.tasks import BackgroundTasks
 from rce_robot.conversion.process import WorkerProcess
+from rce_robot.exceptions import ConversionFailedError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,12 +29,12 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConversionSettings:
-    """How large messages are converted."""
+    """The settings of conversions of large messages."""
 
     workers: int = max(2, min(3, (os.cpu_count() or 1) - 1))
-    """Processes at most. A user has one fewer, so that there is one for others."""
+    """Maximum number of processes. One user has one fewer, so that one remains for others."""
     memory: int = 512 << 20
-    """What one process may use while it converts, in bytes: the largest messages need about 300 MB."""
+    """Bytes that one process may use while it converts: the largest messages need about 300 MB."""
     timeout: float = 10.0
     """Seconds that one conversion may take."""
     idle: float = 10.0
@@ -50,9 +51,9 @@ class _Order:
     answer: asyncio.Future[tuple[Result, list[memoryview]]]
 
     def refuse(self, _: object = None) -> None:
-        """Tell the one who waits that the pool is closed, if there was no answer yet."""
+        """Tell the waiting caller that the pool is closed, if it has no answer yet."""
         if not self.answer.done():
-            self.answer.set_exception(ConversionFailed("the robot endpoint is shutting down"))
+            self.answer.set_exception(ConversionFailedError("the robot endpoint is shutting down"))
 
 
 class ConversionPool:
@@ -62,7 +63,7 @@ class ConversionPool:
 
     Args:
         packages: Folders with packages that define messages.
-        settings: How many processes, and what each may use.
+        settings: The number of processes and their limits.
 
     Attributes:
         killed: How many conversions were given up because they took too long.
@@ -78,27 +79,27 @@ class ConversionPool:
         self._idle: dict[WorkerProcess, asyncio.TimerHandle] = {}
         self._count = 0
         self._alive: set[WorkerProcess] = set()
-        """All whose end was not seen yet."""
-        self._tasks: set[asyncio.Task[None]] = set()
+        """All processes whose end was not observed yet."""
+        self._tasks = BackgroundTasks()
         self._closed = False
         self.killed = 0
 
     async def convert(self, user: str, job: Job, parts: Sequence[Buffer]) -> tuple[Result, list[memoryview]]:
-        """Do a job when it is the user's turn. A job that nobody waits for any more is not begun.
+        """Do a job when it is the user's turn. A job whose caller was cancelled is not begun.
 
         Args:
-            user: Whose message it is.
-            job: What to do.
+            user: The user of the message.
+            job: The job.
             parts: The bytes that belong to it.
 
         Raises:
-            ConversionFailed: Too many of the user's wait, it took too long, or too much memory.
+            ConversionFailedError: Too many of the user's jobs wait, or it took too long or too much memory.
         """
         if self._closed:
-            raise ConversionFailed("the robot endpoint is shutting down")
+            raise ConversionFailedError("the robot endpoint is shutting down")
         orders = self._waiting.setdefault(user, deque())
         if len(orders) >= self._settings.waiting:
-            raise ConversionFailed(f"{len(orders)} large messages wait to be converted already")
+            raise ConversionFailedError(f"{len(orders)} large messages wait to be converted already")
         order = _Order(user, job, parts, asyncio.get_running_loop().create_future())
         orders.append(order)
         self._go_on()
@@ -106,22 +107,19 @@ class ConversionPool:
             return await order.answer
         finally:
             self._withdraw(order)
-            del order  # its error refers to this frame, and so to the message, until the collector comes
+            del order  # its error refers to this frame, and so to the message, until it is collected
 
     async def close(self) -> None:
-        """End all processes; what waits fails."""
+        """End all processes; waiting jobs fail."""
         self._closed = True
         for orders in self._waiting.values():
             for order in orders:
                 order.refuse()
         self._waiting.clear()
-        for task in self._tasks:
-            task.cancel()
-        if self._tasks:
-            await asyncio.wait(self._tasks)
         for timer in self._idle.values():
             timer.cancel()
         self._idle.clear()
+        await self._tasks.close()
         for worker in list(self._alive):  # those too whose end was cut short above
             await self._end(worker)
 
@@ -133,7 +131,7 @@ class ConversionPool:
             del self._waiting[order.user]
 
     def _go_on(self) -> None:
-        """Begin what can be begun."""
+        """Begin as many jobs as possible."""
         while not self._closed and (order := self._next()) is not None:
             if self._idle:
                 worker, timer = self._idle.popitem()
@@ -143,9 +141,7 @@ class ConversionPool:
                 self._alive.add(worker)
                 self._count += 1
             self._running[order.user] += 1
-            task = asyncio.get_running_loop().create_task(self._serve(worker, order))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            task = self._tasks.spawn(self._serve(worker, order), name=f"conversion for {order.user}")
             task.add_done_callback(order.refuse)  # a task cancelled before its first step did not
 
     def _next(self) -> _Order | None:
@@ -163,16 +159,16 @@ class ConversionPool:
         return None
 
     async def _serve(self, worker: WorkerProcess, order: _Order) -> None:
-        """Have an order done; afterwards the worker is idle, or gone."""
+        """Do an order; afterwards the worker is idle or has ended."""
         sound = False
         try:
             result = await self._do(worker, order)
             sound = True
             if not order.answer.done():
                 order.answer.set_result(result)
-        except (ConversionFailed, OSError) as error:
+        except (ConversionFailedError, OSError) as error:
             if not order.answer.done():
-                order.answer.set_exception(ConversionFailed(str(error)))
+                order.answer.set_exception(ConversionFailedError(str(error)))
         finally:
             order.refuse()
             self._running -= Counter([order.user])
@@ -193,17 +189,15 @@ class ConversionPool:
         except TimeoutError as error:
             self.killed += 1
             _log.warning("user %s: a conversion was given up after %g s", order.user, self._settings.timeout)
-            raise ConversionFailed(
+            raise ConversionFailedError(
                 f"converting the message takes more than {self._settings.timeout:g} s"
             ) from error
 
     def _retire(self, worker: WorkerProcess) -> None:
-        """End a process that had nothing to do for a while."""
+        """End a process that had no job for a while."""
         if self._idle.pop(worker, None) is not None:
             self._count -= 1
-            task = asyncio.get_running_loop().create_task(self._end(worker))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            self._tasks.spawn(self._end(worker), name="end of an idle converter")
 
     async def _end(self, worker: WorkerProcess) -> None:
         await worker.end()

@@ -1,4 +1,4 @@
-"""A worker process as the event loop sees it."""
+"""The event loop's side of a worker process."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import sys
 from typing import TYPE_CHECKING
 
 from rce.buffers import unfilled
-from rce_robot.conversion.exceptions import ConversionFailed
 from rce_robot.conversion.jobs import HEAD, MAX_PARTS, decode_result, pack
+from rce_robot.exceptions import ConversionFailedError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,7 +30,7 @@ class WorkerProcess:
 
     Args:
         packages: Folders with packages that define messages.
-        memory: What it may use, in bytes.
+        memory: Bytes that it may use.
     """
 
     def __init__(self, packages: Sequence[Path], memory: int) -> None:
@@ -42,14 +42,14 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int:
-        """Of the process; 0 before it is there."""
+        """The pid; 0 before the process exists."""
         return 0 if self._process is None else self._process.pid
 
     async def start(self) -> None:
         """Start the process and wait until it is ready.
 
         Raises:
-            ConversionFailed: It does not become ready.
+            ConversionFailedError: It does not become ready.
         """
         ours, theirs = socket.socketpair()
         loop = asyncio.get_running_loop()
@@ -79,13 +79,13 @@ class WorkerProcess:
             async with asyncio.timeout(_START_TIMEOUT_S):
                 await self._reader.ready
         except TimeoutError as error:
-            raise ConversionFailed("the process that converts large messages does not start") from error
+            raise ConversionFailedError("the process that converts large messages does not start") from error
 
     async def do(self, job: Job, parts: Sequence[Buffer]) -> tuple[Result, list[memoryview]]:
         """Do a job.
 
         Raises:
-            ConversionFailed: The process ended.
+            ConversionFailedError: The process ended.
         """
         assert self._transport is not None
         answer = self._reader.expect()
@@ -94,7 +94,7 @@ class WorkerProcess:
         return decode_result(meta), received
 
     async def end(self) -> None:
-        """Kill the process and wait until it is gone."""
+        """Kill the process and wait until it has ended."""
         if self._transport is not None:
             self._transport.abort()
         if self._process is not None:
@@ -104,7 +104,7 @@ class WorkerProcess:
 
 
 class _PacketReader(asyncio.BufferedProtocol):
-    """Reads packets straight into memory of their size."""
+    """Reads packets directly into memory of their size."""
 
     def __init__(self) -> None:
         loop = asyncio.get_running_loop()
@@ -115,7 +115,7 @@ class _PacketReader(asyncio.BufferedProtocol):
         self._begin(1)
 
     def expect(self) -> asyncio.Future[list[memoryview]]:
-        """Return the parts of the next packet, when they are there."""
+        """Wait for the next packet; return its parts."""
         self._answer = asyncio.get_running_loop().create_future()
         if self._lost:
             self._fail()
@@ -128,24 +128,26 @@ class _PacketReader(asyncio.BufferedProtocol):
         return self._view[self._filled :]
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Go on with the next part when one is full."""
+        """Continue with the next part when one is full."""
         self._filled += nbytes
         while self._filled == len(self._view):
             self._part_received(self._view)
 
-    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - that it ended is enough
-        """Fail what waits."""
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - the reason is not needed
+        """Fail the waiting call."""
         self._lost = True
         if not self.ready.done():
             self.ready.set_exception(
-                ConversionFailed("the process that converts large messages does not start")
+                ConversionFailedError("the process that converts large messages does not start")
             )
         self._fail()
 
     def _fail(self) -> None:
         if self._answer is not None and not self._answer.done():
             self._answer.set_exception(
-                ConversionFailed("the process that converted the message ended; it may need too much memory")
+                ConversionFailedError(
+                    "the process that converted the message ended; it may need too much memory"
+                )
             )
 
     def _begin(self, size: int) -> None:
@@ -159,13 +161,13 @@ class _PacketReader(asyncio.BufferedProtocol):
         elif self._sizes is None:
             (count,) = HEAD.unpack(part)
             if count > MAX_PARTS:
-                raise ConversionFailed(f"a worker answered with {count} parts")
+                raise ConversionFailedError(f"a worker answered with {count} parts")
             self._sizes = []
             self._begin(8 * count)
         elif not self._sizes:
             self._sizes = list(struct.unpack(f"!{len(part) // 8}Q", part))
             if sum(self._sizes) > _MAX_PACKET:
-                raise ConversionFailed(f"a worker answered with {sum(self._sizes)} bytes")
+                raise ConversionFailedError(f"a worker answered with {sum(self._sizes)} bytes")
             self._begin(self._sizes[0])
         else:
             self._parts.append(part)

@@ -1,4 +1,4 @@
-"""The conversions of one interface that are left to other processes: in order, and not many."""
+"""A short, ordered queue of the conversions of one interface in other processes."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 Out = TypeVar("Out")
 
 MAX_WAITING = 4
-"""Messages that wait for their conversion; more would only grow old."""
+"""Messages that wait for their conversion; more would only become stale."""
 
 
 class QueueOwner(Protocol):
-    """What a queue needs of the robot it belongs to."""
+    """The interface of a queue to its robot."""
 
     def run(self, work: Coroutine[Any, Any, None]) -> bool:
-        """Run something until the robot leaves; False (and nothing done) if too much runs already."""
+        """Run a coroutine until the robot leaves; return False (without effect) if too many run already."""
 
     def hold(self, size: int, give_up: Callable[[], object] | None = None) -> Holding:
         """Count bytes that are held; see :class:`rce.guard.holdings.Holdings`."""
@@ -41,12 +41,12 @@ class _Entry(Generic[Out]):
 
 
 class ConversionQueue(Generic[Out]):
-    """The conversions of one interface in one direction. The oldest that waits gives way to a new one.
+    """The conversions of one interface in one direction. If the queue is full, a new one replaces the oldest.
 
     Args:
         owner: The robot.
-        deliver: Called with what each conversion returned, in order.
-        dropped: Called for each message that is thrown away because memory is short.
+        deliver: Called with the result of each conversion, in order.
+        dropped: Called for each message that is dropped because memory is short.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class ConversionQueue(Generic[Out]):
 
     @property
     def busy(self) -> bool:
-        """Whether something is being converted: what comes now must wait, so that it stays in order."""
+        """Whether a conversion runs: new messages must wait, to keep the order."""
         return self._run != 0
 
     def put(self, size: int, work: Callable[[], Awaitable[Out]]) -> bool:
@@ -73,7 +73,7 @@ class ConversionQueue(Generic[Out]):
             work: Does it; must not raise.
 
         Returns:
-            False if a message had to be thrown away for it, or if it was itself.
+            False if another message was dropped for it, or this one was dropped.
         """
         room = len(self._waiting) < MAX_WAITING
         if not room:
@@ -93,7 +93,7 @@ class ConversionQueue(Generic[Out]):
         return room
 
     def clear(self) -> None:
-        """Forget what waits, because what ran has ended with the robot's connection."""
+        """Drop the waiting conversions, because the running one has ended with the robot's connection."""
         for entry in self._waiting:
             entry.release()
         self._waiting.clear()

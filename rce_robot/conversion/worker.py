@@ -1,8 +1,7 @@
 """A process that converts large messages: ``python -m rce_robot.conversion.worker FD MEGABYTES PACKAGES``.
 
-It reads jobs from a socket and answers them one after the other, until the socket ends. It gives way to the
-process that started it: the kernel lets it run when there is nothing more urgent, and ends it first when
-memory is short.
+It reads jobs from a socket and answers them one after the other, until the socket is closed. It has a lower
+priority than the process that started it, and the kernel kills it first when memory is short.
 """
 
 from __future__ import annotations
@@ -15,16 +14,16 @@ import socket
 import struct
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, assert_never
 
 import msgspec
 
 from rce.buffers import unfilled
-from rce.control.model import InterfaceSpec
 from rce.link import InterfaceError
+from rce.model.names import InterfaceType
+from rce.model.specs import InterfaceSpec
 from rce.protocol.exceptions import ProtocolError
 from rce.protocol.large import read_large
-from rce.protocol.names import InterfaceType
 from rce.protocol.weight import Address
 from rce.ros.packages import PackageIndex
 from rce.ros.tcpros.allocator import give_back_free_memory
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     from rce_robot.outgoing import Buffer
 
 MAX_TEXT = 64 << 20
-"""Longest text that is sent to a robot, in bytes; clients take no longer ones."""
+"""Longest text that is sent to a robot, in bytes; clients do not accept longer ones."""
 _NICE = 10
 _MAX_WARNINGS = 256
 
@@ -50,7 +49,7 @@ class Worker:
 
     Args:
         factory: Makes the forms of interfaces.
-        memory: What the process may use, in bytes, for the words of a fault.
+        memory: Bytes that the process may use, for error texts.
     """
 
     def __init__(self, factory: FormFactory, memory: int) -> None:
@@ -58,7 +57,7 @@ class Worker:
         self._memory = memory
 
     def do(self, job: Job, parts: list[bytes]) -> tuple[Result, list[Buffer]]:
-        """Do a job; what is wrong with the message is in the result."""
+        """Do a job; the result holds faults of the message."""
         try:
             match job:
                 case ReadText():
@@ -67,6 +66,8 @@ class Worker:
                     return self._read(job, msgspec.msgpack.decode(parts[0]), "")
                 case Show():
                     return self._show(job, parts[0])
+                case _:
+                    assert_never(job)
         except (UnreadableError, ProtocolError, InterfaceError) as error:
             return Result(fault=str(error)), []
         except MemoryError:
@@ -75,11 +76,11 @@ class Worker:
 
     def _read_text(self, job: ReadText, parts: list[bytes]) -> tuple[Result, list[Buffer]]:
         binaries = dict(zip(job.ids, parts[1:], strict=True))
-        message = read_large(parts[0], binaries, Address(job.i_tag, job.type))
+        message = read_large(parts[0], binaries, Address(job.i_tag, job.stated_type))
         if isinstance(message, list):
             return Result(ids=tuple(message)), []
-        if message.type != job.cls:
-            raise UnreadableError(f"carries {job.cls}, not {message.type}")
+        if message.message_type != job.message_type:
+            raise UnreadableError(f"carries {job.message_type}, not {message.message_type}")
         if isinstance(message.msg, str):
             return Result(text=message.msg[:4096], msg_id=message.msg_id), []
         return self._read(job, message.msg, message.msg_id)
@@ -94,7 +95,7 @@ class Worker:
 
     def _show(self, job: Show, payload: bytes) -> tuple[Result, list[Buffer]]:
         form = self._forms(job)[1]
-        outgoing = form.pack(job.i_tag, job.cls, job.msg_id, form.show(payload))
+        outgoing = form.pack(job.i_tag, job.message_type, job.msg_id, form.show(payload))
         assert isinstance(outgoing, Outgoing)  # a Forwarder's payload is never heavy
         if len(outgoing.text) > MAX_TEXT:
             size = len(outgoing.text) >> 20
@@ -106,7 +107,9 @@ class Worker:
 
     def _forms(self, job: Job) -> tuple[Form, Form]:
         type_ = InterfaceType.parse(job.interface_type)
-        return self._factory.pair(InterfaceSpec(tag="", type=job.interface_type, cls=job.cls), type_)
+        return self._factory.pair(
+            InterfaceSpec(tag="", type=job.interface_type, message_type=job.message_type), type_
+        )
 
 
 def serve(sock: socket.socket, worker: Worker) -> None:
@@ -124,7 +127,7 @@ def serve(sock: socket.socket, worker: Worker) -> None:
         for buffer in packet:
             sock.sendall(buffer)
         del packet, buffer
-        gc.collect()  # what an error's traceback holds is a cycle
+        gc.collect()  # an error's traceback holds a reference cycle
         give_back_free_memory()
 
 
@@ -136,7 +139,7 @@ def _need(sock: socket.socket, size: int) -> bytes:
 
 
 def _receive(sock: socket.socket, size: int) -> bytes | None:
-    """Read so many bytes; None if the socket ends before the first."""
+    """Read a number of bytes; return None if the socket is closed before the first."""
     if not size:
         return b""
     memory = unfilled(size)
@@ -153,12 +156,12 @@ def _receive(sock: socket.socket, size: int) -> bytes | None:
 
 
 def _give_way(memory: int) -> None:
-    """Use no more than this memory, and be the first to wait and to end."""
+    """Limit the memory of this process, lower its priority, and let the kernel kill it first."""
     resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
     os.nice(_NICE)
-    with contextlib.suppress(OSError):  # a system that does not let it; the limit of memory holds
+    with contextlib.suppress(OSError):  # not permitted on this system; the limit of memory still holds
         Path("/proc/self/oom_score_adj").write_text("800")
-    gc.disable()  # a message is a tree; looking for cycles in it takes longer than to parse it
+    gc.disable()  # a message is a tree; a search for cycles takes longer than parsing it
 
 
 def main() -> None:
@@ -170,7 +173,7 @@ def main() -> None:
     with socket.socket(fileno=int(fd)) as sock:
         gc.freeze()
         sock.sendall(b"\0")
-        with contextlib.suppress(EOFError, ConnectionError):  # the endpoint is gone: so is the work
+        with contextlib.suppress(EOFError, ConnectionError):  # the endpoint has ended
             serve(sock, Worker(FormFactory(types), memory))
 
 

@@ -52,7 +52,7 @@ def make_writer(
 
 
 class _JsonReading:
-    """Values that were read become JSON values."""
+    """Converts read values to JSON values."""
 
     def __init__(self, customs: Mapping[str, CustomConverter]) -> None:
         self._customs = customs
@@ -66,7 +66,7 @@ class _JsonReading:
         return f"{write}({secs}, {nsecs})"
 
     def octets(self, code: Code, chunk: str) -> str:
-        # A view, not a copy: what is big in a message is here.
+        # A view, not a copy: large data is here.
         return f"{code.bind(memoryview)}(b){chunk.removeprefix('b')}"
 
     def numbers(self, code: Code, field: Field, chunk: str) -> str:
@@ -80,7 +80,7 @@ class _JsonReading:
 
 
 class _JsonWriting:
-    """Values are taken from JSON objects; missing fields have their defaults, unknown ones are noted."""
+    """Takes values from JSON objects; missing fields get their defaults, unknown ones are noted."""
 
     def __init__(self, customs: Mapping[str, CustomConverter]) -> None:
         self._customs = customs
@@ -129,7 +129,7 @@ class _JsonWriting:
 
 
 def _check_number(code: Code, field: Field, value: str) -> None:
-    """Add what tells numbers, bools and strings apart; ranges are checked where the numbers are packed."""
+    """Add the checks of numbers, bools and strings; ranges are checked where the numbers are packed."""
     if field.type == "bool":
         code.line(f"elif {value} is not True and {value} is not False: raise Refused")
     elif NUMBERS[field.type].is_float:

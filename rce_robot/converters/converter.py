@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING, Any
 
 from rce.ros.types.codegen import FAULTS
 from rce.ros.types.faults import read_fault
-from rce.ros.types.message import LARGE
+from rce.ros.types.fields import LARGE
 from rce_robot.converters.codec import make_reader, make_writer
 from rce_robot.converters.custom import load_custom_converters
-from rce_robot.converters.exceptions import ConversionError
 from rce_robot.converters.faults import find_fault, unknown_fields
+from rce_robot.exceptions import ConversionError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -54,7 +54,7 @@ class Converter:
 
     @property
     def is_costly(self) -> bool:
-        """Whether a conversion may take long, because a custom converter takes part."""
+        """Whether a conversion may take long, because it includes a custom converter."""
         names = {self.kind.name, *(needed.name for needed in self.kind.dependencies)}
         return not names.isdisjoint(self._customs)
 
@@ -62,14 +62,14 @@ class Converter:
         """Turn a JSON value into the message's bytes.
 
         Args:
-            value: As it came from the robot, binary values in their places.
+            value: The robot's value, with binary values in their places.
 
         Returns:
             The serialized message, and the paths of unknown fields, such as ``header.foo`` or
             ``poses[].bar``, each once.
 
         Raises:
-            ConversionError: It is no message of the type; names the field.
+            ConversionError: It is not a message of the type; names the field.
         """
         notes: list[bool] = []
         try:
@@ -87,11 +87,11 @@ class Converter:
         """Turn a message's bytes into its JSON form.
 
         Returns:
-            An object of the fields, or what the class's custom converter makes. Binary values in it are
+            An object of the fields, or the result of the class's custom converter. Binary values in it are
             ``memoryview`` (of ``payload``, which must not change while they are used) or ``bytes``.
 
         Raises:
-            ConversionError: The bytes are no message of the type.
+            ConversionError: The bytes are not a message of the type.
         """
         if len(payload) > LARGE:
             payload = memoryview(payload)

@@ -1,4 +1,4 @@
-"""Message types that travel in a form of their own, by entry points.
+"""Custom forms of message types, registered by entry points.
 
 A distribution adds a custom converter with an entry point of the group ``rce.converters``, whose name is the
 message class and whose value is a class that :class:`CustomConverter` describes::
@@ -16,28 +16,28 @@ ENTRY_POINTS = "rce.converters"
 """The entry point group."""
 
 _SHIPPED = {"sensor_msgs/Image": "rce_robot.converters.image:ImageConverter"}
-"""Converters that are there also where the package runs without being installed."""
+"""Converters that exist even if the package is not installed."""
 
 
 class CustomConverter(Protocol):
     """Between a message's fields in JSON form and another form of it.
 
-    It is used for a message of its class wherever it stands: as a whole, as a field, in an array.
+    It is used for every message of its class: as a whole, as a field, in an array.
     """
 
     def encode(self, fields: dict[str, Any]) -> Any:
-        """Return what leaves: a binary value, any JSON value, or the fields as they are."""
+        """Return the form to send: a binary value, any JSON value, or the unchanged fields."""
 
     def decode(self, value: Any) -> dict[str, Any]:
-        """Return the fields of what came. JSON objects do not come here: they are fields already.
+        """Return the fields of a received form. Not called for JSON objects: they are fields already.
 
         Raises:
-            ValueError: It is no form of the message; the text says why.
+            ValueError: It is not a form of the message; the text says why.
         """
 
 
 def load_custom_converters() -> dict[str, CustomConverter]:
-    """Return a converter of each class that has its own; what is installed wins over what is shipped."""
+    """Return the converter of each class that has one; installed converters override shipped ones."""
     from importlib.metadata import entry_points
 
     found: dict[str, CustomConverter] = {

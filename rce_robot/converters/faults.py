@@ -6,9 +6,9 @@ import struct
 from typing import TYPE_CHECKING, Any
 
 from rce.ros.types.values import NUMBERS
-from rce_robot.converters.exceptions import ConversionError
 from rce_robot.converters.stamps import duration_from_json, time_from_json
 from rce_robot.converters.values import BINARY, describe, to_octets
+from rce_robot.exceptions import ConversionError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -21,7 +21,7 @@ def find_fault(kind: MessageType, value: Any, customs: Mapping[str, CustomConver
     """Walk a JSON object that could not be converted.
 
     Raises:
-        ConversionError: Of the first field whose value does not fit. Returns if there is none.
+        ConversionError: For the first field whose value does not fit. Returns if all fit.
     """
     if not isinstance(value, dict):
         custom = customs.get(kind.name)

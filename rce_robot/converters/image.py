@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 MAX_PIXELS = 1 << 25
 """Largest image that is decoded: a small file can hold a huge one."""
 MAX_BYTES = 64 << 20
-"""The same for its pixels in memory; a larger message is not passed on."""
+"""The same for its pixels in memory; larger messages are refused."""
 
 _FAST = 1
 """Level of PNG compression; more costs much time and saves little on camera images."""
@@ -50,7 +50,7 @@ _LAYOUTS = {
     **{f"bayer_{order}8": _GREY for order in ("rggb", "bggr", "gbrg", "grbg")},
 }
 _ENCODINGS = {"L": "mono8", "I;16": "mono16", "RGB": "rgb8", "RGBA": "rgba8"}
-"""The encoding of a picture that says nothing about it, by Pillow's mode."""
+"""The default encoding of a picture, by Pillow's mode."""
 
 
 class ImageConverter:

@@ -1,9 +1,9 @@
 """``time`` and ``duration`` as JSON.
 
 A time is an ISO 8601 string in UTC with microseconds and without a zone, ``2013-09-02T12:00:00.000000``,
-which is what the original engine's clients read; a zone is understood when it comes, UTC is meant when it
-does not. A duration is a number of seconds. Both may come as ``{"secs": ..., "nsecs": ...}``, which keeps
-the nanoseconds.
+which is what the original engine's clients read; a received time may have a zone; without one it is UTC. A
+duration is a number of seconds. Both may come as ``{"secs": ..., "nsecs": ...}``, which keeps the
+nanoseconds.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def time_to_json(secs: int, nsecs: int) -> str:
-    """Write a time."""
+    """Format a time."""
     if nsecs >= _NANOSECONDS:
         secs, nsecs = secs + nsecs // _NANOSECONDS, nsecs % _NANOSECONDS
     return f"{_to_second(secs)}.{nsecs // 1000:06d}"
@@ -28,7 +28,7 @@ def time_to_json(secs: int, nsecs: int) -> str:
 
 @lru_cache(maxsize=256)
 def _to_second(secs: int) -> str:
-    # Messages of one second are many; the date is the costly part.
+    # Many messages have the same second; the date is the expensive part.
     return (_EPOCH + timedelta(seconds=secs)).strftime("%Y-%m-%dT%H:%M:%S")
 
 
@@ -36,7 +36,7 @@ def time_from_json(value: Any) -> tuple[int, int]:
     """Read a time into seconds and nanoseconds.
 
     Raises:
-        ValueError: It is no time, or not one between 1970 and 2106.
+        ValueError: It is not a time, or not one between 1970 and 2106.
     """
     if value.__class__ is dict:
         return _parts(value, "time", 0, 0xFFFFFFFF)
@@ -56,7 +56,7 @@ def time_from_json(value: Any) -> tuple[int, int]:
 
 
 def duration_to_json(secs: int, nsecs: int) -> float:
-    """Write a duration: the float nearest to it."""
+    """Return a duration as the nearest float."""
     return (secs * _NANOSECONDS + nsecs) / _NANOSECONDS
 
 
@@ -64,7 +64,7 @@ def duration_from_json(value: Any) -> tuple[int, int]:
     """Read a duration into seconds and nanoseconds; the nanoseconds are never negative.
 
     Raises:
-        ValueError: It is no duration, or out of range.
+        ValueError: It is not a duration, or out of range.
     """
     if value.__class__ is dict:
         return _parts(value, "duration", -0x80000000, 0x7FFFFFFF)
@@ -97,5 +97,5 @@ def _parts(value: dict[str, Any], kind: str, low: int, high: int) -> tuple[int, 
 
 
 def _whole(value: Any) -> Any:
-    """Make an integer of a number without fraction; anything else is left for the check."""
+    """Convert a number without fraction to an integer; leave other values for the check."""
     return int(value) if value.__class__ is float and value.is_integer() else value

@@ -1,7 +1,7 @@
-"""JSON values of single fields, to what is packed and back.
+"""Conversions between JSON values of single fields and packed values.
 
-Floats: JSON has no word for NaN and the infinities. They leave as floats and become ``null`` when the message
-is written as text; ``null`` is read as NaN.
+Floats: JSON cannot represent NaN and the infinities. They stay floats and become ``null`` when the message is
+written as text; ``null`` is read as NaN.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rce.ros.types.faults import short
 from rce.ros.types.values import Number
 
 BINARY = (bytes, bytearray, memoryview)
-"""What a binary value may come as."""
+"""The types of a received binary value."""
 
 _INTEGERS = frozenset({int})
 _FLOATS = frozenset({int, float})
@@ -27,7 +27,7 @@ _BOOLS = frozenset({bool})
 
 
 def to_float(value: Any) -> float:
-    """Read a number that is not a float already."""
+    """Convert a value that is not a float to a float."""
     if value.__class__ is int:
         return float(value)
     if value is None:
@@ -72,7 +72,7 @@ def number_packer(number: Number) -> Callable[[Any], bytes]:
 
 
 def _integers(values: list[Any] | tuple[Any, ...]) -> Any:
-    """Read numbers without fraction; what holds nothing but integers is returned as it is."""
+    """Read numbers without fraction; return a list of only integers unchanged."""
     if _INTEGERS.issuperset(map(type, values)):
         return values
     return [value if value.__class__ is int else to_integer(value) for value in values]
@@ -93,7 +93,7 @@ def unpack_list(code: str, chunk: Any) -> list[Any]:
 
 
 def describe(value: Any) -> str:
-    """Name a value as one who reads JSON knows it."""
+    """Return the JSON name of a value's type."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, BINARY):

@@ -10,7 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.engine import Program, free_ports, running_engine
+from support.engine import Program, running_engine
+from support.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
 ASK = ROOT / "tests" / "support" / "ask.py"

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 from support.engine import Program, running_engine, until
-from support.leaks import Traces, sweep_cgroups
 from support.ports import free_ports
 from support.stranger import ask_for_echo, stranger
+
+from tools.leaks import Traces, sweep_cgroups
 
 pytestmark = [pytest.mark.e2e]
 
@@ -99,7 +100,7 @@ async def test_end_of_containers_whose_manager_hangs(runtime: str) -> None:
             "import asyncio, pathlib, sys; from rce_container.ending import end_containers;"
             "from rce_container.settings import ContainerSettings;"
             "settings = ContainerSettings(machine='vm');"
-            "asyncio.run(end_containers(settings, pathlib.Path(sys.argv[1]), patience=0.1))"
+            "asyncio.run(end_containers(settings, pathlib.Path(sys.argv[1]), timeout=0.1))"
         )
         folder = str(engine.folder / "container")
         ender = Program("end", [sys.executable, "-P", "-c", code, folder], engine.env, engine.folder)

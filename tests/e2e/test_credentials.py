@@ -36,7 +36,7 @@ class Site:
         self.session = session
         self.said: dict[str, list[str]] = {}
 
-    async def api(self, method: str, path: str, body: Any = None, status: int = 204) -> Any:
+    async def api(self, method: str, path: str, body: object = None, status: int = 204) -> Any:
         headers = {"Authorization": f"Bearer {self.engine.token()}"}
         url = f"{self.engine.url}api/v1{path}"
         async with self.session.request(method, url, json=body, headers=headers) as reply:

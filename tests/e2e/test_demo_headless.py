@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,10 @@ import pytest
 from support.demo import clean_folder, environment, run_headless, running_demo
 from support.engine import command_line, engine_processes, until
 
-from rce_fleet.demo.exceptions import StationAwayError
-from rce_fleet.demo.floor import draw
-from rce_fleet.demo.station import StationApi
+from rce_fleet.demo.scenario import choose_scenario
 from rce_fleet.drivers.report import read_report
+from rce_fleet.exceptions import StationUnavailableError
+from rce_fleet.station.client import StationClient
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("pymunk")]
 
@@ -93,11 +94,11 @@ async def test_blocked_cells_never_cut_off_a_goal(tmp_path: Path, cells: int) ->
     assert all(robot["reached"] for robot in report["robots"])
 
 
-async def test_a_run_that_is_too_short_says_so() -> None:
+async def test_run_that_times_out_reports_it() -> None:
     code, report, text = await run_headless("--robots", 1, timeout=1)
     assert code == 1
     assert report["ok"] is False
-    assert "the time of 1 s is over" in text
+    assert "timeout: the run was not complete after 1 s" in text
     assert report["robots"][0]["reached"] is False
 
 
@@ -133,11 +134,11 @@ async def test_sigterm_ends_a_demo_that_is_still_starting() -> None:
         assert b"1 robots" in await process.stdout.readline()
         process.send_signal(signal.SIGTERM)
         assert b"stopped" in await asyncio.wait_for(process.stdout.read(), 30)
-        assert await process.wait() == 1, "a run that was ended early is no good run"
+        assert await process.wait() == 1, "a run that was ended early is not a good run"
 
 
 @pytest.mark.parametrize("runtime", RUNTIMES)
-async def test_robots_go_on_when_parts_of_the_engine_are_killed(runtime: str) -> None:
+async def test_robots_continue_after_parts_of_the_engine_are_killed(runtime: str) -> None:
     async with running_demo("--robots", 2, "--runtime", runtime) as demo:
         (report,) = demo.folder.glob("rce-demo-*/world.json")
 
@@ -145,7 +146,10 @@ async def test_robots_go_on_when_parts_of_the_engine_are_killed(runtime: str) ->
             found = read_report(report)
             return sum(robot.distance_m for robot in found.robots) if found else 0.0
 
-        await until(lambda: driven() > 0.5, timeout=30, what="robots drive")
+        def has_driven(metres: float) -> bool:
+            return driven() > metres
+
+        await until(lambda: has_driven(0.5), timeout=30, what="robots drive")
         for part in ("rce_robot", "rce_master", "rce_container.environment", "rce_container"):
             victims = [
                 process
@@ -156,7 +160,7 @@ async def test_robots_go_on_when_parts_of_the_engine_are_killed(runtime: str) ->
             victims[0].kill()
             before = driven()
             await until(
-                lambda before=before: driven() > before + 1.5,
+                partial(has_driven, before + 1.5),
                 timeout=60,
                 what=f"robots drive on after {part} was killed",
             )
@@ -165,18 +169,18 @@ async def test_robots_go_on_when_parts_of_the_engine_are_killed(runtime: str) ->
         assert found.collisions.total == 0
 
 
-async def test_a_planner_that_is_killed_comes_back_and_knows_what_was_wanted() -> None:
+async def test_killed_planner_returns_with_goals_and_blocked_cells() -> None:
     async with (
         running_demo("--robots", 1, "--seed", 2, "--runtime", "process", "--no-auto") as demo,
         aiohttp.ClientSession() as session,
     ):
-        station = StationApi(session, demo.page)
+        station = StationClient(session, demo.page)
         await until(lambda: states(station, "idle"), timeout=30, what="the robot is in its place")
         (robot,) = (await station.fleet()).robots
-        scenario = draw(1, 2)
+        scenario = choose_scenario(1, 2)
         known = {*scenario.starts, *scenario.goals, *scenario.boxes}
         corner = next(cell for cell in scenario.grid.free if cell not in known)
-        await station.block(corner, blocked=True)
+        await station.set_blocked(corner, blocked=True)
         await station.set_goal(robot.id, scenario.goals[0])
         await until(lambda: states(station, "driving"), timeout=30, what="the robot drives")
         (planner,) = [
@@ -191,9 +195,9 @@ async def test_a_planner_that_is_killed_comes_back_and_knows_what_was_wanted() -
         assert corner in fleet.blocked
 
 
-async def states(station: StationApi, wanted: str) -> bool:
+async def states(station: StationClient, wanted: str) -> bool:
     try:
         fleet = await station.fleet()
-    except StationAwayError:
+    except StationUnavailableError:
         return False
     return bool(fleet.robots) and all(robot.state == wanted for robot in fleet.robots)

@@ -7,6 +7,7 @@ import contextlib
 import re
 import shutil
 from collections.abc import Awaitable
+from functools import partial
 from typing import Any
 
 import aiohttp
@@ -17,9 +18,9 @@ from support.engine import engine_processes, until
 from support.ports import free_port
 
 from rce.ros.xmlrpc import RpcClient
-from rce_fleet.demo.exceptions import StationError
-from rce_fleet.demo.floor import draw
-from rce_fleet.demo.station import StationApi
+from rce_fleet.demo.scenario import choose_scenario
+from rce_fleet.exceptions import StationError
+from rce_fleet.station.client import StationClient
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("pymunk")]
 
@@ -32,7 +33,7 @@ MODES = [("cloud",), ("single",), ("multi",), ("multi", "--machines", "ports")]
 def check(code: int, report: dict[str, Any], text: str, mode: str) -> None:
     """The fleet of the seed is at the goals of the seed."""
     assert code == 0, text
-    scenario = draw(ROBOTS, SEED)
+    scenario = choose_scenario(ROBOTS, SEED)
     assert report["mode"] == mode
     assert [
         (robot["id"], robot["start_cell"], robot["goal_cell"], robot["reached"]) for robot in report["robots"]
@@ -46,7 +47,7 @@ def check(code: int, report: dict[str, Any], text: str, mode: str) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES, ids=" ".join)
-async def test_the_same_fleet_goes_to_the_same_goals(mode: tuple[str, ...]) -> None:
+async def test_each_mode_drives_the_same_fleet_to_the_same_goals(mode: tuple[str, ...]) -> None:
     options = ("--mode", *mode, "--robots", ROBOTS, "--seed", SEED)
     check(*await run_headless(*options, timeout=TIMEOUT_S), mode=mode[0])
 
@@ -60,7 +61,7 @@ async def test_single_with_a_real_roscore() -> None:
 async def test_the_page_of_a_single_core_and_its_end() -> None:
     options = ("--mode", "single", "--robots", 1, "--core-port", free_port(), "--no-auto")
     async with running_demo(*options) as demo, aiohttp.ClientSession() as session:
-        station = StationApi(session, demo.page)
+        station = StationClient(session, demo.page)
 
         await until(lambda: _is(_state(station), "idle"), timeout=30, what="the robot is in its place")
         (robot,) = (await station.fleet()).robots
@@ -78,7 +79,7 @@ async def test_the_page_of_a_single_core_and_its_end() -> None:
         assert news["state"]["robots"][0]["state"] == "arrived"
 
 
-async def test_machines_of_many_masters_share_only_what_they_must() -> None:
+async def test_machines_share_only_the_synced_topics() -> None:
     async with (
         running_demo("--mode", "multi", "--robots", 2, "--no-auto") as demo,
         RpcClient() as rpc,
@@ -106,7 +107,7 @@ async def test_machines_of_many_masters_share_only_what_they_must() -> None:
         await until(lambda: _holds(published("planner"), heard), timeout=20, what="the planner hears all")
         at_robot = {"/Robot1/goalNodesList", "/Robot1/cancelGoal", "/Robot1/odom"}
         await until(lambda: _holds(published("Robot1"), at_robot), timeout=20, what="the robot hears it")
-        station = StationApi(session, demo.page)
+        station = StationClient(session, demo.page)
         await until(lambda: _is(_state(station), "idle"), timeout=30, what="lists are answered")
         assert await foreign("planner") == heard
         assert await foreign("Robot1") == {"/Robot1/goalNodesList", "/Robot1/cancelGoal"}
@@ -117,7 +118,7 @@ async def test_machines_of_many_masters_share_only_what_they_must() -> None:
 async def test_a_killed_planner_and_a_killed_move_client_come_back(mode: str) -> None:
     options = ("--mode", mode, "--robots", 2, "--core-port", free_port(), "--no-auto")
     async with running_demo(*options) as demo, aiohttp.ClientSession() as session:
-        station = StationApi(session, demo.page)
+        station = StationClient(session, demo.page)
         await until(lambda: _is(_state(station), "idle"), timeout=40, what="the robot is in its place")
         fleet = await station.fleet()
         assert fleet.map is not None
@@ -137,14 +138,14 @@ async def test_a_killed_planner_and_a_killed_move_client_come_back(mode: str) ->
             await _send(station, "Robot1", cell)
             kill_program(demo.process.pid, *words)
             await until(
-                lambda cell=cell: _arrives(station, "Robot1", cell),  # type: ignore[misc]
+                partial(_arrives, station, "Robot1", cell),
                 timeout=80,
                 what=f"Robot1 is at cell {cell}",
             )
-        assert demo.output().count("is started again") == 2
+        assert demo.output().count("restarting it") == 2
 
 
-async def _send(station: StationApi, robot: str, cell: int) -> None:
+async def _send(station: StationClient, robot: str, cell: int) -> None:
     """Send a robot to a cell, as soon as the planner can be asked."""
     async with asyncio.timeout(30):
         while True:
@@ -156,7 +157,7 @@ async def _send(station: StationApi, robot: str, cell: int) -> None:
                 return
 
 
-async def _arrives(station: StationApi, robot: str, cell: int) -> bool:
+async def _arrives(station: StationClient, robot: str, cell: int) -> bool:
     with contextlib.suppress(StationError):
         return any(
             (one.id, one.cell, one.goal, one.state) == (robot, cell, cell, "arrived")
@@ -165,7 +166,7 @@ async def _arrives(station: StationApi, robot: str, cell: int) -> bool:
     return False
 
 
-async def _state(station: StationApi) -> str:
+async def _state(station: StationClient) -> str:
     with contextlib.suppress(StationError):
         fleet = await station.fleet()
         return fleet.robots[0].state if fleet.robots else ""
@@ -173,7 +174,7 @@ async def _state(station: StationApi) -> str:
 
 
 @pytest.mark.parametrize("mode", ["single", "multi"])
-async def test_nothing_is_left_when_the_demo_is_killed(mode: str) -> None:
+async def test_killed_demo_leaves_no_processes(mode: str) -> None:
     before = set(psutil.net_if_addrs())
     async with running_demo(
         *("--mode", mode, "--robots", 2, "--core-port", free_port(), "--no-auto")

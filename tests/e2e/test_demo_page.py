@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.async_api import Page, async_playwright
+from playwright.async_api import Page, ViewportSize, async_playwright
 from support.demo import Demo, running_demo
 
-from rce_fleet.demo.floor import FLOOR
+from rce_fleet.demo.scenario import FLOOR
 from rce_fleet.drivers.report import read_report
 from rce_fleet.planning.scenario import midway_cell
 
@@ -29,7 +29,7 @@ BROWSER = (
     "--disable-component-update",
     "--disable-sync",
 )
-DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
+DESKTOP, PHONE = ViewportSize(width=1280, height=800), ViewportSize(width=390, height=844)
 WAIT_MS = 40_000
 
 
@@ -40,7 +40,7 @@ def artifact(name: str) -> Path:
 
 
 @contextlib.asynccontextmanager
-async def opened(demo: Demo, viewport: Any = DESKTOP, *, expected: str = "") -> AsyncIterator[Page]:
+async def opened(demo: Demo, viewport: ViewportSize = DESKTOP, *, expected: str = "") -> AsyncIterator[Page]:
     """The page in a browser; what the browser complains of and is not ``expected`` fails the test."""
     complaints: list[str] = []
     async with async_playwright() as playwright:
@@ -171,6 +171,14 @@ async def test_the_page_shows_engine_and_refusals() -> None:
         engine = await page.locator("#engine").inner_text()
         assert "cTag_01 running" in engine
         assert "moveClient_1 running" in engine
+        # The station hears changes in place of whole states.
+        await page.wait_for_function(
+            """() => {
+                const tags = rceFleet.fleet.engine.connections.map(connection => connection.tag_a);
+                const has = tag => tags.includes(`cTag_fleet/${tag}`);
+                return has("fleetChanges") && has("getState") && !has("fleetState");
+            }"""
+        )
         wall = await page.evaluate("[...rceFleet.fleet.walls][0]")
         async with page.expect_response(lambda reply: f"/cells/{wall}" in reply.url) as answered:
             await click_cell(page, wall)

@@ -10,13 +10,13 @@ import pytest
 from support.demo import kill_program, running_demo
 from support.engine import until
 
-from rce_fleet.demo.exceptions import StationError
-from rce_fleet.demo.station import StationApi
+from rce_fleet.exceptions import StationError
+from rce_fleet.station.client import StationClient
 
 pytestmark = [pytest.mark.e2e]
 
 
-async def reaches(station: StationApi, robot: str, cell: int) -> None:
+async def reaches(station: StationClient, robot: str, cell: int) -> None:
     """Send a robot to a cell, again until the planner knows of it, and wait until it stands there."""
     async with asyncio.timeout(100):
         while True:
@@ -29,9 +29,9 @@ async def reaches(station: StationApi, robot: str, cell: int) -> None:
             await asyncio.sleep(0.5)
 
 
-async def test_killed_bridge_and_station_come_back_and_a_killed_world_is_named() -> None:
+async def test_killed_bridge_and_station_return_killed_world_is_named() -> None:
     async with running_demo("--robots", 2, "--no-auto") as demo, aiohttp.ClientSession() as session:
-        station = StationApi(session, demo.page)
+        station = StationClient(session, demo.page)
         fleet = await station.fleet()
         robot = fleet.robots[0]
         assert fleet.map is not None
@@ -40,7 +40,7 @@ async def test_killed_bridge_and_station_come_back_and_a_killed_world_is_named()
         kill_program(demo.process.pid, "rce_client.ros_bridge", f"{robot.id.lower()}.config")
         kill_program(demo.process.pid, "rce_fleet.station")
         await until(
-            lambda: demo.output().count("was ended by SIGKILL; it is started again") == 2,
+            lambda: demo.output().count("was ended by SIGKILL; restarting it") == 2,
             timeout=30,
             what="the demo tells what it starts again",
         )

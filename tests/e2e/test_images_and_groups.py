@@ -33,7 +33,8 @@ run(main())
 """
 
 
-async def test_a_robot_is_heard_in_an_image_and_answered_through_its_group() -> None:
+async def test_robot_reaches_image_and_group() -> None:
+    """A robot is heard in an image and answered through its group."""
     with tempfile.TemporaryDirectory(prefix="rce-", dir="/tmp") as name:
         folder = Path(name)
         folder.chmod(0o755)

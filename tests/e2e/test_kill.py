@@ -1,4 +1,4 @@
-"""Kill -9 of every part under traffic: what must go on goes on, what must come back comes back."""
+"""Kill -9 of every part under traffic: what must continue continues, what must come back comes back."""
 
 from __future__ import annotations
 

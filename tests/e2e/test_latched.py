@@ -168,15 +168,15 @@ async def test_latched_in_the_cloud_is_latched_at_the_robot(packages: Path, tmp_
 async def test_a_publisher_that_ends_takes_its_message_back(packages: Path, tmp_path: Path) -> None:
     """In both directions: only what the other one latched is left."""
     latcher = str(packages / "latches" / "scripts" / "latcher.py")
-    async with world(packages, tmp_path) as it, visitor(it.engine) as visit:
+    async with world(packages, tmp_path) as it, visitor(it.engine) as pending_login:
         await it.late("/map", "one_says", "two_says")
-        await visit.robot.send("CN", {"removeNodes": [{"containerTag": "box", "nodeTag": "two"}]})
+        await pending_login.robot.send("CN", {"removeNodes": [{"containerTag": "box", "nodeTag": "two"}]})
         await until(lambda: not it.nodes("two"), what="the node ended")
         await it.late("/map", "one_says")
         async with it.graph.program(latcher, "here", "/pose", "here_says", node="/here"):
             async with it.graph.program(latcher, "there", "/pose", "there_says", node="/there"):
-                await visit.late("here_says", "there_says")
-            await visit.late("here_says")
+                await pending_login.late("here_says", "there_says")
+            await pending_login.late("here_says")
 
 
 async def test_latched_at_the_robot_is_latched_in_the_cloud(packages: Path, tmp_path: Path) -> None:
@@ -191,12 +191,12 @@ async def test_latched_at_the_robot_is_latched_in_the_cloud(packages: Path, tmp_
             if part is not None:
                 await part.kill()
                 await part.start(timeout=90)
-            async with visitor(it.engine) as visit:
-                await visit.late("here_says", "there_says")
+            async with visitor(it.engine) as pending_login:
+                await pending_login.late("here_says", "there_says")
         for process in it.engine.processes_of("rce_container.environment"):
             os.kill(process.pid, signal.SIGKILL)
-        async with visitor(it.engine) as visit:
-            await visit.late("here_says", "there_says")
+        async with visitor(it.engine) as pending_login:
+            await pending_login.late("here_says", "there_says")
 
 
 async def test_latched_from_robot_to_robot(packages: Path, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from support.stranger import Stranger, stranger
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600), pytest.mark.needs("rospy", "roslaunch", "tf2")]
 
-PATIENCE_S = 120.0
+TIMEOUT_S = 120.0
 DOWN = (("map", MAP, "/map"), ("tf_down", TF, "/tf_static"))
 UP = (("local", MAP, "/local_map"), ("tf_up", TF, "/tf_static"), ("robot", STRING, "/robot_description"))
 CLOUD = ("server map /map cloud", "shelves tf /tf_static shelf", "docks tf /tf_static dock")
@@ -107,8 +107,8 @@ class Visitor:
         start = {"pkg": "latches", "exe": "listener.py", "args": " ".join((said.rstrip("."), *subjects))}
         await self.robot.send("CN", {"removeNodes": [name]})
         await self.robot.send("CN", {"addNodes": [{**name, **start}]})
-        async with asyncio.timeout(PATIENCE_S):
-            while not (text := (await self.robot.receive("heard", timeout=PATIENCE_S))["data"]).startswith(
+        async with asyncio.timeout(TIMEOUT_S):
+            while not (text := (await self.robot.receive("heard", timeout=TIMEOUT_S))["data"]).startswith(
                 said
             ):
                 print(text)  # noqa: T201 - what was heard in its place
@@ -123,7 +123,7 @@ async def visitor(engine: Engine, box: str) -> AsyncIterator[Visitor]:
         ]
         await robot.send("CN", {"addInterfaces": made})
         await robot.send("CX", {"connect": [{"tagA": f"visitor_{box}/heard", "tagB": f"{box}/heard"}]})
-        await robot.wait_status({"heard": True}, timeout=PATIENCE_S)
+        await robot.wait_status({"heard": True}, timeout=TIMEOUT_S)
         yield Visitor(robot, box)
 
 
@@ -139,7 +139,7 @@ async def restart(*programs: Program) -> None:
     for program in programs:
         await program.kill()
     for program in programs:
-        await program.start(timeout=PATIENCE_S)
+        await program.start(timeout=TIMEOUT_S)
 
 
 async def test_robot_and_container_hear_what_the_other_latched(tmp_path: Path) -> None:
@@ -159,19 +159,19 @@ async def test_robot_and_container_hear_what_the_other_latched(tmp_path: Path) -
         env = {**engine.env, "ROS_MASTER_URI": graph.uri}
         bridge = Program("rce-ros", [program, str(file)], env, engine.folder)
         stack.push_async_callback(bridge.stop)
-        await bridge.start(timeout=PATIENCE_S)
+        await bridge.start(timeout=TIMEOUT_S)
         listener = str(scripts / "listener.py"), AT_ROBOT, "map:/map", "tf:/tf_static"
         subjects = "map:/local_map", "string:/robot_description", "tf:/tf_static"
 
         await graph.says(*listener, text=f"{AT_ROBOT}.")
-        async with visitor(engine, "box") as visit:
-            await visit.late(f"{IN_CLOUD}.", *subjects)
+        async with visitor(engine, "box") as pending_login:
+            await pending_login.late(f"{IN_CLOUD}.", *subjects)
 
         await restart(*engine.robots, engine.container, bridge)
         kill_processes(engine, "rce_container.environment")
         await graph.says(*listener, text=AT_ROBOT)
-        async with visitor(engine, "box") as visit:
-            await visit.late(IN_CLOUD, *subjects)
+        async with visitor(engine, "box") as pending_login:
+            await pending_login.late(IN_CLOUD, *subjects)
 
 
 async def test_container_hears_what_another_one_latched(tmp_path: Path) -> None:
@@ -193,10 +193,10 @@ async def test_container_hears_what_another_one_latched(tmp_path: Path) -> None:
         await owner.send(
             "CX", {"connect": [{"tagA": f"source/{tag}", "tagB": f"target/{tag}"} for tag, _, _ in DOWN]}
         )
-        async with visitor(engine, "target") as visit:
-            await visit.late(f"{said}.", *subjects)
+        async with visitor(engine, "target") as pending_login:
+            await pending_login.late(f"{said}.", *subjects)
             kill_processes(engine, "latcher.py")
-            await visit.late(said, *subjects)
+            await pending_login.late(said, *subjects)
             await restart(engine.container)
             kill_processes(engine, "rce_container.environment")
-            await visit.late(said, *subjects)
+            await pending_login.late(said, *subjects)

@@ -138,7 +138,8 @@ async def hears(listener: Program, *, timeout: float = 90) -> None:
     )
 
 
-async def test_three_machines_find_each_other_and_survive_a_network_drop(folder: Path) -> None:
+async def test_three_machines_survive_a_network_drop(folder: Path) -> None:
+    """Three machines find each other and survive a network drop."""
     async with machines(3, folder) as (robot, station, other):
         for machine in (robot, station, other):
             await machine.core()
@@ -196,7 +197,7 @@ async def test_a_real_master_with_rospy_survives_a_network_drop(folder: Path) ->
         await hears(listener, timeout=60)
 
 
-async def test_one_connection_is_enough_where_nodes_cannot_reach_each_other(folder: Path) -> None:
+async def test_relay_needs_one_connection_only(folder: Path) -> None:
     """Cores and nodes have addresses that nobody but their own machine knows a way to, as behind a NAT."""
     async with machines(2, folder) as (robot, cloud):
         for machine, private in ((robot, "10.99.1.1"), (cloud, "10.99.2.1")):

@@ -174,13 +174,13 @@ async def test_who_has_a_robot_id_is_told_to_its_user(processes: int) -> None:
             program = str(Path(sys.executable).parent / "rce-ros")
             bridge = Program("rce-ros", [program, str(file)], engine.env, engine.folder)
             bridge.env = {**engine.env, "ROS_MASTER_URI": core.uri}
-            await bridge.start(ready="waiting until the robotID is free")
+            await bridge.start(ready="waiting until it is free")
             assert re.search(holder, bridge.output())
-            await until(lambda: bridge.output().count("robotID is free") > 1, what="it is said again")
+            await until(lambda: bridge.output().count("until it is free") > 1, what="it is said again")
             await bridge.stop()
 
 
-async def test_interfaces_of_one_endpoint_and_a_topic_in_both_directions() -> None:
+async def test_interfaces_of_one_endpoint_connect_both_ways() -> None:
     """As in the original engine: a robot with itself, a container with itself, and no echo of a bridge."""
     async with (
         running_engine() as engine,

@@ -12,13 +12,14 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from support.engine import Program, free_ports
+from support.engine import Program
+from support.ports import free_ports
 from support.rootfs import image_of
 
 ROOT = Path(__file__).parents[2]
 ASK = ROOT / "tests" / "support" / "ask.py"
 BIN = Path(sys.executable).parent
-PATIENCE_S = 300.0
+TIMEOUT_S = 300.0
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("root", "podman", "debootstrap"), pytest.mark.timeout(2400)]
 
@@ -129,9 +130,9 @@ async def test_robot_image_works_with_engine_image(images: dict[str, str], tmp_p
         "robot", run("--env", f"ROS_MASTER_URI={uri}", mount, images["robot"]), dict(os.environ), tmp_path
     )
     try:
-        await core.start(ready="ready:", timeout=PATIENCE_S)
-        await engine.start(ready="RCE ready:", timeout=PATIENCE_S)
-        await robot.start(ready="rce-ros ready:", timeout=PATIENCE_S)
+        await core.start(ready="ready:", timeout=TIMEOUT_S)
+        await engine.start(ready="RCE ready:", timeout=TIMEOUT_S)
+        await robot.start(ready="rce-ros ready:", timeout=TIMEOUT_S)
         asking = await asyncio.create_subprocess_exec(
             *("timeout", "180", sys.executable, "-P", str(ASK), "/stringEchoReq", "/stringEchoResp"),
             env=env,

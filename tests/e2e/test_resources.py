@@ -14,8 +14,8 @@ import pytest
 from support.engine import Engine, Program, running_engine, until
 
 from rce_client.connection import Connection
-from rce_client.ends import Publisher
 from rce_client.exceptions import RefusedError
+from rce_client.topics import Publisher
 
 pytestmark = [pytest.mark.e2e]
 
@@ -63,10 +63,12 @@ def machines(engine: Engine) -> dict[str, dict[str, Any]]:
     return {m["machine"]: m for m in engine.get("/api/v1/machines")["machines"] if m["kind"] == "container"}
 
 
-async def wire_echo(conn: Connection, box: str) -> tuple[Publisher[Any], asyncio.Queue[Any]]:
+async def wire_echo(
+    conn: Connection, box: str
+) -> tuple[Publisher[dict[str, Any]], asyncio.Queue[dict[str, Any]]]:
     await conn.add_node(box, "echo", "Test", "stringEcho.py", restart="on-failure")
     say = await conn.publisher("say", STRING)
-    hear: asyncio.Queue[Any] = asyncio.Queue()
+    hear: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
     await conn.subscriber("hear", STRING, hear.put_nowait)
     for tag, kind, topic in (
         ("say", "PublisherInterface", "/stringEchoReq"),
@@ -77,7 +79,9 @@ async def wire_echo(conn: Connection, box: str) -> tuple[Publisher[Any], asyncio
     return say, hear
 
 
-async def echoes(conn: Connection, ends: tuple[Publisher[Any], asyncio.Queue[Any]], text: str) -> None:
+async def echoes(
+    conn: Connection, ends: tuple[Publisher[dict[str, Any]], asyncio.Queue[dict[str, Any]]], text: str
+) -> None:
     """Wait until what is said comes back; a message that was under way while the container moved may not."""
     say, hear = ends
     async with asyncio.timeout(30):
@@ -92,7 +96,8 @@ async def echoes(conn: Connection, ends: tuple[Publisher[Any], asyncio.Queue[Any
                     return
 
 
-async def test_containers_find_their_machine_are_resized_and_handed_over() -> None:
+async def test_containers_are_placed_resized_handed_over() -> None:
+    """Containers find their machine are resized and handed over."""
     async with (
         running_engine() as engine,
         machine(engine, "m1", "--label", "gpu", "--slots", 2),

@@ -20,11 +20,11 @@ from rce.config.resources import examples_dir
 from rce.ros.errors import ServiceError
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
-from rce.ros.types import Time, TypeRegistry
+from rce.ros.types import Message, Time, TypeRegistry
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600), pytest.mark.needs("rospy", "roslaunch")]
 
-PATIENCE_S = 120.0
+TIMEOUT_S = 120.0
 STRING, CLOCK, ECHO = "std_msgs/String", "rosgraph_msgs/Clock", "Test/StringEcho"
 TIMES = """#!/usr/bin/python3
 import os
@@ -93,7 +93,7 @@ class Driver:
             clock.publish(clock=Time(self._now, 0))
             await asyncio.sleep(0.1)
 
-    def _hear(self, message: Any) -> None:
+    def _hear(self, message: Message) -> None:
         pid, secs = map(int, message.data.split())
         self._heard.put_nowait((pid, secs))
 
@@ -107,13 +107,13 @@ class Driver:
             The pid of the node.
         """
         begin = self._now
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(TIMEOUT_S):
             while True:
                 pid, secs = await self._heard.get()
                 if secs > begin and pid != not_pid:
                     break
         client = self.node.service_client("/of_the_cloud", ECHO)
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(TIMEOUT_S):
             while True:
                 try:
                     answer = await client.call({"data": f"at {begin}"}, timeout=10)
@@ -148,7 +148,7 @@ async def test_time_and_services_go_on_after_each_restart(tmp_path: Path) -> Non
         program = str(Path(sys.executable).parent / "rce-ros")
         env = {**engine.env, "ROS_MASTER_URI": graph.uri}
         bridge = Program("rce-ros", [program, str(file)], env, engine.folder)
-        await bridge.start(timeout=PATIENCE_S)
+        await bridge.start(timeout=TIMEOUT_S)
         try:
             async with driver(graph.uri) as drive:
                 pid = await drive.all_goes_on()
@@ -157,7 +157,7 @@ async def test_time_and_services_go_on_after_each_restart(tmp_path: Path) -> Non
                     pid = await drive.all_goes_on(not_pid=pid)
                 for part in (*engine.robots, engine.container, engine.master, bridge):
                     await part.kill()
-                    await part.start(timeout=PATIENCE_S)
+                    await part.start(timeout=TIMEOUT_S)
                     await drive.all_goes_on()
         finally:
             await bridge.stop()

@@ -7,7 +7,7 @@ import contextlib
 import hashlib
 import json
 import struct
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Coroutine
 from urllib.parse import urlencode, urlsplit
 
 import psutil
@@ -155,7 +155,7 @@ async def large_texts(engine: Engine) -> None:
         for number in range(6):
             data = f'{{"iTag":"out","type":"{STRING}","msgID":"nil","msg":{texts[number % 2]}}}'
             await talks.send(f'{{"type":"DM","data":{data}}}')
-            # An answer comes for each: the message itself, or that it is no message or one too many.
+            # An answer comes for each: the message itself, or that it is not a message or one too many.
             async with asyncio.timeout(60):
                 while json.loads(await talks.recv())["type"] not in {"DM", "ER"}:
                     pass
@@ -172,20 +172,26 @@ async def _read(socket: ClientConnection) -> None:
 
 
 def _established(engine: Engine) -> int:
-    return sum(c["established"] for c in engine.get("/api/v1/connections")["connections"])
+    return sum(int(c["established"]) for c in engine.get("/api/v1/connections")["connections"])
 
 
 @pytest.mark.parametrize("attack", [requests_without_answer, topics_that_nobody_reads, halves, large_texts])
-async def test_the_limit_holds_whatever_holds_the_messages(attack: object) -> None:
+async def test_the_limit_holds_whatever_holds_the_messages(
+    attack: Callable[[Engine], Coroutine[None, None, None]],
+) -> None:
     async with running_engine(robot_options=("--user-memory", str(LIMIT_MB))) as engine:
         before, all_before = memory_mb(engine), memory_of_all_mb(engine)
-        assert callable(attack)
         peak = await peak_while(engine, asyncio.create_task(attack(engine)))
         print(f"before {before} MB, most {peak} MB")  # noqa: T201 - what was measured
         assert peak < before + LIMIT_MB + OVERHEAD_MB
-        held = lambda: float(_gauge(engine.get("/metrics"), "rce_task_set_held_bytes"))  # noqa: E731
+
+        def held() -> float:
+            return float(_gauge(engine.get("/metrics"), "rce_task_set_held_bytes"))
+
+        def left() -> float:
+            return memory_of_all_mb(engine) - all_before
+
         await until(lambda: held() < MB, what="the gauge falls when nothing is held")
-        left = lambda: memory_of_all_mb(engine) - all_before  # noqa: E731
         await until(lambda: left() < LEFT_MB, what=f"less than {LEFT_MB} MB are left, not {left()}")
 
 

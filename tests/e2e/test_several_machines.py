@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.e2e, pytest.mark.needs("root", "netns"), pytest.mark.t
 PAGE = Path(__file__).parents[2] / "docs/how-to/several-machines.md"
 ASK = Path(__file__).parents[1] / "support" / "ask.py"
 MACHINES = ("master", "robots", "containers", "robot")
-PATIENCE_S = 120.0
+TIMEOUT_S = 120.0
 PASSWORD = "a password of alice"
 
 
@@ -63,7 +63,7 @@ class Machine:
         argv = [*self.prefix, "bash", "-euc", f"cd; exec {command}"]
         program = Program(f"{self.name}-{command.split(maxsplit=1)[0]}", argv, self.env, self.home)
         stack.push_async_callback(_end, program)
-        await program.start(ready=ready, timeout=PATIENCE_S)
+        await program.start(ready=ready, timeout=TIMEOUT_S)
         return program
 
 
@@ -115,7 +115,7 @@ async def test_how_to_for_several_machines(folder: Path) -> None:
                 listing = await master.run("COLUMNS=200 rce machines")
                 return "robots" in listing and "containers" in listing
 
-            await until(both_there, timeout=PATIENCE_S, what="both machines are listed")
+            await until(both_there, timeout=TIMEOUT_S, what="both machines are listed")
             config = page["robot.config"][0].replace("PASSWORD", PASSWORD)
             (robot.home / "robot.config").write_text(config)
             await robot.serve(stack, "rce core", "ready:")

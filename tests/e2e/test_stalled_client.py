@@ -133,7 +133,7 @@ def established(engine: Engine) -> int:
 
 def dropped_at_the_stalled_client(engine: Engine) -> int:
     interfaces = engine.get("/api/v1/interfaces")["interfaces"]
-    return next(i["dropped"] for i in interfaces if i["endpoint"] == "stalled")
+    return next(int(i["dropped"]) for i in interfaces if i["endpoint"] == "stalled")
 
 
 async def newest_image(socket: ClientConnection) -> int:

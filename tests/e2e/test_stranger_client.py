@@ -7,7 +7,7 @@ import struct
 
 import pytest
 from support.engine import running_engine
-from support.stranger import PATIENCE_S, check_echo, stranger, wire_echo
+from support.stranger import TIMEOUT_S, check_echo, stranger, wire_echo
 
 from rce_client.connection import Connection
 
@@ -58,7 +58,7 @@ async def test_faults_are_told_and_nothing_else_is_lost() -> None:
         await check_echo(client, "still here")
 
 
-async def test_serialized_echo_in_one_frame_beside_a_client_that_knows_two() -> None:
+async def test_echo_in_one_frame_beside_two_frame_client() -> None:
     """Both are connected to one container's topics; a client that did not ask sees nothing new."""
     text = struct.pack("<I", 5) + b"hello"
     topics = (("say", "Publisher", "/stringEchoReq"), ("hear", "Subscriber", "/stringEchoResp"))
@@ -77,7 +77,7 @@ async def test_serialized_echo_in_one_frame_beside_a_client_that_knows_two() -> 
             await asking.add_interface("box", tag, f"{role}Interface", STRING, addr=topic)
             await asking.connect(f"asking/{tag}", f"box/{tag}")
         for tag in ("say", "hear"):
-            await asking.wait_active(tag, PATIENCE_S)
+            await asking.wait_active(tag, TIMEOUT_S)
         for tag, kind in (("say", "SubscriberForwarder"), ("hear", "PublisherForwarder")):
             own = {"endpointTag": "plain", "interfaceTag": tag, "interfaceType": kind, "className": STRING}
             await plain.send("CN", {"addInterfaces": [own]})

@@ -6,6 +6,7 @@ import asyncio
 import json
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ pytestmark = [
 
 BIN = Path(sys.executable).parent
 UNITS = ("rce-master", "rce-robot", "rce-container")
-PATIENCE_S = 120.0
+TIMEOUT_S = 120.0
 
 SETTINGS = """\
 master: {bind: 127.0.0.1}
@@ -48,13 +49,13 @@ async def install(machine: Booted) -> None:
         stdin="wonderland\n",
     )
     said = await machine.run_soon(f"{BIN}/rce install-service master")
-    assert "made the user rce" in said
+    assert "created the user rce" in said
     roles = [machine.run_soon(f"{BIN}/rce install-service {role}") for role in ("robot", "container")]
     assert "made /etc/systemd/system/rce-robot.service" in "".join(await asyncio.gather(*roles))
     for unit in UNITS:
         await until(
-            lambda unit=unit: f"{unit} ready: " in machine.journal(unit),  # type: ignore[misc]
-            timeout=PATIENCE_S,
+            partial(_is_ready, machine, unit),
+            timeout=TIMEOUT_S,
             what=f"{unit} is ready\n{machine.run(f'systemctl status {unit}', code=None)}",
         )
 
@@ -89,20 +90,24 @@ def node_pid(machine: Booted) -> int:
     return int(pids[0]) if len(pids) == 1 and container["state"] == "running" else 0
 
 
+def _is_ready(machine: Booted, unit: str) -> bool:
+    return f"{unit} ready: " in machine.journal(unit)
+
+
 async def test_services_survive_kills_and_reloads_and_stop_whole() -> None:
     async with booted() as machine:
         await install(machine)
         ask(machine, "POST", "/containers", {"tag": "box"})
         ask(machine, "POST", "/containers/box/nodes", NODE)
-        node = await until(lambda: node_pid(machine), timeout=PATIENCE_S, what="the node runs")
+        node = await until(lambda: node_pid(machine), timeout=TIMEOUT_S, what="the node runs")
         assert "/rce-container.service/" in machine.run(f"cat /proc/{node}/cgroup"), "it has no cgroup"
         await asyncio.gather(check_restart(machine, "rce-master"), check_restart(machine, "rce-robot"))
-        assert await until(lambda: node_pid(machine), timeout=PATIENCE_S, what="the master knows") == node
+        assert await until(lambda: node_pid(machine), timeout=TIMEOUT_S, what="the master knows") == node
         await check_reload(machine)
-        assert await until(lambda: node_pid(machine), timeout=PATIENCE_S, what="it is adopted") == node
+        assert await until(lambda: node_pid(machine), timeout=TIMEOUT_S, what="it is adopted") == node
         machine.run("kill -KILL $(systemctl show --value -p MainPID rce-container)")
         await until(
-            lambda: node_pid(machine) not in (0, node), timeout=PATIENCE_S, what="the container is made again"
+            lambda: node_pid(machine) not in (0, node), timeout=TIMEOUT_S, what="the container is made again"
         )
         check_stop(machine)
 
@@ -112,7 +117,7 @@ async def check_restart(machine: Booted, unit: str) -> None:
     before = machine.journal(unit).count(" ready: ")
     machine.run(f"kill -KILL {main_pid(machine, unit)}")
     await until(
-        lambda: machine.journal(unit).count(" ready: ") > before, timeout=PATIENCE_S, what=f"{unit} is back"
+        lambda: machine.journal(unit).count(" ready: ") > before, timeout=TIMEOUT_S, what=f"{unit} is back"
     )
 
 
@@ -130,7 +135,7 @@ async def check_reload(machine: Booted) -> None:
     await machine.run_soon("systemctl reload rce-container")
     await until(
         lambda: machine.journal("rce-container").count(" ready: ") > before,
-        timeout=PATIENCE_S,
+        timeout=TIMEOUT_S,
         what="rce-container is ready again",
     )
     assert main_pid(machine, "rce-container") == pid

@@ -14,20 +14,24 @@ import tempfile
 from collections.abc import AsyncIterator, Callable
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import aiohttp
 import pytest
 import pytest_asyncio
-from support.engine import command_line, engine_processes, free_ports, until
+from support.engine import command_line, engine_processes, until
+from support.ports import free_ports
 
 from rce.ros.core import Core
 from rce.tls import authority
+from rce.tls.authority import CERTIFICATE_DAYS
 from rce.tls.folder import CertificateFolder
 from rce_client import Connection
 from rce_client.exceptions import RefusedError
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("curl", "openssl")]
+
+T = TypeVar("T")
 
 BIN = Path(sys.executable).parent
 START_S = 120.0
@@ -157,7 +161,7 @@ async def stranger(world: World) -> AsyncIterator[aiohttp.ClientWebSocketRespons
             yield socket
 
 
-def frame(type_: str, **data: Any) -> str:
+def frame(type_: str, **data: object) -> str:
     return json.dumps({"type": type_, "data": data})
 
 
@@ -235,7 +239,7 @@ class OneSegment:
         self._reader = reader
         self._writer = writer
 
-    async def complete(self, step: Callable[[], Any]) -> Any:
+    async def complete(self, step: Callable[[], T]) -> T:
         """Do what needs the other end's answers."""
         while True:
             try:
@@ -369,7 +373,7 @@ async def test_certificate_for_another_name_is_refused(world: World) -> None:
 
 @in_world
 @pytest.mark.parametrize("certificate", ["none", "stranger's"])
-async def test_task_set_without_certificate_of_the_authority_is_refused(
+async def test_task_set_without_certificate_is_refused(
     world: World, tmp_path: Path, certificate: str
 ) -> None:
     """Although it knows the secret: the handshake ends before it can show one."""
@@ -407,8 +411,8 @@ def revoked(world: World, own: CertificateFolder) -> None:
     world.certificates.revoke("machine")
 
 
-def bring(of: CertificateFolder, own: CertificateFolder, **options: float) -> None:
-    of.issue("machine", **options)
+def bring(of: CertificateFolder, own: CertificateFolder, days: float = CERTIFICATE_DAYS) -> None:
+    of.issue("machine", days=days)
     for name in ("machine.pem", "machine.key"):
         (own.path / name).write_bytes((of.path / name).read_bytes())
 
@@ -422,7 +426,7 @@ def bring(of: CertificateFolder, own: CertificateFolder, **options: float) -> No
         (revoked, "our certificate was revoked"),
     ],
 )
-async def test_refused_task_set_says_what_is_wrong_with_its_certificate(
+async def test_refused_task_set_names_its_certificates_fault(
     world: World, tmp_path: Path, make: Callable[[World, CertificateFolder], None], words: str
 ) -> None:
     """At its own side, where the operator of that machine looks."""
@@ -510,7 +514,7 @@ async def test_task_set_with_certificate_and_wrong_secret_is_refused(world: Worl
 
 @in_world
 async def test_renewed_certificate_is_used_without_restart(world: World) -> None:
-    """Connections that are there go on with the old one; traffic flows the whole time."""
+    """Connections that are there continue with the old one; traffic flows the whole time."""
 
     async def serial(port: int) -> str:
         code, text = await world.run(
@@ -558,7 +562,7 @@ def replaced(folder: CertificateFolder, aside: Path) -> None:
 async def test_rce_ros_outlives_faults_of_the_certificate(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was connected once: it says what is wrong, keeps trying, and goes on when that is repaired."""
+    """It was connected once: it says what is wrong, keeps trying, and continues when that is repaired."""
     folder = world.certificates
     hosts = folder.details("engine").hosts
     file = tmp_path / "robot.config"
@@ -572,17 +576,18 @@ async def test_rce_ros_outlives_faults_of_the_certificate(
             stderr=asyncio.subprocess.PIPE,
             env=world.env,
         )
-        assert process.stdout is not None
-        assert process.stderr is not None
+        stdout, stderr = process.stdout, process.stderr
+        assert stdout is not None
+        assert stderr is not None
 
         async def told(words: str) -> None:
             async with asyncio.timeout(60):
-                while words not in (line := (await process.stderr.readline()).decode()):
+                while words not in (line := (await stderr.readline()).decode()):
                     assert line, f"rce-ros ended before it said {words!r}"
 
         try:
             async with asyncio.timeout(60):
-                assert b"rce-ros ready: robot patient" in await process.stdout.readline()
+                assert b"rce-ros ready: robot patient" in await stdout.readline()
             folder.issue("engine", hosts, days=-1)
             (endpoint,) = (
                 found for found in engine_processes(world.folder) if "rce_robot" in command_line(found)

@@ -10,14 +10,16 @@ import socket
 import sys
 import tempfile
 from collections.abc import AsyncIterator, Iterator
+from functools import partial
 from pathlib import Path
 
 import psutil
 import pytest
 from support.engine import Program, command_line, engine_processes, until
-from support.leaks import sweep_cgroups
 from support.ports import free_ports
 from support.stranger import check_echo, stranger, wire_echo
+
+from tools.leaks import sweep_cgroups
 
 pytestmark = [pytest.mark.e2e]
 
@@ -58,6 +60,11 @@ def pid_of(folder: Path, module: str) -> int | None:
     return None
 
 
+def _has_another(folder: Path, module: str, old: int) -> bool:
+    """Whether a program runs again with another pid."""
+    return pid_of(folder, module) not in (None, old)
+
+
 async def test_serves_robots_and_stops_on_ctrl_c(folder: Path) -> None:
     ports = free_ports(5)
     async with rce_up(folder, ports, "--runtime", "process") as up:
@@ -85,9 +92,7 @@ async def test_restarts_a_task_set_that_died(folder: Path) -> None:
             old = pid_of(folder, module)
             assert old is not None
             os.kill(old, signal.SIGKILL)
-            await until(
-                lambda m=module, o=old: pid_of(folder, m) not in (None, o), what=f"{module} is started again"
-            )
+            await until(partial(_has_another, folder, module, old), what=f"{module} is started again")
         await until(lambda: up.output().count("rce-robot ready") > 1, what="the robot task set is ready")
         async with stranger(url) as client:
             await wire_echo(client)

@@ -12,6 +12,7 @@ import shlex
 import subprocess
 import tempfile
 from collections.abc import AsyncIterator, Iterator
+from functools import partial
 from pathlib import Path
 
 from support.engine import until
@@ -152,7 +153,7 @@ async def booted() -> AsyncIterator[Booted]:
                 process.kill()
             await process.wait()
             for hierarchy in _hierarchies():
-                await until(lambda top=hierarchy / name: _remove(top), what=f"{name} is removed")  # type: ignore[misc]
+                await until(partial(_remove, hierarchy / name), what=f"{name} is removed")
 
 
 def _tail(fd: int) -> str:

@@ -1,6 +1,6 @@
 """Chaos: kill -9 of random processes of an engine at random moments of its containers' lives, by a seed.
 
-``python -m support.chaos RUNTIME SEED ROUNDS`` does it for as long as is wished.
+``python -m support.chaos RUNTIME SEED ROUNDS`` does it for as long as is asked.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ import signal
 import sys
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rce_container.environment import proc
 from support.engine import Engine, running_engine, until
-from support.leaks import Traces, footprint
 from support.stranger import ROBOT_TAGS, Stranger, ask_for_echo, check_echo, stranger
+from tools.leaks import Traces, footprint
 
 CONTAINERS = 3
 LONGEST_PAUSE_S = 0.4
@@ -43,14 +44,14 @@ class Customer:
     container: str
     robot: str
     client: Stranger
-    wishes: dict[str, Any]
+    requested: dict[str, Any]
     wants: bool = False
     count: int = 0
 
     async def create(self) -> None:
         self.wants = True
         await ask_for_echo(
-            self.client, self.container, self.robot, self.wishes, restart="always", maxRestarts=0
+            self.client, self.container, self.robot, self.requested, restart="always", maxRestarts=0
         )
 
     async def destroy(self) -> None:
@@ -137,7 +138,7 @@ class Chaos:
         """Ask for what is wanted, as clients do, until it is there."""
         for one in self.customers:
             if one.wants:
-                await until(lambda one=one: self._is_served(one), timeout=SETTLE_S, what=one.container)
+                await until(partial(self._is_served, one), timeout=SETTLE_S, what=one.container)
 
     async def _is_served(self, one: Customer) -> bool:
         await one.create()
@@ -145,7 +146,7 @@ class Chaos:
 
 
 def parts(traces: Traces) -> dict[str, list[int]]:
-    """The processes of containers and the nursery, by what they are."""
+    """The processes of containers and the fork server, by what they are."""
     found: dict[str, list[int]] = {}
     for process in traces.look():
         name = _part(process.pid)
@@ -162,8 +163,8 @@ def _part(pid: int) -> str:
     line = " ".join(words)
     names = {
         "rce-container-shim": "shim",
-        "rce_container.nursery.cradle": "cradle",
-        "rce_container.nursery": "nursery",
+        "rce_container.forkserver.nodes": "node fork server",
+        "rce_container.forkserver": "fork server",
         "rce_container.environment": "environment",
         "stringEcho.py": "node",
         "read -r word": "holder",
@@ -175,24 +176,26 @@ def _part(pid: int) -> str:
 
 @contextlib.asynccontextmanager
 async def customers(engine: Engine, *, groups: bool) -> AsyncIterator[list[Customer]]:
-    wishes = {"network": "group", "group": "crowd"} if groups else {}
+    requested = {"network": "group", "group": "crowd"} if groups else {}
     async with contextlib.AsyncExitStack() as stack:
         found = []
         for number in range(CONTAINERS):
             robot = f"robot{number}"
             client = await stack.enter_async_context(stranger(engine.url, robot=robot))
-            found.append(Customer(f"box{number}_{engine.http_port}", robot, client, wishes if number else {}))
+            found.append(
+                Customer(f"box{number}_{engine.http_port}", robot, client, requested if number else {})
+            )
         yield found
 
 
 def allowed(engine: Engine) -> set[int]:
-    """The processes that may run while there is no container: the programs, and the manager's nursery."""
-    nurseries = {
+    """The processes that may run while there is no container: the programs, and the manager's fork server."""
+    fork_servers = {
         one.pid
         for one in proc.table().values()
-        if one.parent == engine.container.pid and _part(one.pid) == "nursery"
+        if one.parent == engine.container.pid and _part(one.pid) == "fork server"
     }
-    return {program.pid for program in engine.programs} | nurseries
+    return {program.pid for program in engine.programs} | fork_servers
 
 
 async def run(runtime: str, seed: int, rounds: int, *, groups: bool) -> list[str]:

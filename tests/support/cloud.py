@@ -9,12 +9,13 @@ import tempfile
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack
 
 import msgspec
 
 from rce.config.secret import Secret
 from rce.control.messages import (
+    TYPED_REQUESTS,
     ClientReply,
     ClientRequest,
     Drop,
@@ -24,26 +25,34 @@ from rce.control.messages import (
     Left,
     Login,
     LoginReply,
+    PatchSpec,
+    PatchStatus,
     Put,
+    SpecWanted,
     Status,
     Sync,
     Usage,
 )
 from rce.control.model import (
+    PATCHES,
     ConnectionSpec,
     EndpointKind,
     EndpointSpec,
     EndpointState,
     EndpointStatus,
-    InterfaceSpec,
     LinkAddress,
     LinkSpec,
 )
+from rce.control.observed import ObservedStatus
 from rce.control.server import ControlServer
 from rce.link import Endpoint, Interface, LinkHub
-from rce.protocol.names import EndpointId, InterfaceType
+from rce.model.names import EndpointId, InterfaceType
+from rce.model.specs import InterfaceSpec
+from rce.protocol.requests import read_request, write_request
 from rce_robot.app import App
+from rce_robot.conversion.pool import ConversionSettings
 from rce_robot.settings import RobotSettings, SessionSettings
+from support.patches import patch_between
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
@@ -51,12 +60,34 @@ if TYPE_CHECKING:
     from rce.control.messages import ToMaster
     from rce.control.peer import Peer
     from rce.link import Buffer, Port
+    from rce.model.requests import Request
+
+T = TypeVar("T")
 
 SECRET = Secret("secret of the tests")
 PASSWORD = "testUser"
 DIGEST = hashlib.sha256(PASSWORD.encode()).hexdigest()
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MACHINE = "here"
+
+
+class Wiring(TypedDict, total=False):
+    """What a spec says of connections."""
+
+    interfaces: tuple[InterfaceSpec, ...]
+    links: tuple[LinkSpec, ...]
+    connections: tuple[ConnectionSpec, ...]
+
+
+class RobotOptions(TypedDict, total=False):
+    """Fields of :class:`rce_robot.settings.RobotSettings` that tests give."""
+
+    origins: tuple[str, ...]
+    login_timeout: float
+    user_memory: int
+    memory: int
+    strangers_per_address: int
+    conversion: ConversionSettings
 
 
 class Signal:
@@ -68,12 +99,17 @@ class Signal:
     def set(self) -> None:
         self._event.set()
 
-    async def until(self, condition: Callable[[], Any]) -> Any:
+    async def until(self, condition: Callable[[], T | None]) -> T:
         async with asyncio.timeout(15):
             while not (found := condition()):
                 self._event.clear()
                 await self._event.wait()
             return found
+
+
+def content_of(request: ClientRequest) -> Request:
+    """What a client asked for, whichever way the task set sent it."""
+    return read_request(request.type, request.data) if request.content is None else request.content
 
 
 class FakeMaster:
@@ -93,6 +129,10 @@ class FakeMaster:
         self.answer: Callable[[ClientRequest], Awaitable[tuple[str, ...]]] = self._agree
         self.peer: Peer | None = None
         self.url = ""
+        self.in_patches = False
+        """Whether it sends what changed of specs, and takes what changed of statuses."""
+        self.wanted: list[str] = []
+        """Of which robots whole specs were asked for."""
         self.silent = False
         """Whether it answers nothing, like a master that hangs."""
 
@@ -118,10 +158,13 @@ class FakeMaster:
             case Login():
                 peer.send(self._login(message))
             case ClientRequest():
-                self.requests.append((message.id, message.type, message.data))
+                assert (message.content is not None) is self.in_patches
+                self.requests.append((message.id, message.type, write_request(content_of(message))))
                 peer.send(ClientReply(request=message.request, errors=await self.answer(message)))
             case Status():
                 self.statuses[message.status.id] = message.status
+            case PatchStatus() | SpecWanted():
+                self._take_patching(peer, message)
             case Left():
                 self.inside.discard(message.id)
                 self.left.append(message.id)
@@ -135,6 +178,17 @@ class FakeMaster:
                 raise AssertionError(message)
         self.changed.set()
 
+    def _take_patching(self, peer: Peer, message: PatchStatus | SpecWanted) -> None:
+        if isinstance(message, SpecWanted):
+            self.wanted.append(message.id)
+            peer.send(Put(endpoint=self.specs[message.id]))
+            return
+        status = message.patch.status
+        observed = ObservedStatus(self.statuses[status.id])
+        assert status.number == observed.header.number + 1
+        observed.patch(message.patch)
+        self.statuses[status.id] = observed.whole
+
     def _login(self, message: Login) -> LoginReply:
         id_ = f"{message.user}/{message.robot}"
         if message.user not in self.users or message.password != DIGEST:
@@ -147,10 +201,12 @@ class FakeMaster:
     def spec(self, id_: str) -> EndpointSpec:
         return self.specs.setdefault(id_, EndpointSpec(id=id_, kind=EndpointKind.ROBOT, revision=1))
 
-    def put(self, id_: str, **changes: Any) -> None:
-        spec = self.spec(id_)
+    def put(self, id_: str, **changes: Unpack[Wiring]) -> None:
+        spec = former = self.spec(id_)
         self.specs[id_] = spec = msgspec.structs.replace(spec, revision=spec.revision + 1, **changes)
-        if self.peer is not None:
+        if self.peer is not None and self.in_patches:
+            self.peer.send(PatchSpec(patch=patch_between(former, spec)))
+        elif self.peer is not None:
             self.peer.send(Put(endpoint=spec))
 
     def drop(self, id_: str, reason: str) -> None:
@@ -163,7 +219,7 @@ class FakeMaster:
         return status is not None and status.state is EndpointState.RUNNING
 
 
-class End(Interface):
+class PeerInterface(Interface):
     """The container's end: notes what comes, answers requests."""
 
     def __init__(self, port: Port) -> None:
@@ -195,12 +251,16 @@ class End(Interface):
         self.losses += not active
         self.active.set()
 
+    async def until_active(self) -> None:
+        """Wait until it has a connection that is established."""
+        await self.active.until(lambda: self.is_active)
+
 
 class Cloud:
     """The master, one robot task set, one container."""
 
     def __init__(
-        self, master: FakeMaster, endpoint: Endpoint, ends: dict[str, End], address: LinkAddress
+        self, master: FakeMaster, endpoint: Endpoint, ends: dict[str, PeerInterface], address: LinkAddress
     ) -> None:
         self.master = master
         self.ends = ends
@@ -210,7 +270,9 @@ class Cloud:
         self._numbers = iter(range(1, 1000))
         self._container = EndpointSpec(id="testUser/cloud", kind=EndpointKind.CONTAINER, revision=1)
 
-    async def wire(self, tag: str, type_: str, cls: str, *, robot: str = "testRobot") -> End:
+    async def wire(
+        self, tag: str, type_: str, message_type: str, *, robot: str = "testRobot"
+    ) -> PeerInterface:
         """Make an interface of the robot and its complement in the container, joined."""
         kind = InterfaceType.parse(type_)
         id_ = f"testUser/{robot}"
@@ -218,9 +280,12 @@ class Cloud:
         number = next(self._numbers)
         peer_tag = f"{robot}_{tag}"
         peer = InterfaceSpec(
-            tag=peer_tag, type=f"{kind.role.complement.value}Interface", cls=cls, addr=f"/{tag}"
+            tag=peer_tag,
+            type=f"{kind.role.complement.value}Interface",
+            message_type=message_type,
+            addr=f"/{tag}",
         )
-        own = InterfaceSpec(tag=tag, type=type_, cls=cls)
+        own = InterfaceSpec(tag=tag, type=type_, message_type=message_type)
         self._container = _grown(
             self._container,
             peer,
@@ -237,10 +302,12 @@ class Cloud:
         self.master.put(id_, interfaces=spec.interfaces, links=spec.links, connections=spec.connections)
         return self.ends[peer_tag]
 
-    async def joined(self, tag: str, type_: str, cls: str, *, robot: str = "testRobot") -> End:
+    async def joined(
+        self, tag: str, type_: str, message_type: str, *, robot: str = "testRobot"
+    ) -> PeerInterface:
         """Wire, and wait until the connection is established."""
-        end = await self.wire(tag, type_, cls, robot=robot)
-        await end.active.until(lambda: end.is_active)
+        end = await self.wire(tag, type_, message_type, robot=robot)
+        await end.until_active()
         return end
 
 
@@ -258,14 +325,17 @@ def _grown(
 
 
 @asynccontextmanager
-async def running_cloud(session: SessionSettings | None = None, **settings: Any) -> AsyncIterator[Cloud]:
-    """Run it all on loopback."""
+async def running_cloud(
+    session: SessionSettings | None = None, *, in_patches: bool = False, **settings: Unpack[RobotOptions]
+) -> AsyncIterator[Cloud]:
+    """Run it all on loopback; ``in_patches`` with a master of this release, else with one of the former."""
     master = FakeMaster()
+    master.in_patches = in_patches
     folder = Path(tempfile.mkdtemp(dir="/tmp"))
-    ends: dict[str, End] = {}
+    ends: dict[str, PeerInterface] = {}
 
     def make(port: Port) -> Interface:
-        end = ends[port.spec.tag] = End(port)
+        end = ends[port.spec.tag] = PeerInterface(port)
         return end
 
     faults: list[str] = []
@@ -278,7 +348,12 @@ async def running_cloud(session: SessionSettings | None = None, **settings: Any)
         endpoint = Endpoint(id_, make, hub, on_change=lambda: None, on_fault=faults.append)
         stack.push_async_callback(endpoint.close)
         server = ControlServer(
-            SECRET, on_hello=master.on_hello, on_message=master.on_message, on_gone=master.on_gone, port=0
+            SECRET,
+            on_hello=master.on_hello,
+            on_message=master.on_message,
+            on_gone=master.on_gone,
+            port=0,
+            features=(TYPED_REQUESTS, PATCHES) if in_patches else (),
         )
         await stack.enter_async_context(server)
         cloud = Cloud(master, endpoint, ends, LinkAddress(machine=MACHINE, unix=str(folder / "s")))
@@ -289,7 +364,7 @@ async def running_cloud(session: SessionSettings | None = None, **settings: Any)
 
 @asynccontextmanager
 async def running_robots(
-    cloud: Cloud, control_port: int, session: SessionSettings | None = None, **settings: Any
+    cloud: Cloud, control_port: int, session: SessionSettings | None = None, **settings: Unpack[RobotOptions]
 ) -> AsyncIterator[None]:
     """Run a robot task set for the cloud's master."""
     ready: asyncio.Queue[str] = asyncio.Queue()

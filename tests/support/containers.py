@@ -8,7 +8,7 @@ import os
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypedDict, TypeVar, Unpack
 
 import msgspec
 import pytest
@@ -31,28 +31,30 @@ from rce.control.model import (
     ConnectionSpec,
     EndpointKind,
     EndpointSpec,
+    EndpointState,
     EndpointStatus,
-    InterfaceSpec,
     LinkAddress,
     LinkSpec,
-    NodeSpec,
     NodeState,
+    NodeStatus,
 )
 from rce.link import Buffer, Endpoint, Interface, LinkHub, Port
-from rce.link.handover import Doorman
-from rce.protocol.names import EndpointId
-from rce_container.bundles.cache import BundleCache
-from rce_container.bundles.supply import Library
+from rce.link.handover import LinkAcceptor
+from rce.model.names import EndpointId
+from rce.model.specs import InterfaceSpec, NodeSpec
 from rce_container.environment import proc
 from rce_container.folder import Record, StateFolder
 from rce_container.limits import choose_limiter
 from rce_container.limits.files import children
 from rce_container.manager import Manager
+from rce_container.packages.cache import PackageCache
+from rce_container.packages.supply import Library
 from rce_container.runtimes.base import Runtime
-from rce_container.runtimes.namespace import NamespaceRuntime
+from rce_container.runtimes.namespace import HOME_BYTES, NamespaceRuntime
 from rce_container.runtimes.podman import PodmanRuntime
 from rce_container.runtimes.process import ProcessRuntime
 from rce_container.settings import ContainerSettings
+from support.parts import SpecParts
 
 MACHINE = "testmachine"
 RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]
@@ -113,9 +115,15 @@ NODES = {
 }
 
 
+T = TypeVar("T")
+
+
 async def until(
-    condition: Callable[[], Any], *, timeout: float = 60.0, what: str | Callable[[], object] = "condition"
-) -> Any:
+    condition: Callable[[], T | None],
+    *,
+    timeout: float = 60.0,
+    what: str | Callable[[], object] = "condition",
+) -> T:
     """Wait until ``condition`` gives something true, and return it."""
     deadline = time.monotonic() + timeout
     while not (found := condition()):
@@ -124,13 +132,35 @@ async def until(
     return found
 
 
+class ManagerOptions(TypedDict, total=False):
+    """Fields of :class:`rce_container.settings.ContainerSettings` that tests give."""
+
+    grace: float
+    interrupt_timeout: float
+    terminate_timeout: float
+    cleanup_timeout: float
+    starts_at_once: int
+    slot_memory: int
+    slot_processes: int
+
+
+class ContainerParts(SpecParts, total=False):
+    """What :func:`container` makes a spec of."""
+
+    peer: str
+    dial: LinkAddress | None
+
+
 class Machine:
     """A machine's disk, and the managers that run on it one after the other."""
 
-    def __init__(self, folder: Path, runtime: str, images: Sequence[str] = (), **options: Any) -> None:
+    def __init__(
+        self, folder: Path, runtime: str, images: Sequence[str] = (), home_bytes: int = HOME_BYTES
+    ) -> None:
         self.folder = folder
-        podman = PodmanRuntime(images, **options)
-        runtimes: tuple[Runtime, ...] = (NamespaceRuntime(**options), podman, ProcessRuntime())
+        podman = PodmanRuntime(images, home_bytes=home_bytes)
+        namespaces = NamespaceRuntime(home_bytes=home_bytes)
+        runtimes: tuple[Runtime, ...] = (namespaces, podman, ProcessRuntime())
         self.runtimes = {one.name: one for one in runtimes}
         self.runtime = self.runtimes[runtime]
         self.runtime.probe()
@@ -140,7 +170,7 @@ class Machine:
         (self.packages / "own" / "package.yaml").write_text("name: own\n")
         for name, text in NODES.items():
             (nodes / name).write_text(text)
-        self.library = Library(cache=BundleCache(folder / "bundles", self._fetch, space=1 << 30))
+        self.library = Library(cache=PackageCache(folder / "bundles", self._fetch, space=1 << 30))
         self.library.open()
         self.contents: dict[str, bytes] = {}
         """What its master hands out, by hash."""
@@ -159,15 +189,14 @@ class Machine:
         return Piece(found[offset : offset + 1000], len(found))
 
     @contextlib.asynccontextmanager
-    async def managed(self, **options: Any) -> AsyncIterator[Manager]:
+    async def managed(self, **options: Unpack[ManagerOptions]) -> AsyncIterator[Manager]:
         """Run a manager; it dies at the end of the block without a word to its containers."""
+        options.setdefault("interrupt_timeout", 5.0)
         settings = ContainerSettings(
-            machine=MACHINE,
-            packages=(self.packages, examples_dir()),
-            **{"usage_interval": 0.2, "interrupt_timeout": 5.0, **options},
+            machine=MACHINE, packages=(self.packages, examples_dir()), usage_interval=0.2, **options
         )
-        doorman = Doorman()
-        port = await doorman.listen("127.0.0.1", 0)
+        acceptor = LinkAcceptor()
+        port = await acceptor.listen("127.0.0.1", 0)
         with (
             StateFolder(self.folder / "state", self.folder / "run") as state,
             contextlib.closing(choose_limiter(state.token, state.cgroups)) as limiter,
@@ -180,7 +209,7 @@ class Machine:
                 runtimes=self.runtimes,
                 runtime=self.runtime,
                 state=state,
-                doorman=doorman,
+                acceptor=acceptor,
                 links=("127.0.0.1", port),
                 limiter=limiter,
                 library=self.library,
@@ -199,10 +228,10 @@ class Machine:
                 task.cancel()
                 waiting.cancel()
                 await asyncio.gather(task, waiting, return_exceptions=True)
-                await doorman.close()
+                await acceptor.close()
 
     @contextlib.asynccontextmanager
-    async def engine(self, **options: Any) -> AsyncIterator[Manager]:
+    async def engine(self, **options: Unpack[ManagerOptions]) -> AsyncIterator[Manager]:
         """Run a manager that ends properly, and check that nothing is left."""
         async with self.managed(**options) as manager:
             yield manager
@@ -221,11 +250,23 @@ class Machine:
     def status(self, id_: str) -> EndpointStatus | None:
         return next((status for status in self.manager.statuses if status.id == id_), None)
 
-    def node(self, id_: str, tag: str) -> Any:
+    def reported(self, id_: str) -> EndpointStatus:
+        """The newest status of a container that has one."""
+        status = self.status(id_)
+        assert status is not None, f"{id_} has no status"
+        return status
+
+    def node(self, id_: str, tag: str) -> NodeStatus | None:
         status = self.status(id_)
         return next((node for node in status.nodes if node.tag == tag), None) if status else None
 
-    def of(self, kind: type) -> list[Any]:
+    def reported_node(self, id_: str, tag: str) -> NodeStatus:
+        """The newest status of a node that has one."""
+        node = self.node(id_, tag)
+        assert node is not None, f"{id_}/{tag} has no status"
+        return node
+
+    def of(self, kind: type[T]) -> list[T]:
         return [message for message in self.told if isinstance(message, kind)]
 
     @property
@@ -238,7 +279,7 @@ class Machine:
 
     # What it is told
 
-    async def put(self, id_: str, revision: int = 1, **parts: Any) -> None:
+    async def put(self, id_: str, revision: int = 1, **parts: Unpack[ContainerParts]) -> None:
         await self.manager.handle(Put(endpoint=container(id_, revision, **parts)))
 
     async def drop(self, id_: str, revision: int = 100) -> None:
@@ -246,8 +287,8 @@ class Machine:
         await self.manager.handle(Drop(id=id_, revision=revision))
         await until(lambda: any(m.id == id_ for m in self.of(Gone)), what=f"{id_} is gone")
 
-    async def node_is(self, id_: str, tag: str, state: NodeState) -> Any:
-        def found() -> Any:
+    async def node_is(self, id_: str, tag: str, state: NodeState) -> NodeStatus:
+        def found() -> NodeStatus | None:
             node = self.node(id_, tag)
             return node if node and node.state is state else None
 
@@ -256,7 +297,7 @@ class Machine:
     async def node_pid(self, id_: str, tag: str) -> int:
         """Wait until the pid of a node's process is reported. It may start yet: not all nodes register."""
         return await until(
-            lambda: (node := self.node(id_, tag)) and node.pid, what=f"the pid of {id_}/{tag} is told"
+            lambda: node.pid if (node := self.node(id_, tag)) else 0, what=f"the pid of {id_}/{tag} is told"
         )
 
     async def log(self, id_: str, node: str, offset: int = 0) -> str:
@@ -342,9 +383,9 @@ class Machine:
         folder = self.folder / "state" / "containers"
         return list(folder.iterdir()) if folder.is_dir() else []
 
-    def cells(self) -> list[Path]:
+    def control_groups(self) -> list[Path]:
         """The cgroups of this machine's containers."""
-        return [cell for parent in self.cell_parents() for cell in children(parent)]
+        return [control_group for parent in self.cell_parents() for control_group in children(parent)]
 
     def cell_parents(self) -> list[Path]:
         lines = self.cgroups.read_text().splitlines() if self.cgroups.exists() else ()
@@ -356,7 +397,7 @@ class Machine:
         found += [f"process {one.pid}" for one in self.processes()]
         found += [f"process {one.pid}" for mark in self.marks for one in proc.marked(mark)]
         found += map(str, self.containers)
-        found += map(str, [*self.cells(), *self.cell_parents()])
+        found += map(str, [*self.control_groups(), *self.cell_parents()])
         found += [str(path) for path in (self.folder / "run").rglob("*") if path.is_socket()]
         found += [line for line in Path("/proc/mounts").read_text().splitlines() if str(self.folder) in line]
         return found
@@ -365,37 +406,46 @@ class Machine:
         assert self.left() == []
 
 
+def is_in(machine: Machine, id_: str, state: EndpointState) -> bool:
+    """Whether a container's newest status says this state."""
+    return machine.reported(id_).state is state
+
+
 def container(
     id_: str,
     revision: int,
     *,
-    nodes: tuple[NodeSpec, ...] = (),
     peer: str = "",
     dial: LinkAddress | None = None,
-    **parts: Any,
+    **parts: Unpack[SpecParts],
 ) -> EndpointSpec:
     """A container's spec; with ``peer``, wired to it over one link."""
-    wires = wiring(peer, dial, [i.tag for i in parts.get("interfaces", ())]) if peer else {}
-    return EndpointSpec(
-        id=id_, kind=EndpointKind.CONTAINER, revision=revision, nodes=nodes, **{**parts, **wires}
-    )
+    if peer:
+        parts["links"], parts["connections"] = wiring(
+            peer, dial, [i.tag for i in parts.get("interfaces", ())]
+        )
+    return EndpointSpec(id=id_, kind=EndpointKind.CONTAINER, revision=revision, **parts)
 
 
-def wiring(peer: str, dial: LinkAddress | None, tags: list[str]) -> dict[str, Any]:
+def wiring(
+    peer: str, dial: LinkAddress | None, tags: list[str]
+) -> tuple[tuple[LinkSpec, ...], tuple[ConnectionSpec, ...]]:
     """The link to a peer, and a connection over it for each tag, with the interface of the same tag there."""
     link = LinkSpec(id="link", peer=peer, token="token", dial=dial is not None, address=dial or LinkAddress())
     connections = tuple(
         ConnectionSpec(id=number, link="link", interface=tag, peer_interface=tag)
         for number, tag in enumerate(tags, 1)
     )
-    return {"links": (link,), "connections": connections}
+    return (link,), connections
 
 
 STRING = "std_msgs/String"
 ECHO_INTERFACES = (
-    InterfaceSpec(tag="req", type="PublisherInterface", cls=STRING, addr="stringEchoReq"),
-    InterfaceSpec(tag="resp", type="SubscriberInterface", cls=STRING, addr="stringEchoResp"),
-    InterfaceSpec(tag="srv", type="ServiceClientInterface", cls="Test/StringEcho", addr="stringEchoService"),
+    InterfaceSpec(tag="req", type="PublisherInterface", message_type=STRING, addr="stringEchoReq"),
+    InterfaceSpec(tag="resp", type="SubscriberInterface", message_type=STRING, addr="stringEchoResp"),
+    InterfaceSpec(
+        tag="srv", type="ServiceClientInterface", message_type="Test/StringEcho", addr="stringEchoService"
+    ),
 )
 
 
@@ -458,14 +508,18 @@ class Peer:
         id_: str = "user/box",
     ) -> None:
         """Connect to a container's interfaces."""
-        own = tuple(InterfaceSpec(tag=i.tag, type=COMPLEMENT[i.type], cls=i.cls) for i in interfaces)
+        own = tuple(
+            InterfaceSpec(tag=i.tag, type=COMPLEMENT[i.type], message_type=i.message_type) for i in interfaces
+        )
+        links, connections = wiring(id_, address, [i.tag for i in interfaces])
         await self.endpoint.apply(
             EndpointSpec(
                 id="user/robot",
                 kind=EndpointKind.ROBOT,
                 revision=revision,
                 interfaces=own,
-                **wiring(id_, address, [i.tag for i in interfaces]),
+                links=links,
+                connections=connections,
             )
         )
 

@@ -10,18 +10,18 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import psutil
 
-from rce_fleet.demo.ports import Ports, option_of
+from rce_fleet.demo.resources import Ports, option_of
 from support.engine import command_line, engine_processes, until
-from support.leaks import sweep_cgroups
 from support.ports import free_ports
 from support.processes import finish
+from tools.leaks import sweep_cgroups
 
 STOP_TIMEOUT_S = 120.0
 
@@ -33,7 +33,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def clean_folder() -> Any:
+def clean_folder() -> Iterator[Path]:
     """A short-named folder; at the end no process of a demo in it may be left, and no file."""
     folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
     try:

@@ -13,27 +13,34 @@ import tempfile
 import urllib.request
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, TypeVar, Unpack, overload
 
 import psutil
 
-from support.leaks import sweep_cgroups
 from support.ports import free_ports
+from tools.leaks import sweep_cgroups
+
+T = TypeVar("T")
 
 READY_TIMEOUT_S = 90.0
 STOP_TIMEOUT_S = 90.0
 
 
+@overload
 async def until(
-    condition: Callable[[], Any | Awaitable[Any]], *, timeout: float = 60.0, what: str = "condition"
-) -> Any:
+    condition: Callable[[], Awaitable[T | None]], *, timeout: float = ..., what: str = ...
+) -> T: ...
+@overload
+async def until(condition: Callable[[], T | None], *, timeout: float = ..., what: str = ...) -> T: ...
+async def until(
+    condition: Callable[[], Awaitable[object] | object], *, timeout: float = 60.0, what: str = "condition"
+) -> object:
     """Wait until ``condition`` gives something true, and return it."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + timeout
     while True:
-        found = condition()
-        if isinstance(found, Awaitable):
-            found = await found
+        made = condition()
+        found = await made if isinstance(made, Awaitable) else made
         if found:
             return found
         if loop.time() > deadline:
@@ -103,6 +110,16 @@ class Program:
             self.process.kill()
             await self.process.wait()
             raise AssertionError(f"{self.name} did not stop on SIGTERM:\n{self.output()}") from None
+
+
+class EngineOptions(TypedDict, total=False):
+    """Keywords of :class:`Engine`."""
+
+    runtime: str
+    robots: int
+    apart: bool
+    packages: Path | None
+    robot_options: tuple[str, ...]
 
 
 class Engine:
@@ -277,7 +294,7 @@ def _environments(folder: Path) -> list[psutil.Process]:
 
 
 @contextlib.asynccontextmanager
-async def running_engine(**options: Any) -> AsyncIterator[Engine]:
+async def running_engine(**options: Unpack[EngineOptions]) -> AsyncIterator[Engine]:
     """Run an engine, and check at its end that it leaves nothing."""
     folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
     engine = Engine(folder, **options)

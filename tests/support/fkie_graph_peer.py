@@ -8,10 +8,14 @@ empty and asked for only once, and each subscriber of ``changes`` is told of one
 The definitions are those of releases 1.1.0 to 1.3.2; ``quoted`` as a last argument takes the constants of
 releases before.
 """
-# ruff: noqa: ANN001, ANN003, ANN201, ANN202, T201
+# ruff: noqa: T201
+
+from __future__ import annotations
 
 import hashlib
 import sys
+from collections.abc import Callable
+from typing import Any
 
 import genpy
 import rospy
@@ -34,7 +38,7 @@ HEADER = "uint32 seq\ntime stamp\nstring frame_id\n"
 NODE = "/master_discovery"
 
 
-def message(name, text, **parts):
+def message(name: str, text: str, **parts: str) -> Any:
     """Make a message class of a definition and those that it uses."""
     full = text + "".join(
         f"{'=' * 80}\nMSG: {part.replace('__', '/')}\n{body}" for part, body in parts.items()
@@ -42,12 +46,12 @@ def message(name, text, **parts):
     return generate_dynamic(PACKAGE + "/" + name, full)[PACKAGE + "/" + name]
 
 
-def master_state(quote):
+def master_state(quote: str) -> Any:
     """Make MasterState, its constants with quotes or without."""
     return message("MasterState", STATE + STATES.format(quote), fkie_multimaster_msgs__ROSMaster=MASTER)
 
 
-def listen(changes):
+def listen(changes: Any) -> None:
     """Print what the discovery says, as master_sync compares it."""
     words = {changes.STATE_NEW: "new", changes.STATE_CHANGED: "changed", changes.STATE_REMOVED: "removed"}
     links = message(
@@ -55,10 +59,10 @@ def listen(changes):
     )
     print("md5", changes._md5sum, links._md5sum, flush=True)
 
-    def changed(said):
+    def changed(said: Any) -> None:
         print("change", words.get(said.state, "?" + said.state), said.master.name, flush=True)
 
-    def linked(said):
+    def linked(said: Any) -> None:
         for link in said.links:
             print("link", link.destination, (said.header.stamp - link.last_heartbeat).to_sec(), flush=True)
 
@@ -68,7 +72,7 @@ def listen(changes):
     rospy.spin()
 
 
-def discover(changes, state, name, uri, monitor_uri):
+def discover(changes: Any, state: str, name: str, uri: str, monitor_uri: str) -> None:
     """Tell every subscriber of one master."""
     known = message("ROSMaster", MASTER)
 
@@ -84,10 +88,10 @@ def discover(changes, state, name, uri, monitor_uri):
             fkie_multimaster_msgs__ROSMaster=MASTER,
         )
 
-    class Greeter(rospy.SubscribeListener):
+    class Greeter(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no types
         """Tells who comes."""
 
-        def peer_subscribe(self, _topic, _publish, peer_publish):
+        def peer_subscribe(self, _topic: str, _publish: object, peer_publish: Callable[[Any], None]) -> None:
             now = genpy.Time.from_sec(rospy.get_time())
             peer_publish(changes(state, known(name, uri, now, now, True, NODE, monitor_uri)))
 

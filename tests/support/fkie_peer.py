@@ -4,7 +4,9 @@ Run by any Python, with the standard library only: ``fkie_peer.py MASTER_URI RPC
 Sends heartbeats to 226.0.0.0, answers the RPC methods, registers at its master what others have, and prints a
 line for each master that it finds or loses.
 """
-# ruff: noqa: ANN001, ANN201, ANN204, PT018, T201, UP031
+# ruff: noqa: PT018, T201, UP031
+
+from __future__ import annotations
 
 import re
 import select
@@ -15,8 +17,13 @@ import sys
 import threading
 import time
 import xmlrpc.client
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 from xmlrpc.server import SimpleXMLRPCServer
 
+Lists = Sequence[tuple[str, Sequence[str]]]
+"""Names of topics or services, each with the nodes that have it."""
+Address = tuple[str, int]
 LAYOUT = "cBBiiHii"  # native alignment
 GROUP = "226.0.0.0"
 ME = "/master_discovery"
@@ -36,28 +43,49 @@ FILTER = (
 )
 
 
+class State(NamedTuple):
+    publishers: Lists
+    subscribers: Lists
+    services: Lists
+    types: Sequence[tuple[str, str]]
+    uris: dict[str, str]
+    service_uris: dict[str, str]
+
+
+class Registration(NamedTuple):
+    kind: str
+    name: str
+    detail: str
+    node: str
+    at: str
+
+
 class Peer:
-    def __init__(self, master_uri, rpc_port, mcast_port, address):
+    socket: socket.socket
+
+    def __init__(self, master_uri: str, rpc_port: int, mcast_port: int, address: str) -> None:
         self.master_uri = master_uri
-        self.master = xmlrpc.client.ServerProxy(master_uri)
+        self.master: Any = xmlrpc.client.ServerProxy(master_uri)  # a call gives any value
         self.rpc_port = rpc_port
         self.mcast_port = mcast_port
         self.address = address
         self.stamp = 0.0
-        self.state = None
-        self.origins = {}
-        self.others = {}
-        self.held = {}
+        self.state: State | None = None
+        self.origins: dict[str, str] = {}
+        self.others: dict[Address, tuple[int, int]] = {}
+        self.held: dict[Address, set[Registration]] = {}
         self.lock = threading.Lock()
 
-    # -------------------------------------------------------------- RPC
+    # RPC
 
-    def contacts(self):
+    def contacts(self) -> tuple[str, str, str, str, str]:
         uri = f"http://{self.address}:{self.rpc_port}"
         return ("%.9f" % self.stamp, self.master_uri, "fkie", ME, uri)
 
-    def info(self, _filter=None):
+    def info(self, _filter: object = None) -> tuple[Any, ...]:
+        """Answer ``masterInfo``."""
         with self.lock:
+            assert self.state is not None
             publishers, subscribers, services, types, uris, service_uris = self.state
             nodes = [
                 (
@@ -84,7 +112,7 @@ class Peer:
                 providers,
             )
 
-    def serve(self):
+    def serve(self) -> None:
         server = SimpleXMLRPCServer((self.address, self.rpc_port), logRequests=False, allow_none=True)
         server.register_introspection_functions()
         server.register_function(self.info, "masterInfo")
@@ -93,23 +121,23 @@ class Peer:
         server.register_function(lambda: (self.master_uri, time.time()), "getCurrentTime")
         threading.Thread(target=server.serve_forever, daemon=True).start()
 
-    # -------------------------------------------------------------- the own master
+    # The own master
 
-    def poll(self):
+    def poll(self) -> None:
         publishers, subscribers, services = self.master.getSystemState(ME)[2]
         types = self.master.getTopicTypes(ME)[2]
         names = {node for part in (publishers, subscribers, services) for _, nodes in part for node in nodes}
         uris = {name: self.master.lookupNode(ME, name)[2] for name in sorted(names)}
         service_uris = {name: self.master.lookupService(ME, name)[2] for name, _ in services}
-        state = (publishers, subscribers, services, types, uris, service_uris)
+        state = State(publishers, subscribers, services, types, uris, service_uris)
         if state != self.state:
             with self.lock:
                 self.state = state
                 self.stamp = time.time()
 
-    # -------------------------------------------------------------- heartbeats
+    # Heartbeats
 
-    def open(self):
+    def open(self) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM, socket.IPPROTO_UDP)
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         self.socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, struct.pack("@i", 20))
@@ -121,14 +149,14 @@ class Peer:
         )
         self.socket.bind((GROUP, self.mcast_port))
 
-    def beat(self, version=2, secs=None, nsecs=None):
+    def beat(self, version: int = 2, secs: int | None = None, nsecs: int = 0) -> None:
         if secs is None:
             secs, nsecs = int(self.stamp), int((self.stamp - int(self.stamp)) * 1000000000)
         packet = struct.pack(LAYOUT, b"R", version, 50, secs, nsecs, self.rpc_port, secs, nsecs)
         assert len(packet) == 24
         self.socket.sendto(packet, (GROUP, self.mcast_port))
 
-    def receive(self):
+    def receive(self) -> None:
         packet, (host, _) = self.socket.recvfrom(1024)
         mark, version, rate, secs, nsecs, port, _, _ = struct.unpack(LAYOUT, packet)
         assert mark == b"R" and version in (2, 3), packet
@@ -141,7 +169,7 @@ class Peer:
         elif version == 3 and secs == 0 and nsecs == 0:
             self.beat()
         elif self.others.get(key) != (secs, nsecs):
-            monitor = xmlrpc.client.ServerProxy(f"http://{host}:{port}")
+            monitor: Any = xmlrpc.client.ServerProxy(f"http://{host}:{port}")
             try:
                 stamp, uri, name, node, _ = monitor.masterContacts()
             except OSError:
@@ -155,59 +183,65 @@ class Peer:
             self.sync(key, monitor.masterInfoFiltered(FILTER))
             self.others[key] = (secs, nsecs)
 
-    # -------------------------------------------------------------- synchronization
+    # Synchronization
 
-    def sync(self, key, info):
-        _, _, uri, _, publishers, subscribers, services, types, nodes, providers = info
-        types = dict(types)
+    def sync(self, key: Address, info: Sequence[Any]) -> None:
+        _, _, uri, _, publishers, subscribers, services, typed, nodes, providers = info
+        types = dict(typed)
         local = {
             name: at for name, at, origin, _, place in nodes if place == "local" and origin != self.master_uri
         }
         served = {name: at for name, at, origin, _, place in providers if place == "local"}
-        wanted = set()
+        wanted: set[Registration] = set()
         for topic, names in publishers:
             wanted |= {
-                ("Publisher", topic, types[topic], name, local[name]) for name in names if name in local
+                Registration("Publisher", topic, types[topic], name, local[name])
+                for name in names
+                if name in local
             }
         for topic, names in subscribers:
             wanted |= {
-                ("Subscriber", topic, types.get(topic, "*"), name, local[name])
+                Registration("Subscriber", topic, types.get(topic, "*"), name, local[name])
                 for name in names
                 if name in local
             }
         for service, names in services:
             wanted |= {
-                ("Service", service, served[service], name, local[name]) for name in names if name in local
+                Registration("Service", service, served[service], name, local[name])
+                for name in names
+                if name in local
             }
         held = self.held.setdefault(key, set())
-        for kind, name, detail, node, at in held - wanted:
-            self.unregister(kind, name, detail, node, at)
+        for entry in held - wanted:
+            self.unregister(entry)
         for kind, name, detail, node, at in wanted - held:
             self.origins[node] = uri
             code, text, value = getattr(self.master, f"register{kind}")(node, name, detail, at)
             assert code == 1, text
             if kind == "Subscriber" and value:
-                xmlrpc.client.ServerProxy(at).publisherUpdate("/master", name, value)
+                subscriber: Any = xmlrpc.client.ServerProxy(at)
+                subscriber.publisherUpdate("/master", name, value)
         self.held[key] = wanted
 
-    def unregister(self, kind, name, detail, node, at):
+    def unregister(self, entry: Registration) -> None:
+        kind, name, detail, node, at = entry
         getattr(self.master, f"unregister{kind}")(node, name, detail if kind == "Service" else at)
 
-    def lose(self, key):
+    def lose(self, key: Address) -> None:
         print("lost", *key, flush=True)
         for entry in self.held.pop(key, ()):
-            self.unregister(*entry)
+            self.unregister(entry)
         del self.others[key]
 
-    # -------------------------------------------------------------- life
+    # Life
 
-    def run(self):
+    def run(self) -> None:
         self.poll()
         self.open()
         self.serve()
         self.beat(version=3, secs=0, nsecs=0)
         next_beat = 0.0
-        stopped = []
+        stopped: list[bool] = []
         signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
         while not stopped:
             if time.time() >= next_beat:

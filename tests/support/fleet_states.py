@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 from rce_fleet.drivers.report import Contacts, RobotTruth, WorldReport
 from rce_fleet.station.api import FleetModel, MapModel, RobotModel
 
 
-def robot(name: str, **fields: Any) -> RobotModel:
-    plan = fields.get("plan", [fields["cell"]] if fields.get("cell") is not None else [])
-    filled = {
-        "state": "idle",
-        "reason": "",
-        "cell": None,
-        "goal": None,
-        "plan": plan,
-        "granted": plan[:1],
-        "replans": 0,
-        "pose": None,
-        **fields,
-    }
-    return RobotModel(id=name, **filled)
+def robot(
+    name: str,
+    *,
+    cell: int | None = None,
+    goal: int | None = None,
+    plan: list[int] | None = None,
+    granted: list[int] | None = None,
+    state: str = "idle",
+    replans: int = 0,
+) -> RobotModel:
+    """A robot; its plan is its cell, and the first cell of its plan is granted, if nothing else is given."""
+    if plan is None:
+        plan = [] if cell is None else [cell]
+    return RobotModel(
+        id=name,
+        state=state,
+        reason="",
+        cell=cell,
+        goal=goal,
+        plan=plan,
+        granted=plan[:1] if granted is None else granted,
+        replans=replans,
+        pose=None,
+    )
 
 
 def fleet(
@@ -33,7 +42,7 @@ def fleet(
 
 
 def truth(
-    *, boxes: Sequence[int] = (), collisions: int = 0, apart: float | None = None, **cells: int
+    cells: Mapping[str, int], *, boxes: Sequence[int] = (), collisions: int = 0, apart: float | None = None
 ) -> WorldReport:
     """A world in which robots stand in ``cells`` and have driven a metre each."""
     contacts = Contacts(robot_robot=collisions, robot_box=0, robot_wall=0, total=collisions)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import schemathesis
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from schemathesis import GenerationMode, checks
+from schemathesis.core.result import Ok
 from schemathesis.specs.openapi import checks as openapi_checks
 
 if TYPE_CHECKING:
@@ -227,11 +228,11 @@ async def exchange(port: int, request: bytes, *, whole: bool = False) -> list[in
     return [int(status) for status in _STATUS.findall(answer)]
 
 
-async def _begin(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, patience: float) -> bytes:
-    """Wait for the beginning of an answer; then, unless it goes on for ever, send the end of the request."""
+async def _begin(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, timeout: float) -> bytes:
+    """Wait for the beginning of an answer; then, unless it never ends, send the end of the request."""
     answer = b""
     with contextlib.suppress(TimeoutError):
-        answer = await asyncio.wait_for(reader.read(1 << 16), patience)
+        answer = await asyncio.wait_for(reader.read(1 << 16), timeout)
     if not _is_stream(answer):
         writer.write_eof()
     return answer
@@ -269,6 +270,7 @@ def answers_of(document: dict[str, Any], url: str, token: str) -> int:
     headers = {"Authorization": f"Bearer {token}"}
     answered = 0
     for result in schema.get_all_operations():
+        assert isinstance(result, Ok), result
         operation = result.ok()
         for mode in (GenerationMode.POSITIVE, GenerationMode.NEGATIVE):
 
@@ -281,7 +283,7 @@ def answers_of(document: dict[str, Any], url: str, token: str) -> int:
                 suppress_health_check=list(HealthCheck),
             )
             @given(case=operation.as_strategy(generation_mode=mode))
-            def run(case: schemathesis.Case) -> None:
+            def run(case: schemathesis.Case[Any]) -> None:
                 nonlocal answered
                 response = case.call(base_url=url, headers=headers, timeout=60)
                 case.validate_response(response, checks=CHECKS)

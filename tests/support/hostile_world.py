@@ -21,17 +21,29 @@ import sys
 import time
 from collections.abc import AsyncIterator, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, Unpack
 from unittest import mock
 
 import msgspec
 
 from rce.control.messages import Fault, Put
-from rce.control.model import EndpointState, InterfaceSpec, LinkSpec, NodeSpec, NodeState, Resources
+from rce.control.model import EndpointState, LinkSpec, NodeState
 from rce.link import LinkError
+from rce.model.specs import InterfaceSpec, NodeSpec, Resources
 from rce_container.environment import proc
+from rce_container.runtimes.namespace import NamespaceRuntime
 from rce_container.seccomp.library import FilterUnavailableError
-from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, Peer, container, until
+from support.containers import (
+    ECHO,
+    ECHO_INTERFACES,
+    MACHINE,
+    ContainerParts,
+    Machine,
+    ManagerOptions,
+    Peer,
+    container,
+    until,
+)
 from support.persons import SECRET
 
 HOSTILE = Path(__file__).parent / "hostile"
@@ -76,7 +88,7 @@ class World:
         self.facts = self.machine.packages / "hostile" / "facts.json"
 
     @contextlib.asynccontextmanager
-    async def running(self, **options: Any) -> AsyncIterator[None]:
+    async def running(self, **options: Unpack[ManagerOptions]) -> AsyncIterator[None]:
         """Run the manager and the neighbour."""
         async with self.machine.engine(**options):
             await self.machine.manager.handle(_put_neighbour())
@@ -85,9 +97,13 @@ class World:
 
     def environment(self, id_: str) -> proc.Process:
         """The environment of a container."""
-        (unit,) = (unit for unit in self.machine.manager._units.values() if unit.id == id_)
-        assert unit.handle.environment is not None
-        return unit.handle.environment
+        (incarnation,) = (
+            incarnation
+            for incarnation in self.machine.manager._incarnations.values()
+            if incarnation.id == id_
+        )
+        assert incarnation.handle.environment is not None
+        return incarnation.handle.environment
 
     async def say(self, id_: str, node: str) -> Any:
         """Wait for a line of JSON from a node."""
@@ -152,7 +168,7 @@ class Bait:
         self.port = 0
 
     def __enter__(self) -> Self:
-        addresses: tuple[Any, ...] = (self.abstract, self.path, ("127.0.0.1", 0))
+        addresses: tuple[str | tuple[str, int], ...] = (self.abstract, self.path, ("127.0.0.1", 0))
         for sock, address in zip(self._sockets, addresses, strict=True):
             sock.bind(address)
             sock.listen()
@@ -166,15 +182,15 @@ class Bait:
 
 def _write_facts(world: World, bait: Bait) -> list[str]:
     """Tell the attacker where to look; returns words that would give the neighbour away."""
-    (unit,) = world.machine.manager._units.values()
+    (incarnation,) = world.machine.manager._incarnations.values()
     environment = world.environment(NEIGHBOUR)
-    shim = unit.handle.process.pid
+    shim = incarnation.handle.process.pid
     facts = {
         "unix": {
             "abstract": bait.abstract,
             "bound": bait.path,
-            "control": str(unit.folder.control_socket),
-            "link": str(unit.folder.link_socket),
+            "control": str(incarnation.folder.control_socket),
+            "link": str(incarnation.folder.link_socket),
             "docker": "/run/docker.sock",
             "podman": "/run/podman/podman.sock",
             "bus": "/run/dbus/system_bus_socket",
@@ -189,7 +205,7 @@ def _write_facts(world: World, bait: Bait) -> list[str]:
             "configuration": "/etc/fstab",
             "state": str(world.folder / "state"),
             "logs": str(world.folder / "state" / "logs"),
-            "neighbour's folder": str(unit.folder.path),
+            "neighbour's folder": str(incarnation.folder.path),
             "users": "/run/rce/uids",
             "neighbour's process": f"/proc/{environment.pid}/status",
             "treasure": "/home/rce/treasure",
@@ -208,7 +224,7 @@ def _write_facts(world: World, bait: Bait) -> list[str]:
         },
     }
     world.facts.write_text(json.dumps(facts))
-    return [*NEIGHBOUR.split("/"), unit.mark]
+    return [*NEIGHBOUR.split("/"), incarnation.incarnation_id]
 
 
 def _try_outside(world: World) -> dict[str, str]:
@@ -253,14 +269,15 @@ def _uid(pid: int) -> int:
 
 def search_from_outside(world: World) -> dict[str, list[str]]:
     """Search the memory of all that takes part, as far as this person may: who knows what?"""
-    pids = {"nursery": world.machine.runtime._nursery.pid}  # type: ignore[attr-defined]
+    assert isinstance(world.machine.runtime, NamespaceRuntime)
+    pids = {"fork server": world.machine.runtime._fork_server.pid}
     inside = world.environment(ATTACKER)
     pids["environment"] = inside.pid
     for process in proc.descendants(inside.pid, proc.table()):
         with contextlib.suppress(FileNotFoundError):  # what the node started is ending
             words = Path(f"/proc/{process.pid}/cmdline").read_bytes().split(b"\0")
-            if b"rce_container.nursery.cradle" in words:
-                pids["cradle"] = process.pid
+            if b"rce_container.forkserver.nodes" in words:
+                pids["node fork server"] = process.pid
     texts = {"secret": SECRET, "token": TOKEN, "other token": OTHER_TOKEN, "neighbour": NEIGHBOUR}
     found = {}
     for who, pid in pids.items():
@@ -343,12 +360,15 @@ class Hunger:
         node = NodeSpec(tag="hog", pkg="hostile", exe="starve.py", args=thing)
         limits = Resources(memory=MEMORY_MB * MB, cpu=0 if thing == "processors" else 0.8)
         interfaces = (
-            InterfaceSpec(tag="flap", type="PublisherInterface", cls="std_msgs/String", addr="/flap"),
+            InterfaceSpec(
+                tag="flap", type="PublisherInterface", message_type="std_msgs/String", addr="/flap"
+            ),
         )
-        parts: dict[str, Any] = {"resources": limits, "interfaces": interfaces, "peer": "user/robot"}
+        parts: ContainerParts = {"resources": limits, "interfaces": interfaces, "peer": "user/robot"}
         await machine.put(self._id, **parts)
         async with self._robot(interfaces):
-            await machine.put(self._id, 2, nodes=(node,), **parts)
+            parts["nodes"] = (node,)
+            await machine.put(self._id, 2, **parts)
             text = await self._outcome()
             if thing == "stop":
                 await until(lambda: _is_stopped(self._world.environment(self._id).pid))
@@ -374,9 +394,8 @@ class Hunger:
     @contextlib.asynccontextmanager
     async def _robot(self, interfaces: tuple[InterfaceSpec, ...]) -> AsyncIterator[None]:
         """A robot of the attacker's, wired to its container."""
-        status = await until(
-            lambda: (one := self._machine.status(self._id)) and one.state is EndpointState.RUNNING and one
-        )
+        await until(lambda: (one := self._machine.status(self._id)) and one.state is EndpointState.RUNNING)
+        status = self._machine.reported(self._id)
         robot = Peer(MACHINE)
         await robot.wire(status.address, interfaces, id_=self._id)
         try:

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Unpack
 
 from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
-from rce.control.model import (
-    EndpointSpec,
-    EndpointState,
-    EndpointStatus,
-    InterfaceSpec,
-    LinkAddress,
-    NodeSpec,
-    Resources,
-)
+from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
+from rce.model.specs import InterfaceSpec, NodeSpec, Resources
 from rce_master.state import commands
 from rce_master.state.changes import Changes
 from rce_master.state.core import State
 from rce_master.state.records import User, UserRole
 from rce_master.state.settings import StateSettings
+from support.parts import MachineParts, ResourceParts, StatusParts
 
 
 class World:
@@ -56,7 +50,13 @@ class World:
         )
 
     def container_set(
-        self, process: str = "c1", endpoints: tuple[EndpointStatus, ...] = (), name: str = "m", **machine: Any
+        self,
+        process: str = "c1",
+        endpoints: tuple[EndpointStatus, ...] = (),
+        name: str = "m",
+        *,
+        draining: bool = False,
+        **machine: Unpack[MachineParts],
     ) -> Changes:
         return self.do(
             commands.TaskSetArrived(
@@ -64,7 +64,7 @@ class World:
                     version=CONTROL_VERSION,
                     kind=TaskSetKind.CONTAINER,
                     process=process,
-                    machine=MachineInfo(name=name, **machine),
+                    machine=MachineInfo(name=name, draining=draining, **machine),
                     endpoints=endpoints,
                 )
             )
@@ -84,23 +84,23 @@ class World:
         return changes
 
     def container(
-        self, tag: str = "c", user: str = "anna", *, wait: bool = False, **resources: Any
+        self, tag: str = "c", user: str = "anna", *, wait: bool = False, **resources: Unpack[ResourceParts]
     ) -> Changes:
-        wish = Resources(**resources)
-        return self.do(commands.CreateContainer(user=user, tag=tag, resources=wish, wait=wait))
+        requested = Resources(**resources)
+        return self.do(commands.CreateContainer(user=user, tag=tag, resources=requested, wait=wait))
 
     def interface(
         self,
         path: str,
         type_: str,
-        cls: str = "std_msgs/String",
+        message_type: str = "std_msgs/String",
         addr: str | None = None,
         user: str = "anna",
     ) -> Changes:
         endpoint, tag = path.split("/")
         if addr is None:
             addr = f"/{tag}" if type_.endswith("Interface") else ""
-        spec = InterfaceSpec(tag=tag, type=type_, cls=cls, addr=addr)
+        spec = InterfaceSpec(tag=tag, type=type_, message_type=message_type, addr=addr)
         return self.do(commands.AddInterface(user=user, endpoint=endpoint, interface=spec))
 
     def node(self, container: str, tag: str, exe: str = "run.py") -> Changes:
@@ -113,7 +113,7 @@ class World:
     def report(self, process: str, status: EndpointStatus) -> Changes:
         return self.do(commands.StatusReported(process=process, status=status))
 
-    def run(self, tag: str = "c", process: str = "c1", **fields: Any) -> Changes:
+    def run(self, tag: str = "c", process: str = "c1", **fields: Unpack[StatusParts]) -> Changes:
         """A container reports that it runs."""
         fields.setdefault("address", LinkAddress(machine="m", unix=f"/run/{tag}"))
         return self.report(

@@ -1,6 +1,6 @@
 """Ends ``rce up`` at random moments by random signals, its parts killed before or not: nothing may be left.
 
-``python -m support.moments SEED COUNT`` does it as often as is wished.
+``python -m support.moments SEED COUNT`` does it as often as is asked.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import aiohttp
 
 from rce_container.environment import proc
 from support.engine import Program, until
-from support.leaks import Traces, sweep_cgroups
 from support.ports import free_ports
 from support.stranger import ask_for_echo, stranger
+from tools.leaks import Traces, sweep_cgroups
 
 PORT_OPTIONS = ("--http-port", "--control-port", "--ws-port", "--robot-link-port", "--container-link-port")
 PROGRAMS = ("rce_master", "rce_robot", "rce_container")

@@ -8,7 +8,6 @@ import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
 
 from rce.ros.core import Core, Graph
 from rce.ros.multimaster.discovery import Discovery
@@ -16,6 +15,7 @@ from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.settings import DiscoverySettings
 from rce.ros.multimaster.sync import MasterSync, SyncSettings
 from rce.ros.node import Node
+from rce.ros.types import TypeRegistry
 from support.ports import free_port
 from support.processes import finish
 
@@ -24,11 +24,11 @@ FAST = 10.0
 """Heartbeats and questions per second in tests."""
 
 
-def node(name: str, uri: str, **more: Any) -> Node:
-    return Node(name, argv=[], master_uri=uri, **more)
+def node(name: str, uri: str, types: TypeRegistry | None = None) -> Node:
+    return Node(name, argv=[], master_uri=uri, types=types)
 
 
-class Neighbourhood:
+class DiscoveryNetwork:
     """Masters of one test share a multicast port that no other test uses."""
 
     def __init__(self) -> None:
@@ -43,7 +43,7 @@ class Neighbourhood:
             "heartbeat_hz": FAST,
             "rosmaster_hz": FAST,
         }
-        return DiscoverySettings(**(values | more))  # type: ignore[arg-type]
+        return DiscoverySettings(**(values | more))  # type: ignore[arg-type]  # a test may give any setting
 
     @asynccontextmanager
     async def machine(
@@ -63,7 +63,7 @@ class Neighbourhood:
         self, uri: str, lists: SyncLists | None, more: dict[str, object]
     ) -> AsyncIterator[Machine]:
         sync_more = {name: more.pop(name) for name in ("distinct_names", "namespaces") if name in more}
-        settings = SyncSettings(uri, lists=lists or SyncLists(), **sync_more)  # type: ignore[arg-type]
+        settings = SyncSettings(uri, lists=lists or SyncLists(), **sync_more)  # type: ignore[arg-type]  # a test may give any setting
         async with Discovery(self.settings(uri, **more)) as discovery, MasterSync(settings) as sync:
             yield Machine(uri, discovery, sync)
 
@@ -80,7 +80,7 @@ class Machine:
         assert self.core is not None
         return self.core.graph
 
-    async def until(self, condition: Callable[..., bool], timeout: float = 20) -> None:
+    async def until(self, condition: Callable[[Graph], bool], timeout: float = 20) -> None:
         assert self.core is not None
         await self.core.wait_until(condition, timeout=timeout)
 

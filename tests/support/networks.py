@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-KILL_PATIENCE_S = 5.0
+KILL_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def _plug_in(machine: NetworkMachine) -> None:
 
 
 def _remove(namespace: str) -> None:
-    deadline = time.monotonic() + KILL_PATIENCE_S
+    deadline = time.monotonic() + KILL_TIMEOUT_S
     while pids := _pids(namespace):
         for pid in pids:
             try:

@@ -27,7 +27,7 @@ class Owner:
             *words,
             cwd=self.folder,
             env={**self.env, "COLUMNS": "200"},
-            **{**pipes, **streams},  # type: ignore[arg-type]
+            **{**pipes, **streams},  # type: ignore[arg-type]  # the streams are keywords of it
         )
 
     async def rce(self, *words: str, typed: str = "", fails: bool = False) -> str:

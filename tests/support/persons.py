@@ -19,7 +19,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 USER = "rce-test"
 SYSTEM_PYTHON = "/usr/bin/python3"
-SECRET = "the secret of the engine"
+SECRET = "what-only-the-engine-of-the-tests-may-know"
 
 
 class Person:
@@ -79,7 +79,7 @@ def normal() -> Iterator[Person]:
     found = subprocess.run([SYSTEM_PYTHON, "-c", version], capture_output=True, text=True, check=False)
     if found.stdout.strip() != wanted:
         pytest.skip(
-            f"{SYSTEM_PYTHON} is no Python {wanted}, so it cannot use the packages that are installed"
+            f"{SYSTEM_PYTHON} is not Python {wanted}, so it cannot use the packages that are installed"
         )
     subprocess.run(["useradd", "--system", "--no-create-home", USER], check=False, capture_output=True)
     folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))

@@ -15,14 +15,14 @@ import psutil
 from rce.ros.core import Core
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "ros"
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 
 
 async def finish(
     process: asyncio.subprocess.Process,
     number: signal.Signals = signal.SIGKILL,
     *,
-    patience: float = PATIENCE_S,
+    timeout: float = TIMEOUT_S,
 ) -> bytes:
     """End a program and its children, unless they have ended, and return what it still printed.
 
@@ -31,7 +31,7 @@ async def finish(
     Args:
         process: The program. No other task may read its output.
         number: The signal that ends it.
-        patience: After so many seconds it is killed.
+        timeout: After so many seconds it is killed.
 
     Raises:
         TimeoutError: It had to be killed.
@@ -41,7 +41,7 @@ async def finish(
         with contextlib.suppress(ProcessLookupError):
             process.send_signal(number)
     try:
-        async with asyncio.timeout(patience):
+        async with asyncio.timeout(timeout):
             output, _ = await process.communicate()
     except TimeoutError:
         with contextlib.suppress(ProcessLookupError):

@@ -8,7 +8,7 @@ import os
 import signal
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rce.ros.core import Core
 from rce.ros.errors import XmlRpcError
@@ -16,7 +16,7 @@ from rce.ros.xmlrpc import RpcClient
 from support.ports import free_port
 from support.processes import finish
 
-PATIENCE_S = 120.0
+TIMEOUT_S = 120.0
 """Seconds that a program of a real ROS may take: some start slowly."""
 
 
@@ -35,6 +35,9 @@ def ros_environment(uri: str, home: Path) -> dict[str, str]:
         "HOME": str(home),
         "PYTHONUNBUFFERED": "1",
     }
+
+
+T = TypeVar("T")
 
 
 class Graph:
@@ -58,7 +61,7 @@ class Graph:
             start_new_session=True,
         )
         try:
-            async with asyncio.timeout(PATIENCE_S):
+            async with asyncio.timeout(TIMEOUT_S):
                 output, _ = await process.communicate(stdin.encode())
         finally:
             await finish(process)
@@ -92,7 +95,7 @@ class Graph:
         assert process.stdout is not None
         printed = ""
         try:
-            async with asyncio.timeout(PATIENCE_S):
+            async with asyncio.timeout(TIMEOUT_S):
                 while printed.count(text) < count:
                     line = await process.stdout.readline()
                     assert line, f"{argv} ended and printed {printed!r}"
@@ -101,7 +104,7 @@ class Graph:
             await finish(process)
         return printed
 
-    async def ask(self, method: str, *arguments: Any) -> Any:
+    async def ask(self, method: str, *arguments: object) -> Any:
         """Call the master; None if it does not answer or refuses."""
         async with RpcClient() as rpc:
             try:
@@ -125,21 +128,21 @@ class Graph:
         state = await self.ask("getSystemState") or [[], [], []]
         return next((nodes for name, nodes in state[0] if name == topic), [])
 
-    async def until(self, condition: Callable[[], Awaitable[Any]], *, what: str) -> Any:
+    async def until(self, condition: Callable[[], Awaitable[T | None]], *, what: str) -> T:
         """Wait until ``condition`` gives something true."""
         try:
-            async with asyncio.timeout(PATIENCE_S):
+            async with asyncio.timeout(TIMEOUT_S):
                 while not (found := await condition()):
                     await asyncio.sleep(0.05)
         except TimeoutError:
-            raise AssertionError(f"{what}: not within {PATIENCE_S:g} s") from None
+            raise AssertionError(f"{what}: not within {TIMEOUT_S:g} s") from None
         return found
 
 
 async def interrupt(process: asyncio.subprocess.Process) -> None:
     """End a program as Ctrl-C does; some of a real ROS's do not always end by that, and are killed."""
     with contextlib.suppress(TimeoutError):
-        await finish(process, signal.SIGINT, patience=20)
+        await finish(process, signal.SIGINT, timeout=20)
 
 
 @contextlib.asynccontextmanager

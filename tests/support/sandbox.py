@@ -13,7 +13,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rce.control.model import EndpointState, NodeSpec
+from rce.control.model import EndpointState
+from rce.model.specs import NodeSpec
 from rce_container.environment import proc
 from support.containers import Machine, until
 
@@ -103,7 +104,7 @@ print(json.dumps({
                 ("/proc/sys/kernel/hostname", "/etc/passwd", "/dev/x", __file__)},
     "hidden": {path: os.path.getsize(path) for path in ("/proc/keys", "/proc/kallsyms", "/proc/timer_list")
                if os.path.exists(path) and open(path).read()},
-    "forked": "rce_container.nursery" in sys.modules,
+    "forked": "rce_container.forkserver" in sys.modules,
 }), flush=True)
 import time
 time.sleep(600)
@@ -125,7 +126,10 @@ async def look(folder: Path, runtime: str, home_bytes: int) -> dict[str, Any]:
                 node = NodeSpec(tag="node", pkg="own", exe=exe, args=arguments)
                 await machine.put(BOX, nodes=(node,))
                 said = await machine.log_holds(BOX, "node", "}\n")
-                await until(lambda: machine.node(BOX, "node").pid, what="the node's process is told")
+                await until(
+                    lambda: (node := machine.node(BOX, "node")) is not None and node.pid,
+                    what="the node's process is told",
+                )
                 seen = json.loads(next(line for line in said.splitlines() if line.startswith("{")))
                 found[exe.partition(".")[0]] = {**seen, "outside": outside(machine)}
                 await machine.drop(BOX)
@@ -136,8 +140,8 @@ async def look(folder: Path, runtime: str, home_bytes: int) -> dict[str, Any]:
 
 def outside(machine: Machine) -> dict[str, Any]:
     """What the machine sees of the container that runs."""
-    (unit,) = machine.manager._units.values()
-    handle = unit.handle
+    (incarnation,) = machine.manager._incarnations.values()
+    handle = incarnation.handle
     assert handle.environment is not None
     status = Path(f"/proc/{handle.environment.pid}/status").read_text().splitlines()
     fields = dict(line.split(":", 1) for line in status)
@@ -146,8 +150,10 @@ def outside(machine: Machine) -> dict[str, Any]:
         "uid": int(fields["Uid"].split()[0]),
         "status": fields,
         "namespaces": namespaces,
-        "logs": unit.folder.logs.stat().st_uid,
-        "oom": [int(Path(f"/proc/{pid}/oom_score_adj").read_text()) for pid in unit.node_pids.values()],
+        "logs": incarnation.folder.logs.stat().st_uid,
+        "oom": [
+            int(Path(f"/proc/{pid}/oom_score_adj").read_text()) for pid in incarnation.node_pids.values()
+        ],
         "members": [process.pid for process in handle.members(proc.table())],
     }
 
@@ -157,8 +163,8 @@ async def two(folder: Path, runtime: str) -> dict[str, Any]:
     machine = Machine(folder, runtime)
 
     def users() -> dict[str, int]:
-        units = machine.manager._units.values()
-        return {unit.id: _uid(unit.handle.environment.pid) for unit in units if unit.handle.environment}
+        incarnations = machine.manager._incarnations.values()
+        return {one.id: _uid(one.handle.environment.pid) for one in incarnations if one.handle.environment}
 
     async def running(id_: str) -> None:
         await machine.put(id_)

@@ -12,7 +12,7 @@ from typing import Any
 
 import aiohttp
 
-PATIENCE_S = 90.0
+TIMEOUT_S = 90.0
 """How long to wait for what should come at once: the machine may be busy."""
 
 
@@ -43,7 +43,7 @@ class Stranger:
         async with self._changed:
             self._changed.notify_all()
 
-    def _fill(self, value: Any) -> bool:
+    def _fill(self, value: object) -> bool:
         if not isinstance(value, dict):
             return True
         if not all(self._fill(inner) for inner in value.values()):
@@ -65,30 +65,32 @@ class Stranger:
                     self.errors.append(data)
                 case "DM":
                     self.queue(data["iTag"]).put_nowait(data)
+                case _:
+                    pass  # a message of a later engine
             self._changed.notify_all()
 
     def queue(self, tag: str) -> asyncio.Queue[dict[str, Any]]:
         return self.data.setdefault(tag, asyncio.Queue())
 
-    async def send(self, kind: str, data: Any) -> None:
+    async def send(self, kind: str, data: object) -> None:
         await self.socket.send_str(json.dumps({"type": kind, "data": data}))
 
-    async def publish(self, tag: str, cls: str, message: Any) -> None:
-        await self.send("DM", {"iTag": tag, "type": cls, "msgID": "nil", "msg": message})
+    async def publish(self, tag: str, message_type: str, message: object) -> None:
+        await self.send("DM", {"iTag": tag, "type": message_type, "msgID": "nil", "msg": message})
 
-    async def call(self, tag: str, cls: str, message: Any, *, timeout: float = PATIENCE_S) -> Any:
+    async def call(self, tag: str, message_type: str, message: object, *, timeout: float = TIMEOUT_S) -> Any:
         number = f"call{next(self._numbers)}"
-        await self.send("DM", {"iTag": tag, "type": cls, "msgID": number, "msg": message})
+        await self.send("DM", {"iTag": tag, "type": message_type, "msgID": number, "msg": message})
         async with asyncio.timeout(timeout):
             answer = await self.queue(tag).get()
         assert answer["msgID"] == number
         return answer["msg"]
 
-    async def receive(self, tag: str, *, timeout: float = PATIENCE_S) -> Any:
+    async def receive(self, tag: str, *, timeout: float = TIMEOUT_S) -> Any:
         async with asyncio.timeout(timeout):
             return (await self.queue(tag).get())["msg"]
 
-    async def wait_status(self, tags: dict[str, bool], *, timeout: float = PATIENCE_S) -> None:
+    async def wait_status(self, tags: dict[str, bool], *, timeout: float = TIMEOUT_S) -> None:
         try:
             async with asyncio.timeout(timeout), self._changed:
                 await self._changed.wait_for(
@@ -97,7 +99,7 @@ class Stranger:
         except TimeoutError:
             raise AssertionError(f"wanted {tags}; status {self.status}, errors {self.errors}") from None
 
-    async def wait_error(self, text: str, *, timeout: float = PATIENCE_S) -> str:
+    async def wait_error(self, text: str, *, timeout: float = TIMEOUT_S) -> str:
         try:
             async with asyncio.timeout(timeout), self._changed:
                 await self._changed.wait_for(lambda: any(text in error for error in self.errors))
@@ -145,13 +147,13 @@ async def wire_echo(client: Stranger, *, container: str = "cTag_01", robot: str 
 
 
 async def ask_for_echo(
-    client: Stranger, container: str, robot: str, wishes: dict[str, Any] | None = None, **node: Any
+    client: Stranger, container: str, robot: str, requested: dict[str, Any] | None = None, **node: object
 ) -> None:
-    """Ask for what :func:`wire_echo` makes, with wishes for its container and more keys for its node.
+    """Ask for what :func:`wire_echo` makes, with resources for its container and more keys for its node.
 
     May be repeated.
     """
-    await client.send("CC", {"containerTag": container, "containerData": wishes or {}})
+    await client.send("CC", {"containerTag": container, "containerData": requested or {}})
     await client.send(
         "CN",
         {
@@ -163,10 +165,10 @@ async def ask_for_echo(
                     "endpointTag": {"cTag_01": container, "testRobot": robot}[endpoint],
                     "interfaceTag": tag,
                     "interfaceType": kind,
-                    "className": cls,
+                    "className": message_type,
                     **({"addr": addr} if addr else {}),
                 }
-                for endpoint, tag, kind, cls, addr in ECHO_INTERFACES
+                for endpoint, tag, kind, message_type, addr in ECHO_INTERFACES
             ],
         },
     )

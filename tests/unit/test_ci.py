@@ -1,4 +1,4 @@
-"""What continuous integration runs: lint, then tests, each once, and any failure fails the run."""
+"""What continuous integration runs: lint, docs, tests, each once, and any failure fails the run."""
 
 from __future__ import annotations
 
@@ -31,13 +31,14 @@ def test_uses_it(made, number):
 """
 
 
-def run_ci(folder: Path, lint: int, tests: int) -> subprocess.CompletedProcess[str]:
+def run_ci(folder: Path, lint: int, docs: int, tests: int) -> subprocess.CompletedProcess[str]:
     """Run ``.ci/run`` where ``make`` only notes what it is asked for."""
     (folder / ".ci").mkdir()
     shutil.copy(ROOT / ".ci" / "run", folder / ".ci" / "run")
     (folder / ".ci" / "packages.txt").write_text("# none\n\ndpkg  # is everywhere\n")
     rules = "{0}:\n\t@echo {0} >> asked; exit {1}\n"
-    (folder / "Makefile").write_text(rules.format("lint", lint) + rules.format("test-all", tests))
+    ends = {"lint": lint, "docs": docs, "test-all": tests}
+    (folder / "Makefile").write_text("".join(rules.format(name, code) for name, code in ends.items()))
     environ = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
     return subprocess.run(
         [folder / ".ci" / "run"], env=environ, capture_output=True, text=True, timeout=60, check=False
@@ -45,11 +46,13 @@ def run_ci(folder: Path, lint: int, tests: int) -> subprocess.CompletedProcess[s
 
 
 @pytest.mark.skipif(shutil.which("dpkg-query") is None, reason=".ci/run is for Debian")
-@pytest.mark.parametrize(("lint", "tests"), [(0, 0), (1, 0), (0, 1), (1, 1)])
-def test_any_failure_fails_the_run_and_nothing_runs_twice(tmp_path: Path, lint: int, tests: int) -> None:
-    done = run_ci(tmp_path, lint, tests)
-    assert (done.returncode == 0) == (lint == tests == 0), done
-    assert (tmp_path / "asked").read_text().split() == ["lint", "test-all"]
+@pytest.mark.parametrize(("lint", "docs", "tests"), [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)])
+def test_any_failure_fails_the_run_and_nothing_runs_twice(
+    tmp_path: Path, lint: int, docs: int, tests: int
+) -> None:
+    done = run_ci(tmp_path, lint, docs, tests)
+    assert (done.returncode == 0) == (lint == docs == tests == 0), done
+    assert (tmp_path / "asked").read_text().split() == ["lint", "docs", "test-all"]
 
 
 def test_workers_have_ports_of_their_own() -> None:

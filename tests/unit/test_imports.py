@@ -16,7 +16,7 @@ _ROW = re.compile(r"^\| `(rce[\w.]*)` \|.*\| ([^|]*) \|$", re.MULTILINE)
 def table() -> dict[str, tuple[str, ...]]:
     """Package to what it may import."""
     text = (ROOT / "docs" / "architecture.md").read_text()
-    section = text[text.index("## Rooms") :].partition("\n## ")[0]
+    section = text[text.index("## Packages") :].partition("\n## ")[0]
     return {name: tuple(re.findall(r"`([\w.]+)`", allowed)) for name, allowed in _ROW.findall(section)}
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import socket
 import threading
-from typing import Any
 
 import pytest
 
@@ -21,7 +20,7 @@ class Names:
         self.asked: list[str] = []
         self._answers: dict[str, threading.Event] = {}
 
-    def __call__(self, host: str, *_: Any) -> list[Info]:
+    def __call__(self, host: str, *_: object) -> list[Info]:
         self.asked.append(host)
         assert self.event(host).wait(60)
         if host.startswith("bad"):

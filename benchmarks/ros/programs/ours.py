@@ -1,6 +1,6 @@
 """Our side: ``ours.py echo | ping SIZES | talk SECONDS | listen | serve | call SECONDS | beat COUNT | idle``.
 
-The other programs in this folder understand the same words.
+The other programs in this folder take the same arguments.
 """
 
 from __future__ import annotations
@@ -9,21 +9,22 @@ import asyncio
 import json
 import sys
 import time
-from typing import Any
+from collections.abc import Awaitable, Callable
 
 from rce.ros.node import Node, run
+from rce.ros.types import Message
 
 STRING = "std_msgs/String"
 SET_BOOL = "std_srvs/SetBool"
 
 
 def ready() -> None:
-    """Tell who measures."""
+    """Print the name of the measured library."""
     print("ready", flush=True)
 
 
 async def echo(node: Node) -> None:
-    """Send everything back."""
+    """Send every message back."""
     pong = await node.advertise("pong", STRING, queue_size=10)
     await node.subscribe("ping", STRING, pong.publish)
     ready()
@@ -31,7 +32,7 @@ async def echo(node: Node) -> None:
 
 
 async def ping(node: Node, sizes: str) -> None:
-    """Send each size so often, one message in flight; print the round trips in seconds."""
+    """Send each size repeatedly, one message in flight; print the round trips in seconds."""
     answered = asyncio.Event()
     await node.subscribe("pong", STRING, lambda _: answered.set())
     publisher = await node.advertise("ping", STRING, queue_size=10)
@@ -65,11 +66,11 @@ async def talk(node: Node, seconds: str) -> None:
 
 
 async def listen(node: Node) -> None:
-    """Count messages; print how many came between the first and the last, and the seconds between these."""
+    """Count messages; print how many arrived from the first to the last, and the seconds between these."""
     first = last = 0.0
     count = 0
 
-    def heard(_: Any) -> None:
+    def heard(_: Message) -> None:
         nonlocal first, last, count
         last = time.perf_counter()
         first = first or last
@@ -120,11 +121,18 @@ async def idle(node: Node) -> None:
 
 
 async def main(word: str, *arguments: str) -> None:
-    """Do what the command line says."""
-    work = {"echo": echo, "ping": ping, "talk": talk, "listen": listen, "serve": serve, "call": call}
+    """Run the command of the command line."""
+    work: dict[str, Callable[..., Awaitable[None]]] = {
+        "echo": echo,
+        "ping": ping,
+        "talk": talk,
+        "listen": listen,
+        "serve": serve,
+        "call": call,
+    }
     work |= {"beat": beat, "idle": idle}
     async with Node(f"ours_{word}", argv=[], signals=True) as node:
-        await work[word](node, *arguments)  # type: ignore[operator]
+        await work[word](node, *arguments)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ QUEUE = None if os.environ.get("QUEUE") == "0" else 10
 
 
 def ready() -> None:
-    """Tell who measures."""
+    """Print the name of the measured library."""
     print("ready", flush=True)
 
 
@@ -32,7 +32,7 @@ def connected(publisher: Any, count: int = 1) -> None:
 
 
 def echo() -> None:
-    """Send everything back."""
+    """Send every message back."""
     pong = rospy.Publisher("pong", String, queue_size=QUEUE, tcp_nodelay=True)
     rospy.Subscriber("ping", String, pong.publish, buff_size=BUFFER, tcp_nodelay=True)
     ready()
@@ -40,7 +40,7 @@ def echo() -> None:
 
 
 def ping(sizes: str) -> None:
-    """Send each size so often, one message in flight."""
+    """Send each size repeatedly, one message in flight."""
     answered = threading.Event()
     rospy.Subscriber("pong", String, lambda _: answered.set(), buff_size=BUFFER, tcp_nodelay=True)
     publisher = rospy.Publisher("ping", String, queue_size=QUEUE, tcp_nodelay=True)
@@ -60,7 +60,7 @@ def ping(sizes: str) -> None:
 
 
 def talk(seconds: str) -> None:
-    """Publish as fast as it goes."""
+    """Publish as fast as possible."""
     publisher = rospy.Publisher("flood", String, queue_size=None if QUEUE is None else 1000)
     connected(publisher)
     text, sent, end = "x" * 60, 0, time.perf_counter() + float(seconds)

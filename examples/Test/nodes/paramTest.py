@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 
-from rce.ros.errors import ParameterMissing, ServiceFault
+from rce.ros.errors import ParameterMissingError, ServiceFaultError
 from rce.ros.names import parse_arguments
 from rce.ros.node import Node, run
 
@@ -19,8 +19,8 @@ async def main(label: str) -> None:
         async def answer(_request: object) -> dict[str, str]:
             try:
                 values = [f"{name}={await node.get_param(name)}" for name in PARAMETERS]
-            except ParameterMissing as error:
-                raise ServiceFault("parameterTest", str(error)) from error
+            except ParameterMissingError as error:
+                raise ServiceFaultError("parameterTest", str(error)) from error
             return {"msg": f"{label}: {' '.join(values)}"}
 
         await node.advertise_service("parameterTest", "Test/ParameterTest", answer)

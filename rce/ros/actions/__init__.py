@@ -1,11 +1,11 @@
-"""Actions: long tasks that a node asks another one for, with feedback, cancellation and a result.
+"""Actions: long tasks that one node requests from another, with feedback, cancellation and a result.
 
 On the wire it is ROS's actionlib: five topics below the action's name.
 """
 
 from rce.ros.actions.client import ActionClient
 from rce.ros.actions.client_goal import ClientGoal
-from rce.ros.actions.exceptions import ActionError, GoalFailed, IllegalTransition, UnknownGoal
+from rce.ros.actions.exceptions import ActionError, GoalFailedError, IllegalTransitionError, UnknownGoalError
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.server import ActionServer, SimpleActionServer
 from rce.ros.actions.server_goal import ServerGoal
@@ -18,11 +18,11 @@ __all__ = [
     "ClientGoal",
     "CommState",
     "GoalEvent",
-    "GoalFailed",
+    "GoalFailedError",
     "GoalId",
     "GoalState",
-    "IllegalTransition",
+    "IllegalTransitionError",
     "ServerGoal",
     "SimpleActionServer",
-    "UnknownGoal",
+    "UnknownGoalError",
 ]

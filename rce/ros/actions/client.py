@@ -1,4 +1,4 @@
-"""Action clients: the five topics around trackers of goals."""
+"""Action clients: the five topics of an action, and a tracker for each goal."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from rce.aio.tasks import TaskScope
 from rce.ros.actions import topics
 from rce.ros.actions.client_goal import ChangeCallback, ClientGoal, FeedbackCallback
-from rce.ros.actions.exceptions import IllegalTransition
+from rce.ros.actions.exceptions import IllegalTransitionError
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.patience import PatientClock
 from rce.ros.actions.states import CommState, GoalState
 from rce.ros.actions.tracker import GoalTracker
-from rce.ros.handles import release
-from rce.ros.tasks import TaskScope
+from rce.ros.closing import release
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher, Subscriber
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 PATIENCE = 10.0
-"""Seconds of silence of a server, which should speak five times a second, after which its goals are lost."""
+"""Seconds without a status of the server, which should send five a second, after which its goals are lost."""
 
 TICK = 0.25
-"""Seconds between two looks whether something must be repeated or given up, while goals are under way."""
+"""Seconds between checks whether a message must be repeated or a goal given up, while goals are under way."""
 
 
 class ActionClient:
@@ -38,7 +38,7 @@ class ActionClient:
     ``async with ActionClient(node, "fibonacci", "actionlib_tutorials/FibonacciAction") as client:``
     ``goal = await client.send(order=5)``, ``print(await goal.result())``
 
-    Leaving the block forgets the goals, which go on at the server; here, they are lost.
+    Leaving the block forgets the goals: they continue at the server, and count as lost here.
 
     Attributes:
         name: The action's global name.
@@ -59,7 +59,7 @@ class ActionClient:
             name: The action's name: the namespace of its topics.
             kind: Its type, such as ``actionlib_tutorials/FibonacciAction``; ``Action`` may be left out.
             patience: Seconds of silence of the server after which its goals are lost; ``math.inf``: never.
-                While simulated time stands still, nothing is missed.
+                Time does not count while simulated time stands still.
         """
         self.name = node.resolve(name)
         self._node = node
@@ -84,7 +84,7 @@ class ActionClient:
         """The goals that are not over, the oldest first."""
         return tuple(self._goals.values())
 
-    # ------------------------------------------------------------------ life
+    # Life
 
     async def __aenter__(self) -> Self:
         node, types = self._node, self._types
@@ -104,7 +104,7 @@ class ActionClient:
                 subscriber = await node.subscribe(f"{self.name}/{topic}", kind, callback)
                 stack.push_async_callback(release, subscriber)
                 self._inputs.append(subscriber)
-            tasks.start(self._look_after_goals(), name=f"goals of {self.name}")
+            tasks.spawn(self._look_after_goals(), name=f"goals of {self.name}")
             self._stack = stack.pop_all()
         return self
 
@@ -114,13 +114,13 @@ class ActionClient:
         await self._stack.aclose()
         self._inputs.clear()
 
-    # ------------------------------------------------------------------ for programs
+    # For programs
 
     async def wait_for_server(self, timeout: float | None = None) -> None:
         """Wait until a server has spoken and all five topics are connected.
 
         Raises:
-            TimeoutError: There is none within ``timeout`` seconds.
+            TimeoutError: No server was connected within ``timeout`` seconds.
         """
         async with asyncio.timeout(timeout):
             await self._heard.wait()
@@ -175,7 +175,7 @@ class ActionClient:
         """Ask the server to end all goals made up to a time, those of other clients and late ones too."""
         self._cancel.publish(stamp=time)
 
-    # ------------------------------------------------------------------ what the server says
+    # Messages of the server
 
     def _status_received(self, message: Message) -> None:
         now = self._clock.now()
@@ -189,7 +189,7 @@ class ActionClient:
                 continue
             try:
                 self._update(goal, goal.tracker.listed(GoalState(status.status), status.text, now))
-            except (IllegalTransition, ValueError) as error:
+            except (IllegalTransitionError, ValueError) as error:
                 _log.warning("the server of %s says what cannot be: %s", self.name, error)
 
     def _result_received(self, message: Message) -> None:
@@ -208,7 +208,7 @@ class ActionClient:
         if goal is not None:
             goal.feedback_received(message.feedback)
 
-    # ------------------------------------------------------------------ looking after goals
+    # Repeating messages and giving goals up
 
     async def _look_after_goals(self) -> None:
         while True:
@@ -246,6 +246,6 @@ class ActionClient:
 
 
 def _patient_clock(node: Node) -> PatientClock:
-    """A machine's clock may be set back; silence is not measured in that, unless time is simulated."""
+    """Return the clock for silence: not the time of day, which may be set back, unless time is simulated."""
     machine = asyncio.get_running_loop().time
     return PatientClock(machine, node.time if node.is_time_simulated else machine)

@@ -1,4 +1,4 @@
-"""A goal as the program sees it that asked for it."""
+"""A goal as the requesting program sees it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from typing import TYPE_CHECKING, Any
 
-from rce.ros.actions.exceptions import GoalFailed
+from rce.aio.queues import BoundedQueue
+from rce.ros.actions.exceptions import GoalFailedError
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.states import CommState, GoalState
 from rce.ros.actions.tracker import GoalTracker
-from rce.ros.node.queue import DropOldest
+from rce.ros.node.settings import MAX_QUEUED_BYTES
 
 if TYPE_CHECKING:
     from rce.ros.types import Message, Time
@@ -42,13 +43,13 @@ class ClientGoal:
     ) -> None:
         self.goal_id = goal_id
         self.tracker = tracker
-        """What is known of it."""
+        """The goal's state."""
         self._send_cancel = send_cancel
         self._on_feedback = on_feedback
         self._on_change = on_change
         self._result: Message | None = None
         self._done = asyncio.Event()
-        self._feedback: DropOldest[Message] = DropOldest(FEEDBACK_QUEUE)
+        self._feedback: BoundedQueue[Message] = BoundedQueue(FEEDBACK_QUEUE, MAX_QUEUED_BYTES)
         self._arrived = asyncio.Event()
 
     def __repr__(self) -> str:
@@ -71,21 +72,21 @@ class ClientGoal:
 
     @property
     def comm_state(self) -> CommState:
-        """How far the exchange with the server is."""
+        """The state of the communication with the server."""
         return self.tracker.comm
 
     @property
     def text(self) -> str:
-        """The server's words on its state."""
+        """The server's text on the goal's state."""
         return self.tracker.text
 
     @property
     def is_done(self) -> bool:
-        """Whether the result is there or the goal is lost."""
+        """Whether the result has come or the goal is lost."""
         return self.tracker.is_done
 
     def cancel(self) -> None:
-        """Ask the server to end it; without effect once it is over. How it ended, its result tells."""
+        """Ask the server to end the goal; without effect once it is over. The result tells how it ended."""
         if not self.is_done:
             self._send_cancel(self)
 
@@ -96,7 +97,7 @@ class ClientGoal:
             How it ended.
 
         Raises:
-            TimeoutError: It is not over within ``timeout`` seconds; it goes on.
+            TimeoutError: It is not over within ``timeout`` seconds; it continues.
         """
         async with asyncio.timeout(timeout):
             await self._done.wait()
@@ -106,12 +107,12 @@ class ClientGoal:
         """Wait for the result. A caller that is cancelled does not cancel the goal.
 
         Raises:
-            GoalFailed: It ended in another way than by success.
-            TimeoutError: It is not over within ``timeout`` seconds; it goes on.
+            GoalFailedError: It ended in another way than by success.
+            TimeoutError: It is not over within ``timeout`` seconds; it continues.
         """
         state = await self.wait(timeout)
         if state is not GoalState.SUCCEEDED or self._result is None:
-            raise GoalFailed(self.id, state, self.text, self._result)
+            raise GoalFailedError(self.id, state, self.text, self._result)
         return self._result
 
     def __aiter__(self) -> AsyncIterator[Message]:
@@ -125,7 +126,7 @@ class ClientGoal:
             await self._arrived.wait()
         return self._feedback.take()
 
-    # ------------------------------------------------------------------ what the client tells
+    # For the client
 
     def feedback_received(self, feedback: Message) -> None:
         """Take feedback."""
@@ -138,7 +139,7 @@ class ClientGoal:
             self._arrived.set()
 
     def changed(self, passed: tuple[CommState, ...], result: Message | None = None) -> None:
-        """Take what the tracker made of an event."""
+        """Take a change of the tracker's state."""
         if not passed:
             return
         if self.is_done:

@@ -1,19 +1,19 @@
-"""What can go wrong with actions.
+"""Errors of actions.
 
 ::
 
     RosError
     +-- ActionError
-        +-- GoalFailed          a goal ended in another way than by success: how, why and with which result
-        +-- IllegalTransition   a goal cannot do that in its present state (misuse, or a peer out of step)
-        +-- UnknownGoal         a server was asked about a goal that it does not remember
+        +-- GoalFailedError         a goal ended without success: how, why, and with which result
+        +-- IllegalTransitionError  a goal cannot do that in its present state (misuse, or a peer out of step)
+        +-- UnknownGoalError        a server was asked about a goal that it does not remember
 """
 
 from __future__ import annotations
 
-from enum import Enum
 from typing import TYPE_CHECKING
 
+from rce.lifecycle import InvalidTransitionError
 from rce.ros.errors import RosError
 
 if TYPE_CHECKING:
@@ -25,14 +25,14 @@ class ActionError(RosError):
     """Base of all errors of :mod:`rce.ros.actions`."""
 
 
-class GoalFailed(ActionError):  # noqa: N818
+class GoalFailedError(ActionError):
     """A goal did not succeed.
 
     Attributes:
         goal_id: Which goal.
         state: How it ended: aborted, rejected, preempted, recalled or lost.
-        text: What the server says about it.
-        result: The result that came all the same; None for a lost goal.
+        text: The server's text on it.
+        result: The result, which comes for failed goals too; None for a lost goal.
     """
 
     def __init__(self, goal_id: str, state: GoalState, text: str, result: Message | None) -> None:
@@ -47,27 +47,15 @@ class GoalFailed(ActionError):  # noqa: N818
         return f"goal {self.goal_id} was {self.state.name.lower()}{reason}"
 
 
-class IllegalTransition(ActionError):  # noqa: N818
+class IllegalTransitionError(InvalidTransitionError, ActionError):
     """An event does not fit the state of a goal; nothing was changed.
 
-    Attributes:
-        goal_id: Which goal.
-        state: The state it is in.
-        event: What should have happened, or the status that a server reported.
+    For a client's goal, the event is the state that its server reported.
     """
 
-    def __init__(self, goal_id: str, state: Enum, event: Enum) -> None:
-        super().__init__(goal_id, state, event)
-        self.goal_id = goal_id
-        self.state = state
-        self.event = event
 
-    def __str__(self) -> str:
-        return f"goal {self.goal_id} is {self.state.name}: {self.event.name} is not possible"
-
-
-class UnknownGoal(ActionError, LookupError):  # noqa: N818
-    """There is no such goal, or not any longer.
+class UnknownGoalError(ActionError, LookupError):
+    """The server does not know the goal, or no longer.
 
     Attributes:
         goal_id: Which goal.

@@ -16,7 +16,7 @@ _counter = count(1)
 
 @dataclass(frozen=True, slots=True)
 class GoalId:
-    """What ``actionlib_msgs/GoalID`` holds.
+    """The contents of an ``actionlib_msgs/GoalID``.
 
     Attributes:
         id: Unique in the graph; empty where all goals are meant, or where the server is to choose one.

@@ -1,4 +1,4 @@
-"""What an action server remembers of its goals. Pure: events and the time go in, what changed comes out.
+"""The goals that an action server keeps. Pure: takes events and the time, and returns what changed.
 
 Rules of ROS's own servers that clients rely on:
 
@@ -14,9 +14,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum, auto
 
-from rce.ros.actions.exceptions import IllegalTransition, UnknownGoal
+from rce.lifecycle import remember
+from rce.ros.actions.exceptions import UnknownGoalError
 from rce.ros.actions.goal_id import GoalId
-from rce.ros.actions.states import GOAL_TRANSITIONS, GoalEvent, GoalState
+from rce.ros.actions.states import GOAL_LIFE, GoalEvent, GoalState
 
 MEMORY = 5.0
 """Seconds that a goal stays in the list after its end."""
@@ -31,10 +32,11 @@ class Entry:
 
     Attributes:
         goal_id: Its name and stamp.
-        state: How it stands.
-        text: The server's words on it.
+        state: Its state.
+        text: The server's text on its state.
         has_come: False for a goal of which only the cancellation has come.
         forget_at: When it leaves the list, seconds; None while it is not over.
+        recent: Its latest event.
     """
 
     goal_id: GoalId
@@ -42,10 +44,11 @@ class Entry:
     text: str = ""
     has_come: bool = True
     forget_at: float | None = None
+    recent: tuple[GoalEvent, ...] = ()
 
 
 class Arrival(Enum):
-    """What a goal that comes means to a server."""
+    """How a server classifies an incoming goal."""
 
     NEW = auto()
     """It is to be worked on."""
@@ -70,12 +73,12 @@ class GoalLedger:
         """Return a goal's entry.
 
         Raises:
-            UnknownGoal: There is none (any longer).
+            UnknownGoalError: The goal is not in the list (any more).
         """
         try:
             return self._entries[goal_id]
         except KeyError:
-            raise UnknownGoal(goal_id) from None
+            raise UnknownGoalError(goal_id) from None
 
     def receive(self, goal_id: GoalId, now: float) -> Arrival:
         """Take a goal. Its id must not be empty; without a stamp, no cancellation up to a time meets it."""
@@ -111,7 +114,7 @@ class GoalLedger:
                 or (request.stamp and entry.goal_id.stamp <= request.stamp)
                 or request == GoalId()
             )
-            if is_meant and (entry.state, GoalEvent.REQUEST_CANCEL) in GOAL_TRANSITIONS:
+            if is_meant and entry.has_come and GOAL_LIFE.allows(entry.state, GoalEvent.REQUEST_CANCEL):
                 self.apply(entry.goal_id.id, GoalEvent.REQUEST_CANCEL, now, entry.text)
                 asked.append(entry.goal_id.id)
         if request.id and request.id not in self._entries:
@@ -122,27 +125,27 @@ class GoalLedger:
         return asked
 
     def begin_anew(self) -> None:
-        """Learn that time jumped back: cancellations of all goals up to a time are void."""
+        """Take note that time jumped back: cancellations of all goals up to a time are void."""
         self._cancelled_up_to = 0
 
     def apply(self, goal_id: str, event: GoalEvent, now: float, text: str = "") -> Entry:
-        """Let something happen to a goal.
+        """Apply an event to a goal.
 
         Raises:
-            UnknownGoal: There is no such goal.
-            IllegalTransition: It is not possible in the goal's state; nothing was changed.
+            UnknownGoalError: The goal has not come, or is forgotten.
+            IllegalTransitionError: It is not possible in the goal's state; nothing was changed.
         """
         entry = self[goal_id]
-        state = GOAL_TRANSITIONS.get((entry.state, event))
-        if state is None:
-            raise IllegalTransition(goal_id, entry.state, event)
-        entry.state, entry.text = state, text
+        if not entry.has_come:
+            raise UnknownGoalError(goal_id)
+        state = GOAL_LIFE.advance(entry.state, event, goal_id, entry.recent)
+        entry.state, entry.text, entry.recent = state, text, remember(entry.recent, event)
         if state.is_over:
             entry.forget_at = now + self.memory
         return entry
 
     def listed(self, now: float) -> Iterable[Entry]:
-        """Forget what is to be forgotten and return the rest, the oldest first."""
+        """Remove expired goals and return the rest, the oldest first."""
         overdue = [
             key
             for key, entry in self._entries.items()

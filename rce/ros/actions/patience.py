@@ -1,4 +1,4 @@
-"""Time in which something could have happened: what silence is measured in."""
+"""A clock for measuring silence, by machine time and ROS time."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Callable
 class PatientClock:
     """Seconds that passed both for this machine and for the graph.
 
-    With simulated time, others do nothing while it stands still, and little while it creeps; a jump is no
-    time at all that they had. Where time is not simulated, both are the same.
+    While simulated time stands still or runs slowly, other nodes do little; a jump gives them no time at all.
+    If time is not simulated, both are the same.
     """
 
     def __init__(self, machine: Callable[[], float], graph: Callable[[], float]) -> None:

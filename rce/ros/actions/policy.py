@@ -1,4 +1,4 @@
-"""Which goals a server works on, and when. Pure: reducers from what happens to the steps to take."""
+"""Policies on which goals a server works on, and when. Pure: reducers from events to steps."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class Start:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Ask who works on a goal to end."""
+    """Ask the handler of a goal to end."""
 
     goal_id: str
 
 
 @dataclass(frozen=True, slots=True)
 class Drop:
-    """Take a goal as cancelled; nobody works on it."""
+    """Cancel a goal that no handler works on."""
 
     goal_id: str
     text: str = ""
@@ -53,10 +53,10 @@ class Policy(Protocol):
         """Take a new goal."""
 
     def cancel(self, goal_id: str) -> list[Step]:
-        """Learn that a client asks to end a goal that is not over."""
+        """Take note that a client asks to end a goal that is not over."""
 
     def ended(self, goal_id: str) -> list[Step]:
-        """Learn that the work on a goal has ended."""
+        """Take note that the work on a goal has ended."""
 
 
 @dataclass(slots=True)

@@ -1,4 +1,4 @@
-"""Action servers: the five topics around a ledger of goals, a policy and the program's handler."""
+"""Action servers: the five topics of an action, a ledger of goals, a policy and the program's handler."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import asyncio
 import logging
 from contextlib import AsyncExitStack
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, assert_never
 
+from rce.aio.tasks import TaskScope
 from rce.ros.actions import topics, work
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.ledger import MEMORY, Arrival, Entry, GoalLedger
 from rce.ros.actions.policy import MAX_GOALS, Drop, ManyGoals, Policy, Refuse, SingleGoal, Start, Step, Stop
 from rce.ros.actions.server_goal import Content, ServerGoal
 from rce.ros.actions.states import GoalEvent
-from rce.ros.handles import release
-from rce.ros.tasks import TaskScope
+from rce.ros.closing import release
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher
@@ -94,7 +94,7 @@ class ActionServer:
         """The goals that are not over, the oldest first."""
         return tuple(goal for goal in self._goals.values() if not goal.state.is_over)
 
-    # ------------------------------------------------------------------ life
+    # Life
 
     async def __aenter__(self) -> Self:
         node, types = self._node, self._types
@@ -116,7 +116,7 @@ class ActionServer:
             self._tasks = await stack.enter_async_context(TaskScope())
             self._publish_status()
             if frequency > 0:
-                self._tasks.start(self._keep_publishing(1 / frequency), name=f"status of {self.name}")
+                self._tasks.spawn(self._keep_publishing(1 / frequency), name=f"status of {self.name}")
             for topic, kind, callback in (
                 ("cancel", topics.GOAL_ID, self._cancel_received),
                 ("goal", types.action_goal, self._goal_received),
@@ -136,11 +136,11 @@ class ActionServer:
 
     async def _keep_publishing(self, period: float) -> None:
         while True:
-            await asyncio.sleep(period)  # of real time: clients learn how goals stand while time stands still
+            await asyncio.sleep(period)  # real time: clients need the list while ROS time stands still
             self._see_time()
             self._publish_status()
 
-    # ------------------------------------------------------------------ what clients say
+    # Messages of clients
 
     def _goal_received(self, message: Message) -> None:
         goal_id, now = GoalId.read(message.goal_id), self._see_time()
@@ -180,26 +180,28 @@ class ActionServer:
             goal = self._goals[step.goal_id]
             match step:
                 case Start():
-                    self._tasks.start(self._work_on(goal), name=f"goal {goal.id}")
+                    self._tasks.spawn(self._work_on(goal), name=f"goal {goal.id}")
                 case Stop():
                     goal.request_cancel()
                 case Drop(text=text):
                     self._end_unstarted(goal, GoalEvent.CANCEL, text)
                 case Refuse(text=text):
                     self._end_unstarted(goal, GoalEvent.REJECT, text)
+                case _:
+                    assert_never(step)
 
     def _end_unstarted(self, goal: ServerGoal, event: GoalEvent, text: str) -> None:
         del self._goals[goal.id]
         if not goal.state.is_over:
             self.transition(self._ledger[goal.id], event, text, None)
 
-    # ------------------------------------------------------------------ what the program says
+    # Calls of the program
 
     def transition(self, entry: Entry, event: GoalEvent, text: str, result: Message | Content | None) -> None:
-        """Let something happen to a goal and tell its clients.
+        """Apply an event to a goal and tell its clients.
 
         Raises:
-            IllegalTransition: It is not possible in the goal's state.
+            IllegalTransitionError: It is not possible in the goal's state.
             SerializationError: The result does not fit its type; nothing was changed.
         """
         content = self._result.type.new(result={} if result is None else result)
@@ -211,7 +213,7 @@ class ActionServer:
             self._publish_result(entry, content.result)
 
     def publish_feedback(self, entry: Entry, feedback: Message | Content) -> None:
-        """Tell a goal's clients how it goes.
+        """Publish feedback to a goal's clients.
 
         Raises:
             SerializationError: The feedback does not fit its type.
@@ -222,10 +224,10 @@ class ActionServer:
         self._feedback.publish_serialized(kind.serialize(message))
 
     async def sleep(self, seconds: float) -> bool:
-        """Sleep in ROS time; tell whether the node goes on."""
+        """Sleep in ROS time; return whether the node continues."""
         return await self._node.sleep(seconds)
 
-    # ------------------------------------------------------------------ work
+    # Work
 
     async def _work_on(self, goal: ServerGoal) -> None:
         """Run the handler; whatever it does, the goal is over at the end."""
@@ -237,7 +239,7 @@ class ActionServer:
         except asyncio.CancelledError:
             work.give_up(goal, STOPPED)
             raise
-        except Exception as error:  # noqa: BLE001 - the program's own fault is the client's to know
+        except Exception as error:  # noqa: BLE001 - the client gets every failure of the program
             _log.exception("the handler of %s failed on goal %s", self.name, goal.id)
             work.give_up(goal, f"{type(error).__name__}: {error}")
         finally:
@@ -251,7 +253,7 @@ class ActionServer:
             _, goal = self._goals.popitem()
             work.give_up(goal, STOPPED)
 
-    # ------------------------------------------------------------------ publishing
+    # Publishing
 
     def _publish_status(self) -> None:
         entries = self._ledger.listed(self._time())

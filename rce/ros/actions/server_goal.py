@@ -1,4 +1,4 @@
-"""A goal as the program sees it that works on it."""
+"""A goal as the program that works on it sees it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
+from rce.aio.tasks import cancel_and_wait
 from rce.ros.actions.goal_id import GoalId
 from rce.ros.actions.ledger import Entry
 from rce.ros.actions.states import GoalEvent, GoalState
@@ -18,16 +19,16 @@ Content = Mapping[str, Any]
 
 
 class GoalServer(Protocol):
-    """What a goal needs of its server."""
+    """The server, as its goals use it."""
 
     def transition(self, entry: Entry, event: GoalEvent, text: str, result: Message | Content | None) -> None:
-        """Let something happen to a goal and tell its clients."""
+        """Apply an event to a goal and tell its clients."""
 
     def publish_feedback(self, entry: Entry, feedback: Message | Content) -> None:
-        """Tell the goal's clients how it goes."""
+        """Publish feedback to the goal's clients."""
 
     async def sleep(self, seconds: float) -> bool:
-        """Sleep in ROS time; tell whether the node goes on."""
+        """Sleep in ROS time; return whether the node continues."""
 
 
 class ServerGoal:
@@ -63,21 +64,21 @@ class ServerGoal:
 
     @property
     def state(self) -> GoalState:
-        """How the goal stands."""
+        """The goal's state."""
         return self._entry.state
 
     @property
     def text(self) -> str:
-        """What was said last on how it stands."""
+        """The latest text on the goal's state."""
         return self._entry.text
 
-    # ------------------------------------------------------------------ what happens to it
+    # Transitions
 
     def accept(self, text: str = "") -> None:
         """Begin to work on it.
 
         Raises:
-            IllegalTransition: It was accepted already, or is over.
+            IllegalTransitionError: It was accepted already, or is over.
         """
         self._server.transition(self._entry, GoalEvent.ACCEPT, text, None)
 
@@ -85,25 +86,25 @@ class ServerGoal:
         """Refuse to work on it.
 
         Raises:
-            IllegalTransition: It was accepted already, or is over.
+            IllegalTransitionError: It was accepted already, or is over.
         """
         self._server.transition(self._entry, GoalEvent.REJECT, text, result)
 
     def succeed(self, result: Message | Content | None = None, text: str = "") -> None:
-        """End it: it was reached. ``result`` is a message, or a mapping of its fields.
+        """End the goal with success. ``result`` is a message, or a mapping of its fields.
 
         Raises:
-            IllegalTransition: It was not accepted, or is over.
-            SerializationError: The result does not fit its type; the goal goes on.
+            IllegalTransitionError: It was not accepted, or is over.
+            SerializationError: The result does not fit its type; the goal continues.
         """
         self._server.transition(self._entry, GoalEvent.SUCCEED, text, result)
 
     def abort(self, text: str = "", result: Message | Content | None = None) -> None:
-        """End it: it is given up.
+        """End the goal without success.
 
         Raises:
-            IllegalTransition: It was not accepted, or is over.
-            SerializationError: The result does not fit its type; the goal goes on.
+            IllegalTransitionError: It was not accepted, or is over.
+            SerializationError: The result does not fit its type; the goal continues.
         """
         self._server.transition(self._entry, GoalEvent.ABORT, text, result)
 
@@ -111,20 +112,20 @@ class ServerGoal:
         """End it early: preempted if it was accepted, else recalled.
 
         Raises:
-            IllegalTransition: It is over.
-            SerializationError: The result does not fit its type; the goal goes on.
+            IllegalTransitionError: It is over.
+            SerializationError: The result does not fit its type; the goal continues.
         """
         self._server.transition(self._entry, GoalEvent.CANCEL, text, result)
 
     def publish_feedback(self, feedback: Message | Content | None = None, /, **fields: Any) -> None:
-        """Tell the clients how it goes, by a message, a mapping of its fields, or its fields.
+        """Publish feedback, given as a message, as a mapping of its fields, or by its fields.
 
         Raises:
             SerializationError: A value does not fit its field.
         """
         self._server.publish_feedback(self._entry, fields if feedback is None else feedback)
 
-    # ------------------------------------------------------------------ being asked to end
+    # Cancellation
 
     @property
     def cancel_requested(self) -> bool:
@@ -149,10 +150,8 @@ class ServerGoal:
             await asyncio.wait((sleeping, stopping), return_when=asyncio.FIRST_COMPLETED)
             return not self._stop.is_set() and sleeping.result()
         finally:
-            for task in (sleeping, stopping):
-                task.cancel()
-            await asyncio.gather(sleeping, stopping, return_exceptions=True)
+            await cancel_and_wait(sleeping, stopping)
 
     def request_cancel(self) -> None:
-        """Ask the handler to end it; the server does, programs may."""
+        """Ask the handler to end the goal. The server calls this; a program may too."""
         self._stop.set()

@@ -10,6 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import Enum, IntEnum, auto
 
+from rce.lifecycle import LifeCycle
+from rce.ros.actions.exceptions import IllegalTransitionError
+
 
 class GoalState(IntEnum):
     """The server's view of a goal; the numbers are those of ``actionlib_msgs/GoalStatus``."""
@@ -54,7 +57,7 @@ _OVER = frozenset(
 
 
 class GoalEvent(Enum):
-    """What happens to a goal at its server."""
+    """An event of a goal at its server."""
 
     ACCEPT = auto()
     """The server begins to work on it."""
@@ -72,23 +75,41 @@ class GoalEvent(Enum):
 
 _S, _E = GoalState, GoalEvent
 
-GOAL_TRANSITIONS: Mapping[tuple[GoalState, GoalEvent], GoalState] = {
-    (_S.PENDING, _E.ACCEPT): _S.ACTIVE,
-    (_S.PENDING, _E.REJECT): _S.REJECTED,
-    (_S.PENDING, _E.REQUEST_CANCEL): _S.RECALLING,
-    (_S.PENDING, _E.CANCEL): _S.RECALLED,
-    (_S.RECALLING, _E.ACCEPT): _S.PREEMPTING,
-    (_S.RECALLING, _E.REJECT): _S.REJECTED,
-    (_S.RECALLING, _E.CANCEL): _S.RECALLED,
-    (_S.ACTIVE, _E.REQUEST_CANCEL): _S.PREEMPTING,
-    (_S.ACTIVE, _E.CANCEL): _S.PREEMPTED,
-    (_S.ACTIVE, _E.SUCCEED): _S.SUCCEEDED,
-    (_S.ACTIVE, _E.ABORT): _S.ABORTED,
-    (_S.PREEMPTING, _E.CANCEL): _S.PREEMPTED,
-    (_S.PREEMPTING, _E.SUCCEED): _S.SUCCEEDED,
-    (_S.PREEMPTING, _E.ABORT): _S.ABORTED,
-}
-"""State and event to the next state; what is not here cannot happen."""
+GOAL_LIFE: LifeCycle[GoalState, GoalEvent] = LifeCycle(
+    "goal",
+    {
+        _S.PENDING: {
+            _E.ACCEPT: _S.ACTIVE,
+            _E.REJECT: _S.REJECTED,
+            _E.REQUEST_CANCEL: _S.RECALLING,
+            _E.CANCEL: _S.RECALLED,
+        },
+        _S.RECALLING: {
+            _E.ACCEPT: _S.PREEMPTING,
+            _E.REJECT: _S.REJECTED,
+            _E.CANCEL: _S.RECALLED,
+        },
+        _S.ACTIVE: {
+            _E.REQUEST_CANCEL: _S.PREEMPTING,
+            _E.CANCEL: _S.PREEMPTED,
+            _E.SUCCEED: _S.SUCCEEDED,
+            _E.ABORT: _S.ABORTED,
+        },
+        _S.PREEMPTING: {
+            _E.CANCEL: _S.PREEMPTED,
+            _E.SUCCEED: _S.SUCCEEDED,
+            _E.ABORT: _S.ABORTED,
+        },
+        _S.REJECTED: {},
+        _S.RECALLED: {},
+        _S.PREEMPTED: {},
+        _S.SUCCEEDED: {},
+        _S.ABORTED: {},
+        _S.LOST: {},
+    },
+    error=IllegalTransitionError,
+)
+"""A goal at its server. Transitions that are not listed are illegal."""
 
 
 class CommState(Enum):

@@ -1,10 +1,10 @@
-"""What an action client knows of one goal. Pure: events and the time go in, the states passed come out."""
+"""An action client's state of one goal. Pure: takes events and the time, and returns the states passed."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rce.ros.actions.exceptions import IllegalTransition
+from rce.ros.actions.exceptions import IllegalTransitionError
 from rce.ros.actions.states import CLIENT_TRANSITIONS, CommState, GoalState
 
 REPEAT_AFTER = 1.0
@@ -29,7 +29,7 @@ class GoalTracker:
         since: When the communication state began.
         comm: The communication state.
         state: The goal's state, as the server last said.
-        text: The server's words on it.
+        text: The server's text on its state.
         is_acknowledged: Whether the server has ever listed the goal.
         sent_at: When the goal, or its cancellation, was sent last.
     """
@@ -48,19 +48,20 @@ class GoalTracker:
         return self.comm is CommState.DONE
 
     def listed(self, state: GoalState, text: str, now: float) -> tuple[CommState, ...]:
-        """Take what the server's list says.
+        """Take the goal's entry in the server's list.
 
         Returns:
-            The communication states that were passed, the present one last; empty if there is no change.
+            The communication states that were passed, the present one last; empty if nothing changed.
 
         Raises:
-            IllegalTransition: No goal goes this way; nothing was changed.
+            IllegalTransitionError: The transition is illegal; nothing was changed.
         """
         if self.is_done:
             return ()
-        passed = CLIENT_TRANSITIONS[self.comm].get(state)
+        row = CLIENT_TRANSITIONS[self.comm]
+        passed = row.get(state)
         if passed is None:
-            raise IllegalTransition(self.goal_id, self.comm, state)
+            raise IllegalTransitionError(f"goal {self.goal_id}", self.comm, state, tuple(row), ())
         self.is_acknowledged = True
         self.state, self.text = state, text
         return self._pass(passed, now)
@@ -81,7 +82,7 @@ class GoalTracker:
         return self._pass((*passed, CommState.DONE), now)
 
     def cancelled(self, now: float) -> tuple[CommState, ...]:
-        """Learn that a cancellation was sent; it changes nothing for a goal that ends already."""
+        """Take note that a cancellation was sent; it changes nothing for a goal that ends already."""
         if self.comm in _ENDING:
             return ()
         self.sent_at = now
@@ -104,7 +105,7 @@ class GoalTracker:
         return ()
 
     def must_repeat(self, now: float) -> bool:
-        """Tell whether goal or cancellation must be sent again; they then count as sent now."""
+        """Return whether goal or cancellation must be sent again; they then count as sent now."""
         waits = not self.is_acknowledged or self.comm is CommState.WAITING_FOR_CANCEL_ACK
         if self.is_done or not waits or now - self.sent_at < REPEAT_AFTER:
             return False

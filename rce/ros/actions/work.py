@@ -1,4 +1,4 @@
-"""Working on one goal: what a program's handler may be, and what its end means for the goal."""
+"""Work on one goal: kinds of handlers, and how a handler's end ends the goal."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def conclude(goal: ServerGoal, result: Message | Content | None) -> None:
 
 
 def give_up(goal: ServerGoal, text: str) -> None:
-    """End a goal that nobody works on any longer, unless it is over."""
+    """End a goal that no handler works on any more, unless it is over."""
     if goal.state in _NOT_ACCEPTED:
         goal.reject(text)
     elif not goal.state.is_over:

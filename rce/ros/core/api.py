@@ -1,4 +1,4 @@
-"""The Master API and the Parameter Server API: checks arguments, asks the graph, words the answers.
+"""The Master API and the Parameter Server API: check arguments, query the graph, format the answers.
 
 http://wiki.ros.org/ROS/Master_API, http://wiki.ros.org/ROS/Parameter%20Server%20API
 """
@@ -14,7 +14,7 @@ from rce.ros.core.events import Outcome
 from rce.ros.core.graph import ANY_TYPE, Graph
 from rce.ros.core.registrations import Kind
 from rce.ros.xmlrpc.arguments import graph_name
-from rce.ros.xmlrpc.dispatch import ERROR, FAILURE, SUCCESS, BadArgument, Method
+from rce.ros.xmlrpc.dispatch import ERROR, FAILURE, SUCCESS, BadArgumentError, Method
 
 Answer = tuple[int, str, Any]
 
@@ -30,7 +30,7 @@ NOTHING: dict[str, Any] = {
     "hasParam": False,
     "getParamNames": [],
 }
-"""What these methods' failures carry as value: as rosmaster's, of the type that is expected."""
+"""The value in a failed answer of each method: of the expected type, as rosmaster's."""
 
 
 class MasterApi:
@@ -47,8 +47,8 @@ class MasterApi:
 
         Args:
             graph: The state.
-            uri: Tells the core's own URI.
-            perform: Takes what follows from an operation.
+            uri: Returns the core's own URI.
+            perform: Takes the outcome of an operation.
             on_shutdown: Takes the reason when the core is told to end; without it, that is refused.
         """
         self._graph = graph
@@ -83,7 +83,7 @@ class MasterApi:
             "getParamNames": self._get_param_names,
         }
 
-    # ------------------------------------------------------------------ the core itself
+    # The core itself
 
     def _get_uri(self, _caller: str) -> Answer:
         return SUCCESS, "", self._uri()
@@ -97,7 +97,7 @@ class MasterApi:
         self._on_shutdown(f"{caller} asked for it: {reason}")
         return SUCCESS, "shutdown", 0
 
-    # ------------------------------------------------------------------ registrations
+    # Registrations
 
     def _register_publisher(self, caller: str, topic: Any, topic_type: Any, uri: Any) -> Answer:
         topic = graph_name("topic", topic, caller)
@@ -141,7 +141,7 @@ class MasterApi:
             return SUCCESS, f"[{uri}] is no longer the current service api handle for [{name}]", 0
         return SUCCESS, f"[{caller}] is not a known provider of [{name}]", 0
 
-    # ------------------------------------------------------------------ questions
+    # Questions
 
     def _lookup_node(self, caller: str, node: Any) -> Answer:
         node = graph_name("node", node, caller)
@@ -154,7 +154,7 @@ class MasterApi:
 
     def _get_published_topics(self, caller: str, namespace: Any) -> Answer:
         if not isinstance(namespace, str):
-            raise BadArgument("parameter [subgraph] must be a string")
+            raise BadArgumentError("parameter [subgraph] must be a string")
         below = (
             names.resolve(namespace, caller).rstrip(names.SEPARATOR) + names.SEPARATOR if namespace else ""
         )
@@ -166,12 +166,12 @@ class MasterApi:
     def _get_system_state(self, _caller: str) -> Answer:
         return SUCCESS, "current system state", self._graph.system_state()
 
-    # ------------------------------------------------------------------ parameters
+    # Parameters
 
     def _set_param(self, caller: str, key: Any, value: Any) -> Answer:
         name = _key(key, caller)
         if _holds_none(value):
-            raise BadArgument("parameter [value] must be specified, and hold no nil")
+            raise BadArgumentError("parameter [value] must be specified, and hold no nil")
         self._perform(self._graph.set_parameter(name, value, by=caller))
         return SUCCESS, f"parameter {name} set", 0
 
@@ -221,7 +221,7 @@ class MasterApi:
 
 def _key(value: Any, caller: str) -> str:
     if not isinstance(value, str) or not value:
-        raise BadArgument("parameter [key] must be a non-empty string")
+        raise BadArgumentError("parameter [key] must be a non-empty string")
     return names.resolve(value, caller)
 
 
@@ -229,20 +229,20 @@ def _type(value: Any) -> str:
     if value == ANY_TYPE:
         return ANY_TYPE
     if not isinstance(value, str) or value.count("/") != 1:
-        raise BadArgument(f"parameter [topic_type] is not of the form package/Type: {value!r}")
+        raise BadArgumentError(f"parameter [topic_type] is not of the form package/Type: {value!r}")
     return value
 
 
 def _uri(role: str, value: Any) -> str:
     if not isinstance(value, str) or not value.startswith(("http://", "rosrpc://")):
-        raise BadArgument(
+        raise BadArgumentError(
             f"parameter [{role}] is not a URI of the form http://host:port or rosrpc://host:port"
         )
     return value
 
 
 def _holds_none(value: Any) -> bool:
-    """Tell whether a value is or holds XML-RPC's extension ``nil``, which not all clients can read."""
+    """Return whether a value is or holds XML-RPC's extension ``nil``, which not all clients can read."""
     if isinstance(value, dict):
         return any(map(_holds_none, value.values()))
     return any(map(_holds_none, value)) if isinstance(value, list) else value is None

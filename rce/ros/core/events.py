@@ -1,4 +1,4 @@
-"""What comes out of the graph's state when something changed: calls to make and events to watch."""
+"""The results of a change of the graph: calls to make, and events for watchers."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A call that the core owes a node, because of something that another node did."""
+    """A call that the core must make to a node because of another node's change."""
 
     uri: str
     """The node's slave API."""
     method: str
     """``publisherUpdate``, ``paramUpdate`` or ``shutdown``."""
     arguments: tuple[Any, ...]
-    """What follows the core's own name."""
+    """The arguments after the core's own name."""
 
     @property
     def key(self) -> tuple[str, Any]:
@@ -25,7 +25,7 @@ class Call:
 
 
 class Change(Enum):
-    """What happened in the graph."""
+    """The kind of a change of the graph."""
 
     NODE_APPEARED = "node appeared"
     NODE_VANISHED = "node vanished"
@@ -50,7 +50,7 @@ class GraphEvent:
 
 @dataclass(slots=True)
 class Outcome:
-    """All that follows from one operation on the graph."""
+    """The calls and events that follow from one operation on the graph."""
 
     calls: list[Call]
     events: list[GraphEvent]

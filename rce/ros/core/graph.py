@@ -1,7 +1,7 @@
-"""The state of a ROS graph and what follows from each operation on it. Pure: no I/O, no clock.
+"""The state of a ROS graph, and the outcome of each operation on it. Pure: no I/O, no clock.
 
-Every operation that changes something returns an :class:`Outcome`: the calls that the core owes nodes and the
-events for those who watch the graph.
+Every operation that changes something returns an :class:`Outcome`: the calls that the core must make to
+nodes, and the events for watchers of the graph.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Graph:
         self._parameters = ParameterTree()
         self._types: dict[str, str] = {}
 
-    # ------------------------------------------------------------------ questions
+    # Questions
 
     @property
     def nodes(self) -> dict[str, str]:
@@ -44,7 +44,7 @@ class Graph:
 
     @property
     def topic_types(self) -> dict[str, str]:
-        """Topics in use whose types somebody said, and ``*`` for those whose publishers did not."""
+        """Topics in use with known types, and ``*`` for those whose publishers did not give one."""
         return dict(self._types)
 
     def publishers(self, topic: str) -> dict[str, str]:
@@ -73,7 +73,7 @@ class Graph:
         """The parameters; to be changed by :meth:`set_parameter` and :meth:`delete_parameter` only."""
         return self._parameters
 
-    # ------------------------------------------------------------------ topics and services
+    # Topics and services
 
     def register_publisher(self, topic: str, topic_type: str, node: str, uri: str) -> Outcome:
         """Note that a node publishes; the topic's subscribers are told."""
@@ -93,7 +93,7 @@ class Graph:
         return outcome
 
     def register_service(self, service: str, service_uri: str, node: str, uri: str) -> Outcome:
-        """Note that a node provides a service, in place of whoever did before."""
+        """Note that a node provides a service, in place of the previous provider."""
         outcome = self._displace(node, uri)
         for other in list(self._registrations.of(Kind.SERVICE, service)):
             if other != node:
@@ -102,7 +102,7 @@ class Graph:
         return outcome
 
     def unregister(self, kind: Kind, name: str, node: str, uri: str) -> tuple[bool, Outcome]:
-        """Take a registration back; tell whether it was there with this ``uri``."""
+        """Remove a registration; return whether it was there with this ``uri``."""
         outcome = Outcome.empty()
         if self._registrations.of(kind, name).get(node) != uri:
             return False, outcome
@@ -110,7 +110,7 @@ class Graph:
         return True, outcome
 
     def forget_node(self, node: str) -> Outcome:
-        """Take back all that a node has registered."""
+        """Remove all registrations of a node."""
         outcome = Outcome.empty()
         entry = self._registrations.nodes.get(node)
         if entry is not None:
@@ -118,7 +118,7 @@ class Graph:
                 self._remove(kind, name, node, outcome)
         return outcome
 
-    # ------------------------------------------------------------------ parameters
+    # Parameters
 
     def set_parameter(self, name: str, value: Any, *, by: str = "") -> Outcome:
         """Set a parameter or namespace; its subscribers are told, but not the node ``by`` that did it."""
@@ -135,7 +135,7 @@ class Graph:
         return self._tell_of_parameter(name)
 
     def subscribe_parameter(self, name: str, node: str, uri: str) -> tuple[Any, Outcome]:
-        """Tell a node of a parameter's changes from now on; return its value now."""
+        """Subscribe a node to a parameter's changes; return its present value."""
         outcome = self._displace(node, uri)
         self._add(Kind.PARAMETER, name, node, uri, None, outcome)
         return self._value(name), outcome
@@ -153,9 +153,9 @@ class Graph:
         """Check the invariants; for tests."""
         self._registrations.validate()
         for topic in self._types:
-            assert self._is_used(topic), f"the type of {topic} is kept although nobody uses it"
+            assert self._is_used(topic), f"the type of {topic} is kept although it is unused"
 
-    # ------------------------------------------------------------------ inside
+    # Inside
 
     def _displace(self, node: str, uri: str) -> Outcome:
         """Remove and shut down an older node of the same name."""
@@ -187,7 +187,7 @@ class Graph:
             outcome.events.append(GraphEvent(Change.NODE_VANISHED, node))
 
     def _drop_parameter_subscriptions(self, node: str) -> None:
-        """Forget them with a node's last topic or service: rospy does not take them back when it leaves."""
+        """Remove a node's subscriptions with its last topic or service: rospy does not when it leaves."""
         entry = self._registrations.nodes.get(node)
         if entry is not None and all(kind is Kind.PARAMETER for kind, _ in entry.held):
             for kind, name in list(entry.held):
@@ -206,7 +206,7 @@ class Graph:
         outcome = Outcome.empty()
         for subscription, reported in affected(self._registrations.names(Kind.PARAMETER), name):
             value = self._value(reported)
-            knows = besides if reported == name else ""  # who sets a tree is told what it means for its parts
+            knows = besides if reported == name else ""  # the caller learns the changed parts
             arguments = (reported.rstrip(SEPARATOR) + SEPARATOR, value)  # as all masters write it
             for node, uri in self._registrations.of(Kind.PARAMETER, subscription).items():
                 if node != knows:

@@ -1,4 +1,4 @@
-"""Delivers the core's calls to nodes: in order for each node, no node waiting for another."""
+"""Delivers the core's calls to nodes: in order for each node, independently of other nodes."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
+from rce.aio.tasks import TaskScope
 from rce.ros.core.events import Call
-from rce.ros.errors import RpcUnreachable, XmlRpcError
-from rce.ros.tasks import TaskScope
+from rce.ros.errors import RpcUnreachableError, XmlRpcError
 from rce.ros.xmlrpc import RpcClient
 from rce.ros.xmlrpc.codec import encode_call
 from rce.ros.xmlrpc.dispatch import ERROR
@@ -19,14 +19,14 @@ CALL_TIMEOUT = 5.0
 """Seconds that a node may take to answer one call."""
 
 MAX_DOCUMENTS = 32
-"""How many of the newest calls are kept as they are written."""
+"""How many of the newest calls are kept in serialized form."""
 
 CALLER = "/master"
 """The name under which a core calls nodes."""
 
 
 class Notifier:
-    """One queue for each node that is owed calls.
+    """One queue of calls for each node.
 
     A newer call takes the place of a waiting one with the same key, so a queue is never longer than the
     number of topics and parameters of its node, however slow the node is.
@@ -39,8 +39,8 @@ class Notifier:
 
         Args:
             client: Makes the calls.
-            tasks: Owns a task for each node while it is owed something.
-            on_unwanted: Takes a call that a node answered with -1: it does not know what this is about.
+            tasks: Owns a task for each node while calls wait for it.
+            on_unwanted: Takes a call that a node answered with -1: it does not know the topic or parameter.
         """
         self._client = client
         self._on_unwanted = on_unwanted
@@ -53,7 +53,7 @@ class Notifier:
         queue = self._waiting.get(call.uri)
         if queue is None:
             queue = self._waiting[call.uri] = {}
-            self._tasks.start(self._deliver(call.uri, queue), name=f"notify {call.uri}")
+            self._tasks.spawn(self._deliver(call.uri, queue), name=f"notify {call.uri}")
         queue.pop(call.key, None)
         queue[call.key] = call
 
@@ -69,11 +69,11 @@ class Notifier:
         """Return a call's document, made once for all nodes that are told the same.
 
         Raises:
-            MalformedDocument: An argument has no XML-RPC form.
+            MalformedDocumentError: An argument has no XML-RPC form.
         """
         key = (call.method, id(call.arguments))
         known = self._documents.get(key)
-        if known is not None:  # what is in here keeps its arguments, so their id is theirs alone
+        if known is not None:  # an entry keeps its arguments alive, so their id stays unique
             return known[1]
         document = encode_call(call.method, (CALLER, *call.arguments))
         if len(self._documents) >= MAX_DOCUMENTS:
@@ -85,9 +85,9 @@ class Notifier:
         try:
             document = self._written(call)
             answer = await self._client.send(call.uri, call.method, document, timeout=CALL_TIMEOUT)
-        except RpcUnreachable as error:
+        except RpcUnreachableError as error:
             _log.info("%s is not delivered: %s", call.method, error)
-            queue.clear()  # nobody is there; who takes the address over registers and learns the state anew
+            queue.clear()  # the node is gone; a new node at this address registers and learns the state anew
         except XmlRpcError as error:
             _log.warning("%s to %s: %s", call.method, call.uri, error)
         else:

@@ -11,12 +11,12 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from rce.ros import names
-from rce.ros.xmlrpc.dispatch import BadArgument
+from rce.ros.xmlrpc.dispatch import BadArgumentError
 
 Tree = dict[str, Any]
 
 UNSET: Tree = {}
-"""What a subscriber is told of a parameter that is not set."""
+"""The value that a subscriber gets for a parameter that is not set."""
 
 
 class ParameterTree:
@@ -29,7 +29,7 @@ class ParameterTree:
         """Return a parameter or, as a dictionary, all of a namespace.
 
         Raises:
-            KeyError: There is neither.
+            KeyError: Neither exists.
         """
         value: Any = self._root
         for segment in names.segments(name):
@@ -39,7 +39,7 @@ class ParameterTree:
         return value
 
     def has(self, name: str) -> bool:
-        """Tell whether ``name`` is a parameter or a namespace of some."""
+        """Return whether ``name`` is a parameter or a namespace of some."""
         try:
             self.get(name)
         except KeyError:
@@ -50,13 +50,13 @@ class ParameterTree:
         """Set a parameter, or replace a whole namespace by a dictionary.
 
         Raises:
-            BadArgument: The root would become something else than a namespace.
+            BadArgumentError: The root would become something other than a namespace.
         """
         path = names.segments(name)
         value = copy.deepcopy(value)
         if not path:
             if not isinstance(value, dict):
-                raise BadArgument("the root of the parameters must be a dictionary")
+                raise BadArgumentError("the root of the parameters must be a dictionary")
             self._root = value
             return
         branch = self._root
@@ -103,11 +103,11 @@ class ParameterTree:
 
 
 def affected(subscribed: Iterable[str], name: str) -> Iterator[tuple[str, str]]:
-    """Tell whom a change of ``name`` concerns.
+    """Return the subscriptions that a change of ``name`` concerns.
 
     Yields:
-        ``(subscribed name, name to report)``: who subscribed to a namespace is told the changed parameter;
-        who subscribed to something inside a changed namespace is told their own.
+        ``(subscribed name, name to report)``: a subscriber of a namespace is told the changed parameter;
+        a subscriber of something inside a changed namespace is told its own name.
     """
     changed = name.rstrip(names.SEPARATOR) + names.SEPARATOR
     for subscription in subscribed:

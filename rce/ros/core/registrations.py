@@ -1,4 +1,4 @@
-"""Who publishes, subscribes and serves what. Pure.
+"""Registrations of publishers, subscribers, services and parameters. Pure.
 
 Invariants: a node is known exactly while it holds a registration of any kind; all registrations of one node
 were made with the node's one slave API URI.
@@ -12,7 +12,7 @@ from enum import Enum
 
 
 class Kind(Enum):
-    """What a node can register."""
+    """The kind of a registration."""
 
     PUBLISHER = "publisher"
     SUBSCRIBER = "subscriber"
@@ -29,7 +29,7 @@ class NodeEntry:
     uri: str
     """Its slave API."""
     held: set[tuple[Kind, str]] = field(default_factory=set)
-    """All that it has registered."""
+    """Everything that it has registered."""
 
 
 class Registrations:
@@ -40,7 +40,7 @@ class Registrations:
         self._tables: dict[Kind, dict[str, dict[str, str]]] = {kind: {} for kind in Kind}
 
     def of(self, kind: Kind, name: str) -> dict[str, str]:
-        """Return who registered ``name``: node names and the URIs they gave (a service's ``rosrpc`` URI)."""
+        """Return the nodes that registered ``name``, and the URIs they gave (a service's ``rosrpc`` URI)."""
         return self._tables[kind].get(name, {})
 
     def names(self, kind: Kind) -> Iterator[str]:
@@ -52,7 +52,7 @@ class Registrations:
         return [[name, list(holders)] for name, holders in self._tables[kind].items()]
 
     def add(self, kind: Kind, name: str, node: str, uri: str, value: str | None = None) -> bool:
-        """Register ``name`` for a node; tell whether that is news.
+        """Register ``name`` for a node; return whether that changed anything.
 
         Args:
             kind: What is registered.
@@ -72,7 +72,7 @@ class Registrations:
         return is_new
 
     def remove(self, kind: Kind, name: str, node: str) -> bool:
-        """Take a registration back; tell whether it was there."""
+        """Remove a registration; return whether it was there."""
         holders = self._tables[kind].get(name)
         if holders is None or holders.pop(node, None) is None:
             return False

@@ -1,4 +1,4 @@
-"""What a core answers to tools that take it for a ``roslaunch`` process, as ``roscore`` is one.
+"""The core's answers to tools that expect a ``roslaunch`` process, as ``roscore`` is one.
 
 Tools find the address in the parameters below ``/roslaunch/uris`` and ask there for the processes that were
 started. A core starts none.

@@ -1,4 +1,4 @@
-"""The core's ``/rosout`` node: gathers the log records of all nodes on one topic and in one file.
+"""The core's ``/rosout`` node: collects the log records of all nodes on one topic and in one file.
 
 A tool that shows logs then holds one connection, to ``/rosout_agg``, instead of one to each node. Records are
 passed on as they are on the wire; they are read only for the file.
@@ -24,7 +24,7 @@ AGGREGATE = "/rosout_agg"
 FILE = "rosout.log"
 MAX_BYTES = 100_000_000
 BACKUPS = 10
-"""When the file is cut, and how many older ones are kept: as ROS's rosout does."""
+"""When the file is rotated, and how many older ones are kept: as ROS's rosout does."""
 
 _WORDS = {1: "DEBUG", 2: "INFO", 4: "WARN", 8: "ERROR", 16: "FATAL"}
 

@@ -12,30 +12,30 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from rce.aio.tasks import TaskScope
 from rce.ros.core.api import NOTHING, MasterApi
 from rce.ros.core.events import Call, GraphEvent, Outcome
 from rce.ros.core.graph import Graph
 from rce.ros.core.notifier import Notifier
 from rce.ros.core.roslaunch import roslaunch_methods
-from rce.ros.errors import ParameterMissing
-from rce.ros.tasks import TaskScope
+from rce.ros.errors import ParameterMissingError
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
 
 DEFAULT_PORT = 11311
 
 ROS_DISTRIBUTION = "noetic"
 ROS_VERSION = "1.15.15"
-"""The release of ROS whose behaviour this core follows; what tools read as ``/rosversion``."""
+"""The release of ROS whose behaviour this core follows; tools read it as ``/rosversion``."""
 
 MAX_WAITING_EVENTS = 10_000
 
 
 class GraphWatch:
-    """What happened in the graph since the watch began, in order; an async iterator that never ends."""
+    """Events of the graph since the watch began, in order; an async iterator that never ends."""
 
     def __init__(self) -> None:
         self.lost = 0
-        """How many events were dropped, the oldest first, because nobody took them."""
+        """How many events were dropped, the oldest first, because they were not taken."""
         self._events: deque[GraphEvent] = deque()
         self._arrived = asyncio.Event()
 
@@ -85,7 +85,7 @@ class Core:
             advertised: Host or address in :attr:`uri`; by default ``host``, or loopback if that is "all".
             rosout: Run the node ``/rosout``, which gathers all nodes' log records on ``/rosout_agg``.
             log_folder: With ``rosout``: where to keep ``RUN_ID/rosout.log``; ``None``: nowhere.
-            on_shutdown: Takes the reason when somebody tells the core to end; without it, nobody may.
+            on_shutdown: Takes the reason when a caller tells the core to end; without it, that is refused.
         """
         self.graph = Graph()
         self._local = "127.0.0.1" if host == "0.0.0.0" else host  # noqa: S104
@@ -103,7 +103,7 @@ class Core:
 
     @property
     def uri(self) -> str:
-        """What ``ROS_MASTER_URI`` must be set to."""
+        """The value for ``ROS_MASTER_URI``."""
         return f"http://{self._advertised}:{self._server.port}/"
 
     async def __aenter__(self) -> Self:
@@ -124,7 +124,7 @@ class Core:
         await self._stack.aclose()
         self._notifier = None
 
-    # ------------------------------------------------------------------ for the hosting process
+    # For the hosting process
 
     @contextmanager
     def watch(self) -> Iterator[GraphWatch]:
@@ -144,7 +144,7 @@ class Core:
             timeout: Seconds.
 
         Raises:
-            TimeoutError: It did not happen in time.
+            TimeoutError: The condition was not met in time.
         """
         async with asyncio.timeout(timeout):
             while not condition(self.graph):
@@ -152,13 +152,13 @@ class Core:
                 await self._changed.wait()
 
     def forget_node(self, name: str) -> bool:
-        """Unregister everything of a node that died; tell whether there was anything."""
+        """Unregister everything of a node that died; return whether anything was registered."""
         known = name in self.graph.nodes
         self._perform(self.graph.forget_node(name))
         return known
 
     def forget_uri(self, uri: str) -> bool:
-        """Unregister everything of the nodes whose slave API is ``uri``; tell whether there was anything."""
+        """Unregister all nodes whose slave API is ``uri``; return whether anything was registered."""
         found = [name for name, node_uri in self.graph.nodes.items() if node_uri == uri]
         for name in found:
             self.forget_node(name)
@@ -172,26 +172,26 @@ class Core:
         """Return a parameter or namespace by its global name.
 
         Raises:
-            ParameterMissing: It is not set.
+            ParameterMissingError: It is not set.
         """
         try:
             return copy.deepcopy(self.graph.parameters.get(name))
         except KeyError as error:
-            raise ParameterMissing(name) from error
+            raise ParameterMissingError(name) from error
 
     def delete_param(self, name: str) -> bool:
-        """Delete a parameter or namespace by its global name; tell whether it was set."""
+        """Delete a parameter or namespace by its global name; return whether it was set."""
         try:
             self._perform(self.graph.delete_parameter(name))
         except KeyError:
             return False
         return True
 
-    # ------------------------------------------------------------------ inside
+    # Inside
 
     @asynccontextmanager
     async def _gathering_logs(self) -> AsyncIterator[None]:
-        from rce.ros.core.rosout import RosoutNode  # a core without it needs no node
+        from rce.ros.core.rosout import RosoutNode  # a core without rosout needs no node
 
         uri = f"http://{self._local}:{self._server.port}/"
         async with RosoutNode(uri, self._advertised, self._log_folder) as node:

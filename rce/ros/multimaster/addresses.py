@@ -1,4 +1,4 @@
-"""This machine's addresses, and which of them others shall use."""
+"""This machine's addresses, and the one for other machines to use."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 import psutil
 
 from rce.lookups import LOOKUPS
-from rce.ros.multimaster.errors import NoSuchInterface
+from rce.ros.multimaster.errors import NoSuchInterfaceError
 from rce.ros.node.settings import LOOPBACK, is_loopback
 
 DEFAULT_GROUP = "226.0.0.0"
@@ -31,7 +31,7 @@ async def address_of(interface: str) -> str:
     """Return the IPv4 address of an interface, given by its name, address or host name.
 
     Raises:
-        NoSuchInterface: There is no such interface, or it has no IPv4 address.
+        NoSuchInterfaceError: The interface does not exist, or has no IPv4 address.
     """
     for entry in psutil.net_if_addrs().get(interface, ()):
         if entry.family == socket.AF_INET:
@@ -40,11 +40,11 @@ async def address_of(interface: str) -> str:
         infos = await LOOKUPS.addresses(interface, 0, family=socket.AF_INET)
         address: str = infos[0][4][0]
     except (OSError, UnicodeError) as error:
-        raise NoSuchInterface(
+        raise NoSuchInterfaceError(
             f"{interface!r} is neither an interface with an IPv4 address nor a host"
         ) from error
     if address not in local_addresses() and not is_loopback(address):
-        raise NoSuchInterface(f"{interface!r} is not an address of this machine")
+        raise NoSuchInterfaceError(f"{interface!r} is not an address of this machine")
     return address
 
 
@@ -58,7 +58,7 @@ async def own_address(interface: str, group: str, environ: Mapping[str, str] | N
         environ: The environment.
 
     Raises:
-        NoSuchInterface: The interface is not there.
+        NoSuchInterfaceError: The interface is not there.
     """
     environ = os.environ if environ is None else environ
     named = interface or environ.get("ROS_IP", "")
@@ -66,7 +66,7 @@ async def own_address(interface: str, group: str, environ: Mapping[str, str] | N
         return await address_of(named)
     if hostname := environ.get("ROS_HOSTNAME", ""):
         address = await address_of(hostname)
-        if not is_loopback(address):  # many systems say of their own name that it is on loopback
+        if not is_loopback(address):  # on many systems the host name resolves to loopback
             return address
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
@@ -95,7 +95,7 @@ def local_hosts(*more: str) -> frozenset[str]:
 def public_uri(master_uri: str, address: str) -> str:
     """Return a master's URI as other machines can use it, with a slash at its end.
 
-    A master that calls itself ``localhost`` would have the same URI as everybody else's.
+    A master that calls itself ``localhost`` would have the same URI as the masters of other machines.
     """
     parts = urlsplit(master_uri)
     host = parts.hostname or LOOPBACK
@@ -105,7 +105,7 @@ def public_uri(master_uri: str, address: str) -> str:
 
 
 def master_name(uri: str) -> str:
-    """Return the name that a master has if nobody gives it one: its host, and its port if that is unusual."""
+    """Return a master's default name: its host, and its port if that is not the default one."""
     parts = urlsplit(uri)
     host, port = parts.hostname or LOOPBACK, parts.port or DEFAULT_MASTER_PORT
     return host if port == DEFAULT_MASTER_PORT else f"{host}_{port}"

@@ -1,4 +1,4 @@
-"""What a discovery shows in its own graph, under the names of master_discovery."""
+"""The topics and services of a discovery in its own graph, with the names of master_discovery."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from rce.ros.multimaster import messages
-from rce.ros.multimaster.neighbourhood import Link, Neighbour, PeerEvent
+from rce.ros.multimaster.peer_table import Link, Neighbour, PeerEvent
 from rce.ros.node import Node, Publisher
 from rce.ros.types.values import Time
 
@@ -14,7 +14,7 @@ NAME_PARAMETER = "/mastername"
 """Set by master_discovery too."""
 
 URI_PARAMETER = "~masteruri"
-"""The master's URI as other machines are told."""
+"""The master's URI for other machines."""
 
 
 LAST_HEARTBEAT = "last_heartbeat"
@@ -52,7 +52,7 @@ class Announcements:
             uri: The local master's URI as others are told.
 
         Raises:
-            MasterError: The master cannot be told.
+            MasterError: The registration at the master failed.
         """
         await cls.set_parameters(node, name, uri)  # before a synchronization finds the rest
         changes = await node.advertise("~changes", messages.MASTER_STATE)
@@ -70,7 +70,7 @@ class Announcements:
 
     @staticmethod
     async def set_parameters(node: Node, name: str, uri: str) -> None:
-        """Leave the master's name and URI at the master."""
+        """Set the parameters with the master's name and URI."""
         await node.set_param(NAME_PARAMETER, name)
         await node.set_param(URI_PARAMETER, uri)
 

@@ -8,10 +8,10 @@ from typing import Any
 
 from rce.ros.errors import MasterError, ServiceError, XmlRpcError
 from rce.ros.multimaster import messages
-from rce.ros.multimaster.errors import MalformedState
+from rce.ros.multimaster.errors import MalformedStateError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.monitor import Origins
-from rce.ros.multimaster.neighbourhood import Contact, PeerKey
+from rce.ros.multimaster.peer_table import Contact, PeerKey
 from rce.ros.multimaster.source import Snapshot
 from rce.ros.multimaster.state import MasterInfo, host_of
 from rce.ros.node import Node, ServiceClient
@@ -23,24 +23,26 @@ _log = logging.getLogger(__name__)
 CONTACT_TIMEOUT = 5.0
 STATE_TIMEOUT = 20.0
 ORIGINS_TIMEOUT = 3.0
-"""Seconds that others get to answer."""
+"""Seconds that others may take to answer."""
 
 SYNC_INFO = "get_sync_info"
 
 
 async def ask_contact(rpc: RpcClient, key: PeerKey) -> Contact:
-    """Ask a discovery who it is.
+    """Ask a discovery for its contact.
 
     Raises:
-        MalformedState: It does not answer, or not in the known form, or does not know its master yet.
+        MalformedStateError: It does not answer, or not in the known form, or does not know its master yet.
     """
     try:
         answer = await rpc.call(key.monitor_uri, "masterContacts", (), timeout=CONTACT_TIMEOUT)
         stamp, master_uri, name, node, _ = answer
         if float(stamp) == 0:
-            raise MalformedState(f"the discovery at {key.monitor_uri} does not know its master yet")
+            raise MalformedStateError(f"the discovery at {key.monitor_uri} does not know its master yet")
     except (XmlRpcError, TypeError, ValueError) as error:
-        raise MalformedState(f"the discovery at {key.monitor_uri} does not say who it is: {error}") from error
+        raise MalformedStateError(
+            f"the discovery at {key.monitor_uri} does not say who it is: {error}"
+        ) from error
     return Contact(str(master_uri), str(name), str(node))
 
 
@@ -49,7 +51,7 @@ async def ask_state(rpc: RpcClient, monitor_uri: str, chosen: SyncFilter) -> Mas
 
     Raises:
         XmlRpcError: No answer, or the discovery refuses one.
-        MalformedState: The answer is not of the known form.
+        MalformedStateError: The answer is not of the known form.
     """
     answer = await rpc.call(monitor_uri, "masterInfoFiltered", (chosen.to_wire(),), timeout=STATE_TIMEOUT)
     return MasterInfo.from_wire(answer)
@@ -71,7 +73,7 @@ class OriginsReader:
         self._clients: dict[str, ServiceClient] = {}
 
     async def read(self, snapshot: Snapshot) -> Origins:
-        """Ask all that are among the registrations in ``snapshot``."""
+        """Ask all synchronizations among the registrations in ``snapshot``."""
         hosts = self._hosts()
         found: list[Any] = []
         for service, uri in snapshot.service_uris.items():

@@ -1,4 +1,4 @@
-"""A discovery: announces its master, finds others, tells its graph and its program of them."""
+"""A discovery: announces its master, finds others, and reports them to its graph and its program."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from contextlib import AsyncExitStack, contextmanager
 from types import TracebackType
 from typing import Self
 
+from rce.aio.tasks import TaskScope
 from rce.ros.core import Core
 from rce.ros.errors import MasterError
 from rce.ros.multimaster import addresses, messages
 from rce.ros.multimaster.announcements import Announcements
 from rce.ros.multimaster.contacts import OriginsReader, ask_contact
-from rce.ros.multimaster.errors import MalformedHeartbeat, MultimasterError
+from rce.ros.multimaster.errors import MalformedHeartbeatError, MultimasterError
 from rce.ros.multimaster.events import EventQueue
 from rce.ros.multimaster.heartbeat import Heartbeat, Kind, decode
 from rce.ros.multimaster.monitor import MasterMonitor
-from rce.ros.multimaster.neighbourhood import (
+from rce.ros.multimaster.peer_table import (
     Contact,
     Neighbour,
-    Neighbourhood,
     PeerEvent,
     PeerKey,
+    PeerTable,
     Step,
 )
 from rce.ros.multimaster.robot_hosts import RobotHosts
@@ -36,17 +37,16 @@ from rce.ros.multimaster.state import MasterInfo
 from rce.ros.multimaster.udp import HeartbeatSocket
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
-from rce.ros.tasks import TaskScope
 from rce.ros.types.exceptions import TypesError
 from rce.ros.xmlrpc import RpcClient, RpcServer
 
 _log = logging.getLogger(__name__)
 
 DEAD_AFTER_POLLS = 3
-"""After so many questions without an answer, others are told that this master is gone."""
+"""After so many requests without an answer, others are told that this master is gone."""
 
 FIRST_REQUESTS = 3
-"""How often, at the start, everybody is asked for their state."""
+"""How often, at the start, all masters are asked for their state."""
 
 
 class Discovery:
@@ -65,13 +65,13 @@ class Discovery:
         self.settings = settings = settings or DiscoverySettings()
         self._core = core
         self._master_uri = core.uri if core is not None else local_master(settings.master_uri)
-        self._neighbours = Neighbourhood(settings.patience)
+        self._neighbours = PeerTable(settings.liveness)
         self._watches: set[EventQueue[PeerEvent]] = set()
         self._beat_now = asyncio.Event()
         self._robots = RobotHosts(settings.robot_addresses, self._beat_now.set)
         self._is_master_up = True
         self._is_listening = False
-        """Heartbeats that come before or after are left alone: they are repeated."""
+        """Whether heartbeats are handled; earlier and later ones are ignored, as they are repeated."""
         self._last_request = 0.0
         self._stack = AsyncExitStack()
         self._monitor: MasterMonitor
@@ -83,7 +83,7 @@ class Discovery:
         self._own = PeerKey("", 0)
         self._contact: Contact
 
-    # ------------------------------------------------------------------ for programs
+    # For programs
 
     @property
     def masters(self) -> list[Neighbour]:
@@ -92,12 +92,12 @@ class Discovery:
 
     @property
     def info(self) -> MasterInfo | None:
-        """What is registered at the own master; None until it was asked."""
+        """The registrations at the own master; None until it was asked."""
         return self._monitor.info
 
     @property
     def monitor_uri(self) -> str:
-        """Where the RPC server is."""
+        """The URI of the RPC server."""
         return self._own.monitor_uri
 
     @contextmanager
@@ -115,7 +115,7 @@ class Discovery:
         request = Heartbeat(Kind.REQUEST, self._own.rpc_port, self.settings.heartbeat_hz).encode()
         self._socket.send(request, self._unicast_addresses())
 
-    # ------------------------------------------------------------------ life
+    # Life
 
     async def __aenter__(self) -> Self:
         settings = self.settings
@@ -150,10 +150,10 @@ class Discovery:
             )
             stack.callback(self._say_goodbye)
             self._tasks = await stack.enter_async_context(TaskScope())
-            self._tasks.start(self._watch_master(source.wait), name="watch the master")
-            self._tasks.start(self._robots.follow(), name="look up robot hosts")
-            self._tasks.start(self._send_heartbeats(), name="send heartbeats")
-            self._tasks.start(self._pass_time(), name="look for silent masters")
+            self._tasks.spawn(self._watch_master(source.wait), name="watch the master")
+            self._tasks.spawn(self._robots.follow(), name="look up robot hosts")
+            self._tasks.spawn(self._send_heartbeats(), name="send heartbeats")
+            self._tasks.spawn(self._pass_time(), name="look for silent masters")
             self._is_listening = True
             self._stack = stack.pop_all()
         return self
@@ -206,7 +206,7 @@ class Discovery:
         self._socket.send(leaving.encode(), self._unicast_addresses())
         self._follow(self._neighbours.leave())
 
-    # ------------------------------------------------------------------ the own master
+    # The own master
 
     async def _watch_master(self, wait: Callable[[float], Awaitable[None]]) -> None:
         failures = 0
@@ -235,7 +235,7 @@ class Discovery:
             self._node, self._contact.master_name, self._contact.master_uri
         )
 
-    # ------------------------------------------------------------------ heartbeats
+    # Heartbeats
 
     async def _send_heartbeats(self) -> None:
         requests = FIRST_REQUESTS
@@ -265,7 +265,7 @@ class Discovery:
     def _received(self, datagram: bytes, sender: tuple[str, int], to_group: bool) -> None:
         try:
             beat = decode(datagram)
-        except MalformedHeartbeat as error:
+        except MalformedHeartbeatError as error:
             _log.debug("from %s: %s", sender, error)
             return
         host = sender[0]
@@ -278,7 +278,7 @@ class Discovery:
             self._answer(sender, to_group=to_group)
 
     def _answer(self, sender: tuple[str, int], *, to_group: bool) -> None:
-        """Send the own state to who asked for it, and to the group if that was asked or has several ends."""
+        """Send the own state to the asking host, and to the group if that was asked or has several ends."""
         now = self._now()
         if (
             to_group or sender[0] == self._own.host
@@ -297,14 +297,14 @@ class Discovery:
             )
 
     def _unicast_addresses(self) -> list[tuple[str, int]]:
-        """Whom heartbeats are sent to one by one: everybody that is known, if not to the group."""
+        """The hosts that heartbeats are sent to one by one: all known ones, if not to the group."""
         known = self._robots.addresses
         if not self.settings.send_mcast:
             named = {host for host, _ in known} | {self._own.host}
             known = known + [(host, self.settings.mcast_port) for host in self._neighbours.hosts - named]
         return known
 
-    # ------------------------------------------------------------------ what follows
+    # Steps and events
 
     def _follow(self, step: Step) -> None:
         for event in step.events:
@@ -316,7 +316,7 @@ class Discovery:
             if key == self._own:
                 self._follow(self._neighbours.contacted(key, self._contact, self._now()))
             else:
-                self._tasks.start(self._learn(key), name=f"ask {key.monitor_uri} for its name")
+                self._tasks.spawn(self._learn(key), name=f"ask {key.monitor_uri} for its name")
         request = Heartbeat(Kind.REQUEST, self._own.rpc_port, self.settings.heartbeat_hz).encode()
         for host in step.request_state:
             self._socket.send_to(request, (host, self.settings.mcast_port))

@@ -1,15 +1,15 @@
-"""What can go wrong between masters.
+"""Errors of multimaster.
 
 ::
 
     RosError
     +-- MultimasterError
-        +-- MalformedHeartbeat   a datagram that is no heartbeat of a known version
-        +-- MalformedState       a master's description that cannot be read
-        +-- NoSuchInterface      an interface or address to discover on that is not there
-        +-- NoDiscovery          no discovery runs at a master
-        +-- NothingToRelay       the type of a topic or service cannot be learned: nobody offers it
-        +-- LinkBroken           the other end of a relay link breaks its protocol or refuses
+        +-- MalformedHeartbeatError  a datagram that is not a heartbeat of a known version
+        +-- MalformedStateError      a master's description that cannot be read
+        +-- NoSuchInterfaceError     an interface or address to discover on that is not there
+        +-- NoDiscoveryError         no discovery runs at a master
+        +-- NothingToRelayError      the type of a topic or service cannot be learned: no node offers it
+        +-- LinkBrokenError          the other end of a relay link breaks its protocol or refuses
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ class MultimasterError(RosError):
     """Base of all errors of :mod:`rce.ros.multimaster`."""
 
 
-class MalformedHeartbeat(MultimasterError):  # noqa: N818
-    """A datagram is no heartbeat of a known version."""
+class MalformedHeartbeatError(MultimasterError):
+    """A datagram is not a heartbeat of a known version."""
 
 
-class MalformedState(MultimasterError):  # noqa: N818
+class MalformedStateError(MultimasterError):
     """A master's description cannot be read."""
 
 
-class NoSuchInterface(MultimasterError):  # noqa: N818
-    """There is no such network interface or address on this machine."""
+class NoSuchInterfaceError(MultimasterError):
+    """The network interface or address does not exist on this machine."""
 
 
-class NoDiscovery(MultimasterError):  # noqa: N818
+class NoDiscoveryError(MultimasterError):
     """No discovery runs at a master."""
 
 
-class NothingToRelay(MultimasterError):  # noqa: N818
+class NothingToRelayError(MultimasterError):
     """The type of a topic or service cannot be learned."""
 
 
-class LinkBroken(MultimasterError):  # noqa: N818
+class LinkBrokenError(MultimasterError):
     """The other end of a relay link breaks the protocol or refuses this one."""

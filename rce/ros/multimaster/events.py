@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections import deque
 from collections.abc import AsyncIterator
 from typing import Generic, TypeVar
+
+from rce.aio.queues import BoundedQueue
 
 T = TypeVar("T")
 
@@ -13,23 +14,20 @@ MAX_WAITING = 10_000
 
 
 class EventQueue(Generic[T]):
-    """What happened, in order; never ends.
-
-    Attributes:
-        lost: How many events were dropped, the oldest first, because nobody took them.
-    """
+    """Events, in order; never ends."""
 
     def __init__(self) -> None:
-        self.lost = 0
-        self._events: deque[T] = deque()
+        self._events: BoundedQueue[T] = BoundedQueue(MAX_WAITING, max_bytes=0)  # events count no bytes
         self._arrived = asyncio.Event()
+
+    @property
+    def lost(self) -> int:
+        """How many events were dropped, the oldest first, because they were not taken."""
+        return self._events.dropped
 
     def put(self, event: T) -> None:
         """Add an event."""
-        if len(self._events) >= MAX_WAITING:
-            self._events.popleft()
-            self.lost += 1
-        self._events.append(event)
+        self._events.put(event, 0)
         self._arrived.set()
 
     def __aiter__(self) -> AsyncIterator[T]:
@@ -39,4 +37,4 @@ class EventQueue(Generic[T]):
         while not self._events:
             self._arrived.clear()
             await self._arrived.wait()
-        return self._events.popleft()
+        return self._events.take()

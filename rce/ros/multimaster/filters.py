@@ -1,7 +1,7 @@
-"""What is synchronized: lists of patterns under the names that master_sync's users know. Pure.
+"""Filters of what is synchronized: lists of patterns with the names of master_sync. Pure.
 
-``ignore`` wins over ``sync``; an empty ``sync`` list takes everything that is not ignored. What belongs to a
-master itself (``/rosout``, the loggers' services, discovery's and sync's own) is never taken.
+``ignore`` wins over ``sync``; an empty ``sync`` list takes everything that is not ignored. The topics and
+services of a master itself (``/rosout``, the loggers' services, discovery's and sync's own) are never taken.
 """
 
 from __future__ import annotations
@@ -66,15 +66,15 @@ class SyncFilter:
     do_not_sync: Patterns = _NONE
 
     def takes_publisher(self, node: str, topic: str, kind: str) -> bool:
-        """Tell whether a node's publishing of a topic is synchronized."""
+        """Return whether a node's publishing of a topic is synchronized."""
         return not self.ignore_publishers.match(topic) and self._takes_topic(node, topic, kind)
 
     def takes_subscriber(self, node: str, topic: str, kind: str) -> bool:
-        """Tell whether a node's subscription to a topic is synchronized."""
+        """Return whether a node's subscription to a topic is synchronized."""
         return not self.ignore_subscribers.match(topic) and self._takes_topic(node, topic, kind)
 
     def takes_service(self, node: str, service: str) -> bool:
-        """Tell whether a service is synchronized."""
+        """Return whether a service is synchronized."""
         if any(self.do_not_sync.match(name) for name in (node, service)):
             return False
         if self.ignore_nodes.match(node) or self.ignore_services.match(service):
@@ -123,7 +123,7 @@ NameList = list[Any]
 
 @dataclass(slots=True)
 class SyncLists:
-    """What a user chose, under master_sync's names; see :meth:`read`."""
+    """The lists that a user set, with master_sync's names; see :meth:`read`."""
 
     ignore_hosts: NameList = field(default_factory=list)
     sync_hosts: NameList = field(default_factory=list)
@@ -144,14 +144,14 @@ class SyncLists:
         """Take the values of an interface file or of a configuration.
 
         Raises:
-            MultimasterError: There is a name or kind of value that means nothing here.
+            MultimasterError: A name, or the kind of a value, is unknown.
         """
         lists = cls()
         for name, value in values.items():
             if name in _NOT_HERE and not value:
                 continue
             if name not in cls.__slots__:
-                raise MultimasterError(f"{name} is no setting of a synchronization")
+                raise MultimasterError(f"{name} is not a setting of a synchronization")
             if name == "sync_remote_nodes":
                 lists.sync_remote_nodes = bool(value)
             elif isinstance(value, str | list | dict) or value is None:
@@ -161,7 +161,7 @@ class SyncLists:
         return lists
 
     def takes_host(self, master: str) -> bool:
-        """Tell whether a master is synchronized with."""
+        """Return whether a master is synchronized with."""
         ignored = Patterns(_for_master(self.ignore_hosts, ""))
         chosen = Patterns(_for_master(self.sync_hosts, ""))
         return not ignored.match(master) and (not chosen or chosen.match(master))

@@ -9,7 +9,7 @@ The layout is fkie master_discovery's, the C struct ``cBBiiHii`` as little-endia
           12   port of the sender's RPC server (uint16)
           16   seconds, nanoseconds of its last change that no synchronization made
 
-A zero stamp in version 3 asks for everybody's state; a stamp of -1 says that the sender leaves.
+A zero stamp in version 3 asks all masters for their state; a stamp of -1 says that the sender leaves.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from rce.ros.multimaster.errors import MalformedHeartbeat
+from rce.ros.multimaster.errors import MalformedHeartbeatError
 
 MAX_RATE = 25.5
-"""Highest rate that a heartbeat can tell, in hertz."""
+"""Highest rate that a heartbeat can hold, in hertz."""
 
 _PACKET = struct.Struct("<cBBxiiHxxii")
 SIZE = _PACKET.size
@@ -57,7 +57,7 @@ ZERO = Stamp(0, 0)
 
 
 class Kind(Enum):
-    """What a heartbeat is for."""
+    """The kind of a heartbeat."""
 
     STATE = "state"
     REQUEST = "request"
@@ -69,11 +69,11 @@ _FIXED_STAMPS = {Kind.REQUEST: (ZERO, ZERO), Kind.LEAVING: (Stamp(_GONE, _GONE),
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """A heartbeat, taken apart."""
+    """A decoded heartbeat."""
 
     kind: Kind
     rpc_port: int
-    """Port of the sender's RPC server; with the sender's address, it tells one sender from another."""
+    """Port of the sender's RPC server; with the sender's address, it identifies the sender."""
     rate: float = 1.0
     """Hertz, 0 to 25.5."""
     stamp: Stamp = ZERO
@@ -93,15 +93,15 @@ def decode(datagram: bytes) -> Heartbeat:
     """Read a datagram.
 
     Raises:
-        MalformedHeartbeat: It is none of these.
+        MalformedHeartbeatError: The datagram is not a heartbeat of a known version.
     """
     if len(datagram) != SIZE:
-        raise MalformedHeartbeat(f"a heartbeat has {SIZE} bytes, not {len(datagram)}")
+        raise MalformedHeartbeatError(f"a heartbeat has {SIZE} bytes, not {len(datagram)}")
     mark, version, rate, secs, nsecs, port, local_secs, local_nsecs = _PACKET.unpack(datagram)
     if mark != _MARK:
-        raise MalformedHeartbeat(f"a heartbeat begins with 'R', not {mark!r}")
+        raise MalformedHeartbeatError(f"a heartbeat begins with 'R', not {mark!r}")
     if version not in (_STATE_VERSION, _REQUEST_VERSION):
-        raise MalformedHeartbeat(f"heartbeats of version {version} are not known")
+        raise MalformedHeartbeatError(f"heartbeats of version {version} are not known")
     stamp, local = Stamp(secs, nsecs), Stamp(local_secs, local_nsecs)
     if _GONE in (secs, local_secs):
         return Heartbeat(Kind.LEAVING, port, rate / 10)

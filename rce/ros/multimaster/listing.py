@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from rce.ros.errors import MasterRefused
+from rce.ros.errors import MasterRefusedError
 from rce.ros.multimaster import messages
-from rce.ros.multimaster.errors import NoDiscovery
-from rce.ros.multimaster.neighbourhood import Neighbour
+from rce.ros.multimaster.errors import NoDiscoveryError
+from rce.ros.multimaster.peer_table import Neighbour
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import RpcClient
@@ -18,7 +18,7 @@ async def list_masters(master_uri: str) -> list[Neighbour]:
     """Return the masters that the discovery at ``master_uri`` knows, fkie's or ours.
 
     Raises:
-        NoDiscovery: None runs there.
+        NoDiscoveryError: None runs there.
         MasterError: The master does not answer.
         ServiceError: The discovery does not answer.
     """
@@ -38,7 +38,7 @@ async def masters_known_at(node: Node, master: MasterClient) -> list[Neighbour]:
     """Return the masters that the discovery in a node's graph knows.
 
     Raises:
-        NoDiscovery: None runs there.
+        NoDiscoveryError: None runs there.
         MasterError: The master does not answer.
         ServiceError: The discovery does not answer.
     """
@@ -52,14 +52,14 @@ async def find_service(master: MasterClient, ending: str) -> str:
     """Return the first service whose name ends so.
 
     Raises:
-        NoDiscovery: There is none.
-        MasterUnreachable: The master does not answer.
+        NoDiscoveryError: No such service is registered.
+        MasterUnreachableError: The master does not answer.
     """
     try:
         state = await master.call("getSystemState")
-    except MasterRefused as error:
-        raise NoDiscovery(str(error)) from error
+    except MasterRefusedError as error:
+        raise NoDiscoveryError(str(error)) from error
     names: list[str] = [name for name, _ in state[2] if name.endswith(ending)]
     if not names:
-        raise NoDiscovery(f"no discovery runs at {master.uri}: start 'rce discovery' there")
+        raise NoDiscoveryError(f"no discovery runs at {master.uri}: start 'rce discovery' there")
     return min(names)

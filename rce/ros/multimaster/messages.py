@@ -12,7 +12,7 @@ from typing import Any
 
 from rce.ros.multimaster.heartbeat import Stamp
 from rce.ros.multimaster.monitor import Origins
-from rce.ros.multimaster.neighbourhood import Neighbour, PeerChange, PeerEvent
+from rce.ros.multimaster.peer_table import Neighbour, PeerChange, PeerEvent
 from rce.ros.multimaster.plan import Registration, RegistrationKind
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
@@ -65,7 +65,7 @@ def read_master_state(message: Any) -> PeerEvent:
     """Read a ``MasterState``, its state with the quotes that older definitions have or without.
 
     Raises:
-        ValueError: Its state is none of the three.
+        ValueError: Its state is not one of the three.
     """
     return PeerEvent(PeerChange(message.state.strip("'\"")), read_ros_master(message.master))
 

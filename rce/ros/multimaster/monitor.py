@@ -1,4 +1,4 @@
-"""Turns what a master has registered into what others are told, and notes when it changed."""
+"""Turns a master's registrations into the state that others are told, and notes when it changed."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class MasterMonitor:
         Args:
             uri: Its URI as others are told.
             name: Its name.
-            source: Tells what is registered.
+            source: Reads the registrations.
             hosts: Tells all names and addresses of the master's machine.
-            ask: Tells what was registered by synchronizations.
+            ask: Returns the registrations that synchronizations made.
         """
         self.info: MasterInfo | None = None
         self.restarts = 0
@@ -52,7 +52,7 @@ class MasterMonitor:
         self._last: Snapshot | None = None
 
     async def poll(self, now: float) -> bool:
-        """Read the master; tell whether it changed.
+        """Read the master; return whether it changed.
 
         Args:
             now: The time of day, in seconds.
@@ -79,7 +79,7 @@ class MasterMonitor:
 
 
 def describe(snapshot: Snapshot, uri: str, name: str, hosts: frozenset[str], origins: Origins) -> MasterInfo:
-    """Say of each registration where it came from and whether it is on this machine."""
+    """Return the state: each registration with its origin and whether it is on this machine."""
 
     def provider(of: Mapping[tuple[str, str], str], key: str, at: str) -> Provider:
         origin = of.get((key, at), uri)

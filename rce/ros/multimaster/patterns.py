@@ -1,9 +1,8 @@
 r"""Patterns of names: ``*`` stands for anything, upper and lower case are alike. Pure.
 
 On the wire, fkie's sync sends its patterns as one regular expression: alternatives ``\A...\Z`` with ``.*``
-for each ``*``. Only that form is understood here. Whatever else a peer may send is no pattern to us, as an
-expression from the network could keep a machine busy for hours; a filter's meaning is then left to the peer,
-which filters once more what it gets.
+for each ``*``. Only that form is accepted here: any other expression from the network could keep a machine
+busy for hours. A filter of another form lets everything pass; the peer filters the result again.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ class Patterns:
         return f"Patterns({list(self._patterns)!r})"
 
     def match(self, name: str) -> bool:
-        """Tell whether a whole name fits one of the patterns."""
+        """Return whether a whole name fits one of the patterns."""
         lowered = name.lower()
         return any(_fits(parts, lowered) for parts in self._parts)
 

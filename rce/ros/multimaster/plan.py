@@ -1,8 +1,8 @@
-"""What a synchronization registers at the local master, and what it must not. Pure.
+"""Plan what a synchronization registers at the local master, and what it must leave out. Pure.
 
 A remote node is registered under its own name and URI, so nodes connect to each other directly. A master
-takes a second node of a name for the first one restarted and tells the first to shut down; so a node whose
-name is taken here by another is left out, and said so.
+takes a second node of the same name for a restart of the first one, and tells the first to shut down. So a
+node whose name is taken here by another is left out and reported.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ANY_TYPE = "*"
 
 
 class RegistrationKind(Enum):
-    """What is registered."""
+    """The kind of a registration."""
 
     SUBSCRIBER = "subscriber"
     PUBLISHER = "publisher"
@@ -42,7 +42,7 @@ class Registration:
 
 @dataclass(frozen=True, slots=True)
 class Clash:
-    """Something remote that cannot be registered, because the local graph has something of that name."""
+    """A remote entry that cannot be registered, because the local graph has one of that name."""
 
     registration: Registration
     taken_by: str
@@ -61,12 +61,12 @@ class Clash:
 def wanted(
     remote: MasterInfo, own_uri: str, chosen: SyncFilter, *, distinct_names: bool = False
 ) -> set[Registration]:
-    """Return what shall be registered of a remote master.
+    """Return the registrations to make for a remote master.
 
     Args:
         remote: The master's state.
-        own_uri: The local master; what came from it is not taken back.
-        chosen: What the user wants.
+        own_uri: The local master; registrations that came from it are left out.
+        chosen: The user's filter.
         distinct_names: Register nodes as ``NODE_at_MASTER``, so that equal names do not clash.
     """
     found = set(_Reader(remote, own_uri, chosen).registrations())
@@ -111,7 +111,7 @@ class _Reader:
 
 
 def unreachable_nodes(remote: MasterInfo) -> list[str]:
-    """Return the nodes that told their master a loopback address, under which no other machine finds them."""
+    """Return the nodes that registered a loopback address, under which other machines cannot reach them."""
     return sorted(name for name, node in remote.nodes.items() if _is_unreachable(node, remote))
 
 
@@ -120,13 +120,13 @@ def split_clashes(
     nodes: Mapping[str, str],
     services: Mapping[str, str],
 ) -> tuple[set[Registration], list[Clash]]:
-    """Part what can be registered from what would displace something.
+    """Split candidates into those that can be registered and those that would displace an entry.
 
-    A node or service that stands here with the very URI is no clash, and is not registered either: it is the
-    same one, registered here by itself or by another synchronization.
+    A node or service that is registered here with the same URI is not a clash, and is not registered again:
+    it is the same one, registered by itself or by another synchronization.
 
     Args:
-        candidates: What shall be registered and is not yet.
+        candidates: The registrations to make.
         nodes: Nodes of the local graph that this synchronization did not register, and their URIs.
         services: Services of the local graph that it did not register, and their addresses.
     """

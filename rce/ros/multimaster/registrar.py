@@ -1,4 +1,4 @@
-"""Keeps remote nodes registered at the local master: adds, takes back, and comes back after a restart."""
+"""Keeps remote nodes registered at the local master: adds, removes, and restores after a restart."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import logging
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from rce.ros.errors import MasterError, ParameterMissing, XmlRpcError
+from rce.aio.tasks import TaskScope
+from rce.ros.errors import MasterError, ParameterMissingError, XmlRpcError
 from rce.ros.multimaster.plan import Clash, Registration, RegistrationKind, split_clashes
 from rce.ros.multimaster.source import multicall, multicall_as
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
-from rce.ros.tasks import TaskScope
 
 _log = logging.getLogger(__name__)
 
 RECORD = "~registrations"
-"""Parameter that holds what is registered, so that a successor can take it back after a kill."""
+"""Parameter that records the registrations, so that a successor can remove them after a kill."""
 
 UPDATE_TIMEOUT = 5.0
 MASTER_CALLER = "/master"
@@ -38,7 +38,7 @@ _ORDER = tuple(_REGISTER)
 
 
 class Registrar:
-    """All that one synchronization has registered, by the master that it is from.
+    """All registrations of one synchronization, by the remote master.
 
     Attributes:
         held: ``{master URI: entries}``.
@@ -63,15 +63,15 @@ class Registrar:
     async def hold(
         self, origin: str, wanted: set[Registration], publishers: Mapping[str, Iterable[str]]
     ) -> list[Clash]:
-        """Have exactly ``wanted`` registered of a remote master.
+        """Make exactly the registrations ``wanted`` for a remote master.
 
         Args:
             origin: The remote master's URI.
-            wanted: What shall be registered of it.
+            wanted: Its registrations.
             publishers: Topic -> URIs of its publishers at the remote master; its subscribers keep them.
 
         Returns:
-            What could not be registered, because the local graph has something of that name.
+            The entries that could not be registered, because the local graph has one of that name.
 
         Raises:
             MasterError: The local master does not answer; to be tried again.
@@ -86,7 +86,7 @@ class Registrar:
         return clashes
 
     async def release(self, origin: str) -> None:
-        """Take back everything of a remote master.
+        """Remove all registrations of a remote master.
 
         Raises:
             MasterError: The local master does not answer; to be tried again.
@@ -108,7 +108,7 @@ class Registrar:
                 await self._register(origin, fine, {})
 
     async def take_back_leftovers(self) -> None:
-        """Unregister what a synchronization that was killed has left.
+        """Remove the registrations of a synchronization that was killed.
 
         Raises:
             MasterError: The local master does not answer.
@@ -116,7 +116,7 @@ class Registrar:
         try:
             entries = json.loads(await self._node.get_param(RECORD))
             left = [Registration(RegistrationKind(kind), *rest) for kind, *rest in entries]
-        except ParameterMissing:
+        except ParameterMissingError:
             return
         except (TypeError, ValueError) as error:
             _log.warning("the record of a former synchronization cannot be read: %s", error)
@@ -125,7 +125,7 @@ class Registrar:
             _log.info("%d registrations of a former synchronization are taken back", len(left))
             await multicall_as(self._master, [_unregistering(entry) for entry in left])
 
-    # ------------------------------------------------------------------ inside
+    # Inside
 
     async def _without_clashes(
         self, origin: str, candidates: set[Registration]
@@ -147,7 +147,7 @@ class Registrar:
         if not entries:
             return
         ordered = sorted(entries, key=lambda entry: (_ORDER.index(entry.kind), entry.name, entry.node))
-        # Held before it is registered: who asks meanwhile where a node is from gets the right answer.
+        # Recorded before it is registered: questions for a node's origin get the right answer meanwhile.
         self.held.setdefault(origin, set()).update(entries)
         try:
             await self._record()
@@ -159,7 +159,7 @@ class Registrar:
             _log.info("%s %s of %s is registered", entry.kind.value, entry.name, entry.node)
             if entry.kind is RegistrationKind.SUBSCRIBER and isinstance(answer, list) and answer:
                 uris = [*dict.fromkeys([*publishers.get(entry.name, ()), *answer])]
-                self._tasks.start(self._tell_subscriber(entry, uris), name=f"tell {entry.node}")
+                self._tasks.spawn(self._tell_subscriber(entry, uris), name=f"tell {entry.node}")
 
     async def _unregister(self, origin: str, entries: set[Registration]) -> None:
         if not entries:
@@ -184,7 +184,7 @@ class Registrar:
             self._recorded = text
 
     async def _tell_subscriber(self, entry: Registration, uris: list[str]) -> None:
-        """Tell a remote subscriber of the publishers: a master leaves that to the answer, which came here."""
+        """Send a remote subscriber its publishers, which the master only gave in its answer to this node."""
         arguments = (MASTER_CALLER, entry.name, uris)
         try:
             await self._master.rpc.call(entry.uri, "publisherUpdate", arguments, timeout=UPDATE_TIMEOUT)

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from rce.ros.errors import RosError
 from rce.ros.multimaster.contacts import ask_state
 from rce.ros.multimaster.filters import SyncFilter
-from rce.ros.multimaster.neighbourhood import Neighbour
+from rce.ros.multimaster.peer_table import Neighbour
 from rce.ros.multimaster.plan import unreachable_nodes, wanted
 from rce.ros.multimaster.registrar import Registrar
 from rce.ros.multimaster.state import MasterInfo
@@ -22,11 +22,11 @@ RETRY = 1.0
 """Seconds until a failed attempt is repeated."""
 
 LOOK_AGAIN = 10.0
-"""Seconds between looks at a master's state that nobody announced: a clash may have ended."""
+"""Seconds between checks of a master's state without an announcement: a clash may have ended."""
 
 
 class Remote(ABC):
-    """Keeps in step with one master, for as long as it is there."""
+    """Synchronizes with one master, for as long as it is there."""
 
     def __init__(self, master: Neighbour) -> None:
         self.master = master
@@ -35,18 +35,18 @@ class Remote(ABC):
         self._wake.set()
 
     def update(self, master: Neighbour) -> None:
-        """Learn what the discovery says of the master now."""
+        """Take the master's present state from the discovery."""
         self._is_gone = False
         if master != self.master:
             self.master = master
             self._wake.set()
 
     def again(self) -> None:
-        """Look at the master again."""
+        """Check the master again."""
         self._wake.set()
 
     def leave(self) -> None:
-        """Learn that the master is gone or no longer wanted; :meth:`run` then ends."""
+        """Take note that the master is gone or no longer wanted; :meth:`run` then ends."""
         self._is_gone = True
         self._wake.set()
 
@@ -56,11 +56,11 @@ class Remote(ABC):
         return self.master.online and not self._is_gone
 
     async def run(self) -> None:
-        """Keep in step until the master is gone and everything is taken back."""
-        patience = 0.0
+        """Synchronize until the master is gone and all its registrations are removed."""
+        timeout = 0.0
         while True:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(patience):
+                async with asyncio.timeout(timeout):
                     await self._wake.wait()
             self._wake.clear()
             try:
@@ -70,14 +70,14 @@ class Remote(ABC):
                     await self.release()
                     if self._is_gone:
                         return
-                patience = LOOK_AGAIN
+                timeout = LOOK_AGAIN
             except (RosError, OSError) as error:
                 _log.warning("master %s: %s", self.master.name, error)
-                patience = RETRY
+                timeout = RETRY
 
     @abstractmethod
     async def synchronize(self) -> None:
-        """Have here what the master has.
+        """Bring the local graph in step with the master.
 
         Raises:
             RosError: It does not work now; it is tried again.
@@ -110,7 +110,7 @@ class DirectRemote(Remote):
         Args:
             master: The remote master.
             own_uri: The local one.
-            chosen: What the user wants of it.
+            chosen: The user's filter.
             registrar: Registers at the local master.
             rpc: Asks the remote discovery.
             distinct_names: Register nodes as ``NODE_at_MASTER``.

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rce.ros.errors import MalformedDocument
+from rce.ros.errors import MalformedDocumentError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.heartbeat import ZERO
 from rce.ros.multimaster.state import MasterInfo, stamp_text
@@ -27,7 +27,7 @@ PlainMethod = Callable[..., Any]
 
 
 class PlainDispatcher(Dispatcher):
-    """Answers with what the methods return; what they raise is answered as a fault."""
+    """Answers with the methods' return values; exceptions are answered as faults."""
 
     def __init__(self, methods: Mapping[str, PlainMethod]) -> None:
         super().__init__({})
@@ -38,8 +38,8 @@ class PlainDispatcher(Dispatcher):
         try:
             method, arguments = decode_call(document)
             return encode_response(self._answer(method, arguments))
-        except Exception as error:  # noqa: BLE001 - whatever was wrong, the caller is told
-            if not isinstance(error, MalformedDocument | _Refused):
+        except Exception as error:  # noqa: BLE001 - the caller gets every failure
+            if not isinstance(error, MalformedDocumentError | _RefusedError):
                 _log.exception("a call of the discovery failed")
             return encode_fault(_FAULT, f"{type(error).__name__}: {error}")
 
@@ -48,21 +48,21 @@ class PlainDispatcher(Dispatcher):
             return sorted([*self._plain, "system.listMethods"])
         handler = self._plain.get(method)
         if handler is None:
-            raise _Refused(f"there is no method {method!r}")
+            raise _RefusedError(f"there is no method {method!r}")
         try:
             inspect.signature(handler).bind(*arguments)
         except TypeError as error:
-            raise _Refused(f"{method}: {error}") from error
+            raise _RefusedError(f"{method}: {error}") from error
         return handler(*arguments)
 
 
-class _Refused(Exception):  # noqa: N818
+class _RefusedError(Exception):
     """A mistake of the caller."""
 
 
 @dataclass(slots=True)
 class DiscoveryApi:
-    """What other discoveries, synchronizations and fkie's tools ask of a discovery."""
+    """The methods that other discoveries, synchronizations and fkie's tools call on a discovery."""
 
     uri: str
     """The master's URI."""
@@ -73,7 +73,7 @@ class DiscoveryApi:
     monitor_uri: Callable[[], str]
     info: Callable[[], MasterInfo | None]
     md5sum: Callable[[str], str | None]
-    """Tells the checksum of a message type, None if that is not known."""
+    """Returns the checksum of a message type, None if the type is not known."""
 
     def methods(self) -> dict[str, PlainMethod]:
         """Return the method table."""
@@ -93,7 +93,7 @@ class DiscoveryApi:
 
     def _master_info_filtered(self, filters: Any) -> list[Any]:
         if not isinstance(filters, list):
-            raise _Refused("a filter is a list of a boolean and ten expressions")
+            raise _RefusedError("a filter is a list of a boolean and ten expressions")
         return self._known().filtered(SyncFilter.from_wire(filters)).to_wire()
 
     def _master_contacts(self) -> list[str]:
@@ -106,12 +106,12 @@ class DiscoveryApi:
 
     def _get_topics_md5sum(self, types: Any) -> list[list[str]]:
         if not isinstance(types, list) or len(types) > MAX_TYPES:
-            raise _Refused("a list of message types is needed")
+            raise _RefusedError("a list of message types is needed")
         pairs = [(kind, self.md5sum(kind)) for kind in types if isinstance(kind, str)]
         return [[kind, md5sum] for kind, md5sum in pairs if md5sum is not None]
 
     def _known(self) -> MasterInfo:
         info = self.info()
         if info is None:
-            raise _Refused("the master's state is not known yet")
+            raise _RefusedError("the master's state is not known yet")
         return info

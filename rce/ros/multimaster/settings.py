@@ -1,4 +1,4 @@
-"""How a discovery is set up; names and meanings are those of master_discovery's parameters."""
+"""Settings of a discovery; names and meanings are those of master_discovery's parameters."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from rce.ros.multimaster.addresses import (
     RPC_PORT_OFFSET,
 )
 from rce.ros.multimaster.heartbeat import MAX_RATE
-from rce.ros.multimaster.neighbourhood import Patience
+from rce.ros.multimaster.peer_table import LivenessSettings
 from rce.ros.node.settings import DEFAULT_MASTER_URI
 
-_PATIENCE = Patience()
+_LIVENESS = LivenessSettings()
 
 
 def local_master(uri: str = "") -> str:
-    """Return ``uri``, or what ``ROS_MASTER_URI`` says, or the usual master of this machine."""
+    """Return ``uri``, or ``ROS_MASTER_URI``, or the default master of this machine."""
     return uri or os.environ.get("ROS_MASTER_URI", "") or DEFAULT_MASTER_URI
 
 
@@ -43,10 +43,10 @@ class DiscoverySettings:
     heartbeat_hz: float = 1.0
     rosmaster_hz: float = 1.0
     """How often the master is asked for changes."""
-    measurement_intervals: float = _PATIENCE.measurement_intervals
-    timeout_factor: float = _PATIENCE.timeout_factor
-    active_request_after: float = _PATIENCE.active_request_after
-    remove_after: float = _PATIENCE.remove_after
+    measurement_intervals: float = _LIVENESS.measurement_intervals
+    timeout_factor: float = _LIVENESS.timeout_factor
+    active_request_after: float = _LIVENESS.active_request_after
+    remove_after: float = _LIVENESS.remove_after
     robot_hosts: tuple[str, ...] = ()
     """Hosts (``HOST`` or ``HOST:PORT``) that get heartbeats of their own, where multicast does not reach."""
     send_mcast: bool = True
@@ -61,9 +61,9 @@ class DiscoverySettings:
             raise ValueError(f"rosmaster_hz must be above 0, not {self.rosmaster_hz:g}")
 
     @property
-    def patience(self) -> Patience:
-        """When a silent master is given up."""
-        return Patience(
+    def liveness(self) -> LivenessSettings:
+        """When a silent master counts as gone."""
+        return LivenessSettings(
             self.measurement_intervals,
             self.timeout_factor,
             self.active_request_after,

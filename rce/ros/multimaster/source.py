@@ -1,4 +1,4 @@
-"""Where a master's registrations are read from: over XML-RPC, or from a core in the same process."""
+"""Sources of a master's registrations: XML-RPC, or a core in the same process."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from rce.ros.core import Core, GraphWatch
-from rce.ros.errors import MasterUnreachable, XmlRpcError
+from rce.ros.errors import MasterUnreachableError, XmlRpcError
 from rce.ros.multimaster.state import Names
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc.dispatch import SUCCESS
@@ -37,7 +37,7 @@ class Snapshot:
 
 
 class MasterSource(Protocol):
-    """Tells what is registered at a master."""
+    """Reads the registrations of a master."""
 
     async def read(self) -> Snapshot:
         """Read everything.
@@ -67,7 +67,7 @@ class RpcSource:
             publishers, subscribers, services = (_names(part) for part in state)
             topic_types = {topic: kind for topic, kind in types if isinstance(kind, str)}
         except (TypeError, ValueError) as error:
-            raise MasterUnreachable(self._master.uri, "its state has no known form") from error
+            raise MasterUnreachableError(self._master.uri, "its state has no known form") from error
         nodes = sorted(
             {
                 node
@@ -89,7 +89,7 @@ class RpcSource:
         )
 
     async def wait(self, longest: float) -> None:
-        """Wait: a master tells nobody of changes."""
+        """Wait ``longest`` seconds: a master does not announce changes."""
         await asyncio.sleep(longest)
 
     async def _many(self, calls: Sequence[tuple[str, ...]]) -> list[Any]:
@@ -107,7 +107,7 @@ async def multicall(master: MasterClient, calls: Sequence[tuple[Any, ...]]) -> l
         The value of each answer; None for a call that the master refused.
 
     Raises:
-        MasterUnreachable: The master does not answer as it should.
+        MasterUnreachableError: The master does not answer as it should.
     """
     values: list[Any] = []
     for begin in range(0, len(calls), MAX_CALLS):
@@ -138,9 +138,9 @@ async def _multicall(master: MasterClient, calls: list[dict[str, Any]]) -> list[
     try:
         answers = await master.rpc.call(master.uri, "system.multicall", (calls,), timeout=master.timeout)
     except XmlRpcError as error:
-        raise MasterUnreachable(master.uri, str(error)) from error
+        raise MasterUnreachableError(master.uri, str(error)) from error
     if not isinstance(answers, list) or len(answers) != len(calls):
-        raise MasterUnreachable(master.uri, "system.multicall was answered in no known form")
+        raise MasterUnreachableError(master.uri, "system.multicall was answered in no known form")
     return [_value(answer) for answer in answers]
 
 

@@ -1,4 +1,4 @@
-"""A master's state as discoveries tell it to each other (``masterInfo``). Pure.
+"""A master's state as discoveries exchange it (``masterInfo``). Pure.
 
 On the wire it is a list of ten: ``stamp, stamp_local`` (seconds, as text with nine decimals), ``masteruri,
 name, publishers, subscribers, services`` (``[[name, [node, ...]], ...]`` each), ``topicTypes``
@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 from urllib.parse import urlsplit
 
-from rce.ros.multimaster.errors import MalformedState
+from rce.ros.multimaster.errors import MalformedStateError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.heartbeat import ZERO, Stamp
 
@@ -53,11 +53,11 @@ class MasterInfo:
     service_uris: Mapping[str, Provider] = field(default_factory=dict)
 
     def same_graph(self, other: MasterInfo) -> bool:
-        """Tell whether the two differ in their stamps only."""
+        """Return whether the two differ in their stamps only."""
         return replace(other, stamp=self.stamp, stamp_local=self.stamp_local) == self
 
     def own_part(self) -> MasterInfo:
-        """Return what was registered here by the nodes themselves, not by a synchronization."""
+        """Return the registrations that nodes made here themselves, not a synchronization."""
         own_nodes = {name: node for name, node in self.nodes.items() if node.master_uri == self.uri}
         own_services = {
             name: service for name, service in self.service_uris.items() if service.master_uri == self.uri
@@ -136,7 +136,7 @@ class MasterInfo:
         """Read the ten values.
 
         Raises:
-            MalformedState: They are not what they should be.
+            MalformedStateError: The values do not have this form.
         """
         try:
             stamp, local, uri, name, publishers, subscribers, services, types, nodes, providers = values
@@ -153,7 +153,7 @@ class MasterInfo:
                 _providers(providers),
             )
         except (TypeError, ValueError, OverflowError) as error:
-            raise MalformedState(f"this is no masterInfo: {error}") from error
+            raise MalformedStateError(f"this is not a masterInfo: {error}") from error
 
 
 def stamp_text(stamp: Stamp) -> str:

@@ -1,4 +1,4 @@
-"""A synchronization: what other masters have, as far as the user wants it, is here too."""
+"""A synchronization: registers the entries of other masters here, as far as the user's filters take them."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
 
+from rce.aio.tasks import TaskScope
 from rce.ros.errors import MasterError, ServiceError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.addresses import master_name
-from rce.ros.multimaster.errors import NoDiscovery
+from rce.ros.multimaster.errors import NoDiscoveryError
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.listing import masters_known_at
-from rce.ros.multimaster.neighbourhood import Neighbour, PeerChange, PeerEvent
+from rce.ros.multimaster.peer_table import Neighbour, PeerChange, PeerEvent
 from rce.ros.multimaster.registrar import Registrar
 from rce.ros.multimaster.relay.exporter import Exporter
 from rce.ros.multimaster.relay.frames import Frame
@@ -28,7 +29,6 @@ from rce.ros.multimaster.settings import local_master
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
 from rce.ros.node.runtime import TypeName
-from rce.ros.tasks import TaskScope
 from rce.ros.tcpros.header import ANY
 from rce.ros.types import MessageType
 from rce.ros.types.exceptions import SerializationError, TypesError
@@ -38,7 +38,7 @@ _log = logging.getLogger(__name__)
 
 DISCOVERY_URI = "/master_discovery/masteruri"
 REFRESH = 5.0
-"""Seconds between complete looks at the discovery's list, besides the changes that it tells."""
+"""Seconds between reads of the discovery's whole list, besides the changes that it announces."""
 
 LOOK_FOR_DISCOVERY = 0.5
 WATCH_MASTER = 1.0
@@ -58,21 +58,21 @@ class SyncSettings:
     namespaces: Mapping[str, str] = field(default_factory=dict)
     """Master's name (``*``: every other) -> namespace that its names get here, which takes a relay."""
     relay_to: tuple[tuple[str, int], ...] = ()
-    """Where to make relay links to: hosts and ports."""
+    """Hosts and ports to make relay links to."""
     relay_listen: int | None = None
     """Port on which to take relay links; None: none, 0: a free one."""
     relay_addr: str = ""
     """Address on which to take relay links; if empty, all."""
     relay_token: str = field(default="", repr=False)
-    """What both sides of a relay link must know."""
+    """The token that both sides of a relay link must have."""
     relay_name: str = ""
     """This side's name on relay links; if empty, the local master's."""
 
     def __post_init__(self) -> None:
-        """Refuse relay links from everybody.
+        """Refuse relay links from other machines without a token.
 
         Raises:
-            MultimasterError: Other machines could connect, and there is no token that they must have.
+            MultimasterError: Other machines could connect, and no token is set that they must have.
         """
         if self.relay_listen is not None:
             check_listening(self.relay_addr, self.relay_token)
@@ -114,7 +114,7 @@ class MasterSync:
         """Names of the masters that are synchronized with and online."""
         return sorted(remote.master.name for remote in self._remotes.values() if remote.is_online)
 
-    # ------------------------------------------------------------------ life
+    # Life
 
     async def __aenter__(self) -> Self:
         async with AsyncExitStack() as stack:
@@ -137,8 +137,8 @@ class MasterSync:
             await self._node.advertise_service("~get_sync_info", messages.GET_SYNC_INFO, self._sync_info)
             stack.push_async_callback(self._take_back)
             self._tasks = await stack.enter_async_context(TaskScope())
-            self._tasks.start(self._follow_discovery(), name="follow the discovery")
-            self._tasks.start(self._watch_master(), name="watch the master")
+            self._tasks.spawn(self._follow_discovery(), name="follow the discovery")
+            self._tasks.spawn(self._watch_master(), name="watch the master")
             await self._start_links()
             self._stack = stack.pop_all()
         return self
@@ -164,10 +164,10 @@ class MasterSync:
             ]
         }
 
-    # ------------------------------------------------------------------ the discovery
+    # The discovery
 
     async def _follow_discovery(self) -> None:
-        """Keep the remotes as the discovery's list has them; its changes come in between."""
+        """Keep the remotes in step with the discovery's list and its changes."""
         has_discovery = True
         while True:
             self._waiting = {}
@@ -175,7 +175,7 @@ class MasterSync:
                 await self._listen_for_changes()
                 masters = await masters_known_at(self._node, self._master)
                 self._own_uri = await self._ask_own_uri()
-            except (NoDiscovery, ServiceError, MasterError, TypesError) as error:
+            except (NoDiscoveryError, ServiceError, MasterError, TypesError) as error:
                 if has_discovery:
                     _log.warning("%s", error)
                 has_discovery = False
@@ -191,7 +191,7 @@ class MasterSync:
         return uri
 
     async def _listen_for_changes(self) -> None:
-        """Hear every discovery: constants differ between releases, and the checksum with them."""
+        """Listen to discoveries of any release: their constants differ, and so does the checksum."""
         types = await self._master.call("getTopicTypes")
         found = {topic for topic, kind in types if kind == messages.MASTER_STATE} - self._changes_topics
         for topic in found:
@@ -219,7 +219,7 @@ class MasterSync:
             self._waiting[event.master.uri] = event
 
     def _take_waiting(self) -> None:
-        """Take the changes that came while the list was asked for: they may be newer than it."""
+        """Apply the changes that came while the list was requested: they may be newer than it."""
         waiting, self._waiting = self._waiting or {}, None
         for event in waiting.values():
             self._take_change(event)
@@ -236,7 +236,7 @@ class MasterSync:
             remote.update(master)
         elif self._is_wanted(master):
             remote = self._remotes[master.uri] = self._make_remote(master)
-            self._tasks.start(self._run(remote), name=f"synchronize with {master.name}")
+            self._tasks.spawn(self._run(remote), name=f"synchronize with {master.name}")
 
     def _is_wanted(self, master: Neighbour) -> bool:
         if self._is_leaving or self._own_uri in ("", master.uri) or master.name in self._links.connected:
@@ -271,7 +271,7 @@ class MasterSync:
         finally:
             del self._remotes[remote.master.uri]
 
-    # ------------------------------------------------------------------ relay links
+    # Relay links
 
     async def _start_links(self) -> None:
         settings = self.settings
@@ -280,16 +280,16 @@ class MasterSync:
         name = settings.relay_name or master_name(await self._ask_own_uri())
         self._links = RelayLinks(LinkIdentity(name, settings.relay_token), self._make_ends)
         for host, port in settings.relay_to:
-            self._tasks.start(self._links.dial(host, port), name=f"relay link to {host}:{port}")
+            self._tasks.spawn(self._links.dial(host, port), name=f"relay link to {host}:{port}")
         if settings.relay_listen is not None:
             server = await self._links.open_server(settings.relay_addr or None, settings.relay_listen)
             self.relay_port = server.sockets[0].getsockname()[1]
-            self._tasks.start(self._links.serve(server), name="take relay links")
+            self._tasks.spawn(self._links.serve(server), name="take relay links")
 
     def _make_ends(
         self, send: Callable[[Frame], None], tasks: TaskScope, name: str
     ) -> tuple[Exporter, Importer]:
-        """Make the ends of a link; the master at its other side is no longer registered directly."""
+        """Make the ends of a link; stop registering the master at its other side directly."""
         for remote in self._remotes.values():
             if remote.master.name == name:
                 remote.leave()
@@ -308,10 +308,10 @@ class MasterSync:
     def _registered_nodes(self) -> set[str]:
         return {entry.node for entries in self.registrar.held.values() for entry in entries}
 
-    # ------------------------------------------------------------------ the own master
+    # The own master
 
     async def _watch_master(self) -> None:
-        """Register everything again when another process stands in the master's place."""
+        """Register everything again when another process has replaced the master."""
         known = None
         while True:
             try:

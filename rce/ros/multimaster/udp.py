@@ -86,7 +86,7 @@ class HeartbeatSocket:
             self.send_to(datagram, host)
 
     def send_to(self, datagram: bytes, address: tuple[str, int]) -> None:
-        """Send to one address. What cannot be sent is lost, as datagrams are; the reason is told once."""
+        """Send to one address. A datagram that cannot be sent is lost; the reason is logged once."""
         if self._own is None:
             return
         try:
@@ -97,17 +97,17 @@ class HeartbeatSocket:
             self._complained.discard(address[0])
 
     def renew(self) -> None:
-        """Join the group again if the interface lost that, as one that was taken away and came back."""
+        """Join the group again if the interface lost its membership, for example because it was replugged."""
         if self._shared is None or self._own is None:
             return
         for transport, work in ((self._shared, self._join), (self._own, self._choose_interface)):
             try:
                 work(transport.get_extra_info("socket"))
             except OSError as error:
-                if error.errno != errno.EADDRINUSE:  # that says: is a member already
+                if error.errno != errno.EADDRINUSE:  # the error for: already a member
                     self._complain(self.group, error)
 
-    # ------------------------------------------------------------------ inside
+    # Inside
 
     async def _open(self, sock: socket.socket, *, to_group: bool) -> asyncio.DatagramTransport:
         try:
@@ -164,7 +164,7 @@ class _Protocol(asyncio.DatagramProtocol):
         self._receive(data, addr, self._to_group)
 
     def error_received(self, exc: Exception) -> None:
-        if isinstance(exc, OSError) and exc.errno != errno.ECONNREFUSED:  # nobody listens there (yet)
+        if isinstance(exc, OSError) and exc.errno != errno.ECONNREFUSED:  # no process listens there (yet)
             self._complain("some hosts", exc)
 
 

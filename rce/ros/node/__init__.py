@@ -1,8 +1,8 @@
 """Nodes of a ROS graph in asyncio: ``async with Node("talker") as node: ...``."""
 
 from rce.ros.node.node import Node
-from rce.ros.node.program import run
 from rce.ros.node.publisher import Publisher
+from rce.ros.node.running import run
 from rce.ros.node.service import Service
 from rce.ros.node.service_client import ServiceClient
 from rce.ros.node.subscriber import Subscriber

@@ -1,4 +1,4 @@
-"""ROS time: the machine's clock or, if the parameter ``/use_sim_time`` says so, what ``/clock`` tells.
+"""ROS time: the machine's clock or, if the parameter ``/use_sim_time`` is true, the topic ``/clock``.
 
 Simulated time is zero until the first tick, may run at any speed, stand still, and jump back when a
 simulation or a bag begins anew.
@@ -46,7 +46,7 @@ class Clock:
     def tick(self, payload: bytes, _latched: bool) -> None:
         """Take a serialized ``rosgraph_msgs/Clock``."""
         if len(payload) != _STAMP.size:
-            _log.warning("%s: a message of %d bytes is no clock", TOPIC, len(payload))
+            _log.warning("%s: a message of %d bytes is not a clock", TOPIC, len(payload))
             return
         secs, nsecs = _STAMP.unpack(payload)
         now = secs * NANOSECONDS + nsecs
@@ -55,7 +55,7 @@ class Clock:
             _wake(heapq.heappop(self._sleepers)[2])
 
     def end(self) -> None:
-        """Wake all who sleep, now and later: the node stops."""
+        """Wake all sleepers, now and later: the node stops."""
         self._stop.set()
         while self._sleepers:
             _wake(self._sleepers.pop()[2])
@@ -64,7 +64,7 @@ class Clock:
         """Sleep until a time in nanoseconds, until simulated time jumps back, or until the node stops.
 
         Returns:
-            Whether the node goes on.
+            Whether the node continues.
         """
         if self._stop.is_set():
             return False

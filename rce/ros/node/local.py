@@ -1,8 +1,8 @@
-"""Messages between nodes of one process: handed over as objects, not written and read again.
+"""Messages between nodes of one process: handed over as objects, without serialization.
 
-What is delivered is the very object that was published, to every subscriber of the process. Neither side may
-change it afterwards; who wants another message makes another one. Delivery is as with a connection otherwise:
-in order, not within the call that publishes, and the oldest messages are dropped if they are too many.
+Every subscriber of the process gets the published object itself. Neither side may change it afterwards; to
+publish another message, make a new object. Otherwise delivery works as over a connection: in order, not
+within the call that publishes, and the oldest messages are dropped if too many wait.
 """
 
 from __future__ import annotations
@@ -12,14 +12,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol
 
-from rce.ros.node.queue import DropOldest
+from rce.aio.queues import BoundedQueue
+from rce.ros.node.settings import MAX_QUEUED_BYTES
 
 if TYPE_CHECKING:
     from rce.ros.node.topics import Topics
     from rce.ros.types import Message, MessageType
 
 TRANSPORT = "INTRAPROCESS"
-"""What the slave API calls it; roscpp's word."""
+"""Name of this transport in the slave API; roscpp's word."""
 
 _neighbours: dict[str, tuple[asyncio.AbstractEventLoop, Topics]] = {}
 """Topics of all nodes of this process that deliver locally, by their slave APIs."""
@@ -27,7 +28,7 @@ _neighbours: dict[str, tuple[asyncio.AbstractEventLoop, Topics]] = {}
 
 @contextmanager
 def neighbour(uri: str, topics: Topics) -> Iterator[None]:
-    """Let the other nodes of this event loop take a node's messages without a connection."""
+    """Register a node's topics for local delivery to the other nodes of this event loop."""
     _neighbours[uri] = (asyncio.get_running_loop(), topics)
     try:
         yield
@@ -41,16 +42,16 @@ def find_neighbour(uri: str) -> Topics | None:
     return topics if loop is asyncio.get_running_loop() else None
 
 
-class Parcel:
-    """A published message, as an object, as bytes, or both; each is made of the other when asked for."""
+class LocalMessage:
+    """A published message, as an object, as bytes, or both; each is made from the other when needed."""
 
-    __slots__ = ("_kind", "_message", "_payload")
+    __slots__ = ("_message", "_message_type", "_payload")
 
     def __init__(
-        self, kind: MessageType | None, message: Message | None = None, payload: bytes | None = None
+        self, message_type: MessageType | None, message: Message | None = None, payload: bytes | None = None
     ) -> None:
-        assert payload is not None or (kind is not None and message is not None)
-        self._kind = kind
+        assert payload is not None or (message_type is not None and message is not None)
+        self._message_type = message_type
         self._message = message
         self._payload = payload
 
@@ -61,22 +62,22 @@ class Parcel:
     def payload(self) -> bytes:
         """Return the serialized message."""
         if self._payload is None:
-            assert self._kind is not None
+            assert self._message_type is not None
             assert self._message is not None
-            self._payload = bytes(self._kind.serialize(self._message))
+            self._payload = bytes(self._message_type.serialize(self._message))
         return self._payload
 
-    def message(self, kind: MessageType) -> Message:
+    def message(self, message_type: MessageType) -> Message:
         """Return the message as an object of a type with the same checksum."""
-        if self._message is None or self._message.__class__ is not kind.cls:
-            return kind.deserialize(self.payload())
+        if self._message is None or self._message.__class__ is not message_type.cls:
+            return message_type.deserialize(self.payload())
         return self._message
 
 
-class Taker(Protocol):
-    """What a local link's messages are given to."""
+class LocalListener(Protocol):
+    """Receives the messages of a local link."""
 
-    def deliver_parcel(self, parcel: Parcel, latched: bool, uri: str) -> None:
+    def deliver_local(self, local_message: LocalMessage, latched: bool, uri: str) -> None:
         """Take a message of the node with this slave API; must neither wait nor raise."""
 
 
@@ -97,18 +98,20 @@ class LocalLink:
     is_greeted = True
     transport = TRANSPORT
 
-    def __init__(self, taker: Taker, *, uri: str, publisher: str, subscriber: str, queue_size: int) -> None:
+    def __init__(
+        self, listener: LocalListener, *, uri: str, publisher: str, subscriber: str, queue_size: int
+    ) -> None:
         self.uri = uri
         self.publisher = publisher
         self.subscriber = subscriber
         self.messages = 0
         self.bytes_in = 0
-        self.kept: Parcel | None = None
+        self.kept: LocalMessage | None = None
         loop = asyncio.get_running_loop()
         self.ended: asyncio.Future[None] = loop.create_future()
         self._loop = loop
-        self._taker = taker
-        self._queue: DropOldest[tuple[Parcel, bool]] = DropOldest(queue_size)
+        self._listener = listener
+        self._queue: BoundedQueue[tuple[LocalMessage, bool]] = BoundedQueue(queue_size, MAX_QUEUED_BYTES)
 
     @property
     def bytes_out(self) -> int:
@@ -122,25 +125,25 @@ class LocalLink:
 
     @property
     def description(self) -> str:
-        """What the slave API says of the connection."""
+        """The connection's description in the slave API."""
         return f"{TRANSPORT} {self.publisher} to {self.subscriber}"
 
-    def send(self, parcel: Parcel, *, latched: bool) -> None:
+    def send(self, local_message: LocalMessage, *, latched: bool) -> None:
         """Queue a message; it is delivered as soon as the event loop is free."""
         if not self._queue:
             self._loop.call_soon(self._deliver)
-        self._queue.put((parcel, latched), len(parcel))
+        self._queue.put((local_message, latched), len(local_message))
 
     def end(self) -> None:
-        """End the link from the publisher's side; what waits is delivered still."""
+        """End the link from the publisher's side; waiting messages are still delivered."""
         if not self.ended.done():
             self.ended.set_result(None)
 
     def _deliver(self) -> None:
         while self._queue:
-            parcel, latched = self._queue.take()
+            local_message, latched = self._queue.take()
             self.messages += 1
-            self.bytes_in += len(parcel)
+            self.bytes_in += len(local_message)
             if latched:
-                self.kept = parcel
-            self._taker.deliver_parcel(parcel, latched, self.uri)
+                self.kept = local_message
+            self._listener.deliver_local(local_message, latched, self.uri)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Any
 
-from rce.ros.errors import ServiceFault
+from rce.ros.errors import ServiceFaultError
 from rce.ros.node.service import SerializedHandler, coding
 
 if TYPE_CHECKING:
@@ -38,9 +38,9 @@ class Loggers:
     def handlers(self, types: Types) -> list[tuple[str, str, SerializedHandler]]:
         """Return name, type and handler of each service; the types are loaded at the first call."""
 
-        def lazily(kind: str, handler: Any) -> SerializedHandler:
+        def lazily(service_type: str, handler: Any) -> SerializedHandler:
             def answer(payload: bytes) -> Any:
-                return coding(types.service(kind), handler)(payload)
+                return coding(types.service(service_type), handler)(payload)
 
             return answer
 
@@ -59,14 +59,14 @@ class Loggers:
         """Set the level of one logger.
 
         Raises:
-            ServiceFault: There is no such logger or level.
+            ServiceFaultError: The logger or the level does not exist.
         """
         logger = self._all().get(request.logger)
         if logger is None:
-            raise ServiceFault(SET[0], f"there is no logger {request.logger!r}")
+            raise ServiceFaultError(SET[0], f"there is no logger {request.logger!r}")
         level = _LEVELS.get(request.level.lower())
         if level is None:
-            raise ServiceFault(SET[0], f"{request.level!r} is not one of {', '.join(_LEVELS)}")
+            raise ServiceFaultError(SET[0], f"{request.level!r} is not one of {', '.join(_LEVELS)}")
         logger.setLevel(level)
 
     def _all(self) -> dict[str, logging.Logger]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from rce.ros.errors import MasterRefused, MasterUnreachable, XmlRpcError
+from rce.ros.errors import MasterRefusedError, MasterUnreachableError, XmlRpcError
 from rce.ros.xmlrpc import RpcClient
 from rce.ros.xmlrpc.dispatch import SUCCESS
 
@@ -24,56 +24,56 @@ class MasterClient:
     """Seconds for each call."""
 
     async def call(self, method: str, *arguments: Any) -> Any:
-        """Call any method; the node's name is put before ``arguments``.
+        """Call any method, with the node's name before ``arguments``.
 
         Returns:
             The value of the answer.
 
         Raises:
-            MasterUnreachable: No usable answer.
-            MasterRefused: The status is not success.
+            MasterUnreachableError: No usable answer.
+            MasterRefusedError: The status is not success.
         """
         try:
             answer = await self.rpc.call(self.uri, method, (self.caller, *arguments), timeout=self.timeout)
             status, text, value = answer
         except XmlRpcError as error:
-            raise MasterUnreachable(self.uri, str(error)) from error
+            raise MasterUnreachableError(self.uri, str(error)) from error
         except (TypeError, ValueError) as error:
-            raise MasterUnreachable(self.uri, f"{method} was answered in no known form") from error
+            raise MasterUnreachableError(self.uri, f"{method} was answered in no known form") from error
         if status != SUCCESS:
-            raise MasterRefused(method, status, text)
+            raise MasterRefusedError(method, status, text)
         return value
 
-    async def register_publisher(self, topic: str, kind: str) -> None:
-        """Say that the node publishes ``topic``."""
-        await self.call("registerPublisher", topic, kind, self.slave_uri)
+    async def register_publisher(self, topic: str, message_type: str) -> None:
+        """Register the node as a publisher of ``topic``."""
+        await self.call("registerPublisher", topic, message_type, self.slave_uri)
 
     async def unregister_publisher(self, topic: str) -> None:
-        """Say that the node publishes ``topic`` no longer."""
+        """Unregister the node as a publisher of ``topic``."""
         await self.call("unregisterPublisher", topic, self.slave_uri)
 
-    async def register_subscriber(self, topic: str, kind: str) -> list[str]:
-        """Say that the node subscribes to ``topic``; return the slave APIs of its publishers."""
-        publishers: list[str] = await self.call("registerSubscriber", topic, kind, self.slave_uri)
+    async def register_subscriber(self, topic: str, message_type: str) -> list[str]:
+        """Register the node as a subscriber of ``topic``; return the slave APIs of its publishers."""
+        publishers: list[str] = await self.call("registerSubscriber", topic, message_type, self.slave_uri)
         return publishers
 
     async def unregister_subscriber(self, topic: str) -> None:
-        """Say that the node subscribes to ``topic`` no longer."""
+        """Unregister the node as a subscriber of ``topic``."""
         await self.call("unregisterSubscriber", topic, self.slave_uri)
 
     async def register_service(self, name: str, service_uri: str) -> None:
-        """Say that the node provides a service at ``service_uri``."""
+        """Register a service of the node, at ``service_uri``."""
         await self.call("registerService", name, service_uri, self.slave_uri)
 
     async def unregister_service(self, name: str, service_uri: str) -> None:
-        """Say that the node no longer provides a service."""
+        """Unregister a service of the node."""
         await self.call("unregisterService", name, service_uri)
 
     async def lookup_node(self, name: str) -> str | None:
         """Return the slave API of a node, if the master knows it."""
         try:
             uri: str = await self.call("lookupNode", name)
-        except MasterRefused:
+        except MasterRefusedError:
             return None
         return uri
 
@@ -81,6 +81,6 @@ class MasterClient:
         """Return the ``rosrpc`` URI of a service's provider, if there is one."""
         try:
             uri: str = await self.call("lookupService", name)
-        except MasterRefused:
+        except MasterRefusedError:
             return None
         return uri

@@ -1,4 +1,4 @@
-"""Being part of a ROS graph: joining it, being told to stop, leaving it."""
+"""Membership in a ROS graph: joining, being told to stop, leaving."""
 
 from __future__ import annotations
 
@@ -9,15 +9,23 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from rce.ros.errors import HandshakeRefused, MasterError, MasterUnreachable, NodeClosed, TypeMismatch
+from rce.aio.tasks import TaskScope
+from rce.ros.errors import (
+    HandshakeRefusedError,
+    MasterError,
+    MasterUnreachableError,
+    NodeClosedError,
+    TypeMismatchError,
+)
 from rce.ros.logfiles import LogFile
-from rce.ros.node import clock, rosout, signals
+from rce.ros.node import clock, rosout
 from rce.ros.node.clock import NANOSECONDS, Clock
 from rce.ros.node.local import neighbour
 from rce.ros.node.loggers import Loggers
 from rce.ros.node.master import MasterClient
 from rce.ros.node.parameters import Parameters
 from rce.ros.node.registrar import Registrar
+from rce.ros.node.running import stop_signals
 from rce.ros.node.runtime import Runtime, Types
 from rce.ros.node.service import SerializedHandler, Service
 from rce.ros.node.service_client import ServiceClient
@@ -25,7 +33,6 @@ from rce.ros.node.settings import NodeSettings
 from rce.ros.node.slave import NOTHING, SlaveApi
 from rce.ros.node.subscriber import CallbackSink
 from rce.ros.node.topics import Topics
-from rce.ros.tasks import TaskScope
 from rce.ros.tcpros.connection import Connection
 from rce.ros.tcpros.framing import SCRATCH_SIZE
 from rce.ros.tcpros.listener import Listener
@@ -40,7 +47,7 @@ DEFAULT_QUEUE = 100
 """How many messages wait for a slow peer before the oldest is dropped."""
 
 GOODBYE_TIMEOUT = 3.0
-"""Seconds that the master gets to take a node's registrations back."""
+"""Seconds that the master may take to remove a node's registrations."""
 
 LOG_FORM = "[%(name)s][%(levelname)s] %(asctime)s: %(message)s"
 LOG_BYTES = 50_000_000
@@ -52,7 +59,7 @@ RETRY = 0.2
 
 
 class GraphMember:
-    """The life of a node; :class:`rce.ros.node.Node` adds what a program does with it."""
+    """The life cycle of a node; :class:`rce.ros.node.Node` adds the methods for programs."""
 
     def __init__(
         self,
@@ -68,7 +75,7 @@ class GraphMember:
         self._settings = settings
         self._types = Types(types)
         if self.log.level == logging.NOTSET:
-            self.log.setLevel(logging.INFO)  # what nodes tell, whatever their program's own logging does
+            self.log.setLevel(logging.INFO)  # independent of the logging of the node's program
         self._signals = signals
         self._intra_process = intra_process
         self._rosout = rosout
@@ -83,7 +90,7 @@ class GraphMember:
         self._parameters: Parameters
         self._listener: Listener
 
-    # ------------------------------------------------------------------ for programs
+    # For programs
 
     @property
     def name(self) -> str:
@@ -131,14 +138,14 @@ class GraphMember:
         if self._signals:
             await self._stop.wait()
             return
-        with signals.handled(self.shutdown):
+        with stop_signals(self.shutdown):
             await self._stop.wait()
 
     async def sleep(self, seconds: float) -> bool:
         """Sleep in ROS time, or wake up early because the node is told to stop or simulated time jumps back.
 
         Returns:
-            Whether the node goes on: ``while await node.sleep(0.1): ...``.
+            Whether the node continues: ``while await node.sleep(0.1): ...``.
         """
         return await self._clock.sleep_until(self._clock.nanoseconds() + round(seconds * NANOSECONDS))
 
@@ -148,11 +155,11 @@ class GraphMember:
         A node does so by itself when its master was restarted.
 
         Raises:
-            MasterError: The master cannot be told.
+            MasterError: The registration at the master failed.
         """
         await self._registrar(self._running.master).register_all()
 
-    # ------------------------------------------------------------------ life
+    # Life
 
     async def __aenter__(self) -> Self:
         settings = self._settings = await self._settings.placed()
@@ -185,9 +192,9 @@ class GraphMember:
             stack.push_async_callback(self._leave_graph)
             await self._until_master_answers()
             await self._join_graph(stack)
-            tasks.start(self._registrar(master).keep(), name=f"{self.name} stays registered")
+            tasks.spawn(self._registrar(master).keep(), name=f"{self.name} stays registered")
             if self._signals:
-                stack.enter_context(signals.handled(self.shutdown))
+                stack.enter_context(stop_signals(self.shutdown))
             self._stack = stack.pop_all()
         return self
 
@@ -209,8 +216,8 @@ class GraphMember:
             await self._publish_log(stack)
         if self._settings.log_file is not None:
             self._keep_log(stack, self._settings.log_file)
-        for name, kind, handler in Loggers(self.log).handlers(self._types):
-            await self._provide(f"{self.name}/{name}", kind, handler)
+        for name, service_type, handler in Loggers(self.log).handlers(self._types):
+            await self._provide(f"{self.name}/{name}", service_type, handler)
 
     async def _publish_log(self, stack: AsyncExitStack) -> None:
         publisher = await self._topics.advertise(
@@ -231,17 +238,19 @@ class GraphMember:
         stack.callback(file.close)
         stack.callback(self.log.removeHandler, file)
 
-    async def _provide(self, name: str, kind: str | ServiceType, handler: SerializedHandler) -> Service:
+    async def _provide(
+        self, name: str, service_type: str | ServiceType, handler: SerializedHandler
+    ) -> Service:
         """Provide a service under a global name."""
         runtime, uri = self._running, self._service_uri
         if name in self._services:
-            raise TypeMismatch(f"this node provides {name} already")
+            raise TypeMismatchError(f"this node provides {name} already")
 
         async def release(service: Service) -> None:
             del self._services[service.name]
             await runtime.master.unregister_service(service.name, uri)
 
-        service = self._services[name] = Service(runtime, name, kind, handler, release)
+        service = self._services[name] = Service(runtime, name, service_type, handler, release)
         try:
             await runtime.master.register_service(name, uri)
         except BaseException:
@@ -256,7 +265,7 @@ class GraphMember:
         while True:
             try:
                 self._clock.simulated = await self._parameters.get(clock.PARAMETER, default=False) is True
-            except MasterUnreachable as error:
+            except MasterUnreachableError as error:
                 if deadline is not None and loop.time() >= deadline:
                     raise
                 _log.info("%s; trying again", error)
@@ -265,7 +274,7 @@ class GraphMember:
                 return
 
     async def _leave_graph(self) -> None:
-        """Unregister everything, as far as there is still a master that listens."""
+        """Unregister everything, as far as the master still answers."""
         for service in self._services.values():
             service.disconnect()
         try:
@@ -284,17 +293,17 @@ class GraphMember:
         for client in self._clients:
             await client.close()
 
-    # ------------------------------------------------------------------ inside
+    # Inside
 
     @property
     def _running(self) -> Runtime:
-        """What the node works with.
+        """The running node's runtime.
 
         Raises:
-            NodeClosed: It is not part of the graph (yet, or any longer).
+            NodeClosedError: It is not part of the graph (yet, or any longer).
         """
         if self._runtime is None:
-            raise NodeClosed(f"node {self.name} is used outside its 'async with' block")
+            raise NodeClosedError(f"node {self.name} is used outside its 'async with' block")
         return self._runtime
 
     @property
@@ -322,5 +331,5 @@ class GraphMember:
     def _accept_service(self, connection: Connection, fields: dict[str, str]) -> None:
         service = self._services.get(fields["service"])
         if service is None:
-            raise HandshakeRefused(f"service {fields['service']} is not provided here")
+            raise HandshakeRefusedError(f"service {fields['service']} is not provided here")
         service.accept(connection, fields)

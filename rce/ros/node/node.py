@@ -1,4 +1,4 @@
-"""The node: a peer of a ROS graph, and all that a program does with it."""
+"""The node: a peer of a ROS graph, and the methods that a program calls on it."""
 
 from __future__ import annotations
 
@@ -76,13 +76,13 @@ class Node(GraphMember):
             anonymous: Make the name unique.
             signals: Stop the node at SIGINT and SIGTERM; ``None`` means: if it is the program's main node,
                 which is the one that takes the program's command line.
-            master_timeout: Seconds to wait for a master that is not up yet; ``None`` for ever.
+            master_timeout: Seconds to wait for a master that is not up yet; ``None`` waits without a limit.
             intra_process: Take messages of other nodes of this process as the objects that they published,
                 which then must not be changed; else by a connection, as from any node.
             rosout: Publish the log on ``/rosout``.
 
         Raises:
-            InvalidName: A name or remapping is not legal.
+            InvalidNameError: A name or remapping is not legal.
         """
         settings = NodeSettings.gather(
             name,
@@ -106,38 +106,43 @@ class Node(GraphMember):
         """Return the global name that ``name`` stands for, after remapping.
 
         Raises:
-            InvalidName: It is not legal.
+            InvalidNameError: It is not legal.
         """
         return self._settings.resolver.resolve(name)
 
-    # ------------------------------------------------------------------ topics
+    # Topics
 
     async def advertise(
-        self, topic: str, kind: str | MessageType, *, latch: bool = False, queue_size: int = DEFAULT_QUEUE
+        self,
+        topic: str,
+        message_type: str | MessageType,
+        *,
+        latch: bool = False,
+        queue_size: int = DEFAULT_QUEUE,
     ) -> Publisher:
         """Publish on a topic.
 
         Args:
             topic: The topic.
-            kind: Its type.
+            message_type: Its type.
             latch: Give the last message to later subscribers.
             queue_size: How many messages wait for a slow subscriber before its oldest is dropped.
 
         Raises:
-            TypeMismatch: This node publishes the topic with another type.
-            UnknownType: There is no such type.
-            MasterError: The master cannot be told.
+            TypeMismatchError: This node publishes the topic with another type.
+            UnknownTypeError: The type does not exist.
+            MasterError: The registration at the master failed.
         """
         runtime = self._running
-        message_type = runtime.types.message(kind)
+        known = runtime.types.message(message_type)
         return await self._topics.advertise(
-            runtime, self.resolve(topic), message_type, latch=latch, queue_size=queue_size
+            runtime, self.resolve(topic), known, latch=latch, queue_size=queue_size
         )
 
     async def subscribe(
         self,
         topic: str,
-        kind: str | MessageType,
+        message_type: str | MessageType,
         callback: MessageCallback | None = None,
         *,
         queue_size: int = DEFAULT_QUEUE,
@@ -146,31 +151,29 @@ class Node(GraphMember):
 
         Args:
             topic: The topic.
-            kind: Its type.
+            message_type: Its type.
             callback: Called with each message, in order. A plain function is called as soon as a message is
                 there and must not block; a coroutine function is awaited before the next message. Without
                 a callback, iterate over the subscriber.
             queue_size: How many messages wait for a coroutine or an iteration before the oldest is dropped.
 
         Raises:
-            TypeMismatch: This node subscribes to the topic with another type.
-            UnknownType: There is no such type.
-            MasterError: The master cannot be told.
+            TypeMismatchError: This node subscribes to the topic with another type.
+            UnknownTypeError: The type does not exist.
+            MasterError: The registration at the master failed.
         """
         runtime = self._running
         name = self.resolve(topic)
-        message_type = runtime.types.message(kind)
+        known = runtime.types.message(message_type)
         if callback is None:
-            return await self._topics.subscribe(
-                runtime, name, message_type, QueueSink(queue_size), decodes=True
-            )
-        sink = sink_for(decoding(message_type, callback), queue_size, name, runtime.tasks)
-        return await self._topics.subscribe(runtime, name, message_type, sink, decodes=True)
+            return await self._topics.subscribe(runtime, name, known, QueueSink(queue_size), decodes=True)
+        sink = sink_for(decoding(known, callback), queue_size, name, runtime.tasks)
+        return await self._topics.subscribe(runtime, name, known, sink, decodes=True)
 
     async def subscribe_serialized(
         self,
         topic: str,
-        kind: str | MessageType | TypeName,
+        message_type: str | MessageType | TypeName,
         callback: SerializedCallback,
         *,
         queue_size: int = DEFAULT_QUEUE,
@@ -179,89 +182,95 @@ class Node(GraphMember):
 
         Args:
             topic: The topic.
-            kind: Its type; ``*`` for any. A :class:`~rce.ros.node.runtime.TypeName` saves loading it.
+            message_type: Its type; ``*`` for any. A :class:`~rce.ros.node.runtime.TypeName` saves loading it.
             callback: Called with ``(payload, latched)``; ``latched`` is what the publisher says of itself.
                 Plain function or coroutine function, as for :meth:`subscribe`.
             queue_size: As for :meth:`subscribe`.
 
         Raises:
-            TypeMismatch: This node subscribes to the topic with another type.
-            UnknownType: There is no such type.
-            MasterError: The master cannot be told.
+            TypeMismatchError: This node subscribes to the topic with another type.
+            UnknownTypeError: The type does not exist.
+            MasterError: The registration at the master failed.
         """
         name = self.resolve(topic)
         sink = sink_for(callback, queue_size, name, self._running.tasks)
-        return await self._subscribe_raw(name, kind, sink)
+        return await self._subscribe_raw(name, message_type, sink)
 
     async def _subscribe_raw(
-        self, name: str, kind: str | MessageType | TypeName, sink: Sink, *, hears_own: bool = True
+        self, name: str, message_type: str | MessageType | TypeName, sink: Sink, *, hears_own: bool = True
     ) -> Subscriber:
         runtime = self._running
         known: MessageType | TypeName | None = None
-        if kind != ANY:
-            known = kind if isinstance(kind, TypeName) else runtime.types.message(kind)
+        if message_type != ANY:
+            known = (
+                message_type if isinstance(message_type, TypeName) else runtime.types.message(message_type)
+            )
         return await self._topics.subscribe(runtime, name, known, sink, decodes=False, hears_own=hears_own)
 
     async def listen(
-        self, topic: str, kind: str | MessageType | TypeName, listener: TopicListener
+        self, topic: str, message_type: str | MessageType | TypeName, listener: TopicListener
     ) -> Subscriber:
-        """Take the messages of a topic as a bridge needs them: as on the wire, and those of others only.
+        """Take the serialized messages of a topic for a bridge, without those of this node itself.
 
         Args:
             topic: The topic.
-            kind: As for :meth:`subscribe_serialized`, and so is what is raised.
+            message_type: As for :meth:`subscribe_serialized`, and so is what is raised.
             listener: Takes the messages, at once and in order; must not block.
         """
         name = self.resolve(topic)
-        return await self._subscribe_raw(name, kind, ListenerSink(listener, name), hears_own=False)
+        return await self._subscribe_raw(name, message_type, ListenerSink(listener, name), hears_own=False)
 
-    # ------------------------------------------------------------------ services
+    # Services
 
-    async def advertise_service(self, name: str, kind: str | ServiceType, handler: Handler) -> Service:
+    async def advertise_service(
+        self, name: str, service_type: str | ServiceType, handler: Handler
+    ) -> Service:
         """Provide a service.
 
         Args:
             name: The service.
-            kind: Its type.
+            service_type: Its type.
             handler: Called with each request; returns a response or a mapping of its fields. A plain function
-                must not block; coroutine functions run side by side for different clients. What it raises is
-                the caller's answer: :class:`~rce.ros.errors.ServiceFault` with its text, anything else is
+                must not block; coroutine functions run side by side for different clients. Exceptions are
+                sent to the caller: :class:`~rce.ros.errors.ServiceFaultError` with its text; any other is
                 logged too.
 
         Raises:
-            TypeMismatch: This node provides the service already.
-            UnknownType: There is no such type.
-            MasterError: The master cannot be told.
+            TypeMismatchError: This node provides the service already.
+            UnknownTypeError: The type does not exist.
+            MasterError: The registration at the master failed.
         """
-        service_type = self._running.types.service(kind)
-        return await self._provide(self.resolve(name), service_type, coding(service_type, handler))
+        known = self._running.types.service(service_type)
+        return await self._provide(self.resolve(name), known, coding(known, handler))
 
     async def advertise_service_serialized(
-        self, name: str, kind: str | ServiceType, handler: SerializedHandler
+        self, name: str, service_type: str | ServiceType, handler: SerializedHandler
     ) -> Service:
         """Provide a service whose requests and responses are passed as they are on the wire.
 
         Raises:
-            TypeMismatch: This node provides the service already.
-            UnknownType: There is no such type.
-            MasterError: The master cannot be told.
+            TypeMismatchError: This node provides the service already.
+            UnknownTypeError: The type does not exist.
+            MasterError: The registration at the master failed.
         """
-        return await self._provide(self.resolve(name), self._running.types.service(kind), handler)
+        return await self._provide(self.resolve(name), self._running.types.service(service_type), handler)
 
-    def service_client(self, name: str, kind: str | ServiceType, *, persistent: bool = True) -> ServiceClient:
+    def service_client(
+        self, name: str, service_type: str | ServiceType, *, persistent: bool = True
+    ) -> ServiceClient:
         """Make a client of a service, which need not be there yet.
 
         Args:
             name: The service.
-            kind: Its type.
+            service_type: Its type.
             persistent: Keep connections for later calls; else every call looks the provider up anew.
 
         Raises:
-            UnknownType: There is no such type.
+            UnknownTypeError: The type does not exist.
         """
         runtime = self._running
         client = ServiceClient(
-            runtime, self.resolve(name), runtime.types.service(kind), persistent=persistent
+            runtime, self.resolve(name), runtime.types.service(service_type), persistent=persistent
         )
         self._clients.append(client)
         return client
@@ -270,15 +279,15 @@ class Node(GraphMember):
         """Wait until a service has a provider that answers.
 
         Raises:
-            TimeoutError: There was none within ``timeout`` seconds.
+            TimeoutError: No provider answered within ``timeout`` seconds.
             MasterError: The master cannot be asked.
         """
         runtime, service = self._running, self.resolve(name)
         async with asyncio.timeout(timeout):
-            while not await answers(runtime, service):  # noqa: ASYNC110 - a master tells nobody of services
+            while not await answers(runtime, service):  # noqa: ASYNC110 - a master announces no services
                 await asyncio.sleep(SERVICE_POLL)
 
-    # ------------------------------------------------------------------ time
+    # Time
 
     @property
     def is_time_simulated(self) -> bool:
@@ -296,7 +305,7 @@ class Node(GraphMember):
         return self._clock.nanoseconds() / NANOSECONDS
 
     def rate(self, hz: float) -> Rate:
-        """Make what keeps a loop at a rate in ROS time: ``async for _ in node.rate(10): ...``."""
+        """Make a rate, which keeps a loop's pace in ROS time: ``async for _ in node.rate(10): ...``."""
         return Rate(self._clock, hz)
 
     def timer(self, period: float, callback: TimerCallback, *, oneshot: bool = False) -> Timer:
@@ -309,23 +318,23 @@ class Node(GraphMember):
         """
         return Timer(self._clock, period, callback, self._running.tasks, oneshot=oneshot)
 
-    # ------------------------------------------------------------------ parameters
+    # Parameters
 
     async def get_param(self, name: str, default: Any = REQUIRED) -> Any:
         """Return a parameter, or all of a namespace as a dictionary.
 
         Raises:
-            ParameterMissing: It is not set and there is no ``default``.
-            MasterUnreachable: The master does not answer.
+            ParameterMissingError: It is not set, and ``default`` is not given.
+            MasterUnreachableError: The master does not answer.
         """
         return await self._parameters.get(self.resolve(name), default)
 
     async def get_param_cached(self, name: str, default: Any = REQUIRED) -> Any:
-        """Return a parameter as the master told it last: the first call asks, later changes are told.
+        """Return a parameter from a cache: the first call asks the master, which then reports changes.
 
         Raises:
-            ParameterMissing: It is not set, or an empty namespace, and there is no ``default``.
-            MasterUnreachable: The master does not answer.
+            ParameterMissingError: It is not set or an empty namespace, and ``default`` is not given.
+            MasterUnreachableError: The master does not answer.
         """
         return await self._parameters.get_cached(self.resolve(name), default)
 
@@ -334,14 +343,14 @@ class Node(GraphMember):
         await self._parameters.set(self.resolve(name), value)
 
     async def has_param(self, name: str) -> bool:
-        """Tell whether a parameter or namespace is set."""
+        """Return whether a parameter or namespace is set."""
         return await self._parameters.has(self.resolve(name))
 
     async def delete_param(self, name: str) -> None:
         """Delete a parameter or namespace.
 
         Raises:
-            ParameterMissing: It is not set.
+            ParameterMissingError: It is not set.
         """
         await self._parameters.delete(self.resolve(name))
 

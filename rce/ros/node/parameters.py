@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rce.ros import names
-from rce.ros.errors import MasterRefused, ParameterMissing
+from rce.ros.errors import MasterRefusedError, ParameterMissingError
 from rce.ros.node.master import MasterClient
 
 ParameterCallback = Callable[[str, Any], None]
@@ -17,7 +17,7 @@ class _Required:
 
 
 UNSET: dict[str, Any] = {}
-"""What a master tells of a parameter that is not set."""
+"""The value that a master reports for a parameter that is not set."""
 
 REQUIRED = _Required()
 """In place of a default: the parameter must be set."""
@@ -30,32 +30,32 @@ class Parameters:
         self._master = master
         self._watchers: dict[str, list[ParameterCallback]] = {}
         self._known: dict[str, Any] = {}
-        """What the master has told of subscribed parameters."""
+        """The values of subscribed parameters, as the master reported them."""
         self._early: dict[str, list[tuple[str, Any]]] = {}
-        """Changes told before the master's answer to a subscription has come."""
+        """Changes that the master reported before its answer to a subscription."""
 
     async def get(self, name: str, default: Any = REQUIRED) -> Any:
         """Return a parameter, or all of a namespace as a dictionary.
 
         Raises:
-            ParameterMissing: It is not set and there is no default.
-            MasterUnreachable: The master does not answer.
+            ParameterMissingError: It is not set, and no default is given.
+            MasterUnreachableError: The master does not answer.
         """
         try:
             return await self._master.call("getParam", name)
-        except MasterRefused as error:
+        except MasterRefusedError as error:
             if default is REQUIRED:
-                raise ParameterMissing(name) from error
+                raise ParameterMissingError(name) from error
             return default
 
     async def get_cached(self, name: str, default: Any = REQUIRED) -> Any:
-        """Return a parameter as the master told it last; only the first call asks.
+        """Return a parameter as the master reported it last; only the first call asks the master.
 
         An empty namespace counts as not set. The value must not be changed.
 
         Raises:
-            ParameterMissing: It is not set and there is no default.
-            MasterUnreachable: The master does not answer.
+            ParameterMissingError: It is not set, and no default is given.
+            MasterUnreachableError: The master does not answer.
         """
         if name not in self._known:
             await self._subscribe(name)
@@ -63,35 +63,35 @@ class Parameters:
         if value != UNSET:
             return value
         if default is REQUIRED:
-            raise ParameterMissing(name)
+            raise ParameterMissingError(name)
         return default
 
     async def set(self, name: str, value: Any) -> None:
         """Set a parameter, or a whole namespace from a dictionary."""
         await self._master.call("setParam", name, value)
-        self._note(name, value)  # the master tells all but who did it
+        self._note(name, value)  # the master reports a change to all nodes except the one that made it
 
     async def has(self, name: str) -> bool:
-        """Tell whether a parameter or namespace is set."""
+        """Return whether a parameter or namespace is set."""
         return bool(await self._master.call("hasParam", name))
 
     async def delete(self, name: str) -> None:
         """Delete a parameter or namespace.
 
         Raises:
-            ParameterMissing: It is not set.
+            ParameterMissingError: It is not set.
         """
         try:
             await self._master.call("deleteParam", name)
-        except MasterRefused as error:
-            raise ParameterMissing(name) from error
+        except MasterRefusedError as error:
+            raise ParameterMissingError(name) from error
         self._note(name, UNSET)
 
     async def search(self, name: str) -> str | None:
         """Look for a relative name in the node's namespace and then upwards; return the global name."""
         try:
             found: str = await self._master.call("searchParam", name)
-        except MasterRefused:
+        except MasterRefusedError:
             return None
         return found
 
@@ -118,14 +118,14 @@ class Parameters:
             await self._master.call("unsubscribeParam", self._master.slave_uri, name)
 
     async def renew(self) -> None:
-        """Subscribe again at a master that forgot; tell those who watch of values that are others now."""
+        """Subscribe again at a master that lost the subscriptions; call the watchers of changed values."""
         for name, before in list(self._known.items()):
             await self._subscribe(name)
             if self._known[name] != before:
                 self._tell(name, self._known[name])
 
     def changed(self, name: str, value: Any) -> bool:
-        """Take a new value and tell those who watch; tell whether the parameter was subscribed to."""
+        """Take a new value and call the watchers; return whether the parameter was subscribed to."""
         name = names.canonical(name)
         is_known = self._note(name, value)
         self._tell(name, value)
@@ -141,7 +141,7 @@ class Parameters:
             self._note(changed, value)
 
     def _note(self, name: str, value: Any) -> bool:
-        """Put a change into what is known of it, of the namespaces above it and of what is below it."""
+        """Update the cached values of a parameter, of the namespaces above it and of everything below it."""
         path = names.segments(name)
         is_known = False
         for known in self._known:
@@ -171,7 +171,7 @@ def _replaced(tree: Any, path: list[str], value: Any) -> Any:
     if not path:
         return value
     if value == UNSET and not isinstance(tree, dict):
-        return tree  # nothing is below a value, so nothing was taken from it
+        return tree  # a value has no parameters below it, so nothing was removed
     branch = dict(tree) if isinstance(tree, dict) else {}
     below = _replaced(branch.get(path[0], UNSET), path[1:], value)
     if len(path) == 1 and below == UNSET:
@@ -182,7 +182,7 @@ def _replaced(tree: Any, path: list[str], value: Any) -> Any:
 
 
 def _within(tree: Any, path: list[str]) -> Any:
-    """Return what a tree holds at a path."""
+    """Return the part of a tree at a path."""
     for segment in path:
         if not isinstance(tree, dict) or segment not in tree:
             return UNSET

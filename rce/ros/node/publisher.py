@@ -6,10 +6,11 @@ import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from rce.ros.errors import HandshakeRefused, NodeClosed, TypeMismatch
-from rce.ros.node.local import LocalLink, Parcel
-from rce.ros.node.queue import DropOldest
+from rce.aio.queues import BoundedQueue
+from rce.ros.errors import HandshakeRefusedError, NodeClosedError, TypeMismatchError
+from rce.ros.node.local import LocalLink, LocalMessage
 from rce.ros.node.runtime import Runtime
+from rce.ros.node.settings import MAX_QUEUED_BYTES
 from rce.ros.tcpros.connection import Connection
 from rce.ros.tcpros.framing import Chunks, frame, payload_of
 from rce.ros.tcpros.header import ANY, check_type, encode_header, require
@@ -32,16 +33,16 @@ class Link:
         self.messages = 0
         self.bytes_out = 0
         self._output = output
-        self._queue: DropOldest[Chunks] = DropOldest(output.queue_size)
+        self._queue: BoundedQueue[Chunks] = BoundedQueue(output.queue_size, MAX_QUEUED_BYTES)
 
     @property
     def dropped(self) -> int:
-        """How many messages the subscriber was too slow for."""
+        """How many messages were dropped because the subscriber was too slow."""
         return self._queue.dropped
 
     @property
     def description(self) -> str:
-        """What the slave API says of the connection."""
+        """The connection's description in the slave API."""
         return str(self.connection)
 
     def send(self, chunks: Chunks, size: int) -> None:
@@ -54,18 +55,18 @@ class Link:
         self.connection.write(chunks)
 
     def connection_made(self, connection: Connection) -> None:
-        """A link begins when the header came."""
+        """Do nothing: a link begins when the header came."""
 
     def frame_received(self, connection: Connection, payload: bytes) -> None:
-        """Ignore what a subscriber says: it has nothing to say."""
+        """Ignore a frame: subscribers send none."""
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
         """Forget the subscriber."""
-        del connection, error  # it will come back if it wants to
+        del connection, error  # the subscriber reconnects by itself
         self._output.drop(self)
 
     def writable(self, connection: Connection) -> None:
-        """Send what waits."""
+        """Send waiting frames."""
         while self._queue and not connection.full:
             chunks = self._queue.take()
             self.send(chunks, sum(map(len, chunks)))
@@ -74,9 +75,11 @@ class Link:
 class TopicOutput:
     """A topic that the node publishes, shared by all its :class:`Publisher` handles."""
 
-    def __init__(self, runtime: Runtime, topic: str, kind: str | MessageType, queue_size: int) -> None:
+    def __init__(
+        self, runtime: Runtime, topic: str, message_type: str | MessageType, queue_size: int
+    ) -> None:
         self.topic = topic
-        self.kind_name = kind if isinstance(kind, str) else kind.name
+        self.message_type_name = message_type if isinstance(message_type, str) else message_type.name
         self.queue_size = queue_size
         self.links: list[Link] = []
         """Subscribers at the other end of a connection."""
@@ -88,36 +91,38 @@ class TopicOutput:
         self.changed = asyncio.Event()
         self.node_name = runtime.name
         self._runtime = runtime
-        self._kind = kind
+        self._message_type = message_type
 
     @property
-    def kind(self) -> MessageType:
+    def message_type(self) -> MessageType:
         """The topic's type."""
-        if isinstance(self._kind, str):
-            self._kind = self._runtime.types.message(self._kind)
-        return self._kind
+        if isinstance(self._message_type, str):
+            self._message_type = self._runtime.types.message(self._message_type)
+        return self._message_type
 
     @property
     def known_kind(self) -> MessageType | None:
         """The topic's type if it was needed already."""
-        return None if isinstance(self._kind, str) else self._kind
+        return None if isinstance(self._message_type, str) else self._message_type
 
     def accept(self, connection: Connection, fields: Mapping[str, str]) -> None:
         """Take a subscriber.
 
         Raises:
-            HandshakeRefused: It means another type.
+            HandshakeRefusedError: It expects another type.
         """
         require(fields, "md5sum")
-        kind = self.kind
-        check_type(fields, md5sum=kind.md5sum, kind=kind.name, subject=f"topic {self.topic}")
+        message_type = self.message_type
+        check_type(
+            fields, md5sum=message_type.md5sum, type_name=message_type.name, subject=f"topic {self.topic}"
+        )
         latched = self._latched()
         reply = {
             "callerid": self._runtime.name,
             "topic": self.topic,
-            "type": kind.name,
-            "md5sum": kind.md5sum,
-            "message_definition": kind.definition,
+            "type": message_type.name,
+            "md5sum": message_type.md5sum,
+            "message_definition": message_type.definition,
             "latching": "1" if self.is_latching else "0",
         }
         link = Link(self, connection, fields.get("callerid", ANY))
@@ -132,22 +137,23 @@ class TopicOutput:
         """Take a subscriber of this process.
 
         Raises:
-            HandshakeRefused: It means another type.
+            HandshakeRefusedError: It expects another type.
         """
-        if md5sum not in (ANY, self.kind.md5sum):
-            raise HandshakeRefused(
-                f"{self.topic} is of type {self.kind.name} there, which does not have md5 sum {md5sum}"
+        if md5sum not in (ANY, self.message_type.md5sum):
+            raise HandshakeRefusedError(
+                f"{self.topic} is of type {self.message_type.name} there, "
+                f"which does not have md5 sum {md5sum}"
             )
         for chunks in self._latched():
-            link.send(Parcel(self.kind, payload=payload_of(chunks)), latched=True)
+            link.send(LocalMessage(self.message_type, payload=payload_of(chunks)), latched=True)
         self.local_links.append(link)
         self._joined()
 
-    def send_locally(self, parcel: Parcel) -> None:
+    def send_locally(self, local_message: LocalMessage) -> None:
         """Give a message to the subscribers of this process."""
         latched = self.is_latching
         for link in self.local_links:
-            link.send(parcel, latched=latched)
+            link.send(local_message, latched=latched)
 
     def drop(self, link: Link | LocalLink) -> None:
         """Forget a subscriber that is gone."""
@@ -188,7 +194,7 @@ class TopicOutput:
 class Publisher:
     """Publishes on one topic. Made by :meth:`rce.ros.node.Node.advertise`.
 
-    Publishing never waits: a subscriber that is too slow loses its own oldest messages and delays nobody.
+    Publishing never waits: a subscriber that is too slow loses its own oldest messages and delays no other.
 
     Attributes:
         latch: Whether the last message is given to later subscribers.
@@ -214,7 +220,7 @@ class Publisher:
     @property
     def type(self) -> MessageType:
         """The topic's type."""
-        return self._output.kind
+        return self._output.message_type
 
     @property
     def connections(self) -> int:
@@ -223,7 +229,7 @@ class Publisher:
 
     @property
     def dropped(self) -> int:
-        """How many messages of the topic subscribers were too slow for, counted once for each subscriber."""
+        """How many messages were dropped for slow subscribers, counted once for each subscriber."""
         return self._output.lost + sum(link.dropped for link in self._output.all_links)
 
     def publish(self, message: Message | Mapping[str, Any] | None = None, /, **fields: Any) -> None:
@@ -233,20 +239,20 @@ class Publisher:
 
         Raises:
             SerializationError: A value does not fit its field.
-            TypeMismatch: The message is of another type.
-            NodeClosed: The publisher was closed.
+            TypeMismatchError: The message is of another type.
+            NodeClosedError: The publisher was closed.
         """
-        kind = self._output.kind
+        message_type = self._output.message_type
         if message is None:
-            message = kind.new(**fields)
+            message = message_type.new(**fields)
         elif fields:
             raise TypeError("give a message or its fields, not both")
-        elif message.__class__ is not kind.cls and not isinstance(message, Mapping):
-            raise TypeMismatch(f"{self.topic} carries {kind.name}, not {type(message).__name__}")
+        elif message.__class__ is not message_type.cls and not isinstance(message, Mapping):
+            raise TypeMismatchError(f"{self.topic} carries {message_type.name}, not {type(message).__name__}")
         if self._output.local_links and not isinstance(message, Mapping):
-            self._publish_locally(kind, message)
+            self._publish_locally(message_type, message)
             return
-        self.publish_serialized(kind.serialize(message))
+        self.publish_serialized(message_type.serialize(message))
 
     def publish_serialized(self, payload: Payload, latch: bool = False, source: str = "") -> None:
         """Publish a serialized message, untouched.
@@ -254,15 +260,15 @@ class Publisher:
         Args:
             payload: The message's bytes.
             latch: Remember this message for later subscribers, whatever :attr:`latch` says.
-            source: Whose message it is, if this publishes for others: one message of each is remembered.
+            source: The original publisher, if this publishes for others: one message of each is remembered.
 
         Raises:
-            NodeClosed: The publisher was closed.
+            NodeClosedError: The publisher was closed.
         """
         output = self._output
         self._send(payload, latch, source)
         if output.local_links:
-            output.send_locally(Parcel(output.known_kind, payload=bytes(payload)))
+            output.send_locally(LocalMessage(output.known_kind, payload=bytes(payload)))
 
     def unlatch(self, source: str = "") -> None:
         """Forget the message that is remembered of a source; no later subscriber gets it."""
@@ -271,7 +277,7 @@ class Publisher:
     def _send(self, payload: Payload, latch: bool, source: str = "") -> None:
         """Send to the subscribers of other processes."""
         if self._closed:
-            raise NodeClosed(f"the publisher of {self.topic} is closed")
+            raise NodeClosedError(f"the publisher of {self.topic} is closed")
         chunks = frame(payload)
         if latch or self.latch:
             self.latched[source] = chunks
@@ -279,15 +285,15 @@ class Publisher:
         for link in self._output.links:
             link.send(chunks, size)
 
-    def _publish_locally(self, kind: MessageType, message: Message) -> None:
+    def _publish_locally(self, message_type: MessageType, message: Message) -> None:
         """Give an object to the subscribers of this process; write it only if there are others."""
         output = self._output
         if self._closed:
-            raise NodeClosed(f"the publisher of {self.topic} is closed")
-        parcel = Parcel(kind, message)
+            raise NodeClosedError(f"the publisher of {self.topic} is closed")
+        local_message = LocalMessage(message_type, message)
         if output.links or self.latch:
-            self._send(parcel.payload(), False)
-        output.send_locally(parcel)
+            self._send(local_message.payload(), False)
+        output.send_locally(local_message)
 
     async def wait_for_subscribers(self, count: int = 1, *, timeout: float | None = None) -> None:
         """Wait until at least ``count`` subscribers are connected.

@@ -1,8 +1,8 @@
-"""Keeps a node registered at its master: one that was restarted, or forgot, is told everything again.
+"""Keeps a node registered at its master: registers everything again after the master lost its state.
 
-A restarted master knows nobody. Nodes notice by a connection that they hold to it for this purpose, and by
-asking now and then whether the master still knows them; parameter ``/run_id`` tells one life of a core from
-the next.
+A restarted master knows no nodes. A node notices a restart by a connection that it keeps open to the master
+for this purpose, and by asking periodically whether the master still knows it; the parameter ``/run_id``
+identifies one run of a core.
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from rce.ros.errors import MasterError, MasterRefused, MasterUnreachable, RpcUnreachable
+from rce.aio.backoff import Backoff
+from rce.ros.errors import MasterError, MasterRefusedError, MasterUnreachableError, RpcUnreachableError
 from rce.ros.node.master import MasterClient
 from rce.ros.node.parameters import Parameters
 from rce.ros.node.service import Service
@@ -25,16 +26,15 @@ _log = logging.getLogger(__name__)
 CHECK_INTERVAL = 30.0
 """Seconds after which the master is asked whether it knows the node, although no connection was lost."""
 
-RETRY_FIRST = 0.1
-RETRY_MOST = 3.0
-"""Seconds between attempts to reach a master that is away: the first wait and the longest."""
+RETRY = Backoff(first=0.1, longest=3.0, jitter=0.5)
+"""Pauses between attempts to reach a master that is away."""
 
 RUN_ID = "/run_id"
 
 
 @dataclass(slots=True)
 class Registrar:
-    """Does it for one node."""
+    """Keeps one node registered."""
 
     master: MasterClient
     topics: Topics
@@ -48,18 +48,18 @@ class Registrar:
     _run_id: Any = field(default=None, init=False)
 
     async def register_all(self) -> None:
-        """Tell the master of all topics, services and parameters of the node.
+        """Register all topics, services and parameters of the node at the master.
 
         Raises:
-            MasterError: The master cannot be told.
+            MasterError: The registration at the master failed.
         """
         master, topics = self.master, self.topics
         for topic, output in list(topics.outputs.items()):
-            await master.register_publisher(topic, output.kind_name)
+            await master.register_publisher(topic, output.message_type_name)
             if topic not in topics.outputs:  # closed meanwhile
                 await master.unregister_publisher(topic)
         for topic, source in list(topics.inputs.items()):
-            publishers = await master.register_subscriber(topic, source.kind_name)
+            publishers = await master.register_subscriber(topic, source.message_type_name)
             if topics.inputs.get(topic) is source:
                 source.set_publishers(publishers, of_new_master=True)
             else:
@@ -71,34 +71,35 @@ class Registrar:
         await self.parameters.renew()
 
     async def keep(self) -> None:
-        """Watch the master for as long as the node lives."""
+        """Watch the master for as long as the node runs."""
         await self._until_reached(self._remember_run)
         while True:
             was_lost = await self._until_in_doubt()
             await self._until_reached(lambda was_lost=was_lost: self._check(was_lost=was_lost))  # type: ignore[misc]
 
     async def _until_in_doubt(self) -> bool:
-        """Wait until there is reason to look; tell whether the connection to the master was lost."""
+        """Wait until the next check is due; return whether the connection to the master was lost."""
         try:
-            async with asyncio.timeout(CHECK_INTERVAL * random.uniform(0.75, 1.25)):  # noqa: S311 - no secret
+            async with asyncio.timeout(CHECK_INTERVAL * random.uniform(0.75, 1.25)):  # noqa: S311 - no key
                 await self.master.rpc.until_lost(self.master.uri)
         except TimeoutError:
             return False
-        except RpcUnreachable as error:
+        except RpcUnreachableError as error:
             _log.debug("%s", error)
         return True
 
     async def _until_reached(self, attempt: Callable[[], Awaitable[None]]) -> None:
-        for wait in _waits():
+        pauses = RETRY.start()
+        while True:
             try:
                 await attempt()
-            except MasterUnreachable as error:
+            except MasterUnreachableError as error:
                 _log.debug("%s; trying again", error)
             except MasterError as error:
                 _log.warning("%s does not take %s back: %s", self.master.uri, self.master.caller, error)
             else:
                 return
-            await asyncio.sleep(wait)
+            await asyncio.sleep(pauses.next())
 
     async def _check(self, *, was_lost: bool) -> None:
         master = self.master
@@ -121,13 +122,5 @@ class Registrar:
     async def _ask_run_id(self) -> Any:
         try:
             return await self.master.call("getParam", RUN_ID)
-        except MasterRefused:
+        except MasterRefusedError:
             return None  # a bare rosmaster has none
-
-
-def _waits() -> Iterator[float]:
-    """Yield growing waits, jittered so that not all nodes come back at once."""
-    wait = RETRY_FIRST
-    while True:
-        yield wait * random.uniform(0.5, 1.0)  # noqa: S311 - no secret
-        wait = min(RETRY_MOST, 2 * wait)

@@ -6,7 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Callable
 
-from rce.ros.errors import NodeClosed
+from rce.ros.errors import NodeClosedError
 from rce.ros.node.clock import NANOSECONDS, Clock
 from rce.ros.node.publisher import Publisher
 
@@ -24,7 +24,7 @@ _DEBUG = 1
 class RosoutHandler(logging.Handler):
     """Publishes log records as ``rosgraph_msgs/Log``.
 
-    Records that come before anybody listens wait for the first listener; the message type is loaded then.
+    Records that come before the first listener wait for it; the message type is loaded then.
     """
 
     def __init__(
@@ -43,12 +43,12 @@ class RosoutHandler(logging.Handler):
         self.flush()
 
     def flush(self) -> None:
-        """Publish what waits, if anybody listens."""
+        """Publish waiting records, if the topic has subscribers."""
         while self._waiting and self._publisher.connections:
             record = self._waiting.popleft()
             try:
                 self._publish(record)
-            except NodeClosed:
+            except NodeClosedError:
                 return
             except Exception:  # noqa: BLE001 - a record that cannot be formatted must not fail its writer
                 self.handleError(record)

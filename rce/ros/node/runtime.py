@@ -1,12 +1,12 @@
-"""What all parts of one node share while it runs."""
+"""State that all parts of one node share while it runs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+from rce.aio.tasks import TaskScope
 from rce.ros.node.master import MasterClient
-from rce.ros.tasks import TaskScope
 from rce.ros.xmlrpc import RpcClient
 
 if TYPE_CHECKING:
@@ -28,25 +28,25 @@ class Types:
 
     @property
     def registry(self) -> TypeRegistry:
-        """Where types come from."""
+        """The source of types."""
         if self._registry is None:
             from rce.ros.types import TypeRegistry
 
             self._registry = TypeRegistry()
         return self._registry
 
-    def message(self, kind: str | MessageType) -> MessageType:
-        """Return a message type by its name, or ``kind`` if it is one."""
-        return self.registry.message(kind) if isinstance(kind, str) else kind
+    def message(self, message_type: str | MessageType) -> MessageType:
+        """Return a message type by its name, or ``message_type`` if it is one."""
+        return self.registry.message(message_type) if isinstance(message_type, str) else message_type
 
-    def service(self, kind: str | ServiceType) -> ServiceType:
-        """Return a service type by its name, or ``kind`` if it is one."""
-        return self.registry.service(kind) if isinstance(kind, str) else kind
+    def service(self, service_type: str | ServiceType) -> ServiceType:
+        """Return a service type by its name, or ``service_type`` if it is one."""
+        return self.registry.service(service_type) if isinstance(service_type, str) else service_type
 
 
 @dataclass(slots=True)
 class Runtime:
-    """A running node's means."""
+    """The shared state of a running node."""
 
     name: str
     """The node's global name."""

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from rce.ros.errors import ServiceFault
+from rce.ros.errors import ServiceFaultError
 from rce.ros.node.runtime import Runtime
 from rce.ros.tcpros.connection import Connection
 from rce.ros.tcpros.framing import Chunks, answer_frame
@@ -25,17 +25,17 @@ Handler = Callable[[Any], Any]
 SerializedHandler = Callable[[bytes], bytes | Awaitable[bytes]]
 
 
-def coding(kind: ServiceType, handler: Handler) -> SerializedHandler:
+def coding(service_type: ServiceType, handler: Handler) -> SerializedHandler:
     """Turn a handler of requests into one of their bytes."""
 
     def encode(response: Any) -> bytes:
-        return kind.response.serialize({} if response is None else response)
+        return service_type.response.serialize({} if response is None else response)
 
     async def finish(response: Awaitable[Any]) -> bytes:
         return encode(await response)
 
     def decode(payload: bytes) -> bytes | Awaitable[bytes]:
-        response = handler(kind.request.deserialize(payload))
+        response = handler(service_type.request.deserialize(payload))
         return finish(response) if inspect.isawaitable(response) else encode(response)
 
     return decode
@@ -48,7 +48,7 @@ class Service:
         self,
         runtime: Runtime,
         name: str,
-        kind: str | ServiceType,
+        service_type: str | ServiceType,
         handler: SerializedHandler,
         release: Callable[[Service], Awaitable[None]],
     ) -> None:
@@ -57,7 +57,7 @@ class Service:
         self.calls = 0
         """How many requests came."""
         self._runtime = runtime
-        self._kind = kind
+        self._service_type = service_type
         self._handler = handler
         self._release = release
         self._sessions: set[Session] = set()
@@ -66,18 +66,18 @@ class Service:
     @property
     def type(self) -> ServiceType:
         """The service's type."""
-        if isinstance(self._kind, str):
-            self._kind = self._runtime.types.service(self._kind)
-        return self._kind
+        if isinstance(self._service_type, str):
+            self._service_type = self._runtime.types.service(self._service_type)
+        return self._service_type
 
     def accept(self, connection: Connection, fields: Mapping[str, str]) -> None:
         """Take a client.
 
         Raises:
-            HandshakeRefused: It means another type.
+            HandshakeRefusedError: It expects another type.
         """
         require(fields, "md5sum")
-        check_type(fields, md5sum=self.type.md5sum, kind=self.type.name, subject=f"service {self.name}")
+        check_type(fields, md5sum=self.type.md5sum, type_name=self.type.name, subject=f"service {self.name}")
         reply = {
             "callerid": self._runtime.name,
             "service": self.name,
@@ -104,13 +104,13 @@ class Service:
         self.calls += 1
         try:
             response = self._handler(payload)
-        except Exception as error:  # noqa: BLE001 - every failure is the caller's to know
+        except Exception as error:  # noqa: BLE001 - the caller gets every failure
             return self._failure(error)
         return answer_frame(response, ok=True) if isinstance(response, bytes) else self._finish(response)
 
     def in_background(self, work: Awaitable[Chunks], session: Session) -> None:
         """Handle a request that takes time."""
-        self._runtime.tasks.start(session.finish(work), name=f"service {self.name}")
+        self._runtime.tasks.spawn(session.finish(work), name=f"service {self.name}")
 
     async def close(self) -> None:
         """Stop providing the service: unregister it and disconnect its clients."""
@@ -127,11 +127,11 @@ class Service:
     async def _finish(self, response: Awaitable[bytes]) -> Chunks:
         try:
             return answer_frame(await response, ok=True)
-        except Exception as error:  # noqa: BLE001 - every failure is the caller's to know
+        except Exception as error:  # noqa: BLE001 - the caller gets every failure
             return self._failure(error)
 
     def _failure(self, error: Exception) -> Chunks:
-        if isinstance(error, ServiceFault):
+        if isinstance(error, ServiceFaultError):
             return answer_frame(error.text.encode(), ok=False)
         _log.error("service %s failed", self.name, exc_info=error)
         return answer_frame(f"error processing request: {error}".encode(), ok=False)
@@ -148,7 +148,7 @@ class Session:
         self._waiting: deque[bytes] = deque()
 
     def connection_made(self, connection: Connection) -> None:
-        """A session begins when the header came."""
+        """Do nothing: a session begins when the header came."""
 
     def frame_received(self, connection: Connection, payload: bytes) -> None:
         """Handle a request, or keep it until those before it have been answered."""
@@ -164,7 +164,7 @@ class Session:
             self._service.in_background(answer, self)
 
     async def finish(self, work: Awaitable[Chunks]) -> None:
-        """Answer a request that takes time, and all that came meanwhile."""
+        """Answer a request that takes time, and the requests that came meanwhile."""
         self._reply(await work)
         while self._waiting:
             answer = self._service.answer(self._waiting.popleft())
@@ -173,13 +173,13 @@ class Session:
         self.connection.resume_reading()
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
-        """Forget the client; what is being handled for it is finished nevertheless."""
+        """Forget the client; the handling of its requests continues to the end."""
         del connection, error  # a client may leave
         self._waiting.clear()
         self._service.drop(self)
 
     def writable(self, connection: Connection) -> None:
-        """Nothing waits: an answer is written whole."""
+        """Do nothing: an answer is written as a whole."""
 
     def _reply(self, chunks: Chunks) -> None:
         self.connection.write(chunks)

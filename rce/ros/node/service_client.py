@@ -9,12 +9,12 @@ from urllib.parse import urlsplit
 
 from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import (
-    HandshakeRefused,
-    NodeClosed,
-    ServiceFault,
-    ServiceLost,
-    ServiceNotFound,
-    ServiceTimeout,
+    HandshakeRefusedError,
+    NodeClosedError,
+    ServiceFaultError,
+    ServiceLostError,
+    ServiceNotFoundError,
+    ServiceTimeoutError,
 )
 from rce.ros.node.runtime import Runtime
 from rce.ros.tcpros.connection import Connection
@@ -28,7 +28,7 @@ MAX_ACTIVE = 64
 """How many calls of one client are under way at once; more wait."""
 
 MAX_IDLE = MAX_ACTIVE
-"""How many idle connections a client keeps: one for each call of a burst, so that the next makes none."""
+"""How many idle connections a client keeps: one for each call of a burst, so that the next opens none."""
 
 
 class ServiceClient:
@@ -38,10 +38,10 @@ class ServiceClient:
     while it lasts; when it is lost, the provider is looked up anew.
     """
 
-    def __init__(self, runtime: Runtime, name: str, kind: ServiceType, *, persistent: bool) -> None:
+    def __init__(self, runtime: Runtime, name: str, service_type: ServiceType, *, persistent: bool) -> None:
         self.name = name
         """The service's global name."""
-        self.type = kind
+        self.type = service_type
         self._runtime = runtime
         self._persistent = persistent
         self._idle: list[_Call] = []
@@ -53,7 +53,7 @@ class ServiceClient:
         """Call the service with a request, or with its fields; without a time limit.
 
         Raises:
-            ServiceError: There is no response; see its subclasses.
+            ServiceError: The call got no response; the subclasses give the reason.
         """
         return await self.call(self.type.request.new(**fields) if request is None else request)
 
@@ -65,7 +65,7 @@ class ServiceClient:
             timeout: Seconds, of everything.
 
         Raises:
-            ServiceError: There is no response; see its subclasses.
+            ServiceError: The call got no response; the subclasses give the reason.
             SerializationError: The request does not fit its type.
         """
         payload = self.type.request.serialize(request)
@@ -79,24 +79,24 @@ class ServiceClient:
     ) -> bytes:
         """Call the service with a serialized request; return the serialized response.
 
-        A call that is cancelled or times out loses its connection, so its late answer reaches nobody.
+        A call that is cancelled or times out closes its connection, so its late answer is discarded.
 
         Raises:
-            ServiceNotFound: Nobody provides the service.
-            ServiceLost: The provider cannot be reached or went away before it answered.
-            ServiceFault: The provider answered with an error.
-            ServiceTimeout: No answer within ``timeout`` seconds.
+            ServiceNotFoundError: The service has no provider.
+            ServiceLostError: The provider cannot be reached or went away before it answered.
+            ServiceFaultError: The provider answered with an error.
+            ServiceTimeoutError: No answer within ``timeout`` seconds.
         """
         if self._closed:
-            raise NodeClosed(f"the client of {self.name} is closed")
+            raise NodeClosedError(f"the client of {self.name} is closed")
         try:
             async with asyncio.timeout(timeout), self._slots:
                 return await self._exchange(payload)
         except TimeoutError as error:
-            raise ServiceTimeout(self.name) from error
+            raise ServiceTimeoutError(self.name) from error
 
     async def close(self) -> None:
-        """Close the kept connections; calls under way end with ServiceLost."""
+        """Close the kept connections; calls under way end with ServiceLostError."""
         self._closed = True
         for call in list(self._open):
             await call.close()
@@ -105,7 +105,7 @@ class ServiceClient:
         call = self._take_idle() or await self._connect()
         try:
             answer = await call.ask(payload)
-        except ServiceFault:
+        except ServiceFaultError:
             await self._give_back(call)
             raise
         except BaseException:
@@ -133,7 +133,7 @@ class ServiceClient:
     async def _connect(self) -> _Call:
         uri = await self._runtime.master.lookup_service(self.name)
         if uri is None:
-            raise ServiceNotFound(self.name)
+            raise ServiceNotFoundError(self.name)
         call = await _Call.open(self.name, uri, self._runtime.scratch)
         self._open.add(call)
         try:
@@ -156,14 +156,16 @@ class ServiceClient:
         answer = decode_header(await call.exchange((encode_header(header),)))
         try:
             raise_error_field(answer)
-            check_type(answer, md5sum=self.type.md5sum, kind=self.type.name, subject=f"service {self.name}")
-        except HandshakeRefused as error:
-            raise ServiceFault(self.name, str(error)) from error
+            check_type(
+                answer, md5sum=self.type.md5sum, type_name=self.type.name, subject=f"service {self.name}"
+            )
+        except HandshakeRefusedError as error:
+            raise ServiceFaultError(self.name, str(error)) from error
         call.connection.header_done(has_lead=True)
 
 
 async def answers(runtime: Runtime, name: str) -> bool:
-    """Tell whether a service has a provider that can be reached."""
+    """Return whether a service has a provider that can be reached."""
     uri = await runtime.master.lookup_service(name)
     if uri is None:
         return False
@@ -174,7 +176,7 @@ async def answers(runtime: Runtime, name: str) -> bool:
             return "error" not in decode_header(await call.exchange((encode_header(probe),)))
         finally:
             await call.close()
-    except ServiceLost:
+    except ServiceLostError:
         return False
 
 
@@ -195,14 +197,14 @@ class _Call:
         try:
             host, port = address.hostname, address.port
             if host is None or port is None:
-                raise ServiceLost(
+                raise ServiceLostError(
                     service, f"the provider's URI {uri!r} is not of the form rosrpc://host:port"
                 )
             _, call.connection = await loop.create_connection(
                 lambda: Connection(call, scratch), sock=await open_peer_socket(host, port)
             )
         except (OSError, ValueError) as error:
-            raise ServiceLost(service, f"the provider at {uri} cannot be reached: {error}") from error
+            raise ServiceLostError(service, f"the provider at {uri} cannot be reached: {error}") from error
         return call
 
     async def ask(self, payload: bytes | bytearray | memoryview) -> bytes:
@@ -212,7 +214,7 @@ class _Call:
     async def exchange(self, chunks: tuple[bytes, ...]) -> bytes:
         """Send a frame and wait for the one that answers it."""
         if not self.connection.is_open:
-            raise ServiceLost(self._service)
+            raise ServiceLostError(self._service)
         self._answer = asyncio.get_running_loop().create_future()
         try:
             self.connection.write(chunks)
@@ -221,29 +223,29 @@ class _Call:
             self._answer = None
 
     async def close(self) -> None:
-        """Close and wait until it is."""
+        """Close the connection and wait until it is closed."""
         self.connection.abort()
         await self.connection.gone.wait()
 
     def connection_made(self, connection: Connection) -> None:
-        """The header is sent by who connected."""
+        """Do nothing: the connecting side sends the header."""
 
     def frame_received(self, connection: Connection, payload: bytes) -> None:
-        """Give the answer to who waits for it."""
+        """Give the answer to the waiting call."""
         if self._answer is None or self._answer.done():
-            connection.abort()  # nobody asked
+            connection.abort()  # no call waits for an answer
         elif connection.reader.lead:
             self._answer.set_result(payload)
         else:
-            self._answer.set_exception(ServiceFault(self._service, payload.decode(errors="replace")))
+            self._answer.set_exception(ServiceFaultError(self._service, payload.decode(errors="replace")))
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
-        """Tell who waits for an answer."""
-        del connection  # the only one
+        """Fail the call that waits for an answer."""
+        del connection  # the only connection
         if self._answer is not None and not self._answer.done():
-            lost = ServiceLost(self._service)
+            lost = ServiceLostError(self._service)
             lost.__cause__ = error
             self._answer.set_exception(lost)
 
     def writable(self, connection: Connection) -> None:
-        """Nothing waits to be written."""
+        """Do nothing: nothing waits to be written."""

@@ -1,4 +1,4 @@
-"""What a node is told from outside: environment variables and command line."""
+"""Settings of a node from outside: environment variables and command line."""
 
 from __future__ import annotations
 
@@ -19,23 +19,25 @@ from rce.ros.names import Resolver, parse_arguments
 
 DEFAULT_MASTER_URI = "http://127.0.0.1:11311/"
 LOOPBACK = "127.0.0.1"
+MAX_QUEUED_BYTES = 64 * 2**20
+"""Most bytes that one queue of messages holds, unless a single message is longer."""
 _DISCARD = 9
-"""A port; that of no service."""
+"""The port of the discard service (RFC 863)."""
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - nodes of other machines must reach it
 
 
 @dataclass(frozen=True, slots=True)
 class NodeSettings:
-    """How one node presents itself."""
+    """Settings of one node."""
 
     resolver: Resolver
     master_uri: str
     host: str
-    """Name or address under which others reach the node; empty if the way to the master tells it."""
+    """Name or address under which others reach the node; if empty, the address that faces the master."""
     parameters: Mapping[str, Any]
     """Private parameters to set: name without ``~`` to value."""
     log_file: Path | None = None
-    """Where to write the node's log, if anybody said."""
+    """Where to write the node's log, if it is set."""
 
     @classmethod
     def gather(
@@ -48,7 +50,7 @@ class NodeSettings:
         master_uri: str | None = None,
         anonymous: bool = False,
     ) -> NodeSettings:
-        """Combine what the program says with its environment and its command line; the command line wins.
+        """Combine the program's settings with its environment and its command line; the command line wins.
 
         Args:
             name: The node's name without namespace.
@@ -60,7 +62,7 @@ class NodeSettings:
             anonymous: Make the name unique.
 
         Raises:
-            InvalidName: A name or remapping is not legal.
+            InvalidNameError: A name or remapping is not legal.
         """
         arguments = parse_arguments(argv)
         specials = arguments.specials
@@ -80,7 +82,7 @@ class NodeSettings:
         )
         parameters = {key: parse_value(text) for key, text in arguments.parameters.items()}
         log = specials.get("__log")
-        log_file = log_folder(environ) / log if log else None  # a full path stays what it is
+        log_file = log_folder(environ) / log if log else None  # an absolute path is taken as it is
         return cls(resolver, master, host, parameters, log_file)
 
     @property
@@ -100,7 +102,7 @@ def anonymous_name(name: str) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Tell whether only programs of this machine can reach ``host``."""
+    """Return whether only programs of this machine can reach ``host``."""
     if host == "localhost":
         return True
     try:
@@ -112,8 +114,8 @@ def is_loopback(host: str) -> bool:
 async def address_towards(uri: str) -> str:
     """Return the address of this machine that faces the server at ``uri``.
 
-    A master on loopback means that the whole graph is on this machine: loopback then. Where that is not so
-    (nodes of other machines join by another address of this one), ``ROS_IP`` must be set, as ROS advises.
+    If the master is on loopback, the whole graph is assumed to be on this machine, and the address is
+    loopback. If nodes of other machines join by another address, set ``ROS_IP``, as ROS advises.
     No packet is sent.
     """
     host = urlsplit(uri).hostname or LOOPBACK

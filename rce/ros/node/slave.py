@@ -1,4 +1,4 @@
-"""The Slave API of a node: what the master and other nodes may ask of it.
+"""The Slave API of a node: the methods that the master and other nodes call.
 
 http://wiki.ros.org/ROS/Slave_API
 """
@@ -12,7 +12,7 @@ from typing import Any
 
 from rce.ros.node.topics import Topics
 from rce.ros.xmlrpc.arguments import graph_name, node_uris
-from rce.ros.xmlrpc.dispatch import ERROR, FAILURE, SUCCESS, BadArgument, Method
+from rce.ros.xmlrpc.dispatch import ERROR, FAILURE, SUCCESS, BadArgumentError, Method
 
 Answer = tuple[int, str, Any]
 
@@ -29,7 +29,7 @@ NOTHING: dict[str, Any] = {
     "publisherUpdate": -1,
     "paramUpdate": -1,
 }
-"""What these methods' failures carry as value: as rospy's, of the type that is expected."""
+"""The value in a failed answer of each method: of the expected type, as rospy's."""
 
 
 @dataclass(slots=True)
@@ -43,11 +43,11 @@ class SlaveApi:
     topics: Topics
     master_uri: str
     tcpros_address: Callable[[], tuple[str, int]]
-    """Where subscribers connect to."""
+    """The address that subscribers connect to."""
     on_shutdown: Callable[[str], None]
     """Takes the reason for which the node is told to stop."""
     on_parameter: Callable[[str, Any], bool]
-    """Takes a parameter's name and new value; tells whether the node subscribed to it."""
+    """Takes a parameter's name and new value; returns whether the node subscribed to it."""
 
     def methods(self) -> dict[str, Method]:
         """Return the method table: the specification's, and the two that rospy's nodes have beside."""
@@ -70,7 +70,7 @@ class SlaveApi:
         name = graph_name("topic", topic, caller)
         is_list = isinstance(protocols, list) and all(isinstance(protocol, list) for protocol in protocols)
         if not protocols or not (is_list or isinstance(protocols, str)):
-            raise BadArgument('parameter [protocols] must be a list of lists such as ["TCPROS"]')
+            raise BadArgumentError('parameter [protocols] must be a list of lists such as ["TCPROS"]')
         if name not in self.topics.outputs:
             return ERROR, f"Not a publisher of [{name}]", []
         if any(protocol[:1] == ["TCPROS"] for protocol in protocols):
@@ -87,7 +87,7 @@ class SlaveApi:
 
     def _param_update(self, _caller: str, key: Any, value: Any) -> Answer:
         if not isinstance(key, str) or not key:
-            raise BadArgument("parameter [key] must be a non-empty string")
+            raise BadArgumentError("parameter [key] must be a non-empty string")
         if not self.on_parameter(key, value):
             return ERROR, f"not subscribed to {key}", 0  # the master then forgets the subscription
         return SUCCESS, "", 0
@@ -106,14 +106,14 @@ class SlaveApi:
         return (
             SUCCESS,
             "subscriptions",
-            [[topic, source.kind_name] for topic, source in self.topics.inputs.items()],
+            [[topic, source.message_type_name] for topic, source in self.topics.inputs.items()],
         )
 
     def _get_publications(self, _caller: str) -> Answer:
         return (
             SUCCESS,
             "publications",
-            [[topic, output.kind_name] for topic, output in self.topics.outputs.items()],
+            [[topic, output.message_type_name] for topic, output in self.topics.outputs.items()],
         )
 
     def _get_bus_stats(self, _caller: str) -> Answer:

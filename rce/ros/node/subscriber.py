@@ -8,11 +8,12 @@ import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
-from rce.ros.errors import NodeClosed
-from rce.ros.node.local import Parcel
-from rce.ros.node.queue import DropOldest
+from rce.aio.queues import BoundedQueue
+from rce.aio.tasks import TaskScope
+from rce.ros.errors import NodeClosedError
+from rce.ros.node.local import LocalMessage
 from rce.ros.node.runtime import TypeName
-from rce.ros.tasks import TaskScope
+from rce.ros.node.settings import MAX_QUEUED_BYTES
 from rce.ros.tcpros.framing import LARGE
 
 if TYPE_CHECKING:
@@ -23,15 +24,15 @@ _log = logging.getLogger(__name__)
 MessageCallback = Callable[[Any], Awaitable[None] | None]
 SerializedCallback = Callable[[bytes, bool], Awaitable[None] | None]
 
-Item = bytes | Parcel
+Item = bytes | LocalMessage
 """A message that arrived: over a connection, or from a publisher of this process."""
 
 ItemCallback = Callable[[Any, bool], Awaitable[None] | None]
-"""Takes items, or nothing but bytes if the subscriber does not decode."""
+"""Takes items, or only bytes if the subscriber does not decode."""
 
 
 class Sink(Protocol):
-    """What a topic's messages are given to."""
+    """Receives the messages of a topic."""
 
     @property
     def dropped(self) -> int:
@@ -41,10 +42,10 @@ class Sink(Protocol):
         """Take a message of the publisher with this slave API; must neither wait nor raise."""
 
     def lose(self, source: str) -> None:
-        """Learn that the connection to a publisher ended."""
+        """Take note that the connection to a publisher ended."""
 
     def end(self) -> None:
-        """Learn that no more will come."""
+        """Take note that no more messages will come."""
 
 
 class CallbackSink:
@@ -56,7 +57,7 @@ class CallbackSink:
 
     @property
     def dropped(self) -> int:
-        """Nothing ever is."""
+        """Return 0: nothing is dropped."""
         return 0
 
     def deliver(self, payload: Item, latched: bool, source: str) -> None:
@@ -68,10 +69,10 @@ class CallbackSink:
             _log.exception("the callback of %s failed", self._topic)
 
     def lose(self, source: str) -> None:
-        """Nothing is kept."""
+        """Do nothing: nothing is kept."""
 
     def end(self) -> None:
-        """Nothing is kept."""
+        """Do nothing: nothing is kept."""
 
 
 class TopicListener(Protocol):
@@ -84,7 +85,7 @@ class TopicListener(Protocol):
         """Take a latched message; it replaces the one that the same publisher latched before."""
 
     def source_ended(self, source: str) -> None:
-        """Learn that a publisher ended: nothing of it is latched any more."""
+        """Take note that a publisher ended: its latched messages are void."""
 
 
 class ListenerSink:
@@ -97,12 +98,12 @@ class ListenerSink:
 
     @property
     def dropped(self) -> int:
-        """Nothing ever is."""
+        """Return 0: nothing is dropped."""
         return 0
 
     def deliver(self, payload: Item, latched: bool, source: str) -> None:
         """Hand over."""
-        data = payload.payload() if isinstance(payload, Parcel) else payload
+        data = payload.payload() if isinstance(payload, LocalMessage) else payload
         try:
             if latched:
                 self._sources.add(source)
@@ -113,20 +114,20 @@ class ListenerSink:
             _log.exception("the listener of %s failed", self._topic)
 
     def lose(self, source: str) -> None:
-        """Tell of the end of a publisher that had latched something."""
+        """Report the end of a publisher that had latched a message."""
         if source in self._sources:
             self._sources.remove(source)
             self._listener.source_ended(source)
 
     def end(self) -> None:
-        """Nothing is kept."""
+        """Do nothing: nothing is kept."""
 
 
 class QueueSink:
     """Keeps messages until a task takes them; drops the oldest when they are too many."""
 
     def __init__(self, queue_size: int) -> None:
-        self._queue: DropOldest[tuple[Item, bool]] = DropOldest(queue_size)
+        self._queue: BoundedQueue[tuple[Item, bool]] = BoundedQueue(queue_size, MAX_QUEUED_BYTES)
         self._arrived = asyncio.Event()
         self._ended = False
 
@@ -142,10 +143,10 @@ class QueueSink:
         self._arrived.set()
 
     def lose(self, source: str) -> None:
-        """What was kept stays: it may still be wanted."""
+        """Do nothing: kept messages stay, as the program may still want them."""
 
     def end(self) -> None:
-        """Let those who wait go."""
+        """Wake the waiting callers."""
         self._ended = True
         self._arrived.set()
 
@@ -153,7 +154,7 @@ class QueueSink:
         """Wait for the next message.
 
         Raises:
-            EOFError: There is none and none will come.
+            EOFError: The queue is empty and no more messages will come.
         """
         while not self._queue:
             if self._ended:
@@ -179,34 +180,34 @@ async def call_in_order(
 
 
 def sink_for(callback: ItemCallback, queue_size: int, topic: str, tasks: TaskScope) -> Sink:
-    """Make what gives messages to ``callback``, a function or coroutine function."""
+    """Make a sink that gives messages to ``callback``, a function or coroutine function."""
     if not inspect.iscoroutinefunction(callback):
         return CallbackSink(callback, topic)
     sink = QueueSink(queue_size)
-    tasks.start(call_in_order(sink, callback, topic), name=f"callback of {topic}")
+    tasks.spawn(call_in_order(sink, callback, topic), name=f"callback of {topic}")
     return sink
 
 
-def decode(kind: MessageType, payload: Item) -> Message:
+def decode(message_type: MessageType, payload: Item) -> Message:
     """Read a message. Fields cut out of a view are copied once, out of bytes twice."""
-    if isinstance(payload, Parcel):
-        return payload.message(kind)
-    return kind.deserialize(memoryview(payload) if len(payload) >= LARGE else payload)
+    if isinstance(payload, LocalMessage):
+        return payload.message(message_type)
+    return message_type.deserialize(memoryview(payload) if len(payload) >= LARGE else payload)
 
 
-def decoding(kind: MessageType, callback: MessageCallback) -> ItemCallback:
+def decoding(message_type: MessageType, callback: MessageCallback) -> ItemCallback:
     """Turn a callback that takes messages into one that takes their bytes."""
     if inspect.iscoroutinefunction(callback):
 
         async def decode_and_wait(payload: Item, latched: bool) -> None:
             del latched
-            await callback(decode(kind, payload))
+            await callback(decode(message_type, payload))
 
         return decode_and_wait
 
     def decode_and_call(payload: Item, latched: bool) -> None:
         del latched
-        callback(decode(kind, payload))
+        callback(decode(message_type, payload))
 
     return decode_and_call
 
@@ -221,7 +222,7 @@ class Subscriber:
     def __init__(
         self,
         topic: str,
-        kind: MessageType | TypeName | None,
+        message_type: MessageType | TypeName | None,
         sink: Sink,
         release: Callable[[Subscriber], Awaitable[None]],
         connected: Callable[[], int],
@@ -235,10 +236,10 @@ class Subscriber:
         self.sink = sink
         """Takes what arrives."""
         self.decodes = decodes
-        """Whether the sink's messages are read: objects will do."""
+        """Whether the sink decodes its messages: it takes objects too."""
         self.hears_own = hears_own
-        """Whether it takes what its own node publishes."""
-        self._kind = None if isinstance(kind, TypeName) else kind
+        """Whether it takes the messages of its own node."""
+        self._message_type = None if isinstance(message_type, TypeName) else message_type
         self._release = release
         self._connected = connected
         self._changed = changed
@@ -272,15 +273,15 @@ class Subscriber:
         """Wait for the next message.
 
         Raises:
-            NodeClosed: The subscriber has a callback, which takes the messages.
+            NodeClosedError: The subscriber has a callback, which takes the messages.
         """
-        if not isinstance(self.sink, QueueSink) or self._kind is None:
-            raise NodeClosed(f"the messages of {self.topic} go to a callback")
+        if not isinstance(self.sink, QueueSink) or self._message_type is None:
+            raise NodeClosedError(f"the messages of {self.topic} go to a callback")
         try:
             payload, _ = await self.sink.take()
         except EOFError:
             raise StopAsyncIteration from None
-        return decode(self._kind, payload)
+        return decode(self._message_type, payload)
 
     async def close(self) -> None:
         """Stop taking messages; the last subscriber of a topic unregisters it."""

@@ -1,4 +1,4 @@
-"""Doing things at a rate, in ROS time: :class:`Rate` in a loop of one's own, :class:`Timer` beside it."""
+"""Rates and timers in ROS time: :class:`Rate` in the program's own loop, :class:`Timer` beside it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import NamedTuple
 
+from rce.aio.tasks import TaskScope
 from rce.ros.node.clock import NANOSECONDS, Clock
-from rce.ros.tasks import TaskScope
 
 _log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class Rate:
         """Sleep until the next beat.
 
         Returns:
-            Whether the node goes on.
+            Whether the node continues.
         """
         self._last = min(self._last, self._clock.nanoseconds())  # time may have jumped back
         goes_on = await self._clock.sleep_until(self._last + self._step)
@@ -65,7 +65,7 @@ class Rate:
 
 
 class TimerEvent(NamedTuple):
-    """What a timer's callback is told; all in seconds."""
+    """The argument of a timer's callback; all times in seconds."""
 
     expected: float
     """When the call was due, in ROS time."""
@@ -96,7 +96,7 @@ class Timer:
         self._rate = Rate(clock, 1.0 / period)
         self._callback = callback
         self._oneshot = oneshot
-        self._task: asyncio.Task[None] = tasks.start(self._run(), name="timer")
+        self._task: asyncio.Task[None] = tasks.spawn(self._run(), name="timer")
 
     def stop(self) -> None:
         """Make no more calls; one that is being made is cancelled."""

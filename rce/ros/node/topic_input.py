@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import random
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
+from rce.aio.backoff import Backoff
 from rce.ros.dialing import open_peer_socket
-from rce.ros.errors import HandshakeRefused, RosError, TcprosError, TypeMismatch
-from rce.ros.node.local import LocalLink, Parcel, find_neighbour
+from rce.ros.errors import HandshakeRefusedError, RosError, TcprosError, TypeMismatchError
+from rce.ros.node.local import LocalLink, LocalMessage, find_neighbour
 from rce.ros.node.runtime import Runtime
 from rce.ros.node.subscriber import Subscriber
 from rce.ros.tcpros.connection import Connection
@@ -23,17 +23,16 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 CONNECT_TIMEOUT = 10.0
-RETRY_FIRST = 0.05
-RETRY_MOST = 5.0
+RETRY = Backoff(first=0.05, longest=5.0, jitter=0.5)
 """Seconds between attempts to reach a publisher: the first wait and the longest."""
 
 
 class TopicInput:
     """A topic that the node subscribes to, shared by all its :class:`Subscriber` handles."""
 
-    def __init__(self, runtime: Runtime, topic: str, kind_name: str, md5sum: str) -> None:
+    def __init__(self, runtime: Runtime, topic: str, message_type_name: str, md5sum: str) -> None:
         self.topic = topic
-        self.kind_name = kind_name
+        self.message_type_name = message_type_name
         self.md5sum = md5sum
         self.subscribers: list[Subscriber] = []
         self.links: list[InputLink | LocalLink] = []
@@ -46,20 +45,22 @@ class TopicInput:
         self._orphans: set[str] = set()
         """Publishers that a restarted master has not named yet: followed until their connection ends."""
 
-    def check(self, kind_name: str, md5sum: str) -> None:
-        """Check that another subscriber of the node means the same type; the first concrete one counts.
+    def check(self, message_type_name: str, md5sum: str) -> None:
+        """Check that another subscriber of the node expects the same type; the first concrete one counts.
 
         Raises:
-            TypeMismatch: It does not.
+            TypeMismatchError: It does not.
         """
         if md5sum in (ANY, self.md5sum):
             return
         if self.md5sum != ANY:
-            raise TypeMismatch(f"{self.topic} is subscribed to as {self.kind_name} already, not {kind_name}")
-        self.kind_name, self.md5sum = kind_name, md5sum
+            raise TypeMismatchError(
+                f"{self.topic} is subscribed to as {self.message_type_name} already, not {message_type_name}"
+            )
+        self.message_type_name, self.md5sum = message_type_name, md5sum
 
     def connected(self) -> int:
-        """Tell how many publishers have accepted the subscription."""
+        """Return how many publishers have accepted the subscription."""
         return sum(link.is_greeted for link in self.links)
 
     def deliver(self, payload: bytes, latched: bool, uri: str) -> None:
@@ -69,12 +70,14 @@ class TopicInput:
             if subscriber.hears_own or not own:
                 subscriber.sink.deliver(payload, latched, uri)
 
-    def deliver_parcel(self, parcel: Parcel, latched: bool, uri: str) -> None:
+    def deliver_local(self, local_message: LocalMessage, latched: bool, uri: str) -> None:
         """Give a message of a publisher of this process to all subscribers."""
         own = uri == self._own_uri
         for subscriber in self.subscribers:
             if subscriber.hears_own or not own:
-                subscriber.sink.deliver(parcel if subscriber.decodes else parcel.payload(), latched, uri)
+                subscriber.sink.deliver(
+                    local_message if subscriber.decodes else local_message.payload(), latched, uri
+                )
 
     def lose(self, uri: str) -> None:
         """Tell all subscribers that the connection to a publisher ended."""
@@ -87,7 +90,7 @@ class TopicInput:
         for link in self.links:
             if link.uri == self._own_uri and not subscriber.hears_own:
                 continue
-            if isinstance(link.kept, Parcel) and not subscriber.decodes:
+            if isinstance(link.kept, LocalMessage) and not subscriber.decodes:
                 subscriber.sink.deliver(link.kept.payload(), True, link.uri)
             elif link.kept is not None:
                 subscriber.sink.deliver(link.kept, True, link.uri)
@@ -97,7 +100,7 @@ class TopicInput:
 
         Args:
             uris: The publishers.
-            of_new_master: The master was restarted and may not know all yet: connections that are there stay.
+            of_new_master: The master was restarted and may not know all yet: existing connections stay.
         """
         self._publishers = set(uris)
         self._follow_publishers(of_new_master=of_new_master)
@@ -112,24 +115,24 @@ class TopicInput:
         for uri in self._following.keys() - wanted - self._orphans:
             self._following.pop(uri).cancel()
         for uri in wanted - self._following.keys():
-            self._following[uri] = self._runtime.tasks.start(
+            self._following[uri] = self._runtime.tasks.spawn(
                 self._follow(uri), name=f"{self.topic} from {uri}"
             )
 
     def close(self) -> None:
-        """Follow nobody any longer."""
+        """Follow no publishers any more."""
         self._orphans.clear()
         self.set_publishers(())
 
     async def _follow(self, uri: str) -> None:
         """Receive from one publisher for as long as the master names it, reconnecting when needed."""
-        waits = _waits()
+        pauses = RETRY.start()
         while True:
             link = InputLink(self, uri)
             neighbour = find_neighbour(uri) if self._runtime.intra_process else None
             try:
                 await (self._receive(link) if neighbour is None else self._receive_locally(uri, neighbour))
-            except HandshakeRefused as error:
+            except HandshakeRefusedError as error:
                 _log.warning("no messages of %s from %s: %s", self.topic, uri, error)
             except (RosError, OSError) as error:
                 _log.info("%s from %s: %s", self.topic, uri, str(error) or type(error).__name__)
@@ -138,8 +141,8 @@ class TopicInput:
                 del self._following[uri]
                 return
             if link.messages:
-                waits = _waits()
-            await asyncio.sleep(next(waits))
+                pauses.reset()
+            await asyncio.sleep(pauses.next())
 
     async def _receive_locally(self, uri: str, neighbour: Topics) -> None:
         output = neighbour.outputs.get(self.topic)
@@ -197,7 +200,7 @@ class TopicInput:
         return {
             "callerid": self._runtime.name,
             "topic": self.topic,
-            "type": self.kind_name,
+            "type": self.message_type_name,
             "md5sum": self.md5sum,
             "tcp_nodelay": "1",
         }
@@ -224,7 +227,7 @@ class InputLink:
         self._latched = False
 
     def connection_made(self, connection: Connection) -> None:
-        """The header is sent by who connected."""
+        """Do nothing: the connecting side sends the header."""
 
     def frame_received(self, connection: Connection, payload: bytes) -> None:
         """Take the publisher's header, then messages."""
@@ -246,17 +249,19 @@ class InputLink:
             self._target.changed.set()
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
-        """Let who waits for the end go on."""
-        del connection  # the only one
+        """Wake the task that waits for the end."""
+        del connection  # the only connection
         self._end(error)
 
     def writable(self, connection: Connection) -> None:
-        """Nothing waits to be written."""
+        """Do nothing: nothing waits to be written."""
 
     def _greet(self, fields: Mapping[str, str]) -> None:
         raise_error_field(fields)
         target = self._target
-        check_type(fields, md5sum=target.md5sum, kind=target.kind_name, subject=f"topic {target.topic}")
+        check_type(
+            fields, md5sum=target.md5sum, type_name=target.message_type_name, subject=f"topic {target.topic}"
+        )
         self.publisher = fields.get("callerid", "")
         self._latched = fields.get("latching") == "1"
 
@@ -267,11 +272,3 @@ class InputLink:
             self.ended.set_result(None)
         else:
             self.ended.set_exception(error)
-
-
-def _waits() -> Iterator[float]:
-    """Yield growing waits, jittered so that many subscribers do not come back at once."""
-    wait = RETRY_FIRST
-    while True:
-        yield wait * random.uniform(0.5, 1.0)  # noqa: S311 - no secret
-        wait = min(RETRY_MOST, 2 * wait)

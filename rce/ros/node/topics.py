@@ -1,10 +1,10 @@
-"""All topics of a node: which are published and subscribed to, and what flows over their connections."""
+"""All topics of a node, published and subscribed, and the statistics of their connections."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.ros.errors import HandshakeRefused, TypeMismatch
+from rce.ros.errors import HandshakeRefusedError, TypeMismatchError
 from rce.ros.node.publisher import Publisher, TopicOutput
 from rce.ros.node.runtime import Runtime, TypeName
 from rce.ros.node.subscriber import Sink, Subscriber
@@ -28,21 +28,21 @@ class Topics:
         self.inputs: dict[str, TopicInput] = {}
 
     async def advertise(
-        self, runtime: Runtime, topic: str, kind: str | MessageType, *, latch: bool, queue_size: int
+        self, runtime: Runtime, topic: str, message_type: str | MessageType, *, latch: bool, queue_size: int
     ) -> Publisher:
         """Make a publisher; return once the master knows of the topic.
 
         Raises:
-            TypeMismatch: The node publishes the topic with another type already.
-            MasterError: The master cannot be told.
+            TypeMismatchError: The node publishes the topic with another type already.
+            MasterError: The registration at the master failed.
         """
-        name = kind if isinstance(kind, str) else kind.name
+        name = message_type if isinstance(message_type, str) else message_type.name
         output = self.outputs.get(topic)
         is_first = output is None
         if output is None:
-            output = self.outputs[topic] = TopicOutput(runtime, topic, kind, queue_size)
-        elif output.kind_name != name:
-            raise TypeMismatch(f"{topic} is published as {output.kind_name} already, not {name}")
+            output = self.outputs[topic] = TopicOutput(runtime, topic, message_type, queue_size)
+        elif output.message_type_name != name:
+            raise TypeMismatchError(f"{topic} is published as {output.message_type_name} already, not {name}")
         output.queue_size = max(output.queue_size, queue_size)
 
         async def release(publisher: Publisher) -> None:
@@ -66,7 +66,7 @@ class Topics:
         self,
         runtime: Runtime,
         topic: str,
-        kind: MessageType | TypeName | None,
+        message_type: MessageType | TypeName | None,
         sink: Sink,
         *,
         decodes: bool,
@@ -75,18 +75,18 @@ class Topics:
         """Make a subscriber; return once the master knows of it. Publishers are connected to after that.
 
         Args:
-            runtime: The node's means.
+            runtime: The node's shared state.
             topic: The topic.
-            kind: Its type; ``None`` for any. Its name and checksum will do if nothing is decoded.
+            message_type: Its type; ``None`` for any. Its name and checksum will do if nothing is decoded.
             sink: Takes the messages.
-            decodes: Whether the messages are read: the objects of publishers of this process will do.
-            hears_own: Whether it takes what this node publishes.
+            decodes: Whether the sink decodes messages: it takes objects of publishers of this process too.
+            hears_own: Whether it takes the messages of this node.
 
         Raises:
-            TypeMismatch: The node subscribes to the topic with another type already.
-            MasterError: The master cannot be told.
+            TypeMismatchError: The node subscribes to the topic with another type already.
+            MasterError: The registration at the master failed.
         """
-        name, md5sum = (kind.name, kind.md5sum) if kind is not None else (ANY, ANY)
+        name, md5sum = (message_type.name, message_type.md5sum) if message_type is not None else (ANY, ANY)
         source = self.inputs.get(topic)
         is_first = source is None
         if source is None:
@@ -102,7 +102,7 @@ class Topics:
 
         subscriber = Subscriber(
             topic,
-            kind,
+            message_type,
             sink,
             release,
             source.connected,
@@ -125,14 +125,14 @@ class Topics:
         """Take a subscriber's connection.
 
         Raises:
-            HandshakeRefused: The topic is not published here, or as another type.
+            HandshakeRefusedError: The topic is not published here, or as another type.
         """
         output = self.outputs.get(fields["topic"])
         if output is None:
-            raise HandshakeRefused(f"topic {fields['topic']} is not published here")
+            raise HandshakeRefusedError(f"topic {fields['topic']} is not published here")
         output.accept(connection, fields)
 
-    # ------------------------------------------------------------------ what the slave API tells
+    # For the slave API
 
     def names(self) -> list[str]:
         """Return the topics that are published or subscribed to."""

@@ -23,7 +23,7 @@ _M_MMAP_THRESHOLD = -3
 
 @cache
 def keep_large_blocks() -> None:
-    """Let the allocator keep up to 128 MiB of freed memory. Without effect where it is not glibc's."""
+    """Make the allocator keep up to 128 MiB of freed memory. Without effect if it is not glibc's."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError):
@@ -34,7 +34,7 @@ def keep_large_blocks() -> None:
 
 
 def give_back_free_memory() -> bool:
-    """Give freed memory back to the kernel, also what lies between blocks that are used.
+    """Return freed memory to the kernel, also between blocks in use.
 
     100 MB take some milliseconds, in which nothing else can be allocated.
 

@@ -20,27 +20,27 @@ LARGE_MESSAGE = 2**16
 """From this length on, a message's memory is worth keeping (see :mod:`rce.ros.tcpros.allocator`)."""
 
 WRITE_HIGH = 2**16
-"""More bytes than this waiting to be sent, and the connection says that it is full."""
+"""The connection is full when more bytes than this wait to be sent."""
 
 
 class Owner(Protocol):
-    """What a connection's frames are for."""
+    """The receiver of a connection's frames."""
 
     def connection_made(self, connection: Connection) -> None:
-        """Learn that the connection is there."""
+        """Take note that the connection was made."""
 
     def frame_received(self, connection: Connection, payload: bytes) -> None:
         """Take a frame.
 
         Raises:
-            TcprosError: The connection cannot go on and shall be closed.
+            TcprosError: The connection cannot continue and shall be closed.
         """
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
-        """Learn that the connection is gone."""
+        """Take note that the connection is gone."""
 
     def writable(self, connection: Connection) -> None:
-        """Learn that a full connection takes more again."""
+        """Take note that a full connection takes more again."""
 
 
 class Connection(asyncio.BufferedProtocol):
@@ -48,7 +48,7 @@ class Connection(asyncio.BufferedProtocol):
 
     Attributes:
         owner: Takes the frames; may be exchanged, as when the header told what the connection is for.
-        full: Whether too much waits to be sent already. Writing is possible still, but unwise.
+        full: Whether too much waits to be sent already. Writing is still possible, but should wait.
         bytes_in: Bytes of frames received, without their heads.
         frames_in: Frames received, the connection header among them.
         gone: Set when the socket is closed.
@@ -60,7 +60,7 @@ class Connection(asyncio.BufferedProtocol):
         Args:
             owner: Takes the frames.
             scratch: Buffer shared by all connections of one event loop's node.
-            siblings: Where the connection keeps itself while it is there.
+            siblings: The set of open connections, to which it adds itself.
         """
         self.owner = owner
         self.full = False
@@ -74,7 +74,7 @@ class Connection(asyncio.BufferedProtocol):
         self._large: bytes | None = None  # a frame that was set aside
         self._peer = "?"
 
-    # ------------------------------------------------------------------ for the owner
+    # For the owner
 
     @property
     def is_open(self) -> bool:
@@ -110,19 +110,19 @@ class Connection(asyncio.BufferedProtocol):
             self._transport.abort()
 
     def pause_reading(self) -> None:
-        """Let the peer wait."""
+        """Stop reading from the peer."""
         if self._transport is not None and self._transport.is_reading():
             self._transport.pause_reading()
 
     def resume_reading(self) -> None:
-        """Take more from the peer."""
+        """Read from the peer again."""
         if self._transport is not None and not self._transport.is_reading() and not self._closing:
             self._transport.resume_reading()
 
     def __str__(self) -> str:
         return f"TCPROS connection with {self._peer}"
 
-    # ------------------------------------------------------------------ for the transport
+    # For the transport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Keep the transport."""
@@ -158,7 +158,7 @@ class Connection(asyncio.BufferedProtocol):
         except TcprosError as error:
             self._fail(error)
         if reader.is_large_complete:
-            # The transport still holds the frame's memory: taken now, it would have to be copied.
+            # The transport still holds the frame's memory; taking the frame now would copy it.
             asyncio.get_running_loop().call_soon(self._take_large)
 
     def pause_writing(self) -> None:
@@ -170,20 +170,20 @@ class Connection(asyncio.BufferedProtocol):
         self.full = False
         self.owner.writable(self)
 
-    # ------------------------------------------------------------------ inside
+    # Inside
 
     def _set_large_aside(self) -> None:
-        """Take a complete frame out of memory of its own, to be handed over later.
+        """Set a complete large frame aside, to be handed over later.
 
-        Not now: the owner may close the connection or pause it, and while a buffer is asked for, uvloop's
-        transports do not survive that.
+        Not at once: the owner may close or pause the connection, which breaks uvloop's transports while they
+        ask for a buffer.
         """
         if self.reader.is_large_complete:
             self._large = self.reader.take_large()
             self._learn_size(len(self._large))
 
     def _take_large(self) -> None:
-        """Hand over a frame that was read into memory of its own, unless more was read since."""
+        """Hand over a large frame, unless more was read since."""
         self._set_large_aside()
         try:
             self._hand_over_large()

@@ -1,6 +1,6 @@
 """Frames in a byte stream: a length (4 bytes, little-endian) and that many bytes. Sans-I/O.
 
-A service's answer has one byte in front of the length, the *lead*, that tells success from error.
+A service's answer has one byte before the length, the *lead*, for success or error.
 
 Reading is made for two kinds of traffic. Many small frames arrive in one read into a scratch buffer that all
 connections of a node share, and are cut out of it. A large frame gets memory of its own as soon as its length
@@ -14,7 +14,7 @@ import io
 import struct
 
 from rce.buffers import unfilled
-from rce.ros.errors import MalformedFrame
+from rce.ros.errors import MalformedFrameError
 
 MAX_FRAME = 2**28
 """Longest message in bytes."""
@@ -29,7 +29,7 @@ _LENGTH = struct.Struct("<I")
 _FIRST_TRUST = 2**24
 
 Chunks = tuple[bytes, ...]
-"""A frame on its way out: written one after the other, shared by all who get it."""
+"""An outgoing frame, as buffers to write one after the other; all receivers share them."""
 
 
 def frame(payload: bytes | bytearray | memoryview) -> Chunks:
@@ -41,7 +41,7 @@ def frame(payload: bytes | bytearray | memoryview) -> Chunks:
 
 
 def payload_of(chunks: Chunks) -> bytes:
-    """Return what :func:`frame` was given."""
+    """Return the payload of a frame made by :func:`frame`."""
     return chunks[1] if len(chunks) > 1 else chunks[0][_LENGTH.size :]
 
 
@@ -59,7 +59,7 @@ class FrameReader:
     Use: read into :meth:`buffer`, tell :meth:`received` how much came, then call :meth:`next_frame` until it
     returns ``None``. All of this must happen before another reader with the same scratch buffer is used.
     A frame with memory of its own is complete when :attr:`is_large_complete` says so; :meth:`take_large` then
-    returns it, to be called when nobody holds the memory of :meth:`buffer` any longer.
+    returns it, to be called when no reference to the memory of :meth:`buffer` is held any longer.
 
     Attributes:
         limit: Longest frame accepted; may be changed between frames.
@@ -86,7 +86,7 @@ class FrameReader:
         return self._large is not None and self._have == self._need
 
     def buffer(self) -> memoryview:
-        """Return where the next bytes shall be read to."""
+        """Return the buffer for the next read."""
         if self._large is not None:
             if self._have == len(self._view):
                 self._extend(min(self._need, 4 * self._have))
@@ -109,7 +109,7 @@ class FrameReader:
         """Return the next complete frame, without head.
 
         Raises:
-            MalformedFrame: A frame is longer than :attr:`limit`.
+            MalformedFrameError: A frame is longer than :attr:`limit`.
         """
         if self._large is not None:
             return None
@@ -120,7 +120,7 @@ class FrameReader:
             return None
         length: int = _LENGTH.unpack_from(self._scratch, body - 4)[0]
         if length > self.limit:
-            raise MalformedFrame(f"a frame of {length} bytes is longer than {self.limit}")
+            raise MalformedFrameError(f"a frame of {length} bytes is longer than {self.limit}")
         self.lead = self._scratch[self._begin] if self.has_lead else 1
         stop = body + length
         if stop > self._end:
@@ -133,12 +133,12 @@ class FrameReader:
         """Return the frame that is complete in memory of its own."""
         assert self._large is not None
         self._view.release()
-        payload = self._large.getvalue()  # copies while somebody still holds the memory
+        payload = self._large.getvalue()  # copies while a reference to the memory is held
         self._large = None
         return payload
 
     def _begin_large(self, body: int, length: int) -> None:
-        """Give an incomplete frame memory of its own and move there what has come of it."""
+        """Give an incomplete frame memory of its own and copy its received bytes there."""
         self._need = length
         self._have = self._end - body
         self._large = unfilled(min(length, max(_FIRST_TRUST, self._have)))
@@ -149,7 +149,7 @@ class FrameReader:
     def _extend(self, size: int) -> None:
         """Make the frame's memory ``size`` bytes long.
 
-        A peer's word on a length is trusted for 16 MiB, then it must deliver before it gets more.
+        A peer's length is trusted up to 16 MiB; beyond that, memory is added as the data arrives.
         """
         assert self._large is not None
         self._view.release()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping
 
-from rce.ros.errors import HandshakeRefused, MalformedFrame
+from rce.ros.errors import HandshakeRefusedError, MalformedFrameError
 
 ANY = "*"
 """Stands for any md5 sum or type."""
@@ -31,60 +31,60 @@ def decode_header(body: bytes) -> dict[str, str]:
     """Read a connection header, without the length in front of it.
 
     Raises:
-        MalformedFrame: The bytes are no header.
+        MalformedFrameError: The bytes are not a header.
     """
     fields: dict[str, str] = {}
     position = 0
     while position < len(body):
         start = position + _LENGTH.size
         if start > len(body):
-            raise MalformedFrame("a connection header ends within a field's length")
+            raise MalformedFrameError("a connection header ends within a field's length")
         position = start + _LENGTH.unpack_from(body, start - _LENGTH.size)[0]
         if position > len(body):
-            raise MalformedFrame("a field of a connection header is longer than the header")
+            raise MalformedFrameError("a field of a connection header is longer than the header")
         name, mark, value = body[start:position].partition(b"=")
         if not mark:
-            raise MalformedFrame("a field of a connection header has no '='")
+            raise MalformedFrameError("a field of a connection header has no '='")
         fields[name.decode(errors="replace")] = value.decode(errors="replace")
     return fields
 
 
 def raise_error_field(fields: Mapping[str, str]) -> None:
-    """Raise what the other end put into its header's ``error`` field, if it did.
+    """Raise the error in the other end's header, if it has a field ``error``.
 
     Raises:
-        HandshakeRefused: It did.
+        HandshakeRefusedError: The header has that field.
     """
     if "error" in fields:
-        raise HandshakeRefused(fields["error"])
+        raise HandshakeRefusedError(fields["error"])
 
 
 def require(fields: Mapping[str, str], *required: str) -> None:
     """Check that a header has all ``required`` fields.
 
     Raises:
-        HandshakeRefused: One is missing.
+        HandshakeRefusedError: One is missing.
     """
     missing = [name for name in required if not fields.get(name)]
     if missing:
-        raise HandshakeRefused(f"the connection header lacks {', '.join(missing)}")
+        raise HandshakeRefusedError(f"the connection header lacks {', '.join(missing)}")
 
 
-def check_type(fields: Mapping[str, str], *, md5sum: str, kind: str, subject: str) -> None:
-    """Check that the other end means the same type; ``*`` on either side matches all.
+def check_type(fields: Mapping[str, str], *, md5sum: str, type_name: str, subject: str) -> None:
+    """Check that the other end expects the same type; ``*`` on either side matches all.
 
     Args:
         fields: The other end's header.
         md5sum: This end's md5 sum.
-        kind: This end's type name.
+        type_name: This end's type name.
         subject: The topic or service, for the error's text.
 
     Raises:
-        HandshakeRefused: Another md5 sum. An equal sum under another type name is the same type.
+        HandshakeRefusedError: Another md5 sum. An equal sum under another type name is the same type.
     """
     theirs = fields.get("md5sum", ANY)
     if ANY not in (theirs, md5sum) and theirs != md5sum:
-        raise HandshakeRefused(
-            f"{subject} is of type {kind} with md5 sum {md5sum} here,"
+        raise HandshakeRefusedError(
+            f"{subject} is of type {type_name} with md5 sum {md5sum} here,"
             f" of type {fields.get('type', ANY)} with md5 sum {theirs} there"
         )

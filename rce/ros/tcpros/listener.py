@@ -9,14 +9,14 @@ from types import TracebackType
 from typing import Self
 
 from rce.ros.closing import close_all
-from rce.ros.errors import HandshakeRefused
+from rce.ros.errors import HandshakeRefusedError
 from rce.ros.tcpros.connection import Connection
 from rce.ros.tcpros.header import decode_header, encode_header
 
 _log = logging.getLogger(__name__)
 
 HEADER_TIMEOUT = 30.0
-"""Seconds that a peer may take to say what it wants."""
+"""Seconds that a peer may take to send its header."""
 
 Accept = Callable[[Connection, dict[str, str]], None]
 """Takes a connection over, given the peer's header: answers it and sets its owner, or refuses."""
@@ -83,18 +83,18 @@ class _Greeter:
             elif "topic" in fields:
                 self._topic(connection, fields)
             else:
-                raise HandshakeRefused("the connection header names neither a topic nor a service")  # noqa: TRY301
-        except HandshakeRefused as error:
+                raise HandshakeRefusedError("the connection header names neither a topic nor a service")  # noqa: TRY301
+        except HandshakeRefusedError as error:
             _log.warning("refused %s of %s: %s", connection, fields.get("callerid", "?"), error)
             connection.write((encode_header({"error": str(error)}),))
             connection.close()
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
-        del connection, error  # it went before it said what it wanted
+        del connection, error  # the peer left before it sent its header
         self._stop_waiting()
 
     def writable(self, connection: Connection) -> None:
-        """Nothing waits to be written."""
+        """Do nothing: nothing waits to be written."""
 
     def _stop_waiting(self) -> None:
         if self._deadline is not None:

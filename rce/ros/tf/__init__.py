@@ -15,7 +15,7 @@ from rce.ros.tf.exceptions import (
     ExtrapolationError,
     FrameLoopError,
     TransformError,
-    TransformTimeout,
+    TransformTimeoutError,
     UnknownFrameError,
 )
 from rce.ros.tf.frames import resolve
@@ -36,7 +36,7 @@ __all__ = [
     "TransformBroadcaster",
     "TransformError",
     "TransformListener",
-    "TransformTimeout",
+    "TransformTimeoutError",
     "UnknownFrameError",
     "Vector",
     "find_prefix",

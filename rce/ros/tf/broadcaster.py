@@ -1,4 +1,4 @@
-"""Telling the graph where frames are."""
+"""Broadcasters, which publish transforms to the graph."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from rce.ros.handles import release
+from rce.ros.closing import release
 from rce.ros.tf.frames import PARAMETER, resolve
 from rce.ros.tf.stamped import StampedTransform
 from rce.ros.tf.transform import Transform
@@ -21,7 +21,7 @@ KIND = "tf2_msgs/TFMessage"
 
 
 async def find_prefix(node: Node) -> str:
-    """Return what the frames of a node's robot live below: the parameter ``tf_prefix``; empty without it."""
+    """Return the prefix of the frames of a node's robot: the parameter ``tf_prefix``; empty without it."""
     parameter = await node.search_param(PARAMETER)
     return "" if parameter is None else str(await node.get_param(parameter, ""))
 
@@ -32,7 +32,7 @@ class TransformBroadcaster:
     ``async with TransformBroadcaster(node) as tf: tf.send("odom", "base_link", Transform.make(x=1.0))``
 
     Attributes:
-        prefix: What names of frames without a slash at their beginning live below.
+        prefix: The prefix of frames whose names do not begin with a slash.
     """
 
     _topic, _latch = TF, False
@@ -42,7 +42,7 @@ class TransformBroadcaster:
 
         Args:
             node: The node that it is part of; it must be running while the broadcaster is.
-            prefix: What the frames live below; None: what the parameter ``tf_prefix`` says.
+            prefix: The prefix of the frames; None: the parameter ``tf_prefix``.
         """
         self.prefix = prefix or ""
         self._search = prefix is None
@@ -63,7 +63,7 @@ class TransformBroadcaster:
         await self._stack.aclose()
 
     def send(self, parent: str, child: str, transform: Transform, stamp: Time | None = None) -> None:
-        """Tell where a frame is.
+        """Send the transform of a frame.
 
         Args:
             parent: The frame that ``transform`` takes coordinates to.
@@ -78,7 +78,7 @@ class TransformBroadcaster:
         self.send_stamped(StampedTransform(parent, child, transform, moment))
 
     def send_stamped(self, *transforms: StampedTransform) -> None:
-        """Tell where frames are, in one message.
+        """Send the transforms of frames in one message.
 
         Raises:
             BadTransformError: One of them cannot be an edge of a tree; nothing was sent.
@@ -100,9 +100,9 @@ class TransformBroadcaster:
 
 
 class StaticTransformBroadcaster(TransformBroadcaster):
-    """Publishes on ``/tf_static`` what holds for ever; whoever comes later gets all of it.
+    """Publishes transforms that never change on ``/tf_static``; later subscribers get all of them.
 
-    A frame that is sent again replaces what was sent of it before.
+    A new transform of a frame replaces its earlier one.
     """
 
     _topic, _latch = TF_STATIC, True

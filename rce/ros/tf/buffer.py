@@ -1,6 +1,6 @@
-"""The tree of frames over the last seconds, and questions to it. Pure: no I/O, no clock.
+"""The tree of frames over the last seconds, and lookups in it. Pure: no I/O, no clock.
 
-Answers are those of ROS's tf2. Times in questions are :class:`~rce.ros.types.Time`; zero, or None, means the
+Results are those of ROS's tf2. Times in lookups are :class:`~rce.ros.types.Time`; zero, or None, means the
 latest time at which all edges of the path are known.
 """
 
@@ -30,9 +30,9 @@ _Place = Callable[[str], Sample]
 
 
 class Buffer:
-    """What is known of all frames.
+    """The known transforms of all frames.
 
-    Invariant: every parent and child that was told of is in :attr:`frames`.
+    Invariant: every parent and child of an inserted transform is in :attr:`frames`.
     """
 
     def __init__(self, cache_time: float = CACHE_TIME) -> None:
@@ -53,14 +53,14 @@ class Buffer:
         """Each frame's present parent; roots are missing."""
         return {child: edge.latest.parent for child, edge in self._edges.items()}
 
-    # ------------------------------------------------------------------ telling
+    # Telling
 
     def insert(self, stamped: StampedTransform, *, static: bool = False) -> bool:
         """Take a transform.
 
         Args:
             stamped: The edge.
-            static: It holds for ever; its stamp does not count.
+            static: It is valid at all times; its stamp is ignored.
 
         Returns:
             False if it is older than the cache reaches, or its time is known already.
@@ -82,13 +82,13 @@ class Buffer:
         return edge.insert(Sample(stamped.stamp.to_nsec(), parent, transform))
 
     def clear(self) -> None:
-        """Forget all but what holds for ever; for a time that begins anew."""
+        """Remove all transforms except static ones; for a time that begins anew."""
         self._edges = {child: edge for child, edge in self._edges.items() if isinstance(edge, StaticEdge)}
         self._frames = {}
         for child, edge in self._edges.items():
             self._frames |= {child: None, edge.latest.parent: None}
 
-    # ------------------------------------------------------------------ asking
+    # Asking
 
     def lookup(self, target: str, source: str, time: Time | None = None) -> StampedTransform:
         """Return ``target_from_source``.
@@ -99,13 +99,13 @@ class Buffer:
             time: When; zero or None: the latest time that all edges of the path have in common.
 
         Returns:
-            The transform with the time that it holds at; zero if it holds for ever.
+            The transform with its time; zero if it is valid at all times.
 
         Raises:
-            UnknownFrameError: There is no such frame.
+            UnknownFrameError: The frame does not exist.
             ConnectivityError: The two are in different trees.
             ExtrapolationError: The time is not within the cache.
-            FrameLoopError: The frames are no tree.
+            FrameLoopError: The frames are not a tree.
         """
         target, source = self._known(target), self._known(source)
         moment = self._moment(target, source, time)
@@ -121,7 +121,7 @@ class Buffer:
         source_time: Time | None,
         fixed: str,
     ) -> StampedTransform:
-        """Return ``target_from_source`` between two times: where what was seen then is now.
+        """Return ``target_from_source`` between two times: from the source then to the target now.
 
         Args:
             target: The frame to take coordinates to.
@@ -143,7 +143,7 @@ class Buffer:
         )
 
     def can_transform(self, target: str, source: str, time: Time | None = None) -> bool:
-        """Tell whether :meth:`lookup` has an answer."""
+        """Return whether :meth:`lookup` has an answer."""
         try:
             self.lookup(target, source, time)
         except TransformError:
@@ -151,12 +151,12 @@ class Buffer:
         return True
 
     def latest_common_time(self, target: str, source: str) -> Time:
-        """Return the latest time at which all edges between two frames are known; zero: they hold for ever.
+        """Return the latest time at which all edges between two frames are known; zero: they always hold.
 
         Raises:
-            UnknownFrameError: There is no such frame.
+            UnknownFrameError: The frame does not exist.
             ConnectivityError: The two are in different trees.
-            FrameLoopError: The frames are no tree.
+            FrameLoopError: The frames are not a tree.
         """
         moment = self._moment(self._known(target), self._known(source), None)
         return Time(*divmod(moment, NANOSECONDS))
@@ -178,7 +178,7 @@ class Buffer:
             add(root, 0)
         return "\n".join(lines)
 
-    # ------------------------------------------------------------------ walking the tree
+    # Walking the tree
 
     def _known(self, frame: str) -> str:
         name = strip(frame)
@@ -208,7 +208,7 @@ class Buffer:
                 return up[: meeting[frame]], down[:index]
         for end in (up_end, down_end):
             if end.obstacle is not None:
-                self._moment(target, source, None)  # that there is no way at all is the better reason
+                self._moment(target, source, None)  # a missing connection is the better reason
                 raise end.obstacle
         raise ConnectivityError(target, down_end.frame, source, up_end.frame)
 
@@ -231,7 +231,7 @@ class Buffer:
 
 
 class _End:
-    """Where a way up ended, the frames on it, and why it did not reach the root."""
+    """The end of a path towards the root, the frames on it, and why it did not reach the root."""
 
     __slots__ = ("frame", "obstacle", "passed")
 

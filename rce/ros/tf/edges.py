@@ -1,4 +1,4 @@
-"""What is known of one frame's place below its parent: over time, or for ever. Pure.
+"""One frame's transforms to its parent: over time, or static. Pure.
 
 Times are nanoseconds.
 """
@@ -29,13 +29,13 @@ class Edge(Protocol):
 
     @property
     def latest(self) -> Sample:
-        """The newest sample; its time is 0 if it holds for ever."""
+        """The newest sample; its time is 0 if it is static."""
 
     def at(self, child: str, time: int) -> Sample:
         """Return the place at a time; ``child`` is for errors.
 
         Raises:
-            ExtrapolationError: It is not known.
+            ExtrapolationError: The place is not known at that time.
         """
 
 
@@ -86,7 +86,7 @@ class TimedEdge:
         return True
 
     def at(self, child: str, time: int) -> Sample:
-        """Return the sample of a time, or what is between its neighbours.
+        """Return the sample of a time, or interpolate between its neighbours.
 
         Between samples with different parents, the older one holds.
 

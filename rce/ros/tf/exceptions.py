@@ -1,15 +1,15 @@
-"""What can go wrong with transforms.
+"""Errors of transforms.
 
 ::
 
     RosError
     +-- TransformError
-        +-- UnknownFrameError     nobody has told of such a frame (also a LookupError)
-        +-- ConnectivityError     two frames are in different trees
-        +-- FrameLoopError        the frames form a circle: no tree at all
-        +-- ExtrapolationError    the time is before or after what is known of an edge
-        +-- TransformTimeout      no answer in time; the cause is one of the above (also a TimeoutError)
-        +-- BadTransformError     a transform that cannot be taken (also a ValueError)
+        +-- UnknownFrameError      no transform has such a frame (also a LookupError)
+        +-- ConnectivityError      two frames are in different trees
+        +-- FrameLoopError         the frames form a cycle, not a tree
+        +-- ExtrapolationError     the time is before or after what is known of an edge
+        +-- TransformTimeoutError  no answer in time; the cause is one of the above (also a TimeoutError)
+        +-- BadTransformError      a transform that cannot be taken (also a ValueError)
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class TransformError(RosError):
 
 
 class UnknownFrameError(TransformError, LookupError):
-    """Nobody has told of a frame.
+    """No transform has the frame.
 
     Attributes:
         frame: The frame.
@@ -68,7 +68,7 @@ class ConnectivityError(TransformError):
 
 
 class FrameLoopError(TransformError):
-    """The frames form a circle.
+    """The frames form a cycle.
 
     Attributes:
         frames: The frames, each followed by its parent.
@@ -88,7 +88,7 @@ class ExtrapolationError(TransformError):
     Attributes:
         child: The edge's child.
         parent: Its parent.
-        time: What was asked for, nanoseconds.
+        time: The requested time, nanoseconds.
         earliest: The first time known, nanoseconds.
         latest: The last time known, nanoseconds.
     """
@@ -103,7 +103,7 @@ class ExtrapolationError(TransformError):
 
     @property
     def is_future(self) -> bool:
-        """Whether the time is after all that is known: waiting may help."""
+        """Whether the time is after all known times: waiting may help."""
         return self.time > self.latest
 
     def __str__(self) -> str:
@@ -118,7 +118,7 @@ class ExtrapolationError(TransformError):
         )
 
 
-class TransformTimeout(TransformError, TimeoutError):  # noqa: N818
+class TransformTimeoutError(TransformError, TimeoutError):
     """A transform did not become known in time.
 
     Attributes:

@@ -21,7 +21,7 @@ def resolve(prefix: str, frame: str) -> str:
     """Return the full name of a frame: ``resolve("robot1", "base_link") == "robot1/base_link"``.
 
     Args:
-        prefix: What the robot's frames live below; empty for nothing.
+        prefix: The prefix of the robot's frames; empty for none.
         frame: The name; ``/map`` is ``map`` for every robot.
     """
     root = prefix.strip(SEPARATOR)

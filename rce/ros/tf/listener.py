@@ -1,4 +1,4 @@
-"""Hearing from the graph where frames are."""
+"""The listener, which receives transforms from the graph."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from functools import partial
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from rce.ros.errors import NodeClosed
-from rce.ros.handles import release
-from rce.ros.tasks import TaskScope
+from rce.aio.tasks import TaskScope
+from rce.ros.closing import release
+from rce.ros.errors import NodeClosedError
 from rce.ros.tf.broadcaster import KIND, TF, TF_STATIC, find_prefix
 from rce.ros.tf.buffer import Buffer
 from rce.ros.tf.exceptions import (
     BadTransformError,
     ConnectivityError,
     ExtrapolationError,
-    TransformTimeout,
+    TransformTimeoutError,
     UnknownFrameError,
 )
 from rce.ros.tf.frames import resolve
@@ -34,7 +34,7 @@ JUMP = 1.0
 """Seconds that time must jump back for the buffer to forget: a simulation or a bag began anew."""
 
 MAX_COMPLAINTS = 100
-"""How many different frames the log complains of."""
+"""For how many different frames warnings are logged."""
 
 _A_LONG_TIME = 3600.0
 
@@ -45,8 +45,8 @@ class TransformListener:
     ``async with TransformListener(node) as tf: pose = await tf.wait_for("map", "base_link", timeout=1.0)``
 
     Attributes:
-        buffer: What was heard; its names of frames are full names.
-        prefix: What names of frames without a slash at their beginning live below, in questions.
+        buffer: The received transforms, with full names of frames.
+        prefix: The prefix of frames in lookups whose names do not begin with a slash.
     """
 
     def __init__(self, node: Node, buffer: Buffer | None = None, *, prefix: str | None = None) -> None:
@@ -54,8 +54,8 @@ class TransformListener:
 
         Args:
             node: The node that it is part of; it must be running while the listener is.
-            buffer: Where to keep what is heard; None: in a new one.
-            prefix: What the frames live below; None: what the parameter ``tf_prefix`` says.
+            buffer: Keeps the received transforms; None: a new one.
+            prefix: The prefix of the frames; None: the parameter ``tf_prefix``.
         """
         self.buffer = buffer if buffer is not None else Buffer()
         self.prefix = prefix or ""
@@ -67,7 +67,7 @@ class TransformListener:
         self._latest = 0.0
         self._complaints: set[str] = set()
 
-    # ------------------------------------------------------------------ life
+    # Life
 
     async def __aenter__(self) -> Self:
         async with AsyncExitStack() as stack:
@@ -75,7 +75,7 @@ class TransformListener:
                 self.prefix = await find_prefix(self._node)
             stack.callback(self._stop)
             tasks = await stack.enter_async_context(TaskScope())
-            tasks.start(self._notice_stop(), name=f"tf of {self._node.name}")
+            tasks.spawn(self._notice_stop(), name=f"tf of {self._node.name}")
             for topic, static in ((TF_STATIC, True), (TF, False)):
                 take = partial(self._received, static=static)
                 stack.push_async_callback(release, await self._node.subscribe(topic, KIND, take))
@@ -96,7 +96,7 @@ class TransformListener:
         self._stopped = True
         self._changed.set()
 
-    # ------------------------------------------------------------------ for programs
+    # For programs
 
     def lookup(self, target: str, source: str, time: Time | None = None) -> StampedTransform:
         """Return ``target_from_source``; as :meth:`rce.ros.tf.Buffer.lookup`, below the prefix.
@@ -119,7 +119,7 @@ class TransformListener:
         )
 
     def can_transform(self, target: str, source: str, time: Time | None = None) -> bool:
-        """Tell whether :meth:`lookup` has an answer."""
+        """Return whether :meth:`lookup` has an answer."""
         return self._fresh_buffer().can_transform(self.resolve(target), self.resolve(source), time)
 
     async def wait_for(
@@ -131,13 +131,13 @@ class TransformListener:
             target: The frame to take coordinates to.
             source: The frame to take them from.
             time: When; zero or None: as soon as there is any answer.
-            timeout: Real seconds to wait; None: for ever.
+            timeout: Real seconds to wait; None: without a limit.
 
         Raises:
-            TransformTimeout: It did not become known in time; the cause says why.
-            ExtrapolationError: ``time`` is before what the buffer holds: waiting does not help.
-            FrameLoopError: The frames are no tree.
-            NodeClosed: The node stops.
+            TransformTimeoutError: It did not become known in time; the cause says why.
+            ExtrapolationError: ``time`` is before the times in the buffer: waiting does not help.
+            FrameLoopError: The frames are not a tree.
+            NodeClosedError: The node stops.
         """
         try:
             async with asyncio.timeout(timeout):
@@ -151,17 +151,17 @@ class TransformListener:
                     await self._next_change()
         except TimeoutError as error:
             assert timeout is not None
-            raise TransformTimeout(timeout, reason) from error
+            raise TransformTimeoutError(timeout, reason) from error
 
     def resolve(self, frame: str) -> str:
         """Return the full name of a frame."""
         return resolve(self.prefix, frame)
 
-    # ------------------------------------------------------------------ hearing
+    # Receiving
 
     async def _next_change(self) -> None:
         if self._stopped:
-            raise NodeClosed(f"{self._node.name} listens to transforms no longer")
+            raise NodeClosedError(f"{self._node.name} listens to transforms no longer")
         self._changed.clear()
         await self._changed.wait()
 
@@ -175,7 +175,7 @@ class TransformListener:
         self._changed.set()
 
     def _fresh_buffer(self) -> Buffer:
-        """Return the buffer, without what is from before a jump of time."""
+        """Return the buffer, without transforms from before a jump of time."""
         now = self._node.time()
         if now < self._latest - JUMP:
             _log.warning("time jumped back by %.3f s: transforms are forgotten", self._latest - now)

@@ -39,7 +39,7 @@ class StampedTransform:
         """Read a ``geometry_msgs/TransformStamped``; a slash before a frame's name is dropped.
 
         Raises:
-            BadTransformError: It has no frames, or not two, or values that are no transform.
+            BadTransformError: It has no frames, or not two, or values that are not a transform.
         """
         moved, turned = message.transform.translation, message.transform.rotation
         transform = Transform(

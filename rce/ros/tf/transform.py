@@ -147,7 +147,7 @@ class Transform:
 
     @property
     def yaw(self) -> float:
-        """The angle about z, radians; all that there is to the rotation in a plane."""
+        """The angle about z, radians; in a plane, this is the whole rotation."""
         return self.rotation.to_euler()[2]
 
     def __matmul__(self, other: Transform) -> Transform:
@@ -167,7 +167,7 @@ class Transform:
         return Transform(Vector(-x, -y, -z), back)
 
     def interpolate(self, other: Transform, fraction: float) -> Transform:
-        """Return what is between: 0 is this one, 1 the other; translations on a line, rotations on an arc."""
+        """Interpolate: 0 is this one, 1 the other; translations on a line, rotations on an arc."""
         blend = (a + fraction * (b - a) for a, b in zip(self.translation, other.translation, strict=True))
         return Transform(Vector(*blend), self.rotation.slerp(other.rotation, fraction))
 

@@ -1,1 +1,1 @@
-"""Look into a ROS graph and take part in it from a command line: topics, services, parameters."""
+"""Command-line tools to inspect and use a ROS graph: topics, services, parameters."""

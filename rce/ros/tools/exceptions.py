@@ -1,4 +1,4 @@
-"""What can go wrong in the tools."""
+"""Errors of the tools."""
 
 from __future__ import annotations
 

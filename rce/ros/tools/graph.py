@@ -1,4 +1,4 @@
-"""What a master knows of a graph, and what publishers and services say of their types."""
+"""A graph as its master knows it, and the types that publishers and services report."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ async def service_type(name: str, master: MasterClient) -> str:
     """Ask a service's provider for the service's type.
 
     Raises:
-        ToolError: There is no such service, or its provider does not answer.
+        ToolError: The service does not exist, or its provider does not answer.
     """
     uri = await master.lookup_service(name)
     if uri is None:
@@ -111,7 +111,7 @@ async def service_type(name: str, master: MasterClient) -> str:
 
 
 async def _definition(topic: str, node: str, master: MasterClient, rpc: RpcClient) -> str:
-    """Ask a publisher for the text of its topic's type; empty if it does not say."""
+    """Ask a publisher for the text of its topic's type; empty if it does not send it."""
     uri = await master.lookup_node(node)
     if uri is None:
         return ""
@@ -127,7 +127,7 @@ async def _definition(topic: str, node: str, master: MasterClient, rpc: RpcClien
 
 
 async def _exchange_headers(host: str, port: int, fields: dict[str, str]) -> dict[str, str]:
-    """Connect, send a connection header, and return the one that is answered."""
+    """Connect, send a connection header, and return the other end's."""
     async with asyncio.timeout(CONNECT_S):
         reader, writer = await asyncio.open_connection(sock=await open_socket(host, port))
         try:

@@ -11,32 +11,32 @@ from rce.ros.tools.exceptions import ToolError
 from rce.ros.tools.plain import read_value
 
 if TYPE_CHECKING:
-    from rce.ros.tools.topics import Desk
+    from rce.ros.tools.topics import ToolContext
 
 
-async def list_parameters(desk: Desk, namespace: str) -> None:
+async def list_parameters(context: ToolContext, namespace: str) -> None:
     """Print the names of all parameters in a namespace."""
-    prefix = desk.node.resolve(namespace).rstrip("/")
-    for name in sorted(await desk.node.get_param_names()):
+    prefix = context.node.resolve(namespace).rstrip("/")
+    for name in sorted(await context.node.get_param_names()):
         if name == prefix or name.startswith(f"{prefix}/"):
-            desk.show(name)
+            context.show(name)
 
 
-async def get(desk: Desk, name: str, *, as_json: bool) -> None:
+async def get(context: ToolContext, name: str, *, as_json: bool) -> None:
     """Print a parameter, or a whole namespace.
 
     Raises:
-        ParameterMissing: It is not set.
+        ParameterMissingError: It is not set.
     """
-    value = await desk.node.get_param(name)
+    value = await context.node.get_param(name)
     if as_json:
-        desk.show(json.dumps(value, ensure_ascii=False, default=str))
+        context.show(json.dumps(value, ensure_ascii=False, default=str))
     else:
         text = yaml.safe_dump(value, allow_unicode=True, default_flow_style=None)
-        desk.show(text.removesuffix("...\n").rstrip("\n"))
+        context.show(text.removesuffix("...\n").rstrip("\n"))
 
 
-async def set_value(desk: Desk, name: str, text: str) -> None:
+async def set_value(context: ToolContext, name: str, text: str) -> None:
     """Set a parameter to a YAML value; a mapping sets a whole namespace.
 
     Raises:
@@ -47,14 +47,14 @@ async def set_value(desk: Desk, name: str, text: str) -> None:
     except ValueError as error:
         raise ToolError(str(error)) from error
     if value is None:
-        raise ToolError(f"{text!r} is no value; use 'param delete {name}' to delete the parameter")
-    await desk.node.set_param(name, value)
+        raise ToolError(f"{text!r} is not a value; use 'param delete {name}' to delete the parameter")
+    await context.node.set_param(name, value)
 
 
-async def delete(desk: Desk, name: str) -> None:
+async def delete(context: ToolContext, name: str) -> None:
     """Delete a parameter or a namespace.
 
     Raises:
-        ParameterMissing: It is not set.
+        ParameterMissingError: It is not set.
     """
-    await desk.node.delete_param(name)
+    await context.node.delete_param(name)

@@ -1,4 +1,4 @@
-"""Messages as plain values, and as text for people and programs."""
+"""Messages as plain values, and as text for users and programs."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from rce.ros.types import Duration, Time
-from rce.ros.types.message import Message, attribute
+from rce.ros.types.fields import attribute
+from rce.ros.types.values import Message
 
 if TYPE_CHECKING:
     from rce.ros.types import MessageType
 
 _LONG = 64
-"""Elements of an array above which it is cut in text for people."""
+"""Elements of an array above which it is cut in text for users."""
 
 
 def plain(message: Message, *, longest: int | None = None) -> dict[str, Any]:
@@ -30,8 +31,10 @@ def plain(message: Message, *, longest: int | None = None) -> dict[str, Any]:
         The fields in the order of the definition. Times and durations are ``{secs, nsecs}``; ``uint8[]`` and
         ``char[]`` are lists of numbers if cut, else base64.
     """
-    kind: MessageType = message._type  # noqa: SLF001 - its documented class variable
-    return {field.name: _plain(getattr(message, attribute(field.name)), longest) for field in kind.fields}
+    message_type: MessageType = message._type  # noqa: SLF001 - its documented class variable
+    return {
+        field.name: _plain(getattr(message, attribute(field.name)), longest) for field in message_type.fields
+    }
 
 
 def _plain(value: Any, longest: int | None) -> Any:
@@ -91,28 +94,30 @@ def read_value(text: str) -> Any:
         raise ValueError(f"not a YAML value: {' '.join(str(error).split())}") from error
 
 
-def read_fields(text: str, kind: MessageType) -> dict[str, Any]:
+def read_fields(text: str, message_type: MessageType) -> dict[str, Any]:
     """Read the fields of a message as YAML: a mapping, a list in order, or the only field's value.
 
     Args:
         text: Such as ``{data: hello}``, ``[1, 2]`` or ``hello``; empty for all defaults.
-        kind: The message's type.
+        message_type: The message's type.
 
     Raises:
         ValueError: The value does not fit the type; the text says what was expected.
     """
     value = read_value(text)
-    names = [field.name for field in kind.fields]
+    names = [field.name for field in message_type.fields]
     if value is None:
         return {}
     if isinstance(value, dict):
         return {str(name): item for name, item in value.items()}
     values = (
-        value if isinstance(value, list) and not (len(names) == 1 and kind.fields[0].is_array) else [value]
+        value
+        if isinstance(value, list) and not (len(names) == 1 and message_type.fields[0].is_array)
+        else [value]
     )
     if len(values) != len(names):
         raise ValueError(
-            f"{kind.name} has {len(names)} fields ({', '.join(names) or 'none'}), "
+            f"{message_type.name} has {len(names)} fields ({', '.join(names) or 'none'}), "
             f"but {len(values)} values came; "
             "write a mapping such as {" + ", ".join(f"{name}: VALUE" for name in names[:2]) + "}"
         )

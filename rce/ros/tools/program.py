@@ -17,7 +17,7 @@ from rce.ros.node import Node, run
 from rce.ros.node.master import MasterClient
 from rce.ros.tools import parameters, services, topics
 from rce.ros.tools.exceptions import ToolError
-from rce.ros.tools.topics import WINDOW, Desk
+from rce.ros.tools.topics import WINDOW, ToolContext
 from rce.ros.types import TypeRegistry
 from rce.ros.types.exceptions import TypesError
 from rce.ros.xmlrpc import RpcClient
@@ -37,7 +37,9 @@ Values = Annotated[str, typer.Argument(help="Fields as YAML, such as '{data: hel
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object a line.")]
 
 
-def _do(work: Callable[Concatenate[Desk, P], Awaitable[None]], *args: P.args, **kwargs: P.kwargs) -> None:
+def _do(
+    work: Callable[Concatenate[ToolContext, P], Awaitable[None]], *args: P.args, **kwargs: P.kwargs
+) -> None:
     """Run a command with a node of its own; print why if it fails.
 
     Raises:
@@ -45,7 +47,7 @@ def _do(work: Callable[Concatenate[Desk, P], Awaitable[None]], *args: P.args, **
     """
     logging.basicConfig(level=logging.ERROR, format="%(message)s")
     try:
-        run(_with_node(lambda desk: work(desk, *args, **kwargs)))
+        run(_with_node(lambda context: work(context, *args, **kwargs)))
     except (ToolError, RosError, TypesError, TimeoutError) as error:
         typer.echo(str(error) or "no answer in time", err=True)
         raise typer.Exit(1) from None
@@ -54,14 +56,14 @@ def _do(work: Callable[Concatenate[Desk, P], Awaitable[None]], *args: P.args, **
         raise typer.Exit(1) from None
 
 
-async def _with_node(work: Callable[[Desk], Awaitable[None]]) -> None:
+async def _with_node(work: Callable[[ToolContext], Awaitable[None]]) -> None:
     types = TypeRegistry()
     async with (
         Node("rce_tool", argv=[], types=types, anonymous=True, signals=True, rosout=False) as node,
         RpcClient() as rpc,
     ):
         master = MasterClient(uri=node.master_uri, caller=node.name, slave_uri=node.uri, rpc=rpc)
-        command = asyncio.ensure_future(work(Desk(node, master, rpc, types, _show)))
+        command = asyncio.ensure_future(work(ToolContext(node, master, rpc, types, _show)))
         told = asyncio.ensure_future(node.spin())
         done, _ = await asyncio.wait((command, told), return_when=asyncio.FIRST_COMPLETED)
         for task in (told, command):

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from rce.ros.xmlrpc import RpcClient
 
 WINDOW = 100
-"""Messages of which the rate is taken."""
+"""Number of messages over which the rate is measured."""
 LATE_SUBSCRIBERS_S = 1.0
 """How long a single message waits for a subscriber, and stays for those that come at once."""
 
 
-class Desk(NamedTuple):
-    """What a command works with."""
+class ToolContext(NamedTuple):
+    """The context of a command."""
 
     node: Node
     master: MasterClient
@@ -37,52 +37,54 @@ class Desk(NamedTuple):
     """Prints a line for the user."""
 
 
-async def list_topics(desk: Desk, *, verbose: bool) -> None:
+async def list_topics(context: ToolContext, *, verbose: bool) -> None:
     """Print all topics; if ``verbose`` with their types and how many nodes publish and subscribe."""
-    graph = await look(desk.master)
+    graph = await look(context.master)
     for topic in graph.topics:
         if not verbose:
-            desk.show(topic)
+            context.show(topic)
             continue
         kind = graph.types.get(topic, "*")
         counts = f"{len(graph.publishers.get(topic, []))} pub, {len(graph.subscribers.get(topic, []))} sub"
-        desk.show(f"{topic} [{kind}] {counts}")
+        context.show(f"{topic} [{kind}] {counts}")
 
 
-async def info(desk: Desk, topic: str) -> None:
+async def info(context: ToolContext, topic: str) -> None:
     """Print a topic's type and nodes."""
-    graph, topic = await look(desk.master), desk.node.resolve(topic)
-    desk.show(f"Type: {graph.type_of(topic)}")
+    graph, topic = await look(context.master), context.node.resolve(topic)
+    context.show(f"Type: {graph.type_of(topic)}")
     for title, nodes in (("Publishers", graph.publishers), ("Subscribers", graph.subscribers)):
-        desk.show(f"{title}:")
+        context.show(f"{title}:")
         for node in nodes.get(topic, []):
-            desk.show(f" * {node}")
+            context.show(f" * {node}")
 
 
-async def show_type(desk: Desk, topic: str) -> None:
+async def show_type(context: ToolContext, topic: str) -> None:
     """Print a topic's type."""
-    desk.show((await look(desk.master)).type_of(desk.node.resolve(topic)))
+    context.show((await look(context.master)).type_of(context.node.resolve(topic)))
 
 
-async def echo(desk: Desk, topic: str, *, count: int, json: bool, whole: bool, no_arrays: bool) -> None:
+async def echo(
+    context: ToolContext, topic: str, *, count: int, json: bool, whole: bool, no_arrays: bool
+) -> None:
     """Print a topic's messages as they come.
 
     Args:
-        desk: What to work with.
+        context: What to work with.
         topic: The topic.
         count: End after so many; 0 for no end.
         json: One JSON object a line in place of YAML.
         whole: Long arrays whole.
         no_arrays: Leave arrays out.
     """
-    name = desk.node.resolve(topic)
-    kind = await message_type(name, await look(desk.master), desk.master, desk.rpc, desk.types)
+    name = context.node.resolve(topic)
+    kind = await message_type(name, await look(context.master), context.master, context.rpc, context.types)
     seen = 0
-    async for message in await desk.node.subscribe(name, kind):
+    async for message in await context.node.subscribe(name, kind):
         if json:
-            desk.show(as_json(message))
+            context.show(as_json(message))
         else:
-            desk.show(as_yaml(message, whole=whole, arrays=not no_arrays) + "---")
+            context.show(as_yaml(message, whole=whole, arrays=not no_arrays) + "---")
         seen += 1
         if seen == count:
             return
@@ -117,7 +119,7 @@ class Rate:
         )
 
 
-async def hz(desk: Desk, topic: str, *, window: int, interval: float, count: int) -> None:
+async def hz(context: ToolContext, topic: str, *, window: int, interval: float, count: int) -> None:
     """Print a topic's rate every ``interval`` seconds, ``count`` times or without end."""
     rate, came = Rate(window), 0
 
@@ -126,21 +128,23 @@ async def hz(desk: Desk, topic: str, *, window: int, interval: float, count: int
         came += 1
         rate.note(time.monotonic())
 
-    await desk.node.subscribe_serialized(topic, "*", take)
+    await context.node.subscribe_serialized(topic, "*", take)
     shown = before = 0
-    while await _pause(desk.node, interval):
+    while await _pause(context.node, interval):
         text = rate.describe() if came > before else ""
-        desk.show(text or "no new messages")
+        context.show(text or "no new messages")
         before, shown = came, shown + 1
         if shown == count:
             return
 
 
-async def publish(desk: Desk, topic: str, kind: str, values: str, *, rate: float, latch: bool) -> None:
+async def publish(
+    context: ToolContext, topic: str, kind: str, values: str, *, rate: float, latch: bool
+) -> None:
     """Publish a message.
 
     Args:
-        desk: What to work with.
+        context: What to work with.
         topic: The topic.
         kind: Its type; empty for the one that the graph knows.
         values: The fields as YAML.
@@ -150,30 +154,32 @@ async def publish(desk: Desk, topic: str, kind: str, values: str, *, rate: float
     Raises:
         ToolError: The values do not fit the type, or the type is not known.
     """
-    name = desk.node.resolve(topic)
+    name = context.node.resolve(topic)
     if kind:
-        message_kind = desk.types.message(kind)
+        message_kind = context.types.message(kind)
     else:
-        message_kind = await message_type(name, await look(desk.master), desk.master, desk.rpc, desk.types)
+        message_kind = await message_type(
+            name, await look(context.master), context.master, context.rpc, context.types
+        )
     try:
         message: Message = message_kind.new(**read_fields(values, message_kind))
     except ValueError as error:
         raise ToolError(f"the message for {name}: {error}") from error
-    publisher = await desk.node.advertise(name, message_kind, latch=latch or not rate)
+    publisher = await context.node.advertise(name, message_kind, latch=latch or not rate)
     if rate:
-        async for _ in desk.node.rate(rate):
+        async for _ in context.node.rate(rate):
             publisher.publish(message)
         return
     publisher.publish(message)
     if latch:
-        desk.show("published and latched; interrupt to end")
-        await desk.node.spin()
+        context.show("published and latched; interrupt to end")
+        await context.node.spin()
         return
     try:
         await publisher.wait_for_subscribers(timeout=LATE_SUBSCRIBERS_S)
     except TimeoutError:
-        desk.show("published, but no node has subscribed")
-    await _pause(desk.node, LATE_SUBSCRIBERS_S)
+        context.show("published, but no node has subscribed")
+    await _pause(context.node, LATE_SUBSCRIBERS_S)
 
 
 async def _pause(node: Node, seconds: float) -> bool:

@@ -9,13 +9,14 @@
     echo = types.service("Test/StringEcho")  # echo.request, echo.response, echo.md5sum
 """
 
-from rce.ros.types.exceptions import BadDefinition, SerializationError, TypesError, UnknownType
-from rce.ros.types.message import Buffer, Field, Message, MessageType, ServiceType
+from rce.ros.types.exceptions import BadDefinitionError, SerializationError, TypesError, UnknownTypeError
+from rce.ros.types.fields import Buffer, Field
+from rce.ros.types.message import MessageType, ServiceType
 from rce.ros.types.registry import TypeRegistry
-from rce.ros.types.values import Duration, Time
+from rce.ros.types.values import Duration, Message, Time
 
 __all__ = [
-    "BadDefinition",
+    "BadDefinitionError",
     "Buffer",
     "Duration",
     "Field",
@@ -26,5 +27,5 @@ __all__ = [
     "Time",
     "TypeRegistry",
     "TypesError",
-    "UnknownType",
+    "UnknownTypeError",
 ]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from rce.ros.types.exceptions import BadDefinition
+from rce.ros.types.exceptions import BadDefinitionError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -26,7 +26,7 @@ class ActionPart(NamedTuple):
     """One of the seven message types."""
 
     suffix: str
-    """What follows the action's name in the type's name."""
+    """The part of the type's name after the action's name."""
     text: str
     """The definition."""
     first_line: int
@@ -53,7 +53,7 @@ def parse_action(name: str, text: str, source: str = "") -> dict[str, ActionPart
         The parts by their suffixes.
 
     Raises:
-        BadDefinition: The text has not exactly two ``---`` lines.
+        BadDefinitionError: The text has not exactly two ``---`` lines.
     """
     pieces: list[list[str]] = [[]]
     starts = [1]
@@ -64,7 +64,7 @@ def parse_action(name: str, text: str, source: str = "") -> dict[str, ActionPart
         else:
             pieces[-1].append(line + "\n")
     if len(pieces) != len(_PARTS):
-        raise BadDefinition(
+        raise BadDefinitionError(
             source or name, 0, f"an action has two '---' lines, this text has {len(pieces) - 1}"
         )
     parts = [

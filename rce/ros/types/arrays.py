@@ -8,7 +8,7 @@ from array import array
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rce.ros.types.message import Buffer
+    from rce.ros.types.fields import Buffer
 
 BOOL_BYTES = {False: 0, True: 1}
 """How a bool is written; 0, 1 and numpy's bools are equal to the keys."""

@@ -1,9 +1,9 @@
 """Generated codecs: straight-line Python for one message type, made once.
 
 A codec reads or writes all fields of a fixed size that stand next to each other with one
-:class:`struct.Struct`, nested messages included, and touches every byte of an array once. What the values
-look like on the Python side is the business of a *dialect*: message objects (:mod:`rce.ros.types.objects`)
-or JSON objects (``rce_robot.converters``). Readers are made by :mod:`rce.ros.types.readers`, writers by
+:class:`struct.Struct`, nested messages included, and touches every byte of an array once. A *dialect* defines
+the values on the Python side: message objects (:mod:`rce.ros.types.objects`) or JSON objects
+(``rce_robot.converters``). Readers are made by :mod:`rce.ros.types.readers`, writers by
 :mod:`rce.ros.types.writers`.
 
 Generated code checks only what costs nothing. When it fails in any of :data:`FAULTS`, the caller walks the
@@ -17,7 +17,7 @@ from typing import Any
 
 
 class RefusedValueError(ValueError):
-    """Raised by generated code: a value does not fit. The field is found afterwards."""
+    """A value does not fit. Raised by generated code; the caller then finds the field."""
 
 
 FAULTS = (
@@ -28,11 +28,11 @@ FAULTS = (
     LookupError,
     OverflowError,
 )
-"""What generated code raises for a value or a buffer that does not fit the type."""
+"""Exceptions of generated code for a value or a buffer that does not fit the type."""
 
 
 class Code:
-    """Lines of a function in the making, and the objects they name."""
+    """Lines of a function that is being generated, and the objects they name."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -60,7 +60,7 @@ class Code:
 
         Args:
             signature: Such as ``f(a, b)``.
-            source: What to call the code in a traceback.
+            source: The code's name in tracebacks.
         """
         text = "\n".join([f"def {signature}:", *self.lines, ""])
         exec(compile(text, f"<generated {source}>", "exec"), self.names)  # noqa: S102  # of our own making

@@ -10,7 +10,7 @@ import hashlib
 import re
 from typing import TYPE_CHECKING, NamedTuple
 
-from rce.ros.types.exceptions import BadDefinition
+from rce.ros.types.exceptions import BadDefinitionError
 from rce.ros.types.values import BUILTINS, NUMBERS
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ SEPARATOR = "=" * 80
 """Line between the parts of a full definition text."""
 
 PART_HEADER = "MSG: "
-"""What follows the separator, before the name of the part's type."""
+"""The text between the separator and the name of the part's type."""
 
 MAX_FIXED_LENGTH = 1 << 20
 """Longest fixed array that a definition may ask for: its default value is made in memory."""
@@ -75,7 +75,7 @@ def parse_message(name: str, text: str, source: str = "", first_line: int = 1) -
         first_line: Line number of the text's first line in ``source``.
 
     Raises:
-        BadDefinition: The text cannot be read.
+        BadDefinitionError: The text cannot be read.
     """
     source = source or name
     fields: list[RawField] = []
@@ -91,7 +91,7 @@ def parse_message(name: str, text: str, source: str = "", first_line: int = 1) -
             else:
                 fields.append(_parse_field(code, package, number))
         except ValueError as error:
-            raise BadDefinition(source, number, str(error)) from error
+            raise BadDefinitionError(source, number, str(error)) from error
         _refuse_twice(fields, constants, source, number)
     return Definition(name, text, tuple(fields), tuple(constants), source)
 
@@ -100,7 +100,7 @@ def parse_service(name: str, text: str, source: str = "") -> tuple[Definition, D
     """Read the text of a service type into its request and its response.
 
     Raises:
-        BadDefinition: The text cannot be read, or has not exactly one ``---`` line.
+        BadDefinitionError: The text cannot be read, or has not exactly one ``---`` line.
     """
     parts: list[list[str]] = [[]]
     for line in text.splitlines(keepends=True):
@@ -109,7 +109,7 @@ def parse_service(name: str, text: str, source: str = "") -> tuple[Definition, D
         else:
             parts[-1].append(line)
     if len(parts) != 2:  # noqa: PLR2004
-        raise BadDefinition(
+        raise BadDefinitionError(
             source or name, 0, f"a service has one '---' line, this text has {len(parts) - 1}"
         )
     request, response = ("".join(part) for part in parts)
@@ -123,7 +123,7 @@ def split_full_text(name: str, text: str) -> Iterator[tuple[str, str]]:
     """Split a full definition text into ``(type name, text)``, the named type first.
 
     Raises:
-        BadDefinition: A part does not begin with ``MSG: package/Type``.
+        BadDefinitionError: A part does not begin with ``MSG: package/Type``.
     """
     first, *rest = re.split(rf"^{SEPARATOR}=*[ \t]*\r?\n", text, flags=re.MULTILINE)
     # ROS puts a line end after every part but the last.
@@ -131,7 +131,7 @@ def split_full_text(name: str, text: str) -> Iterator[tuple[str, str]]:
     for index, part in enumerate(rest, 1):
         head, _, body = part.partition("\n")
         if not head.startswith(PART_HEADER):
-            raise BadDefinition(
+            raise BadDefinitionError(
                 name, 0, f"a part of the definition begins with {head[:80]!r}, not with 'MSG: '"
             )
         yield head.removeprefix(PART_HEADER).strip(), body.removesuffix("\n") if index < len(rest) else body
@@ -186,7 +186,7 @@ def _parse_constant(code: str, line: str) -> Constant:
     type_name, _, rest = code.partition(" ")
     name, _, text = rest.partition("=")
     if type_name == "string":
-        # All that follows the first '=' belongs to a string, a '#' too.
+        # Everything after the first '=' belongs to a string, a '#' too.
         text = line.partition("=")[2]
     name, text = name.strip(), text.strip()
     if _NAME.fullmatch(name) is None:
@@ -217,4 +217,4 @@ def _refuse_twice(fields: list[RawField], constants: list[Constant], source: str
     names = [field.name for field in fields] + [constant.name for constant in constants]
     for index, name in enumerate(names):
         if name in names[:index]:
-            raise BadDefinition(source, line, f"{name!r} is declared twice")
+            raise BadDefinitionError(source, line, f"{name!r} is declared twice")

@@ -1,11 +1,11 @@
-"""What can go wrong with message types.
+"""Errors of message types.
 
 ::
 
     TypesError
-    +-- UnknownType          no definition of that name was found
-    +-- BadDefinition        a definition's text is wrong (where: file and line)
-    +-- SerializationError   a value does not fit its type, or bytes do not hold a message of it
+    +-- UnknownTypeError    no definition of that name was found
+    +-- BadDefinitionError  a definition's text is wrong (where: file and line)
+    +-- SerializationError  a value does not fit its type, or bytes do not hold a message of it
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ class TypesError(Exception):
     """Base of all errors of :mod:`rce.ros.types`."""
 
 
-class UnknownType(TypesError, LookupError):  # noqa: N818
-    """There is no definition of a type.
+class UnknownTypeError(TypesError, LookupError):
+    """The definition of a type was not found.
 
     Attributes:
-        name: The type that was asked for.
-        hint: Where it was looked for and what was missing.
+        name: The requested type.
+        hint: The places that were searched, and what was missing.
     """
 
     def __init__(self, name: str, hint: str) -> None:
@@ -32,13 +32,13 @@ class UnknownType(TypesError, LookupError):  # noqa: N818
         return f"unknown type {self.name}: {self.hint}"
 
 
-class BadDefinition(TypesError, ValueError):  # noqa: N818
+class BadDefinitionError(TypesError, ValueError):
     """The text of a definition cannot be read.
 
     Attributes:
         source: The file, or the type's name where the text came from elsewhere.
         line: Line number in ``source``, from 1; 0 where the fault is of the whole.
-        reason: What is wrong.
+        reason: The fault.
     """
 
     def __init__(self, source: str, line: int, reason: str) -> None:

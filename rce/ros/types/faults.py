@@ -1,4 +1,4 @@
-"""Slow walks that find out which field is to blame when a codec failed."""
+"""Slow walks that find the faulty field after a codec failed."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 from rce.ros.types.arrays import BOOL_BYTES
 from rce.ros.types.codegen import FAULTS
 from rce.ros.types.exceptions import SerializationError
-from rce.ros.types.message import Message, attribute
+from rce.ros.types.fields import attribute
 from rce.ros.types.readers import MAX_EMPTY_ELEMENTS
-from rce.ros.types.values import NUMBERS, STAMPS
+from rce.ros.types.values import NUMBERS, STAMPS, Message
 
 if TYPE_CHECKING:
-    from rce.ros.types.message import Buffer, Field, MessageType
+    from rce.ros.types.fields import Buffer, Field
+    from rce.ros.types.message import MessageType
 
 _LONG_INTEGER_BITS = 200
 """Python refuses to write very long integers as decimals."""
@@ -22,18 +23,18 @@ _LONGEST = 40
 """Characters of a value in an error's text."""
 
 
-def find_fault(kind: MessageType, message: Any, root: str, path: str = "") -> None:
+def find_fault(message_type: MessageType, message: Any, root: str, path: str = "") -> None:
     """Walk a message that could not be serialized.
 
     Raises:
         SerializationError: Of the first field whose value does not fit. Returns if there is none.
     """
-    for field in kind.fields:
+    for field in message_type.fields:
         where = path + field.name
         try:
             value = getattr(message, attribute(field.name))
         except AttributeError:
-            raise SerializationError(root, where, f"{short(message)} is not a {kind.name}") from None
+            raise SerializationError(root, where, f"{short(message)} is not a {message_type.name}") from None
         if field.is_array:
             fault = array_fault(field, value, root, where)
             if fault.reason:
@@ -74,7 +75,7 @@ def _check_element(field: Field, value: Any, root: str, path: str) -> None:
 
 
 def scalar_fault(type_name: str, value: Any) -> str:
-    """Tell why ``value`` does not fit a built-in type; empty if it does."""
+    """Return why ``value`` does not fit a built-in type; empty if it does."""
     try:
         if type_name == "string":
             value.encode()
@@ -110,19 +111,19 @@ def short(value: object) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
-def read_fault(kind: MessageType, buffer: Buffer) -> SerializationError:
-    """Find out why ``buffer`` is not a message of ``kind``."""
+def read_fault(message_type: MessageType, buffer: Buffer) -> SerializationError:
+    """Find out why ``buffer`` is not a message of ``message_type``."""
     try:
-        end = _walk(kind, memoryview(buffer).cast("B"), 0, kind.name, "")
+        end = _walk(message_type, memoryview(buffer).cast("B"), 0, message_type.name, "")
     except SerializationError as fault:
         return fault
     return SerializationError(
-        kind.name, "", f"{len(buffer) - end} bytes too many: {len(buffer)}, the message has {end}"
+        message_type.name, "", f"{len(buffer) - end} bytes too many: {len(buffer)}, the message has {end}"
     )
 
 
-def _walk(kind: MessageType, buffer: memoryview, position: int, root: str, path: str) -> int:
-    for field in kind.fields:
+def _walk(message_type: MessageType, buffer: memoryview, position: int, root: str, path: str) -> int:
+    for field in message_type.fields:
         position = _walk_field(field, buffer, position, root, path + field.name)
     return position
 

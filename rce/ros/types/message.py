@@ -1,78 +1,23 @@
-"""Message and service types, and the objects that hold messages."""
+"""Message and service types."""
 
 from __future__ import annotations
 
-import keyword
-from array import array
 from collections.abc import Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from rce.ros.types.definition import PART_HEADER, SEPARATOR, checksum_text, md5
-from rce.ros.types.exceptions import UnknownType
-from rce.ros.types.values import BUILTINS, BYTES_TYPES, NUMBERS, STAMPS, Duration, Time
+from rce.ros.types.exceptions import UnknownTypeError
+from rce.ros.types.fields import Field, min_size
+from rce.ros.types.objects import make_class, make_codec, make_message
+from rce.ros.types.values import BUILTINS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rce.ros.types.definition import Constant, Definition, RawField
-
-Buffer = bytes | bytearray | memoryview
-"""What a serialized message is read from."""
-
-LARGE = 1 << 16
-"""Bytes above which a message is read through a view: slicing it copies nothing."""
-
-
-class Field(NamedTuple):
-    """A field of a message type."""
-
-    name: str
-    type: str
-    """A built-in type (``uint8``, ``string``, ``time`` ...) or a message type; without brackets."""
-    is_array: bool
-    length: int | None
-    """Number of elements of a fixed array; None for a variable array or no array."""
-    message: MessageType | None
-    """The type of the field's message or messages; None for built-in types."""
-
-    @property
-    def declared(self) -> str:
-        """The type as a definition writes it, such as ``float64[36]``."""
-        if not self.is_array:
-            return self.type
-        return f"{self.type}[{'' if self.length is None else self.length}]"
-
-    @property
-    def is_bytes(self) -> bool:
-        """Whether the value is held as ``bytes``."""
-        return self.is_array and self.type in BYTES_TYPES
-
-
-class Message:
-    """Base of the generated classes that hold messages; one slot per field."""
-
-    __slots__ = ()
-    _type: ClassVar[MessageType]
-
-    def __eq__(self, other: object) -> bool:
-        if other.__class__ is not self.__class__:
-            return NotImplemented
-        slots: tuple[str, ...] = self.__class__.__slots__
-        return all(getattr(self, slot) == getattr(other, slot) for slot in slots)
-
-    __hash__ = None  # type: ignore[assignment]  # messages can be changed
-
-    def __repr__(self) -> str:
-        slots: tuple[str, ...] = self.__class__.__slots__
-        values = ", ".join(f"{slot}={getattr(self, slot)!r}" for slot in slots)
-        return f"{self._type.name}({values})"
-
-    if TYPE_CHECKING:
-        # Fields are known at run time only.
-        def __init__(self, *args: Any, **values: Any) -> None: ...
-        def __getattr__(self, name: str) -> Any: ...
-        def __setattr__(self, name: str, value: Any) -> None: ...
+    from rce.ros.types.fields import Buffer
+    from rce.ros.types.values import Message
 
 
 class MessageType:
@@ -118,7 +63,7 @@ class MessageType:
     @cached_property
     def min_size(self) -> int:
         """Bytes of the shortest message on the wire."""
-        return sum(_min_size(field) for field in self.fields)
+        return sum(min_size(field) for field in self.fields)
 
     @cached_property
     def cls(self) -> type[Message]:
@@ -127,24 +72,18 @@ class MessageType:
         Its constructor takes the fields by position or by name; a field that is left out has its default:
         zero, empty, or a message of defaults. A field whose name is a Python keyword gets a ``_`` at its end.
         """
-        from rce.ros.types.objects import make_class
-
         return make_class(self)
 
     @cached_property
     def _codec(self) -> tuple[Callable[[Message], bytes], Callable[[Buffer], Message]]:
-        from rce.ros.types.objects import make_codec
-
         return make_codec(self)
 
     def new(self, /, **values: Any) -> Message:
         """Make a message; nested messages may be given as dicts, arrays as any sequence.
 
         Raises:
-            SerializationError: There is no such field, or a value cannot be made into what the field holds.
+            SerializationError: A field does not exist, or a value cannot be converted to the field's type.
         """
-        from rce.ros.types.objects import make_message
-
         return make_message(self, values, self.name, "")
 
     def serialize(self, message: Message | Mapping[str, Any]) -> bytes:
@@ -186,56 +125,13 @@ class ServiceType:
         return f"<ServiceType {self.name} {self.md5sum}>"
 
 
-def attribute(name: str) -> str:
-    """Return the attribute that holds a field: its name, with a ``_`` at the end of a Python keyword."""
-    return f"{name}_" if keyword.iskeyword(name) else name
-
-
-def default_value(field: Field) -> Any:
-    """Return a new default of a field: zero, empty, or a message of defaults."""
-    if field.is_array:
-        length = field.length or 0
-        if field.is_bytes:
-            return bytes(length)
-        if field.type in NUMBERS and field.type != "bool":
-            number = NUMBERS[field.type]
-            return array(number.code, bytes(number.size * length))
-        return [_default_element(field) for _ in range(length)]
-    return _default_element(field)
-
-
-def _default_element(field: Field) -> Any:
-    if field.message is not None:
-        return field.message.cls()
-    if field.type in STAMPS:
-        return Time() if field.type == "time" else Duration()
-    if field.type == "string":
-        return ""
-    if field.type == "bool":
-        return False
-    return 0.0 if NUMBERS[field.type].is_float else 0
-
-
-def _min_size(field: Field) -> int:
-    if field.is_array and field.length is None:
-        return 4
-    return element_min_size(field) * (field.length if field.length is not None else 1)
-
-
-def element_min_size(field: Field) -> int:
-    """Return the bytes of the shortest value, or of the shortest element of an array."""
-    if field.message is not None:
-        return field.message.min_size
-    if field.type in NUMBERS:
-        return NUMBERS[field.type].size
-    return 8 if field.type in STAMPS else 4
-
-
 def _field(raw: RawField, definition: Definition, resolve: Callable[[str], MessageType]) -> Field:
     message = None
     if raw.type not in BUILTINS:
         try:
             message = resolve(raw.type)
-        except UnknownType as error:
-            raise UnknownType(error.name, f"{error.hint} (used at {definition.source}:{raw.line})") from error
+        except UnknownTypeError as error:
+            raise UnknownTypeError(
+                error.name, f"{error.hint} (used at {definition.source}:{raw.line})"
+            ) from error
     return Field(raw.name, raw.type, raw.is_array, raw.length, message)

@@ -6,13 +6,14 @@ import struct
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rce.ros.types.codegen import Code
-from rce.ros.types.message import element_min_size
+from rce.ros.types.fields import element_min_size
 from rce.ros.types.values import NUMBERS, STAMPS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rce.ros.types.message import Buffer, Field, MessageType
+    from rce.ros.types.fields import Buffer, Field
+    from rce.ros.types.message import MessageType
 
     Reader = Callable[[Buffer, int], tuple[Any, int]]
     """Reads a value at a position and returns it with the position after it."""
@@ -36,7 +37,7 @@ class ReadDialect(Protocol):
     def numbers(self, code: Code, field: Field, chunk: str) -> str:
         """Make the value of an array of numbers; ``chunk`` is a slice of the buffer."""
 
-    def message(self, code: Code, kind: MessageType, values: Sequence[str]) -> str:
+    def message(self, code: Code, message_type: MessageType, values: Sequence[str]) -> str:
         """Make a message of the expressions of its fields."""
 
 
@@ -49,16 +50,18 @@ class ReaderBuilder:
         self._code = Code()
         self._pending: list[tuple[str, str]] = []
 
-    def build(self, kind: MessageType) -> Reader:
-        """Return the reader of ``kind``."""
-        value = self._message(kind)
+    def build(self, message_type: MessageType) -> Reader:
+        """Return the reader of ``message_type``."""
+        value = self._message(message_type)
         self._flush()
         self._code.line(f"return {value}, p")
-        reader: Reader = self._code.compile("read(b, p)", f"reader of {kind.name}")
+        reader: Reader = self._code.compile("read(b, p)", f"reader of {message_type.name}")
         return reader
 
-    def _message(self, kind: MessageType) -> str:
-        return self._dialect.message(self._code, kind, [self._field(field) for field in kind.fields])
+    def _message(self, message_type: MessageType) -> str:
+        return self._dialect.message(
+            self._code, message_type, [self._field(field) for field in message_type.fields]
+        )
 
     def _field(self, field: Field) -> str:
         if field.is_array:
@@ -100,13 +103,13 @@ class ReaderBuilder:
             return f"[{self._dialect.stamp(self._code, field, 's', 'n')} for s, n in {unpack}(b[p:e])]"
         return self._dialect.numbers(self._code, field, "b[p:e]")
 
-    def _messages(self, field: Field, kind: MessageType, count: str, value: str) -> None:
+    def _messages(self, field: Field, message_type: MessageType, count: str, value: str) -> None:
         code = self._code
-        if kind.min_size == 0 and field.length is None:
+        if message_type.min_size == 0 and field.length is None:
             code.line(f"if {count} > {MAX_EMPTY_ELEMENTS}: raise Refused")
         code.line(f"{value} = []")
         code.line(f"for _ in range({count}):")
-        code.line(f"    x, p = {code.bind(self._reader_of(kind))}(b, p)")
+        code.line(f"    x, p = {code.bind(self._reader_of(message_type))}(b, p)")
         code.line(f"    {value}.append(x)")
 
     def _string(self) -> str:

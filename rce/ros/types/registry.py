@@ -1,4 +1,4 @@
-"""Where message and service types come from: packages, the built-in definitions, connection headers."""
+"""Sources of message and service types: packages, the built-in definitions, connection headers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from rce.ros.packages import PackageIndex
 from rce.ros.types.action import action_names, parse_action
 from rce.ros.types.definition import SEPARATOR, Definition, parse_message, parse_service, split_full_text
-from rce.ros.types.exceptions import BadDefinition, UnknownType
+from rce.ros.types.exceptions import BadDefinitionError, UnknownTypeError
 from rce.ros.types.message import MessageType, ServiceType
 
 if TYPE_CHECKING:
@@ -37,8 +37,8 @@ class TypeRegistry:
     ROS packages, then among those learned with :meth:`from_definition`.
 
     Args:
-        packages: Where to look for packages; None: on the paths that the environment names
-            (:meth:`~rce.ros.packages.PackageIndex.from_environ`).
+        packages: The packages to search; None: those on the paths in the environment
+        (:meth:`~rce.ros.packages.PackageIndex.from_environ`).
     """
 
     def __init__(self, packages: PackageIndex | None = None) -> None:
@@ -54,14 +54,14 @@ class TypeRegistry:
             name: ``package/Type``.
 
         Raises:
-            UnknownType: There is no definition of it, or of a type that it uses.
-            BadDefinition: Its definition, or one that it uses, is wrong.
+            UnknownTypeError: Its definition, or that of a type it uses, was not found.
+            BadDefinitionError: Its definition, or one that it uses, is wrong.
         """
         found = self._messages.get(name)
         if found is None:
             try:
                 found = _Builder(self._definition, self._messages).build(name)
-            except UnknownType:
+            except UnknownTypeError:
                 found = self._learned.get(name)
                 if found is None:
                     raise
@@ -71,8 +71,8 @@ class TypeRegistry:
         """Return a service type.
 
         Raises:
-            UnknownType: There is no definition of it, or of a type that it uses.
-            BadDefinition: Its definition, or one that it uses, is wrong.
+            UnknownTypeError: Its definition, or that of a type it uses, was not found.
+            BadDefinitionError: Its definition, or one that it uses, is wrong.
         """
         found = self._services.get(name)
         if found is None:
@@ -87,17 +87,17 @@ class TypeRegistry:
         """Return the type that a full definition text describes, as a connection header carries it.
 
         The text alone counts: types of the same names that the registry knows are not used. The type is
-        remembered, so that :meth:`message` finds it where there is no other definition.
+        remembered, so that :meth:`message` finds it if no other definition exists.
 
         Raises:
-            UnknownType: The text uses a type that it does not hold.
-            BadDefinition: The text cannot be read.
+            UnknownTypeError: The text uses a type that it does not hold.
+            BadDefinitionError: The text cannot be read.
         """
         parts = dict(reversed(list(split_full_text(name, full_text))))
 
         def definition(wanted: str) -> Definition:
             if wanted not in parts:
-                raise UnknownType(wanted, f"the definition text of {name} does not hold it")
+                raise UnknownTypeError(wanted, f"the definition text of {name} does not hold it")
             return parse_message(wanted, parts[wanted])
 
         kind = _Builder(definition, {}).build(name)
@@ -115,7 +115,7 @@ class TypeRegistry:
         """Return the definition text of ``name``."""
         match = _NAME.fullmatch(name)
         if match is None:
-            raise UnknownType(name, "a type is named package/Type")
+            raise UnknownTypeError(name, "a type is named package/Type")
         package, type_name = match.groups()
         folder = self._packages.locate(package)
         if folder is None:
@@ -131,7 +131,7 @@ class TypeRegistry:
         text = builtin_definitions().get((kind, name))
         if text is None:
             builtin = "messages" if kind == "msg" else "services"
-            raise UnknownType(name, f"{hint}, and it is not among the built-in {builtin}")
+            raise UnknownTypeError(name, f"{hint}, and it is not among the built-in {builtin}")
         return _Text(text, name)
 
 
@@ -150,7 +150,7 @@ class _Builder:
         definition = self._definition(name)
         if name in self._open:
             chain = " > ".join([*self._open, name])
-            raise BadDefinition(definition.source, 0, f"the type holds itself: {chain}")
+            raise BadDefinitionError(definition.source, 0, f"the type holds itself: {chain}")
         self._open.append(name)
         try:
             kind = self._done[name] = MessageType(definition, self.build)
@@ -173,7 +173,7 @@ def _read(data: bytes, source: str) -> str:
     try:
         return data.decode()
     except UnicodeDecodeError as error:
-        raise BadDefinition(source, 0, f"is not UTF-8: {error.reason}") from error
+        raise BadDefinitionError(source, 0, f"is not UTF-8: {error.reason}") from error
 
 
 @cache

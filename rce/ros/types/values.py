@@ -10,7 +10,10 @@ from __future__ import annotations
 
 import time
 from functools import total_ordering
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+if TYPE_CHECKING:
+    from rce.ros.types.message import MessageType
 
 NANOSECONDS = 1_000_000_000
 
@@ -131,3 +134,29 @@ class Duration(_Stamp):
     def from_sec(cls, seconds: float) -> Duration:
         """Make a duration from seconds."""
         return cls(*divmod(round(seconds * NANOSECONDS), NANOSECONDS))
+
+
+class Message:
+    """Base of the generated classes that hold messages; one slot per field."""
+
+    __slots__ = ()
+    _type: ClassVar[MessageType]
+
+    def __eq__(self, other: object) -> bool:
+        if other.__class__ is not self.__class__:
+            return NotImplemented
+        slots: tuple[str, ...] = self.__class__.__slots__
+        return all(getattr(self, slot) == getattr(other, slot) for slot in slots)
+
+    __hash__ = None  # type: ignore[assignment]  # messages can be changed
+
+    def __repr__(self) -> str:
+        slots: tuple[str, ...] = self.__class__.__slots__
+        values = ", ".join(f"{slot}={getattr(self, slot)!r}" for slot in slots)
+        return f"{self._type.name}({values})"
+
+    if TYPE_CHECKING:
+        # Fields are known at run time only.
+        def __init__(self, *args: Any, **values: Any) -> None: ...
+        def __getattr__(self, name: str) -> Any: ...
+        def __setattr__(self, name: str, value: Any) -> None: ...

@@ -6,22 +6,23 @@ import struct
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rce.ros.types.codegen import Code, IndentedCode
-from rce.ros.types.message import element_min_size
+from rce.ros.types.fields import element_min_size
 from rce.ros.types.values import NUMBERS, STAMPS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.ros.types.message import Field, MessageType
+    from rce.ros.types.fields import Field
+    from rce.ros.types.message import MessageType
 
 
 class WriteDialect(Protocol):
-    """How Python values become what is packed. Methods may add lines to the code."""
+    """The conversion of Python values to packed ones. Methods may add lines to the code."""
 
-    def open(self, code: Code, kind: MessageType, holder: str) -> None:
+    def open(self, code: Code, message_type: MessageType, holder: str) -> None:
         """Begin a message whose fields are taken from the variable ``holder``."""
 
-    def close(self, code: Code, kind: MessageType, holder: str) -> None:
+    def close(self, code: Code, message_type: MessageType, holder: str) -> None:
         """End a message: all its fields have been taken."""
 
     def take(self, code: Code, field: Field, holder: str) -> str:
@@ -46,7 +47,7 @@ class WriteDialect(Protocol):
 class WriterBuilder:
     """Generates the writer of one message type.
 
-    The writer takes the message and a list, which the dialect may use to note what it saw on the way.
+    The writer takes the message and a list, in which the dialect may note its findings.
     """
 
     def __init__(self, dialect: WriteDialect, writer_of: Callable[[MessageType], Any]) -> None:
@@ -56,23 +57,23 @@ class WriterBuilder:
         self._pending: list[tuple[str, str]] = []
         self._parts: list[str] = []
 
-    def build(self, kind: MessageType) -> Any:
-        """Return the writer of ``kind``: ``write(message, notes) -> bytes``."""
-        self._message(kind, "m")
+    def build(self, message_type: MessageType) -> Any:
+        """Return the writer of ``message_type``: ``write(message, notes) -> bytes``."""
+        self._message(message_type, "m")
         self._flush()
         self._code.line(f"return {self._joined()}")
-        return self._code.compile("write(m, notes)", f"writer of {kind.name}")
+        return self._code.compile("write(m, notes)", f"writer of {message_type.name}")
 
     def _joined(self) -> str:
         if len(self._parts) > 2:  # noqa: PLR2004  # two parts are added faster than joined
             return f"b''.join(({', '.join(self._parts)}))"
         return " + ".join(self._parts) or "b''"
 
-    def _message(self, kind: MessageType, holder: str) -> None:
-        self._dialect.open(self._code, kind, holder)
-        for field in kind.fields:
+    def _message(self, message_type: MessageType, holder: str) -> None:
+        self._dialect.open(self._code, message_type, holder)
+        for field in message_type.fields:
             self._field(field, self._dialect.take(self._code, field, holder))
-        self._dialect.close(self._code, kind, holder)
+        self._dialect.close(self._code, message_type, holder)
 
     def _field(self, field: Field, value: str) -> None:
         if field.is_array:

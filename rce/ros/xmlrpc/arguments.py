@@ -6,13 +6,13 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from rce.ros import names
-from rce.ros.xmlrpc.dispatch import BadArgument
+from rce.ros.xmlrpc.dispatch import BadArgumentError
 
 
 def graph_name(role: str, value: Any, caller: str) -> str:
     """Check a topic, service or node name and make it global.
 
-    Only what cannot be a name is refused: real nodes use names that the written rules do not allow.
+    Only impossible names are refused: real nodes use names that the written rules do not allow.
 
     Args:
         role: The parameter's name, for errors.
@@ -20,15 +20,15 @@ def graph_name(role: str, value: Any, caller: str) -> str:
         caller: The caller's name, below which private names are.
 
     Raises:
-        BadArgument: It is not a name.
+        BadArgumentError: It is not a name.
     """
     if not isinstance(value, str) or not value:
-        raise BadArgument(f"parameter [{role}] must be a non-empty string")
+        raise BadArgumentError(f"parameter [{role}] must be a non-empty string")
     if ":" in value or any(character.isspace() for character in value):
-        raise BadArgument(f"parameter [{role}] contains illegal characters: {value!r}")
+        raise BadArgumentError(f"parameter [{role}] contains illegal characters: {value!r}")
     resolved = names.resolve(value, caller)
     if resolved == names.SEPARATOR:
-        raise BadArgument(f"parameter [{role}] cannot be the global namespace")
+        raise BadArgumentError(f"parameter [{role}] cannot be the global namespace")
     return resolved
 
 
@@ -40,13 +40,13 @@ def node_uris(role: str, value: Any) -> list[str]:
         value: What was sent.
 
     Raises:
-        BadArgument: It is not a list, or an entry is not a URI with a scheme and a host.
+        BadArgumentError: It is not a list, or an entry is not a URI with a scheme and a host.
     """
     if not isinstance(value, list):
-        raise BadArgument(f"parameter [{role}] must be a list of URIs of the form http://host:port/")
+        raise BadArgumentError(f"parameter [{role}] must be a list of URIs of the form http://host:port/")
     for entry in value:
         if not _has_scheme_and_host(entry):
-            raise BadArgument(
+            raise BadArgumentError(
                 f"parameter [{role}] holds {entry!r}, which is not a URI of the form http://host:port/"
             )
     return value

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import h11
 
 from rce.ros.dialing import open_peer_socket
-from rce.ros.errors import RpcUnreachable
+from rce.ros.errors import RpcUnreachableError
 from rce.ros.xmlrpc.codec import decode_response, encode_call
 
 _log = logging.getLogger(__name__)
@@ -67,14 +67,14 @@ class RpcClient:
             timeout: Seconds for all of it.
 
         Raises:
-            RpcUnreachable: No answer came, for whatever reason.
-            RemoteFault: The server answered with a fault.
-            MalformedDocument: An argument cannot be sent or the answer cannot be read.
+            RpcUnreachableError: No answer came, for whatever reason.
+            RemoteFaultError: The server answered with a fault.
+            MalformedDocumentError: An argument cannot be sent or the answer cannot be read.
         """
         return await self.send(uri, method, encode_call(method, arguments), timeout=timeout)
 
     async def send(self, uri: str, method: str, document: bytes, *, timeout: float = DEFAULT_TIMEOUT) -> Any:
-        """Make a call that was written already, as :meth:`call` does.
+        """Make a call from an encoded document, as :meth:`call` does.
 
         Args:
             uri: ``http://host:port/``.
@@ -83,29 +83,29 @@ class RpcClient:
             timeout: Seconds for all of it.
 
         Raises:
-            RpcUnreachable: No answer came, for whatever reason.
-            RemoteFault: The server answered with a fault.
-            MalformedDocument: The answer cannot be read.
+            RpcUnreachableError: No answer came, for whatever reason.
+            RemoteFaultError: The server answered with a fault.
+            MalformedDocumentError: The answer cannot be read.
         """
         try:
             async with asyncio.timeout(timeout):
                 answer = await self._exchange(uri, document)
         except TimeoutError as error:
-            raise RpcUnreachable(uri, f"{method} took longer than {timeout:g} s") from error
+            raise RpcUnreachableError(uri, f"{method} took longer than {timeout:g} s") from error
         except (OSError, h11.ProtocolError, EOFError, ValueError) as error:
-            raise RpcUnreachable(uri, str(error) or type(error).__name__) from error
+            raise RpcUnreachableError(uri, str(error) or type(error).__name__) from error
         return decode_response(answer)
 
     async def until_lost(self, uri: str) -> None:
         """Wait until the server at ``uri`` goes away: until a connection made for nothing else is lost.
 
         Raises:
-            RpcUnreachable: It is away already.
+            RpcUnreachableError: It is away already.
         """
         try:
             reader, writer = await asyncio.open_connection(sock=await open_peer_socket(*_address(uri)))
         except (OSError, ValueError) as error:
-            raise RpcUnreachable(uri, str(error)) from error
+            raise RpcUnreachableError(uri, str(error)) from error
         _keep_alive(writer.get_extra_info("socket"))
         try:
             with contextlib.suppress(OSError):  # lost, whatever the reason
@@ -171,9 +171,9 @@ class _Connection:
         return self._http.our_state is h11.IDLE and not self._reader.at_eof()
 
     async def close(self) -> None:
-        """Close at once and wait until it is."""
+        """Close at once and wait until it is closed."""
         self._writer.transport.abort()
-        with contextlib.suppress(OSError):  # it may have been lost already: as good as closed
+        with contextlib.suppress(OSError):  # it may have been lost already, which counts as closed
             await self._writer.wait_closed()
 
     async def post(self, document: bytes) -> bytes:
@@ -217,7 +217,7 @@ class _Connection:
 
 
 def _keep_alive(connection: socket.socket) -> None:
-    """Let the system notice within half a minute that the other machine vanished without a word."""
+    """Set TCP keep-alive, so that the system notices within half a minute that the other machine is gone."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 4)):
         if hasattr(socket, option):

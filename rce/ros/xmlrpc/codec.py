@@ -13,7 +13,7 @@ from typing import Any
 from xml.parsers import expat
 from xmlrpc.client import Error, Fault, Marshaller, Unmarshaller
 
-from rce.ros.errors import MalformedDocument, RemoteFault
+from rce.ros.errors import MalformedDocumentError, RemoteFaultError
 
 MAX_DEPTH = 200
 """How deep elements may be nested; each level of a list or dictionary costs four."""
@@ -26,7 +26,7 @@ def encode_call(method: str, arguments: Sequence[Any]) -> bytes:
     """Write a method call.
 
     Raises:
-        MalformedDocument: An argument has no XML-RPC form.
+        MalformedDocumentError: An argument has no XML-RPC form.
     """
     return (
         _HEAD
@@ -38,7 +38,7 @@ def encode_response(value: Any) -> bytes:
     """Write the answer to a call.
 
     Raises:
-        MalformedDocument: ``value`` has no XML-RPC form.
+        MalformedDocumentError: ``value`` has no XML-RPC form.
     """
     return _HEAD + f"<methodResponse>\n{_params((value,))}</methodResponse>\n".encode()
 
@@ -53,12 +53,12 @@ def decode_call(document: bytes) -> tuple[str, tuple[Any, ...]]:
     """Read a method call: the method's name and its arguments.
 
     Raises:
-        MalformedDocument: This is not a method call, or it breaks a limit.
+        MalformedDocumentError: This is not a method call, or it breaks a limit.
     """
     target = _parse(document)
     method = target.getmethodname()
     if method is None:
-        raise MalformedDocument("the document calls no method")
+        raise MalformedDocumentError("the document calls no method")
     return method, _close(target)
 
 
@@ -66,12 +66,12 @@ def decode_response(document: bytes) -> Any:
     """Read the answer to a call.
 
     Raises:
-        RemoteFault: The server answered with a fault.
-        MalformedDocument: This is not an answer, or it breaks a limit.
+        RemoteFaultError: The server answered with a fault.
+        MalformedDocumentError: This is not an answer, or it breaks a limit.
     """
     values = _close(_parse(document))
     if len(values) != 1:
-        raise MalformedDocument(f"an answer holds one value, not {len(values)}")
+        raise MalformedDocumentError(f"an answer holds one value, not {len(values)}")
     return values[0]
 
 
@@ -79,9 +79,9 @@ def _params(values: Sequence[Any]) -> str:
     try:
         text = Marshaller("utf-8").dumps(tuple(values))
     except (TypeError, OverflowError, RecursionError) as error:
-        raise MalformedDocument(f"a value has no XML-RPC form: {error}") from error
+        raise MalformedDocumentError(f"a value has no XML-RPC form: {error}") from error
     if _NOT_XML.search(text):
-        raise MalformedDocument("a string holds a character that XML does not have")
+        raise MalformedDocumentError("a string holds a character that XML does not have")
     return text.replace("\r", "&#13;")  # a parser would read a bare one as a line feed
 
 
@@ -95,7 +95,7 @@ def _parse(document: bytes) -> Unmarshaller:
         nonlocal depth
         depth += 1
         if depth > MAX_DEPTH:
-            raise MalformedDocument(f"elements are nested deeper than {MAX_DEPTH}")
+            raise MalformedDocumentError(f"elements are nested deeper than {MAX_DEPTH}")
         target.start(tag, attributes)
 
     def end(tag: str) -> None:
@@ -104,7 +104,7 @@ def _parse(document: bytes) -> Unmarshaller:
         target.end(tag)
 
     def refuse_doctype(*_: object) -> None:
-        raise MalformedDocument("document types are not accepted")
+        raise MalformedDocumentError("document types are not accepted")
 
     parser.StartElementHandler = start
     parser.EndElementHandler = end
@@ -113,10 +113,10 @@ def _parse(document: bytes) -> Unmarshaller:
     parser.buffer_text = True
     try:
         parser.Parse(document, True)
-    except MalformedDocument:
+    except MalformedDocumentError:
         raise
-    except Exception as error:  # the unmarshaller raises whatever a wrong value leads it to
-        raise MalformedDocument(f"not XML-RPC: {error}") from error
+    except Exception as error:  # the unmarshaller may raise any exception for a wrong value
+        raise MalformedDocumentError(f"not XML-RPC: {error}") from error
     return target
 
 
@@ -124,6 +124,6 @@ def _close(target: Unmarshaller) -> tuple[Any, ...]:
     try:
         return target.close()
     except Fault as fault:
-        raise RemoteFault(fault.faultCode, str(fault.faultString)) from fault
+        raise RemoteFaultError(fault.faultCode, str(fault.faultString)) from fault
     except Error as error:
-        raise MalformedDocument(f"not XML-RPC: {error}") from error
+        raise MalformedDocumentError(f"not XML-RPC: {error}") from error

@@ -1,7 +1,7 @@
-"""The HTTP server under a ROS API: h11 for the framing, a dispatcher for the answers.
+"""The HTTP server of a ROS API: h11 for the framing, a dispatcher for the answers.
 
-All methods of ROS APIs only look at or change state in memory, so a request is answered in the callback that
-received its last byte: no task, no queue, answers of one connection in order.
+The methods of ROS APIs only read or change state in memory, so a request is answered in the callback that
+received its last byte: without a task or a queue, and in order on each connection.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class _Connection(asyncio.Protocol):
         self._siblings.add(self)
 
     def connection_lost(self, error: Exception | None) -> None:
-        del error  # a client that leaves needs no reason
+        del error  # a client may leave at any time
         self._transport = None
         self._siblings.discard(self)
         self._finish_request()
@@ -108,7 +108,7 @@ class _Connection(asyncio.Protocol):
         """Close at once: a client that ends its side has got all its answers."""
 
     def close(self) -> None:
-        """Close once what was written is out."""
+        """Close once the written data has been sent."""
         if self._transport is not None:
             self._transport.close()
 
@@ -118,7 +118,7 @@ class _Connection(asyncio.Protocol):
             self._transport.abort()
 
     def _next_event(self) -> bool:
-        """Handle one event; tell whether there may be more."""
+        """Handle one event; return whether there may be more."""
         event = self._http.next_event()
         if event is h11.NEED_DATA or event is h11.PAUSED:
             if self._http.they_are_waiting_for_100_continue:
@@ -164,7 +164,7 @@ class _Connection(asyncio.Protocol):
         self.close()
 
     def _respond(self, status: int, kind: bytes, body: bytes, *, last: bool = False) -> None:
-        # The spelling of Content-length is the one that roscpp's parser has always been given.
+        # roscpp's parser is known to read this spelling of Content-length.
         headers = [(b"Content-type", kind), (b"Content-length", b"%d" % len(body))]
         if last:
             headers.append((b"Connection", b"close"))

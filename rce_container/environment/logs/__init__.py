@@ -1,1 +1,1 @@
-"""What a container's nodes say: standard output, standard error and ROS's log, in bounded files."""
+"""The output of a container's nodes: standard output, standard error and ROS's log, in bounded files."""

@@ -1,8 +1,8 @@
-"""Logs of bounded size: rows of segments, each named by the offset of its first byte.
+"""Logs of bounded size: sequences of segments, each named by the offset of its first byte.
 
 ``echo.000001048576.log`` holds the log of ``echo`` after its first megabyte.
-An offset counts the bytes since the log began, so it stays valid when old segments are thrown away, and a
-reader in another process needs nothing but the folder.
+An offset counts the bytes since the log began, so it stays valid when old segments are removed, and a reader
+in another process needs only the folder.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 
 ENVIRONMENT_LOG = "_environment"
-"""The environment's own log; no node can be called like that."""
+"""The environment's own log; a node cannot have this name."""
 ROSOUT_LOG = "_rosout"
 """All nodes' log records in ROS, as ROS's own ``rosout.log`` holds them."""
 
@@ -23,12 +23,12 @@ _FLAGS = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def segment_path(folder: Path, name: str, start: int) -> Path:
-    """The file that holds a log from offset ``start``."""
+    """Return the file that holds a log from offset ``start``."""
     return folder / f"{name}.{start:012d}.log"
 
 
 def segments(folder: Path, name: str) -> list[tuple[int, Path]]:
-    """The kept segments of a log as (offset of the first byte, file), oldest first."""
+    """Return the kept segments of a log as (offset of the first byte, file), oldest first."""
     found = []
     for path in folder.glob(f"{name}.*.log"):
         start = path.name[len(name) + 1 : -len(".log")]
@@ -38,13 +38,13 @@ def segments(folder: Path, name: str) -> list[tuple[int, Path]]:
 
 
 def remove_log(folder: Path, name: str) -> None:
-    """Remove all segments of a log that nobody writes."""
+    """Remove all segments of a log that has no writer."""
     for _, path in segments(folder, name):
         path.unlink(missing_ok=True)
 
 
 class LogWriter:
-    """Appends to a log and keeps its size bounded. Goes on where an earlier writer ended.
+    """Appends to a log and keeps its size bounded. Continues where an earlier writer ended.
 
     Args:
         folder: Where the segments are.
@@ -67,7 +67,7 @@ class LogWriter:
         self._fd = self._open()
 
     def write(self, data: bytes) -> None:
-        """Append. A full disk loses the data and nothing else; what it cut off ends there."""
+        """Append data. On a full disk only this data is lost; a line that was cut off ends there."""
         try:
             if os.fstat(self._fd).st_size >= self._segment_bytes:
                 self._rotate()
@@ -78,7 +78,7 @@ class LogWriter:
             return
 
     def close(self) -> None:
-        """Close the file; what is written later is lost."""
+        """Close the file; later writes are lost."""
         os.close(self._fd)
         self._fd = -1
 

@@ -1,4 +1,4 @@
-"""The log of one node: what it prints, what it tells ROS, and what became of it, in order of arrival."""
+"""The log of one node: its output, its ROS log records and its state changes, in order of arrival."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ _WORDS_LENGTH = 300
 
 
 class Words:
-    """Remembers the last line with something in it."""
+    """Remembers the last line that is not empty."""
 
     def __init__(self) -> None:
         self._tail = b""
 
     def take(self, data: bytes) -> None:
-        """Look at what was written."""
+        """Process written data."""
         self._tail = (self._tail + data[-_WORDS_BYTES:])[-_WORDS_BYTES:]
 
     def __str__(self) -> str:
@@ -28,7 +28,7 @@ class Words:
 
 
 class NodeLog:
-    """Writes a node's log, over all its lives.
+    """Writes a node's log, across all its restarts.
 
     Args:
         folder: Where logs are.
@@ -41,21 +41,21 @@ class NodeLog:
     def __init__(self, folder: Path, tag: str) -> None:
         self._writer = LogWriter(folder, tag)
         self._rests = {streams.STDOUT: b"", streams.STDERR: b""}
-        """Beginnings of characters whose end has not come yet."""
+        """Incomplete characters, whose remaining bytes have not arrived yet."""
         self._open_lines: set[bytes] = set()
         self._words: dict[bytes, Words] = {}
         self.begin()
 
     def begin(self) -> None:
-        """Note that a new life of the node begins."""
+        """Note that the node starts again."""
         self._words = {streams.STDOUT: Words(), streams.STDERR: Words()}
 
     def stdout(self, data: bytes) -> None:
-        """Write what came from the node's standard output."""
+        """Write data from the node's standard output."""
         self._print(streams.STDOUT, data)
 
     def stderr(self, data: bytes) -> None:
-        """Write what came from the node's standard error."""
+        """Write data from the node's standard error."""
         self._print(streams.STDERR, data)
 
     def record(self, record: LogRecord) -> None:
@@ -64,7 +64,7 @@ class NodeLog:
         self._writer.write(streams.fragments(streams.letter_of(record.level), line + b"\n"))
 
     def note(self, text: str) -> None:
-        """Write what the engine has to say of the node, on a line of its own."""
+        """Write a message of the engine about the node, on a separate line."""
         for letter, rest in self._rests.items():
             if rest or letter in self._open_lines:
                 self._writer.write(streams.fragments(letter, rest + b"\n"))
@@ -74,7 +74,7 @@ class NodeLog:
 
     @property
     def last_words(self) -> str:
-        """The last line of the newest life's standard error, or of its output if there was no error."""
+        """Return the newest life's last line of standard error; of standard output if that is empty."""
         return str(self._words[streams.STDERR]) or str(self._words[streams.STDOUT])
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""From the pipe that a node writes to into its log."""
+"""Moves a node's output from its pipe into its log."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ _RATE_BYTES = 2 << 20
 
 
 class Pump:
-    """Takes what comes out of a pipe, and slows down a writer that floods it.
+    """Reads a pipe, and slows down a writer that floods it.
 
     Args:
-        pipe: The reading end; the pump owns it.
-        take: Gets it, piece by piece.
+        pipe: The read end; the pump owns it.
+        take: Receives the data in pieces.
     """
 
     def __init__(self, pipe: int, take: Callable[[bytes], None]) -> None:
@@ -31,7 +31,7 @@ class Pump:
         self._loop.add_reader(pipe, self._read)
 
     def close(self) -> None:
-        """Take what is in the pipe still, and close it."""
+        """Read the rest of the pipe, and close it."""
         for _ in range(_RATE_BYTES // _CHUNK):
             if not self._open or not self._move():
                 break
@@ -53,7 +53,7 @@ class Pump:
         self._loop.add_reader(self._pipe, self._read)
 
     def _move(self) -> bool:
-        """Move one chunk; whether there may be more."""
+        """Move one chunk; return whether there may be more."""
         try:
             data = os.read(self._pipe, _CHUNK)
         except (BlockingIOError, InterruptedError):

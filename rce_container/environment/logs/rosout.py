@@ -1,4 +1,4 @@
-"""Keeps what nodes tell ROS: each node's log records go to its own log, all of them to one like ROS's."""
+"""Keeps ROS log records: each node's records go to its own log, and all records to one like ROS's."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from rce.ros.logrecord import LogRecord, read_record, started
 from rce_container.environment.logs.files import ROSOUT_LOG, LogWriter
 from rce_container.environment.logs.node_log import NodeLog
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 WINDOW_S = 1.0
 WINDOW_BYTES = 1 << 18
-"""So much of each node is kept in a window of time; more would keep the environment from its work."""
+"""How much is kept of each node in a time window; more would slow down the environment."""
 _MAX_WAITING = 200
 
 
 class RosoutLog:
-    """Writes log records to where they belong.
+    """Writes log records to their logs.
 
     Args:
         folder: Where logs are.
-        log_of: Finds a node's log by the name that it has in ROS.
-        clock: Seconds that never go back.
+        log_of: Finds a node's log by its name in ROS.
+        clock: Seconds of a monotonic clock.
 
     Raises:
         OSError: The log cannot be opened.
@@ -38,7 +38,7 @@ class RosoutLog:
         self._log_of = log_of
         self._clock = clock
         self._waiting: deque[LogRecord] = deque(maxlen=_MAX_WAITING)
-        """Records of nodes that are not known yet: who registers is asked for its process first."""
+        """Records of nodes that are not known yet: a node that registers is first asked for its process."""
         self._bytes: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()
         self._window_end = 0.0
@@ -51,7 +51,7 @@ class RosoutLog:
         try:
             record = read_record(payload)
         except ValueError as error:
-            log.warning("%s", error)
+            _log.warning("%s", error)
             return
         if self._clock() >= self._window_end:
             self._begin_window()
@@ -67,7 +67,7 @@ class RosoutLog:
             self._waiting.append(record)
 
     def known(self, name: str) -> None:
-        """Learn that a node of this name belongs to one of the container's."""
+        """Note that a node of this name is one of the container's."""
         node_log = self._log_of(name)
         if node_log is None:
             return
@@ -76,7 +76,7 @@ class RosoutLog:
             self._waiting.remove(record)
 
     def close(self) -> None:
-        """Say what was dropped, and close the file."""
+        """Log what was dropped, and close the file."""
         self._begin_window()
         self._all.close()
 

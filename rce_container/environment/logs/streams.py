@@ -1,9 +1,9 @@
-"""How a node's log keeps apart what comes from where: each piece of a line begins with a letter. Pure.
+"""How a node's log keeps its streams apart: each piece of a line begins with a letter. Pure.
 
-A log is a row of *fragments*: a letter, some text, a newline. A small letter means that the line ends with
-the fragment, the capital that it goes on in a later one of the same letter. The letter tells the stream, and
-of ROS's log records how serious it is. So a log is read in the order in which it came, all of it or some of
-its streams, and nothing that a node prints can look like something else.
+A log is a sequence of *fragments*: a letter, some text, a newline. A lower-case letter means that the line
+ends with the fragment; an upper-case letter means that it continues in a later fragment of the same letter.
+The letter names the stream and, for ROS's log records, their level. So a reader gets all or some streams in
+order of arrival, and a node's output cannot imitate another stream.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ _MAX_TAIL = 3
 
 
 def letter_of(level: int) -> bytes:
-    """The letter of log records of a level; that of the next lower one for a level that ROS does not have."""
+    """Return the letter of a log level; for a level that ROS does not have, of the next lower one."""
     return _ROSOUT[max((known for known in _ROSOUT if known <= level), default=Level.DEBUG)]
 
 
 def letters_of(streams: Collection[LogStream], level: LogLevel = LogLevel.DEBUG) -> bytes:
-    """The letters of some streams, all if there are none.
+    """Return the letters of some streams; of all streams if none are given.
 
     Args:
         streams: Which.
@@ -56,7 +56,7 @@ def letters_of(streams: Collection[LogStream], level: LogLevel = LogLevel.DEBUG)
 
 
 def fragments(letter: bytes, data: bytes) -> bytes:
-    """Put text into fragments; the last one goes on later if the text does not end with a newline.
+    """Put text into fragments; the last one continues later if the text does not end with a newline.
 
     Args:
         letter: The stream's.
@@ -79,7 +79,7 @@ def _cut(letter: bytes, line: bytes) -> Iterator[bytes]:
 
 
 def whole_characters(data: bytes) -> int:
-    """How much of it does not end within a character of UTF-8."""
+    """Return the length of the data up to an incomplete UTF-8 character at its end."""
     for back in range(1, min(_MAX_TAIL, len(data)) + 1):
         byte = data[-back]
         if byte & _CONTINUATION_MASK != _CONTINUATION:
@@ -89,7 +89,7 @@ def whole_characters(data: bytes) -> int:
 
 
 def text_of(log: bytes, letters: bytes) -> bytes:
-    """The text of whole fragments, of those with one of some letters (see :func:`letters_of`) only."""
+    """Return the text of whole fragments, only of those with some letters (see :func:`letters_of`)."""
     wanted = letters + letters.upper()
     found = []
     for fragment in log.split(b"\n"):

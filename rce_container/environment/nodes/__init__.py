@@ -1,1 +1,1 @@
-"""The nodes of a container: what is decided about them, and the processes that they are."""
+"""The nodes of a container: decisions about them, and their processes."""

@@ -1,6 +1,6 @@
-"""Why processes of the container are killed: the manager can know, the environment cannot.
+"""Asks the manager why processes of the container were killed.
 
-What counts a container's memory is out of sight from inside.
+The environment cannot know: the counters of a container's memory are not visible from inside.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class Causes:
     """Asks the manager for causes of death.
 
     Args:
-        send: Sends a message to the manager; whether there is one.
+        send: Sends a message to the manager; returns whether one is connected.
     """
 
     def __init__(self, send: Callable[[Killed], bool]) -> None:
@@ -27,10 +27,10 @@ class Causes:
         self._asked: dict[int, asyncio.Future[str]] = {}
 
     async def ask(self) -> str:
-        """Ask why a process was killed that ended by SIGKILL just now, and not by the environment's.
+        """Ask why a process ended by a SIGKILL that the environment did not send.
 
         Returns:
-            The cause in words; empty if nobody knows one, or there is no manager now.
+            The cause as text; empty if it is unknown, or no manager is connected.
         """
         number = next(self._numbers)
         answer: asyncio.Future[str] = asyncio.get_running_loop().create_future()
@@ -46,7 +46,7 @@ class Causes:
             del self._asked[number]
 
     def answered(self, request: int, cause: str) -> None:
-        """Take the manager's answer."""
+        """Handle the manager's answer."""
         answer = self._asked.get(request)
         if answer is not None and not answer.done():
             answer.set_result(cause)

@@ -1,7 +1,7 @@
-"""What is decided about a container's nodes: events in, instructions out. Pure: no I/O, no clock, no task.
+"""Decisions about a container's nodes: events in, instructions out. Pure: no I/O, no clock, no task.
 
-A node lives several lives, numbered over all nodes. Events of a life that is over are ignored. A node never
-has two processes: the next life is launched when all of the last one has ended.
+A node has several lives, numbered over all nodes. Events of an ended life are ignored. A node never has two
+processes: its next life is launched after all processes of the last one have ended.
 """
 
 from __future__ import annotations
@@ -9,8 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from itertools import count
+from typing import assert_never
 
-from rce.control.model import NodeSpec, NodeState, NodeStatus
+from rce.aio.backoff import Backoff
+from rce.control.model import NodeState, NodeStatus
+from rce.model.specs import NodeSpec
 from rce_container.environment.nodes.events import (
     Beat,
     Desire,
@@ -28,18 +31,18 @@ from rce_container.environment.nodes.events import (
     Tell,
     Tick,
 )
-from rce_container.environment.nodes.life import Happening, after
+from rce_container.environment.nodes.life import LifeEvent
 from rce_container.environment.nodes.order import StartOrder, levels, ready_to_end
 from rce_container.environment.nodes.record import LAST_CHANCE_S, Node
 
-BACKOFF_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
-"""Pauses before a node that ended is started again: the first, second, ... time in a row."""
+BACKOFF = Backoff(first=0.5, longest=30.0)
+"""Delays before a node that ended is started again."""
 FIRST_BEAT_WITHIN_S = 30.0
-"""How long after its start a node may take for its first heartbeat."""
+"""Seconds from a node's start within which its first heartbeat has to arrive."""
 REGISTERS_WITHIN_S = 10.0
-"""A node that did not register with the ROS core for so long probably never will."""
+"""A node that did not register with the ROS core within this time probably never will."""
 SETTLES_WITHIN_S = 0.5
-"""After a node's first registration its others follow within this time."""
+"""A node's other registrations follow its first one within this time."""
 SOON_S = 5.0
 """A node that is started again within this time is worth waiting for."""
 
@@ -56,7 +59,7 @@ class NodesCore:
         self._nodes: dict[str, Node] = {}
         self._order = StartOrder()
         self._impossible: dict[str, str] = {}
-        """Nodes that can never start as things are, with the reason."""
+        """Nodes that can never start with the present specifications, with the reason."""
         self._lacking: Mapping[str, str] = {}
         """Nodes that lack what they are launched with, with the reason."""
         self._lives = count(1)
@@ -64,11 +67,11 @@ class NodesCore:
         self._now = 0.0
 
     def handle(self, event: Event, now: float) -> list[Instruction]:
-        """Take in what happened; return what is to be done about it.
+        """Handle an event; return the resulting instructions.
 
         Args:
             event: What happened.
-            now: Seconds on a clock that never goes back.
+            now: Seconds on a monotonic clock.
         """
         self._now, self._out = now, []
         match event:
@@ -85,15 +88,17 @@ class NodesCore:
                 node = self._nodes.get(event.tag)
                 if node is not None and node.life == event.life and node.has_process:
                     self._happen(node, event)
+            case _:
+                assert_never(event)
         self._end_those_whose_turn_it_is()
         self._launch_those_whose_turn_it_is()
         return self._out
 
-    # What is asked
+    # Queries
 
     @property
     def statuses(self) -> tuple[NodeStatus, ...]:
-        """What there is to report, by tag."""
+        """Return the nodes' statuses, by tag."""
         return tuple(self._nodes[tag].status() for tag in sorted(self._nodes))
 
     @property
@@ -106,12 +111,12 @@ class NodesCore:
         )
 
     def life(self, tag: str) -> int:
-        """The number of a node's newest life; 0 if there is none."""
+        """Return the number of a node's newest life; 0 if it has none."""
         node = self._nodes.get(tag)
         return node.life if node is not None else 0
 
     def is_settling(self, now: float) -> bool:
-        """Whether a node has yet to take up its topics and services, and is likely to do so soon."""
+        """Whether a node has yet to register its topics and services, and is likely to do so soon."""
         return any(self._settles_at(node) > now for node in self._nodes.values())
 
     @property
@@ -128,7 +133,7 @@ class NodesCore:
             limit = node.spec.max_restarts
             assert not limit or node.in_a_row <= limit
 
-    # What happens
+    # Events
 
     def _desire(self, desired: dict[str, NodeSpec]) -> None:
         for tag, node in list(self._nodes.items()):
@@ -155,7 +160,7 @@ class NodesCore:
             if not node.has_process:
                 self._forget(node)
         elif not node.has_process:
-            self._renew(node, Happening.RENEW)
+            self._renew(node, LifeEvent.RENEW)
         elif node.state is NodeState.STOPPING:
             node.failing = False
         elif not node.is_leaving:  # its process is as desired, only how it is watched changes
@@ -175,15 +180,17 @@ class NodesCore:
             case Ended(code=code, reason=reason):
                 self._note(node, f"ended: {reason}")
                 self._end(node, code, reason)
+            case _:
+                assert_never(event)
 
     def _register(self, node: Node) -> None:
         if node.registered_at is None:
             node.registered_at = self._now
         if node.state is NodeState.STARTING:
-            self._become(node, Happening.REGISTER)
+            self._become(node, LifeEvent.REGISTER)
 
     def _beat(self, tag: str) -> bool:
-        """Take a heartbeat; whether it changes anything."""
+        """Handle a heartbeat; return whether it changes anything."""
         node = self._nodes.get(tag)
         if node is None or not node.has_process:
             return False
@@ -191,7 +198,7 @@ class NodesCore:
         if node.state is not NodeState.STUCK:
             return False
         node.ill_at = math.inf
-        self._become(node, Happening.BEAT)
+        self._become(node, LifeEvent.BEAT)
         self._note(node, "its heartbeat is there again")
         return True
 
@@ -207,13 +214,13 @@ class NodesCore:
 
     def _stuck(self, node: Node) -> None:
         node.ill_at = self._now
-        self._become(node, Happening.SILENCE, detail=f"no message on {node.spec.heartbeat} any more")
+        self._become(node, LifeEvent.SILENCE, detail=f"no message on {node.spec.heartbeat} any more")
         again = "; it is restarted" if node.restarts_after(failed=True) else ""
         self._note(node, f"stuck: {node.detail}")
         self._tell(node, f"is stuck: {node.detail}{again}")
 
     def _end(self, node: Node, code: int | None, reason: str, *, hopeless: bool = False) -> None:
-        """A life ended, or could not begin."""
+        """Handle the end of a life, or of an attempt to start one."""
         stopped = node.state is NodeState.STOPPING
         node.pid, node.exit_code = 0, code
         if stopped and node.failing:
@@ -221,7 +228,7 @@ class NodesCore:
         if node.desired is None:
             self._forget(node)
         elif stopped and not node.failing:
-            self._renew(node, Happening.PAUSE)
+            self._renew(node, LifeEvent.PAUSE)
         elif code == 0 and not stopped:
             self._end_well(node)
         elif hopeless or not node.restarts_after(failed=True):
@@ -232,12 +239,12 @@ class NodesCore:
     def _end_well(self, node: Node) -> None:
         node.is_done = True
         if node.restarts_after(failed=False):
-            self._again(node, "ended by itself", failed=False)
+            self._again(node, "ended", failed=False)
         else:
-            self._become(node, Happening.DONE, detail="ended by itself")
+            self._become(node, LifeEvent.DONE, detail="ended")
 
     def _again(self, node: Node, reason: str, *, failed: bool) -> None:
-        """Start a node that ended again, after a pause, unless that was done too often."""
+        """Restart a node that ended, after a delay, unless it was restarted too often."""
         if node.ran_well(self._now):
             node.in_a_row = 0
         limit = node.spec.max_restarts
@@ -245,13 +252,13 @@ class NodesCore:
             self._fail(
                 node,
                 f"{reason}; it was started again {node.in_a_row} times in a row, which is its limit: "
-                "to start it anew, remove it and add it again, or change it",
+                "to start it again, remove it and add it again, or change it",
             )
             return
-        delay = BACKOFF_S[min(node.in_a_row, len(BACKOFF_S) - 1)]
         node.in_a_row += 1
+        delay = BACKOFF.pause_after(node.in_a_row)
         node.pausing, node.failing, node.due = True, failed, self._now + delay
-        self._become(node, Happening.PAUSE, detail=f"{reason}; starts again after {delay:g} s")
+        self._become(node, LifeEvent.PAUSE, detail=f"{reason}; starts again after {delay:g} s")
         self._note(node, f"starts again after {delay:g} s")
         if failed:
             if node.in_a_row == 1:
@@ -260,11 +267,11 @@ class NodesCore:
 
     def _fail(self, node: Node, reason: str) -> None:
         node.failing = True
-        self._become(node, Happening.FAIL, detail=reason.removeprefix("cannot be started: "))
+        self._become(node, LifeEvent.FAIL, detail=reason.removeprefix("cannot be started: "))
         node.told = ""
         self._tell(node, _failure(reason))
 
-    # What is done about it
+    # Instructions
 
     def _end_those_whose_turn_it_is(self) -> None:
         """Nodes that are not desired end in the reverse of their start order, changed ones at once."""
@@ -299,7 +306,7 @@ class NodesCore:
         return node.spec.tag in self._impossible
 
     def _awaited(self, node: Node) -> list[str]:
-        """The nodes before it that are not ready."""
+        """Return the nodes that have to be ready before it and are not."""
         assert node.desired is not None, "one that is not desired is forgotten, not waiting"
         return [tag for tag in node.desired.after if not self._nodes[tag].is_ready]
 
@@ -314,17 +321,17 @@ class NodesCore:
         node.pausing = node.failing = node.is_done = False
         node.started_at, node.registered_at, node.ill_at = self._now, None, math.inf
         node.silent_at = self._now + FIRST_BEAT_WITHIN_S
-        self._become(node, Happening.LAUNCH)
+        self._become(node, LifeEvent.LAUNCH)
         self._out.append(Launch(spec.tag, node.life, spec))
 
     def _halt(self, node: Node, detail: str = "") -> None:
-        self._become(node, Happening.HALT, detail=detail)
+        self._become(node, LifeEvent.HALT, detail=detail)
         self._out.append(Halt(node.spec.tag, node.life, node.share))
 
-    def _renew(self, node: Node, happening: Happening) -> None:
-        """Begin anew with what is desired."""
+    def _renew(self, node: Node, life_event: LifeEvent) -> None:
+        """Start again with the desired specification."""
         assert node.desired is not None
-        self._become(node, happening)
+        self._become(node, life_event)
         node.spec = node.desired
         node.exit_code, node.told = None, ""
         node.restarts = node.in_a_row = 0
@@ -334,8 +341,8 @@ class NodesCore:
         del self._nodes[node.spec.tag]
         self._out.append(Forget(node.spec.tag))
 
-    def _become(self, node: Node, happening: Happening, *, detail: str = "") -> None:
-        node.state = after(node.state, happening)
+    def _become(self, node: Node, life_event: LifeEvent, *, detail: str = "") -> None:
+        node.course.advance(life_event)
         node.detail = detail
 
     def _note(self, node: Node, text: str) -> None:
@@ -346,7 +353,7 @@ class NodesCore:
             node.told = text
             self._out.append(Tell(f"node {node.spec.tag} {text}"))
 
-    # What is worked out
+    # Helpers
 
     def _settles_at(self, node: Node) -> float:
         match node.state:
@@ -358,7 +365,17 @@ class NodesCore:
                 return math.inf
             case NodeState.WAITING if node.pausing and node.due - self._now <= SOON_S:
                 return node.due + REGISTERS_WITHIN_S
-        return -math.inf
+            case (
+                NodeState.RUNNING
+                | NodeState.STOPPING
+                | NodeState.WAITING
+                | NodeState.STUCK
+                | NodeState.EXITED
+                | NodeState.FAILED
+            ):
+                return -math.inf
+            case _:
+                assert_never(node.state)
 
     def _deadline(self, node: Node) -> float:
         return min(self._moments(node), default=math.inf)

@@ -1,11 +1,11 @@
-"""What can happen to a container's nodes (events), and what is to be done about it (instructions)."""
+"""Events of a container's nodes, and the instructions that result from them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rce.control.model import NodeSpec
+from rce.model.specs import NodeSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Refused:
     life: int
     reason: str
     hopeless: bool
-    """Whether trying again would not help: package or executable is not there."""
+    """Whether a retry would not help: the package or executable does not exist."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Registered:
 
 @dataclass(frozen=True, slots=True)
 class Lack:
-    """Exactly these nodes cannot be launched yet, with the reason in words, by tag."""
+    """Exactly these nodes cannot be launched yet, with the reason as text, by tag."""
 
     texts: Mapping[str, str]
 
@@ -66,7 +66,7 @@ class Ended:
     code: int
     """As :attr:`subprocess.Popen.returncode`."""
     reason: str
-    """The end in words."""
+    """How it ended, as text."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ class Halt:
     tag: str
     life: int
     share: float
-    """The part of the usual patience that there is for it: others wait for their turn."""
+    """The share of the usual grace times that it gets: other nodes wait for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ class Note:
 
 @dataclass(frozen=True, slots=True)
 class Forget:
-    """Nothing is left of a node that is not desired."""
+    """An undesired node has ended completely."""
 
     tag: str
 

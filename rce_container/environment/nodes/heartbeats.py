@@ -1,38 +1,36 @@
-"""Listens to the topics by which nodes show that they are well."""
+"""Listens to the heartbeat topics of nodes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from rce.control.model import NodeSpec
+from rce.model.specs import NodeSpec
 from rce.ros import names
-from rce.ros.errors import RosError
-from rce.ros.node import Node, Subscriber
-from rce.ros.tcpros.header import ANY
+from rce_container.environment.graph import Graph, GraphError, Subscription
 
 
 class _Listening(NamedTuple):
     topic: str
-    subscriber: Subscriber
+    subscription: Subscription
 
 
 class Heartbeats:
-    """Subscribes to the heartbeat topics of a container's nodes, whatever their types.
+    """Subscribes to the heartbeat topics of a container's nodes, of any message type.
 
     Args:
-        node: The environment's own node.
-        on_beat: Takes the tag of a node that gave a sign.
+        graph: The container's graph.
+        on_beat: Takes the tag of a node that sent a heartbeat.
         on_fault: A topic cannot be listened to; a text for the user.
     """
 
-    def __init__(self, node: Node, on_beat: Callable[[str], None], on_fault: Callable[[str], None]) -> None:
-        self._node = node
+    def __init__(self, graph: Graph, on_beat: Callable[[str], None], on_fault: Callable[[str], None]) -> None:
+        self._graph = graph
         self._on_beat = on_beat
         self._on_fault = on_fault
         self._listening: dict[str, _Listening] = {}
         self._refused: dict[str, str] = {}
-        """Topics that cannot be listened to, by the nodes' tags; the user was told."""
+        """Topics that cannot be subscribed to, by the nodes' tags; reported to the user."""
 
     async def follow(self, specs: Iterable[NodeSpec]) -> None:
         """Listen to exactly the topics that these nodes name."""
@@ -40,7 +38,7 @@ class Heartbeats:
         for tag, listening in list(self._listening.items()):
             if tag not in wanted or listening.topic != topic_of(wanted[tag]):
                 del self._listening[tag]
-                await listening.subscriber.close()
+                await listening.subscription.close()
         self._refused = {tag: text for tag, text in self._refused.items() if tag in wanted}
         for tag, spec in wanted.items():
             if tag not in self._listening:
@@ -51,15 +49,15 @@ class Heartbeats:
         if not topic or self._refused.get(tag) == topic:
             return
         try:
-            subscriber = await self._node.subscribe_serialized(topic, ANY, lambda *_: self._on_beat(tag))
-        except RosError as error:
+            subscription = await self._graph.listen(topic, lambda: self._on_beat(tag))
+        except GraphError as error:
             self._refused[tag] = topic
             self._on_fault(f"node {tag}: its heartbeat {topic} cannot be listened to: {error}")
             return
-        self._listening[tag] = _Listening(topic, subscriber)
+        self._listening[tag] = _Listening(topic, subscription)
 
 
 def topic_of(spec: NodeSpec) -> str:
-    """The global name of a node's heartbeat topic, which may be relative or private to the node."""
+    """Return the global name of a node's heartbeat topic, which may be relative or private to the node."""
     caller = "/" + "/".join(filter(None, (spec.namespace.strip("/"), spec.name or spec.tag)))
     return names.resolve(spec.heartbeat, caller)

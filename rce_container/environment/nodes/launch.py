@@ -1,4 +1,4 @@
-"""What a node's process is started with: its arguments and its environment."""
+"""The arguments and the environment of a node's process."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from rce.ros.substitution import split_arguments
-from rce_container.environment.bundles import Outfit
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.nodes.system import system_environ
+from rce_container.environment.user_packages import LaunchEnvironment
 
 NODE_MARK = "RCE_NODE"
 """Environment variable that every process of a node carries; its value names one life of one node."""
@@ -25,21 +25,21 @@ class Launch(NamedTuple):
     argv: list[str]
     env: dict[str, str]
     ros_name: str
-    """The global ROS name that it was told to take; empty if it chooses by itself."""
+    """The global ROS name that it is to take; empty if it chooses its own name."""
 
 
-def prepare(outfit: Outfit, mark: str) -> Launch:
+def prepare(launch_environment: LaunchEnvironment, mark: str) -> Launch:
     """Work out how to start a node.
 
     Args:
-        outfit: What it is started with.
+        launch_environment: The folders and variables of its launch.
         mark: The value of :data:`NODE_MARK`.
 
     Raises:
         NodeError: It cannot be started; the text says what to do.
     """
-    spec, packages = outfit.spec, outfit.packages
-    environ: Mapping[str, str] = outfit.environ
+    spec, packages = launch_environment.spec, launch_environment.packages
+    environ: Mapping[str, str] = launch_environment.environ
     try:
         package = packages.find(spec.pkg)
         executable = package.executable(spec.exe)
@@ -50,8 +50,10 @@ def prepare(outfit: Outfit, mark: str) -> Launch:
     if package.python == "system":
         environ = system_environ(environ, package.path)
     env = {**environ, NODE_MARK: mark}
-    if outfit.python_path:
-        env["PYTHONPATH"] = os.pathsep.join(filter(None, (outfit.python_path, env.get("PYTHONPATH", ""))))
+    if launch_environment.python_path:
+        env["PYTHONPATH"] = os.pathsep.join(
+            filter(None, (launch_environment.python_path, env.get("PYTHONPATH", "")))
+        )
     if spec.name:
         arguments.append(f"__name:={spec.name}")
     if namespace:

@@ -1,7 +1,8 @@
-"""The life of a node: its states, what may happen in each, and what follows.
+"""The life cycle of a node: its states, the events of each, and the transitions.
 
-What each state means is said at :class:`rce.control.model.NodeState`. A node has a process exactly while it
-is starting, running, stuck or stopping. One that is not desired any more is forgotten as soon as it has none.
+:class:`rce.control.model.NodeState` describes each state. A node has a process exactly while it
+is starting, running, stuck or stopping. A node that is not desired any more is forgotten as soon as it has no
+process.
 """
 
 from __future__ import annotations
@@ -9,9 +10,10 @@ from __future__ import annotations
 from enum import Enum
 
 from rce.control.model import NodeState
+from rce.lifecycle import LifeCycle
 
 
-class Happening(Enum):
+class LifeEvent(Enum):
     """What can happen to a node."""
 
     LAUNCH = "launch"
@@ -25,7 +27,7 @@ class Happening(Enum):
     HALT = "halt"
     """It is told to end: it is not desired any more, is another one now, or is stuck."""
     DONE = "done"
-    """It ended by itself with exit code 0, and stays so."""
+    """It ended with exit code 0, and stays so."""
     FAIL = "fail"
     """It could not be started or ended in another way, and stays so."""
     PAUSE = "pause"
@@ -34,56 +36,47 @@ class Happening(Enum):
     """It ended for good, and is another one now."""
 
 
-NEXT: dict[NodeState, dict[Happening, NodeState]] = {
-    NodeState.WAITING: {
-        Happening.LAUNCH: NodeState.STARTING,
-        Happening.RENEW: NodeState.WAITING,
+NODE_LIFE: LifeCycle[NodeState, LifeEvent] = LifeCycle(
+    "node",
+    {
+        NodeState.WAITING: {
+            LifeEvent.LAUNCH: NodeState.STARTING,
+            LifeEvent.RENEW: NodeState.WAITING,
+        },
+        NodeState.STARTING: {
+            LifeEvent.REGISTER: NodeState.RUNNING,
+            LifeEvent.SILENCE: NodeState.STUCK,
+            LifeEvent.HALT: NodeState.STOPPING,
+            LifeEvent.DONE: NodeState.EXITED,
+            LifeEvent.FAIL: NodeState.FAILED,
+            LifeEvent.PAUSE: NodeState.WAITING,
+        },
+        NodeState.RUNNING: {
+            LifeEvent.SILENCE: NodeState.STUCK,
+            LifeEvent.HALT: NodeState.STOPPING,
+            LifeEvent.DONE: NodeState.EXITED,
+            LifeEvent.FAIL: NodeState.FAILED,
+            LifeEvent.PAUSE: NodeState.WAITING,
+        },
+        NodeState.STUCK: {
+            LifeEvent.BEAT: NodeState.RUNNING,
+            LifeEvent.HALT: NodeState.STOPPING,
+            LifeEvent.DONE: NodeState.EXITED,
+            LifeEvent.FAIL: NodeState.FAILED,
+            LifeEvent.PAUSE: NodeState.WAITING,
+        },
+        NodeState.STOPPING: {
+            LifeEvent.FAIL: NodeState.FAILED,
+            LifeEvent.PAUSE: NodeState.WAITING,
+        },
+        NodeState.EXITED: {
+            LifeEvent.RENEW: NodeState.WAITING,
+        },
+        NodeState.FAILED: {
+            LifeEvent.RENEW: NodeState.WAITING,
+        },
     },
-    NodeState.STARTING: {
-        Happening.REGISTER: NodeState.RUNNING,
-        Happening.SILENCE: NodeState.STUCK,
-        Happening.HALT: NodeState.STOPPING,
-        Happening.DONE: NodeState.EXITED,
-        Happening.FAIL: NodeState.FAILED,
-        Happening.PAUSE: NodeState.WAITING,
-    },
-    NodeState.RUNNING: {
-        Happening.SILENCE: NodeState.STUCK,
-        Happening.HALT: NodeState.STOPPING,
-        Happening.DONE: NodeState.EXITED,
-        Happening.FAIL: NodeState.FAILED,
-        Happening.PAUSE: NodeState.WAITING,
-    },
-    NodeState.STUCK: {
-        Happening.BEAT: NodeState.RUNNING,
-        Happening.HALT: NodeState.STOPPING,
-        Happening.DONE: NodeState.EXITED,
-        Happening.FAIL: NodeState.FAILED,
-        Happening.PAUSE: NodeState.WAITING,
-    },
-    NodeState.STOPPING: {
-        Happening.FAIL: NodeState.FAILED,
-        Happening.PAUSE: NodeState.WAITING,
-    },
-    NodeState.EXITED: {
-        Happening.RENEW: NodeState.WAITING,
-    },
-    NodeState.FAILED: {
-        Happening.RENEW: NodeState.WAITING,
-    },
-}
+)
 
-WITH_PROCESS = frozenset(state for state, row in NEXT.items() if Happening.PAUSE in row)
+WITH_PROCESS = frozenset(state for state, row in NODE_LIFE.table.items() if LifeEvent.PAUSE in row)
 """The states in which a node has a process."""
-
-
-def after(state: NodeState, happening: Happening) -> NodeState:
-    """The state that follows.
-
-    Raises:
-        ValueError: This cannot happen in that state.
-    """
-    found = NEXT[state].get(happening)
-    if found is None:
-        raise ValueError(f"{happening.value} cannot happen to a node that is {state.value}")
-    return found

@@ -1,4 +1,4 @@
-"""One life of a node: a process group, from its start to the end of all that it started."""
+"""One life of a node: a process group, from its start to the end of all processes that it started."""
 
 from __future__ import annotations
 
@@ -11,40 +11,40 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from rce.control.model import NodeSpec
-from rce_container.environment.bundles import Outfit
+from rce.model.specs import NodeSpec
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.logs.node_log import NodeLog
 from rce_container.environment.logs.pump import Pump
 from rce_container.environment.nodes.events import Ended, Event, Made, Refused
 from rce_container.environment.nodes.launch import NODE_MARK, Launch, prepare
 from rce_container.environment.nodes.reaper import Child, Reaper
-from rce_container.environment.process import strike_all
+from rce_container.environment.process import kill_marked
+from rce_container.environment.user_packages import LaunchEnvironment
 
 _PASSING = frozenset({errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.ETXTBSY, errno.ENOSPC})
-"""Errors for which a start may succeed when it is tried later."""
+"""Errors after which a later start may succeed."""
 _LONGEST_FIRST_LINE = 256
 """Bytes that the kernel reads of it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Workshop:
-    """What nodes are made with."""
+class NodeContext:
+    """The shared context of a container's nodes."""
 
     reaper: Reaper
-    outfit: Callable[[NodeSpec], Outfit]
-    """Says what a node is started with."""
+    launch_environment: Callable[[NodeSpec], LaunchEnvironment]
+    """Returns the launch environment of a node."""
     mark: str
     home: str
     logs: Path
     interrupt_timeout: float
     terminate_timeout: float
     on_change: Callable[[], None]
-    """Some node's status is another one."""
+    """Called when a node's status has changed."""
     on_fault: Callable[[str], None]
     """A node failed; a text for the user."""
     why_killed: Callable[[], Awaitable[str]]
-    """Says why a process ended by SIGKILL just now that nobody here sent; empty if nobody knows."""
+    """Returns why a process ended by a SIGKILL that the environment did not send; empty if unknown."""
 
 
 class NodeLife:
@@ -53,35 +53,35 @@ class NodeLife:
     Args:
         spec: The node.
         life: The life's number.
-        workshop: What it is made with.
+        context: The context shared by all nodes.
         log: Where its output goes.
-        feed: Takes what happens.
+        feed: Takes the events of this life.
     """
 
     def __init__(
-        self, spec: NodeSpec, life: int, workshop: Workshop, log: NodeLog, feed: Callable[[Event], None]
+        self, spec: NodeSpec, life: int, context: NodeContext, log: NodeLog, feed: Callable[[Event], None]
     ) -> None:
         self.pid = 0
         """The process, which is also its group and its session; 0 while there is none."""
         self.ros_name = ""
-        """The global ROS name that it was told to take; empty if it chooses by itself."""
+        """The global ROS name that it is to take; empty if it chooses its own name."""
         self.life = life
         self._spec = spec
-        self._workshop = workshop
+        self._context = context
         self._log = log
         self._feed = feed
         self._halted: asyncio.Future[float] = asyncio.get_running_loop().create_future()
 
     def halt(self, share: float) -> None:
-        """Have it ended by SIGINT, SIGTERM and SIGKILL, with a share of the usual pauses between them."""
+        """End it by SIGINT, SIGTERM and SIGKILL, with a share of the usual grace times between them."""
         if not self._halted.done():
             self._halted.set_result(share)
 
     async def run(self) -> None:
-        """Live. Tells of the beginning when it is known, and of the end when nothing is left."""
-        mark = f"{self._workshop.mark}.{self._spec.tag}.{self.life}"
+        """Run this life. Reports the start when it is known, and the end when no process is left."""
+        mark = f"{self._context.mark}.{self._spec.tag}.{self.life}"
         try:
-            launch = prepare(self._workshop.outfit(self._spec), mark)
+            launch = prepare(self._context.launch_environment(self._spec), mark)
             event = await self._live(launch)
         except NodeError as error:
             event = Refused(self._spec.tag, self.life, str(error), hopeless=True)
@@ -99,7 +99,7 @@ class NodeLife:
                 code, reason = await self._watch(child)
             finally:
                 child.signal_group(signal.SIGKILL)
-                await strike_all(launch.env[NODE_MARK], variable=NODE_MARK)
+                await kill_marked(launch.env[NODE_MARK], variable=NODE_MARK)
         if code and not self._halted.done() and (words := self._log.last_words):
             reason += f"; its last words: {words}"
         return Ended(self._spec.tag, self.life, code, reason)
@@ -108,29 +108,29 @@ class NodeLife:
         with ExitStack() as ends:
             stdout = _pipe(self._log.stdout, pumps, ends)
             stderr = _pipe(self._log.stderr, pumps, ends)
-            child = self._workshop.reaper.spawn(
-                launch.argv, env=launch.env, cwd=self._workshop.home, stdout=stdout, stderr=stderr
+            child = self._context.reaper.spawn(
+                launch.argv, env=launch.env, cwd=self._context.home, stdout=stdout, stderr=stderr
             )
         self.pid, self.ros_name = child.pid, launch.ros_name
         self._feed(Made(self._spec.tag, self.life, child.pid))
         return child
 
     async def _watch(self, child: Child) -> tuple[int, str]:
-        """Wait until it ended, by itself or because it is to; returns its exit code and the end in words."""
+        """Wait until it has ended, by itself or on request; return its exit code and a text about the end."""
         await asyncio.wait((child.ended, self._halted), return_when=asyncio.FIRST_COMPLETED)
         if not child.ended.done():
             return await self._escalate(child, self._halted.result())
         code = child.ended.result()
-        cause = await self._workshop.why_killed() if code == -signal.SIGKILL else ""
+        cause = await self._context.why_killed() if code == -signal.SIGKILL else ""
         return code, cause or describe_exit(code)
 
     async def _escalate(self, child: Child, share: float) -> tuple[int, str]:
-        for number, patience in (
-            (signal.SIGINT, self._workshop.interrupt_timeout),
-            (signal.SIGTERM, self._workshop.terminate_timeout),
+        for number, timeout in (
+            (signal.SIGINT, self._context.interrupt_timeout),
+            (signal.SIGTERM, self._context.terminate_timeout),
         ):
             child.signal_group(number)
-            done, _ = await asyncio.wait((child.ended,), timeout=patience * share)
+            done, _ = await asyncio.wait((child.ended,), timeout=timeout * share)
             if done:
                 return child.ended.result(), f"it was told to by {number.name}"
         child.signal_group(signal.SIGKILL)
@@ -138,7 +138,7 @@ class NodeLife:
 
 
 def _pipe(take: Callable[[bytes], None], pumps: ExitStack, ends: ExitStack) -> int:
-    """Make a pipe; returns the end to write to, which ``ends`` closes, as ``pumps`` do the other."""
+    """Make a pipe; return the write end, which ``ends`` closes. ``pumps`` closes the read end."""
     reading, writing = os.pipe()
     ends.callback(os.close, writing)
     pumps.callback(Pump(reading, take).close)
@@ -146,7 +146,7 @@ def _pipe(take: Callable[[bytes], None], pumps: ExitStack, ends: ExitStack) -> i
 
 
 def describe_exit(code: int) -> str:
-    """Say in words how a process ended."""
+    """Describe how a process ended."""
     if code >= 0:
         return f"exit code {code}"
     try:
@@ -168,7 +168,7 @@ def _in_words(error: OSError) -> str:
 
 
 def _interpreter(script: str) -> str:
-    """What the first line of a script names; empty if there is none."""
+    """Return the interpreter that a script's first line names; empty if it names none."""
     try:
         with Path(script).open("rb") as file:
             line = file.readline(_LONGEST_FIRST_LINE)

@@ -1,4 +1,4 @@
-"""The nodes of a container: does what :mod:`rce_container.environment.nodes.core` decides."""
+"""The nodes of a container: carries out the decisions of :mod:`rce_container.environment.nodes.core`."""
 
 from __future__ import annotations
 
@@ -7,28 +7,30 @@ import math
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from typing import assert_never
 
-from rce.control.model import NodeSpec, NodeStatus
+from rce.control.model import NodeStatus
+from rce.model.specs import NodeSpec
 from rce_container.environment.logs.files import remove_log
 from rce_container.environment.logs.node_log import NodeLog
 from rce_container.environment.nodes import events as e
 from rce_container.environment.nodes.core import NodesCore
-from rce_container.environment.nodes.node_life import NodeLife, Workshop
+from rce_container.environment.nodes.node_life import NodeContext, NodeLife
 
 MAX_DEPARTED = 50
-"""How many logs are kept of nodes that are gone, while their container lives."""
+"""How many logs of removed nodes are kept while their container runs."""
 
 
 class NodeSet:
-    """All nodes of a container, made like the desired ones.
+    """All nodes of a container, kept as desired.
 
     Args:
-        workshop: What nodes are made with.
+        context: The shared context of all nodes.
         tasks: Where the nodes' lives run.
     """
 
-    def __init__(self, workshop: Workshop, tasks: asyncio.TaskGroup) -> None:
-        self._workshop = workshop
+    def __init__(self, context: NodeContext, tasks: asyncio.TaskGroup) -> None:
+        self._context = context
         self._tasks = tasks
         self._loop = asyncio.get_running_loop()
         self._core = NodesCore()
@@ -36,7 +38,7 @@ class NodeSet:
         """The newest life of each node, by tag."""
         self._logs: dict[str, NodeLog] = {}
         self._departed: deque[str] = deque()
-        """Nodes that are gone and whose logs are kept."""
+        """Removed nodes whose logs are kept."""
         self._ros_names: dict[str, str] = {}
         """Tags by the names under which nodes registered with the ROS core."""
         self._timer: asyncio.TimerHandle | None = None
@@ -44,20 +46,20 @@ class NodeSet:
         self._empty.set()
 
     def apply(self, specs: Iterable[NodeSpec]) -> None:
-        """Start nodes that are missing, stop those that are too many, restart those that changed."""
+        """Start missing nodes, stop undesired ones and restart changed ones."""
         self._feed(e.Desire(tuple(specs)))
 
     def lack(self, texts: Mapping[str, str]) -> None:
-        """Hold nodes back that cannot start yet, and let all others go that were held back.
+        """Hold back exactly the nodes that cannot start yet; release all others.
 
         Args:
-            texts: Why not, in words, by tag.
+            texts: The reason as text, by tag.
         """
         self._feed(e.Lack(texts))
 
     @property
     def statuses(self) -> tuple[NodeStatus, ...]:
-        """What there is to report, by tag."""
+        """Return the nodes' statuses, by tag."""
         return self._core.statuses
 
     @property
@@ -67,15 +69,15 @@ class NodeSet:
 
     @property
     def is_settling(self) -> bool:
-        """Whether a node has yet to take up its topics and services, and is likely to do so soon."""
+        """Whether a node has yet to register its topics and services, and is likely to do so soon."""
         return self._core.is_settling(self._loop.time())
 
     def registered(self, ros_name: str) -> bool:
-        """Note that a node of this global ROS name registered; whether one was told to take that name."""
+        """Note that a global ROS name registered; return whether a node was to take that name."""
         return self._note_registered(ros_name, lambda life: life.ros_name == ros_name)
 
     def registered_process(self, ros_name: str, pid: int) -> bool:
-        """Note that a process registered with the ROS core; whether it belongs to one of the nodes."""
+        """Note that a process registered with the ROS core; return whether it belongs to one of the nodes."""
         try:
             session = os.getsid(pid)
         except OSError:
@@ -87,7 +89,7 @@ class NodeSet:
         self._feed(e.Beat(tag))
 
     def log_of(self, ros_name: str) -> NodeLog | None:
-        """The log of the node that registered under a name in ROS; None if there is none."""
+        """Return the log of the node that registered under a name in ROS; None if no node did."""
         return self._logs.get(self._ros_names.get(ros_name, ""))
 
     async def close(self) -> None:
@@ -111,7 +113,7 @@ class NodeSet:
             self._perform(instruction)
         self._set_timer()
         if instructions or not isinstance(event, e.Beat):
-            self._workshop.on_change()
+            self._context.on_change()
 
     def _perform(self, instruction: e.Instruction) -> None:
         match instruction:
@@ -126,19 +128,21 @@ class NodeSet:
                 if tag in self._logs:
                     self._logs[tag].note(text)
             case e.Tell(text=text):
-                self._workshop.on_fault(text)
+                self._context.on_fault(text)
             case e.Forget(tag=tag):
                 self._forget(tag)
+            case _:
+                assert_never(instruction)
 
     def _launch(self, tag: str, number: int, spec: NodeSpec) -> None:
         try:
-            log = self._logs.get(tag) or NodeLog(self._workshop.logs, tag)
+            log = self._logs.get(tag) or NodeLog(self._context.logs, tag)
         except OSError as error:
             text = f"its log cannot be opened: {error.strerror}"
             self._loop.call_soon(self._feed, e.Refused(tag, number, text, hopeless=False))
             return
         self._logs[tag] = log
-        life = self._lives[tag] = NodeLife(spec, number, self._workshop, log, self._feed)
+        life = self._lives[tag] = NodeLife(spec, number, self._context, log, self._feed)
         self._tasks.create_task(life.run(), name=f"node {tag}")
 
     def _forget(self, tag: str) -> None:
@@ -149,7 +153,7 @@ class NodeSet:
         while len(self._departed) > MAX_DEPARTED:
             oldest = self._departed.popleft()
             if oldest not in self._logs and oldest not in self._departed:
-                remove_log(self._workshop.logs, oldest)
+                remove_log(self._context.logs, oldest)
         self._lives.pop(tag, None)
         self._ros_names = {name: owner for name, owner in self._ros_names.items() if owner != tag}
         if not self._core.statuses:
@@ -159,7 +163,7 @@ class NodeSet:
         deadline = self._core.deadline
         if self._timer is not None:
             if not self._timer.cancelled() and self._timer.when() <= deadline:
-                return  # it comes too early at worst, and is set anew then
+                return  # at worst the timer fires too early, and is set again
             self._timer.cancel()
         self._timer = self._loop.call_at(deadline, self._tick) if deadline < math.inf else None
 

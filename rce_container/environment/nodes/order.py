@@ -1,14 +1,14 @@
-"""In which order nodes start and end: what ``after`` of their specifications makes of them. Pure."""
+"""The order in which nodes start and end, from ``after`` in their specifications. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 
-from rce.control.model import NodeSpec
+from rce.model.specs import NodeSpec
 
 
 class StartOrder:
-    """Who comes after whom.
+    """The order of nodes.
 
     Args:
         specs: All nodes of a container.
@@ -18,7 +18,7 @@ class StartOrder:
         self._after: dict[str, tuple[str, ...]] = {spec.tag: spec.after for spec in specs}
 
     def faults(self) -> dict[str, str]:
-        """Which nodes can never start, by their own order alone, each with a text for the user."""
+        """Return the nodes that can never start because of their order, each with a text for the user."""
         return dict(self._faults())
 
     def _faults(self) -> Iterator[tuple[str, str]]:
@@ -33,7 +33,7 @@ class StartOrder:
                 yield tag, f"waits for itself ({' after '.join(circle)}); change 'after' of one of them"
 
     def _circle(self, tag: str) -> list[str] | None:
-        """The shortest way from a node over those before it back to itself."""
+        """Return the shortest cycle from a node over its predecessors back to itself."""
         ways = [[tag]]
         seen = {tag}
         for way in ways:
@@ -47,20 +47,20 @@ class StartOrder:
 
 
 def ready_to_end(leaving: Mapping[str, tuple[str, ...]]) -> set[str]:
-    """Which of the nodes that are to end may do so now: those that no other one of them comes after.
+    """Return which of the nodes that are to end may end now: those that no other one depends on.
 
     Args:
-        leaving: The nodes that are to end and have not yet, with what they were started after.
+        leaving: The nodes that still have to end, with the nodes that they were started after.
 
     Returns:
-        Never nothing, unless nothing is to end: of nodes in a circle, all.
+        Empty only if no node is to end; all nodes of a cycle.
     """
     needed = {before for tag, befores in leaving.items() for before in befores if before != tag}
     return {tag for tag in leaving if tag not in needed} or set(leaving)
 
 
 def levels(leaving: Mapping[str, tuple[str, ...]]) -> int:
-    """How many rounds it takes to end all, each beginning when the one before is over."""
+    """Return how many consecutive rounds it takes to end all nodes."""
     left = dict(leaving)
     count = 0
     while left:

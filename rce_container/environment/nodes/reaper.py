@@ -1,4 +1,4 @@
-"""Starting processes and waiting for them, adopted orphans included."""
+"""Starts processes and waits for them, adopted orphans included."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
-from rce_container.environment.nodes.cradle import Cradle
-from rce_container.environment.process import OF_NODES, die_before_others
+from rce_container.environment.nodes.fork_server import NodeForkServer
+from rce_container.environment.process import OF_NODES, set_oom_score
 
 
 class Child:
@@ -22,7 +22,7 @@ class Child:
         self.pid = pid
         """The process id, which is also its group's and its session's."""
         self.ended = ended
-        """Its exit code; negative for a signal."""
+        """The exit code; negative for a signal."""
         self._process = process
 
     def signal_group(self, number: signal.Signals) -> None:
@@ -41,17 +41,17 @@ class Child:
 
 
 class Reaper:
-    """Waits for every child of this process, so that orphans which the kernel hands to it leave no zombie.
+    """Waits for every child of this process, so that orphans which it adopts leave no zombies.
 
     Use as a context manager in the main thread, one per process, and start processes by :meth:`spawn` only:
-    it collects exit codes that nobody else will see then.
+    it collects the exit codes of all children, which then nothing else can read.
 
     Args:
-        cradle: Starts the processes that it can; None for none.
+        node_server: Starts the processes that it can; None for none.
     """
 
-    def __init__(self, cradle: Cradle | None = None) -> None:
-        self._cradle = cradle
+    def __init__(self, node_server: NodeForkServer | None = None) -> None:
+        self._node_server = node_server
         self._children: dict[int, Child] = {}
         self._before: Any = None
 
@@ -74,11 +74,11 @@ class Reaper:
             OSError: It cannot be started.
         """
         ended: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-        if self._cradle is not None:
-            pid = self._cradle.spawn(argv, env=env, cwd=cwd, stdout=stdout, stderr=stderr)
+        if self._node_server is not None:
+            pid = self._node_server.spawn(argv, env=env, cwd=cwd, stdout=stdout, stderr=stderr)
             if pid:
                 return self._keep(Child(pid, ended))
-        process = subprocess.Popen(  # noqa: S603 - what a user's package offers is what runs here
+        process = subprocess.Popen(  # noqa: S603 - runs the programs of users' packages
             argv,
             env=env,
             cwd=cwd,
@@ -87,7 +87,7 @@ class Reaper:
             stderr=stderr,
             start_new_session=True,
         )
-        die_before_others(OF_NODES, process.pid)
+        set_oom_score(OF_NODES, process.pid)
         return self._keep(Child(process.pid, ended, process))
 
     def spawn_attached(
@@ -106,7 +106,7 @@ class Reaper:
             env: All of its environment variables.
             cwd: Where it starts.
             streams: The descriptors.
-            terminal: The first of them becomes the session's terminal.
+            terminal: Whether the first of them becomes the session's terminal.
 
         Raises:
             OSError: It cannot be started.
@@ -123,7 +123,7 @@ class Reaper:
             start_new_session=True,
             preexec_fn=_take_terminal if terminal else None,  # noqa: PLW1509 - no other way; one system call
         )
-        die_before_others(OF_NODES, process.pid)
+        set_oom_score(OF_NODES, process.pid)
         return self._keep(Child(process.pid, ended, process))
 
     def _keep(self, child: Child) -> Child:

@@ -8,17 +8,17 @@ from collections.abc import Mapping
 from pathlib import Path
 
 ROS_PREFIXES = Path("/opt/ros")
-"""Where ROS distributions install themselves; Debian's own ROS lies in ``/usr``."""
+"""Where ROS distributions are installed; Debian's own ROS is in ``/usr``."""
 
 _ENGINE_ONLY = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
 
 
 def system_environ(environ: Mapping[str, str], package: Path) -> dict[str, str]:
-    """Return what a node of a ROS package gets: ``python3`` is the machine's, ROS is found where it is.
+    """Return the variables of a node of a ROS package: with the machine's ``python3`` and its ROS.
 
     Args:
         environ: The environment of the engine's own nodes.
-        package: The package's folder: of several distributions the one that holds it is chosen.
+        package: The package's folder; selects the distribution that contains it.
     """
     engine = str(Path(sys.executable).parent)
     env = {name: value for name, value in environ.items() if name not in _ENGINE_ONLY}
@@ -36,7 +36,7 @@ def _distribution(package: Path) -> Path | None:
 
 
 def _distribution_environ(prefix: Path, path: str) -> dict[str, str]:
-    """What the distribution's ``setup.sh`` would set."""
+    """Return the variables that the distribution's ``setup.sh`` would set."""
     return {
         "PATH": f"{prefix / 'bin'}{os.pathsep}{path}",
         "PYTHONPATH": str(prefix / "lib" / "python3" / "dist-packages"),

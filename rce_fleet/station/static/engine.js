@@ -1,4 +1,4 @@
-// What carries the fleet: containers with what they use, their nodes, and advice; or the nodes of a ROS graph.
+// The engine's state: containers with usage, nodes and advice; or the nodes of a ROS graph.
 
 const TONE = {
   running: "good", connected: "good", placed: "warn", starting: "warn", requested: "warn", waiting: "warn",
@@ -20,7 +20,7 @@ function stateLine(label, state, detail = "") {
   return item;
 }
 
-// A bar for a share of a limit; only words where there is no limit.
+// A bar for the used share of a limit; only text without a limit.
 function bar(name, used, limit, words) {
   const line = element("div", "", "use");
   line.append(element("span", name, "quiet"));
@@ -56,7 +56,7 @@ function adviceLine(advice) {
 }
 
 function containerItem(container) {
-  const place = container.moving_to ? `${container.machine}, is being handed over to ${container.moving_to}` : container.machine;
+  const place = container.moving_to ? `${container.machine}, moving to ${container.moving_to}` : container.machine;
   const item = stateLine(container.tag, container.state, place);
   if (container.usage) item.append(uses(container.usage));
   for (const advice of container.advice ?? []) item.append(adviceLine(advice));
@@ -66,7 +66,7 @@ function containerItem(container) {
   return item;
 }
 
-// A machine and how much of it is promised.
+// A machine and its reserved resources.
 function machineItem(machine) {
   const state = !machine.connected ? "away" : machine.draining ? "draining" : "connected";
   const item = stateLine(machine.machine, state, `${machine.containers} containers`);
@@ -99,7 +99,7 @@ function engineItems(engine) {
   ];
 }
 
-// The list that shows an engine's (or a ROS graph's) state, or why it is not known.
+// The list with the state of an engine or ROS graph, or the error that prevents reading it.
 export function engineList(engine) {
   if (engine.error) return element("p", engine.error, "bad");
   const list = element("ul");

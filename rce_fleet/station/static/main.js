@@ -1,4 +1,4 @@
-// Joins model, view and panel with the station: a socket for what happens, HTTP for what the operator wants.
+// Connects model, view and panel to the station: a WebSocket for changes, HTTP for the operator's requests.
 
 import { Fleet } from "./model.js";
 import { Panel } from "./panel.js";
@@ -109,7 +109,7 @@ document.querySelector("#logout").addEventListener("click", async () => {
 const LOGIN_ENDED = 1008;
 
 function connect(delay = 500) {
-  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/live`);
+  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/live?changes=1`);
   let opened = false;
   socket.addEventListener("open", () => {
     opened = true;
@@ -119,6 +119,8 @@ function connect(delay = 500) {
   socket.addEventListener("message", (event) => {
     const received = JSON.parse(event.data);
     fleet.apply(received);
+    // A change is missing; the next connection begins with the complete state.
+    if (received.type === "changes" && fleet.isBehind) socket.close();
   });
   socket.addEventListener("close", ({ code }) => {
     if (code === LOGIN_ENDED) return location.replace("/login");

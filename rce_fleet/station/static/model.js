@@ -1,4 +1,5 @@
-// What the page knows of the fleet. Fed by messages of the station's socket; knows nothing of the screen.
+// The page's model of the fleet, updated by messages of the station's WebSocket; independent of the screen.
+// The station sends the complete state first (map, state, poses), then numbered changes.
 
 export const TRAIL_LENGTH = 240;
 
@@ -10,6 +11,8 @@ export class Fleet extends EventTarget {
   pending = new Set();
   engine = null;
   selected = null;
+  sequence = 0;        // number of the last change that is known
+  isBehind = false;    // a change is missing: everything is needed again
 
   apply(message) {
     const handler = this[`on_${message.type}`];
@@ -25,7 +28,10 @@ export class Fleet extends EventTarget {
   }
 
   on_state(message) {
-    for (const [text, tone] of this.#news(message)) this.#tell(text, tone);
+    this.sequence = message.sequence;
+    this.isBehind = false;
+    for (const [text, tone] of this.#cellNews(message)) this.#tell(text, tone);
+    for (const [text, tone] of this.#robotNews(message.robots)) this.#tell(text, tone);
     this.blocked = new Set(message.blocked);
     this.pending = new Set(message.pending);
     const present = new Set();
@@ -34,9 +40,28 @@ export class Fleet extends EventTarget {
       Object.assign(this.#robot(state.id), state);
     }
     for (const id of this.robots.keys()) {
-      if (!present.has(id)) this.robots.delete(id);
+      if (!present.has(id)) this.#remove(id);
     }
-    if (this.selected && !present.has(this.selected)) this.selected = null;
+  }
+
+  on_changes(message) {
+    this.isBehind ||= message.sequence !== this.sequence + 1;
+    if (this.isBehind) return;
+    this.sequence = message.sequence;
+    for (const cell of message.blocked) if (!this.blocked.has(cell)) this.#tell(`cell ${cell} is blocked`, "warn");
+    for (const cell of message.freed) if (this.blocked.has(cell)) this.#tell(`cell ${cell} is free`, "good");
+    for (const [text, tone] of this.#robotNews(message.robots)) this.#tell(text, tone);
+    for (const cell of [...message.pending, ...message.freed]) this.blocked.delete(cell);
+    for (const cell of [...message.blocked, ...message.freed]) this.pending.delete(cell);
+    for (const cell of message.blocked) this.blocked.add(cell);
+    for (const cell of message.pending) this.pending.add(cell);
+    for (const state of message.robots) Object.assign(this.#robot(state.id), state);
+    for (const id of message.removed) this.#remove(id);
+  }
+
+  #remove(id) {
+    this.robots.delete(id);
+    if (this.selected === id) this.selected = null;
   }
 
   on_poses(message) {
@@ -61,22 +86,25 @@ export class Fleet extends EventTarget {
     this.#tell(message.text, message.tone);
   }
 
-  // What an operator should read of a new state.
-  *#news(message) {
-    if (this.blocked.size) {
-      for (const cell of message.blocked) if (!this.blocked.has(cell)) yield [`cell ${cell} is blocked`, "warn"];
-      const left = new Set([...message.blocked, ...message.pending]);
-      for (const cell of this.blocked) if (!left.has(cell)) yield [`cell ${cell} is free`, "good"];
-    }
-    for (const state of message.robots) {
+  // Events for the operator from the cells of a complete state.
+  *#cellNews(message) {
+    if (!this.blocked.size) return;
+    for (const cell of message.blocked) if (!this.blocked.has(cell)) yield [`cell ${cell} is blocked`, "warn"];
+    const left = new Set([...message.blocked, ...message.pending]);
+    for (const cell of this.blocked) if (!left.has(cell)) yield [`cell ${cell} is free`, "good"];
+  }
+
+  // Events for the operator from robots that changed.
+  *#robotNews(robots) {
+    for (const state of robots) {
       const before = this.robots.get(state.id);
       if (!before) continue;
       if (state.replans > before.replans) yield [`${state.id} gets a new path`, "warn"];
       if (state.state === before.state) continue;
       if (state.state === "arrived") yield [`${state.id} is at its goal, cell ${state.goal}`, "good"];
-      if (state.state === "unreachable") yield [`no way leads ${state.id} to cell ${state.goal}`, "bad"];
+      if (state.state === "unreachable") yield [`no path leads ${state.id} to cell ${state.goal}`, "bad"];
       if (state.state === "silent") yield [`${state.id} is silent: ${state.reason}`, "bad"];
-      if (before.state === "silent") yield [`${state.id} is heard again`, "good"];
+      if (before.state === "silent") yield [`${state.id} sends messages again`, "good"];
     }
   }
 
@@ -120,7 +148,7 @@ export class Fleet extends EventTarget {
   }
 }
 
-// A colour that stays with a robot: chosen ones for the first, then hues spread by the golden angle.
+// A fixed colour for each robot: chosen ones for the first, then hues spread by the golden angle.
 const COLOURS = ["#2a7de1", "#d9480f", "#0f9d76", "#9c36b5", "#c2255c", "#5f7d0e", "#0b7285", "#7048e8"];
 
 export function colourOf(id) {

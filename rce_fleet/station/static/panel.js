@@ -3,6 +3,7 @@
 import { element, engineList } from "./engine.js";
 import { colourOf } from "./model.js";
 
+const DRAW_EVERY_MS = 200;
 const TROUBLE = new Set(["unreachable", "silent", "stopping"]);
 
 export class Panel {
@@ -14,11 +15,19 @@ export class Panel {
     this.events = document.querySelector("#events");
     this.summary = document.querySelector("#summary");
     for (const type of ["state", "selected"]) fleet.addEventListener(type, () => this.drawRobots());
+    fleet.addEventListener("changes", () => this.#drawRobotsSoon());
     fleet.addEventListener("engine", () => this.drawEngine());
     setInterval(() => this.drawRobots(), 1000);
   }
 
+  // Changes come up to ten times a second; the table is drawn less often.
+  #drawRobotsSoon() {
+    this.drawing ??= setTimeout(() => this.drawRobots(), DRAW_EVERY_MS);
+  }
+
   drawRobots() {
+    clearTimeout(this.drawing);
+    this.drawing = null;
     const robots = [...this.fleet.robots.values()];
     robots.sort((a, b) => TROUBLE.has(b.state) - TROUBLE.has(a.state) || a.id.localeCompare(b.id, "en", { numeric: true }));
     this.body.replaceChildren(...robots.map((robot) => this.#row(robot)));

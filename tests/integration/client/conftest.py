@@ -5,23 +5,26 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
-from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from ssl import SSLContext
+from typing import TYPE_CHECKING, Protocol
 
 import pytest
-from support.cloud import PASSWORD, Cloud, running_cloud
+from support.cloud import PASSWORD, Cloud, PeerInterface, content_of, running_cloud
 
-from rce_client.backoff import Backoff
-from rce_client.connection import Connection
-from rce_client.courier import Timing
-from rce_robot.websocket import RobotSocket
+from rce.aio.backoff import Backoff
+from rce.model.requests import ConfigureComponents
+from rce_client.connection import Connection, State
+from rce_client.engine_transport import Timing
+from rce_robot.doors.client.websocket import RobotSocket
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from rce.control.messages import ClientRequest
 
-TIMING = Timing(backoff=Backoff(first=0.01, cap=0.05), ping_interval=None, close=1.0)
+TIMING = Timing(backoff=Backoff(first=0.01, longest=0.05, jitter=1.0), ping_interval=None, close=1.0)
 
 
 class Door:
@@ -43,8 +46,14 @@ class Door:
         await writer.wait_closed()
 
 
+class OpenDoor(Protocol):
+    """Opens a door; see :func:`open_door`."""
+
+    def __call__(self, ssl: SSLContext | None = None) -> AbstractAsyncContextManager[Door]: ...
+
+
 @asynccontextmanager
-async def open_door(ssl: Any = None) -> AsyncIterator[Door]:
+async def open_door(ssl: SSLContext | None = None) -> AsyncIterator[Door]:
     door = Door()
     server = await asyncio.start_server(door.serve, "127.0.0.1", 0, ssl=ssl)
     async with server:
@@ -66,15 +75,17 @@ class Engine:
     async def _answer(self, request: ClientRequest) -> tuple[str, ...]:
         robot = request.id.partition("/")[2]
         errors = []
-        for item in request.data.get("addInterfaces", ()):
-            tag = item["interfaceTag"]
-            if tag in self.refuse:
-                errors.append(self.refuse[tag])
-            elif item["endpointTag"] == robot and f"{robot}_{tag}" not in self.cloud.ends:
-                await self.cloud.wire(tag, item["interfaceType"], item["className"], robot=robot)
+        content = content_of(request)
+        added = content.add_interfaces if isinstance(content, ConfigureComponents) else ()
+        for item in added:
+            spec = item.interface
+            if spec.tag in self.refuse:
+                errors.append(self.refuse[spec.tag])
+            elif item.endpoint == robot and f"{robot}_{spec.tag}" not in self.cloud.ends:
+                await self.cloud.wire(spec.tag, spec.type, spec.message_type, robot=robot)
         return tuple(errors)
 
-    def end(self, tag: str) -> Any:
+    def end(self, tag: str) -> PeerInterface:
         return self.cloud.ends[f"testRobot_{tag}"]
 
     async def kick(self) -> None:
@@ -84,8 +95,26 @@ class Engine:
             socket.abort()
         await self.master.changed.until(lambda: len(self.master.left) > before)
 
-    def connection(self, **options: Any) -> Connection:
-        return Connection(self.door.url, "testUser", PASSWORD, "testRobot", timing=TIMING, **options)
+    def stop_reading(self) -> None:
+        """Take nothing more from the robot's connection, until that is broken."""
+        for socket in _server_sockets():
+            socket.transport.pause_reading()
+
+    def connection(
+        self,
+        *,
+        on_error: Callable[[str], None] | None = None,
+        on_state: Callable[[State, str], None] | None = None,
+    ) -> Connection:
+        return Connection(
+            self.door.url,
+            "testUser",
+            PASSWORD,
+            "testRobot",
+            timing=TIMING,
+            on_error=on_error,
+            on_state=on_state,
+        )
 
 
 def _server_sockets() -> list[RobotSocket]:
@@ -105,5 +134,5 @@ async def engine(door: Door) -> AsyncIterator[Engine]:
 
 
 @pytest.fixture(name="open_door")
-def _open_door() -> Any:
+def _open_door() -> OpenDoor:
     return open_door

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
 
 import pytest
 
@@ -14,7 +13,7 @@ from rce.ros.node import Node
 from rce_client.ros_bridge.type_lookup import find_types
 
 
-def bridge(**keys: Any) -> Bridge:
+def bridge(**keys: object) -> Bridge:
     return Bridge.model_validate(keys)
 
 
@@ -62,10 +61,10 @@ async def test_types_are_read_as_nodes_appear() -> None:
 async def test_what_the_graph_does_not_tell_is_named() -> None:
     async with Core(port=0) as core, node("asker", core) as asker:
         with pytest.raises(ConfigError) as caught:
-            await find_types({4: TOPIC}, asker, "file", lambda _: None, patience=0.1)
+            await find_types({4: TOPIC}, asker, "file", lambda _: None, timeout=0.1)
         assert str(caught.value) == (
-            "file: bridges[4].type: is missing, and within 0.1 s no node of the robot's graph told that of "
-            "topic pose; start the node first, or give the type"
+            "file: bridges[4].type: is missing, and no node of the robot's graph had the type of topic pose "
+            "within 0.1 s; start the node first, or give the type"
         )
         with pytest.raises(ConfigError, match="topic /a has no end at the robot"):
             await find_types({0: INNER}, asker, "file", lambda _: None)

@@ -7,8 +7,11 @@ import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.cloud import PASSWORD
 
-from rce.link import PeerFault
+from rce.link import PeerFaultError
+from rce.protocol import codec
+from rce_client import Serialized
 from rce_client.connection import Connection, State
 from rce_client.exceptions import (
     CallError,
@@ -20,7 +23,7 @@ from rce_client.exceptions import (
 from rce_client.reminder import Reminder
 
 if TYPE_CHECKING:
-    from tests.integration.client.conftest import Door, Engine
+    from integration.client.conftest import Door, Engine
 
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"
@@ -53,7 +56,8 @@ async def test_publisher_and_subscriber(engine: Engine) -> None:
         assert received == ["one", "two"]
 
 
-async def test_a_program_that_is_started_again_gets_the_latched_message(engine: Engine) -> None:
+async def test_restarted_program_gets_the_latched_message(engine: Engine) -> None:
+    """A program that is started again gets the latched message."""
     async with engine.connection() as conn:
         await conn.subscriber("hear", STRING)
         await conn.wait_active("hear", 10)
@@ -69,7 +73,7 @@ async def test_a_program_that_is_started_again_gets_the_latched_message(engine: 
 
 
 async def test_raw_publisher_and_subscriber(engine: Engine) -> None:
-    got: asyncio.Queue[bytes] = asyncio.Queue()
+    got: asyncio.Queue[Serialized] = asyncio.Queue()
     async with engine.connection() as conn:
         publisher = await conn.publisher("say", STRING, raw=True)
         await conn.subscriber("hear", STRING, got.put_nowait, raw=True)
@@ -118,6 +122,24 @@ async def test_service_client(engine: Engine) -> None:
         assert not conn.errors
 
 
+async def test_failed_call_is_known_from_the_text_of_an_older_engine(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An engine of the release before says in words only which call failed."""
+    monkeypatch.setattr(codec, "write_report", lambda report: {"type": "ER", "data": report.text})
+
+    async def answer(payload: bytes) -> bytes:
+        raise ValueError("no such thing")
+
+    async with engine.connection() as conn:
+        client = await conn.service_client("ask", ECHO)
+        await client.wait_active(10)
+        engine.end("ask").answer = answer
+        with pytest.raises(CallError, match="no such thing"):
+            await client({"data": "fail"})
+        assert not conn.errors
+
+
 async def test_service_provider(engine: Engine) -> None:
     async def handler(request: dict[str, Any]) -> dict[str, Any]:
         if request["data"] == "fail":
@@ -135,7 +157,7 @@ async def test_service_provider(engine: Engine) -> None:
 
 
 async def test_an_answer_that_cannot_be_sent_fails_its_caller(engine: Engine) -> None:
-    """The connection goes on, too: the next call is answered."""
+    """The connection continues, too: the next call is answered."""
 
     def handler(request: dict[str, Any]) -> dict[str, Any]:
         return {"data": object() if request["data"] == "bad" else "good"}
@@ -143,7 +165,7 @@ async def test_an_answer_that_cannot_be_sent_fails_its_caller(engine: Engine) ->
     async with engine.connection() as conn:
         provider = await conn.service_provider("serve", ECHO, handler)
         await provider.wait_active(10)
-        with pytest.raises(PeerFault, match="the answer cannot be sent"):
+        with pytest.raises(PeerFaultError, match="the answer cannot be sent"):
             await engine.end("serve").port.call(ros_string("bad"))
         assert await engine.end("serve").port.call(ros_string("x")) == ros_string("good")
 
@@ -229,10 +251,12 @@ async def test_a_robot_id_in_use_is_told_at_once_and_again(
     engine: Engine, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Who has it is told, and the second client comes in when the first is gone."""
-    monkeypatch.setattr(Reminder.__init__, "__defaults__", (0.1, *Reminder.__init__.__defaults__[1:]))
+    defaults = Reminder.__init__.__defaults__
+    assert defaults is not None
+    monkeypatch.setattr(Reminder.__init__, "__defaults__", (0.1, *defaults[1:]))
 
     def told() -> list[str]:
-        return [record.message for record in caplog.records if "robotID is free" in record.message]
+        return [record.message for record in caplog.records if "until it is free" in record.message]
 
     async with asyncio.timeout(30):
         async with engine.connection():
@@ -348,3 +372,62 @@ async def test_a_refusal_on_the_way_back_closes_the_connection(engine: Engine) -
         with pytest.raises(RefusedError):
             await conn.create_container("c1")
         assert conn.state is State.CLOSED
+
+
+# Cancelling
+
+
+async def stall(engine: Engine, conn: Connection) -> None:
+    """Fill what the network takes: what is sent from now on waits in the queue of the connection."""
+    say = await conn.publisher("stalled", STRING, raw=True)
+    await say.wait_active(10)
+    engine.stop_reading()
+    say.publish(bytes(32 << 20))
+    while conn._session.transport._queue:  # until it is in the socket, as far as it goes
+        await asyncio.sleep(0)
+
+
+async def test_a_cancelled_request_is_sent_after_the_reconnect(engine: Engine) -> None:
+    async with engine.connection() as conn:
+        await conn.create_container("c1")
+        await stall(engine, conn)
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.1):
+                await conn.destroy_container("c1")
+        await engine.kick()
+        requests = engine.master.requests
+        await engine.master.changed.until(lambda: any(type_ == "DC" for _, type_, _ in requests))
+        assert conn.connected
+
+
+async def test_an_interface_whose_making_was_cancelled_can_be_made(engine: Engine) -> None:
+    async with engine.connection() as conn:
+        making = asyncio.create_task(conn.publisher("say", STRING))
+        await asyncio.sleep(0)
+        making.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await making
+        await conn.wait_active("say", 10)
+        publisher = await conn.publisher("say", STRING)
+        assert publisher.publish({"data": "up"})
+        assert await engine.end("say").received.get() == ros_string("up")
+
+
+async def test_leaving_can_be_cancelled_while_messages_wait(engine: Engine) -> None:
+    conn = await engine.connection().__aenter__()
+    await stall(engine, conn)
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(0.1):
+            await conn.__aexit__(None, None, None)
+    assert conn.state is State.CLOSED
+    with pytest.raises(NotConnectedError):
+        await conn.create_container("c1")
+
+
+async def test_of_several_masters_the_first_that_answers_is_used(engine: Engine) -> None:
+    nowhere = "http://127.0.0.1:1/"
+    for masters in ([nowhere, engine.door.url], f"{nowhere},{engine.door.url}"):
+        connection = Connection(masters, "testUser", PASSWORD, "testRobot")
+        async with asyncio.timeout(30), connection:
+            assert connection.connected
+        await engine.cloud.master.changed.until(lambda: not engine.cloud.master.inside)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import ssl
 import subprocess
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -15,7 +15,7 @@ from rce_client.exceptions import RefusedError, UnavailableError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.integration.client.conftest import Door
+    from integration.client.conftest import Door, OpenDoor
 
 
 async def test_asks_for_user_and_version(door: Door) -> None:
@@ -72,7 +72,7 @@ async def test_nobody_there() -> None:
         await locate(f"http://127.0.0.1:{port}/", "u")
 
 
-async def test_https(open_door: Any, tmp_path: Path) -> None:
+async def test_https(open_door: OpenDoor, tmp_path: Path) -> None:
     cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
     subprocess.run(
         f"openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 1 -keyout {key}"

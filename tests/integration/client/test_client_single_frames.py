@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce_client.ends import ServiceClient
-from rce_robot import gate
-from rce_robot.websocket import RobotSocket
+from rce_client import Serialized
+from rce_robot.doors.client import gate
+from rce_robot.doors.client.websocket import RobotSocket
 
 if TYPE_CHECKING:
-    from tests.integration.client.conftest import Engine
+    from integration.client.conftest import Engine
 
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"
@@ -31,7 +31,7 @@ class Counted:
                 self.texts += b'"DM"' in bytes(data)
             else:
                 self.marks.append(bytes(data[:1]))
-            deliver(socket, opcode, data)  # type: ignore[arg-type]
+            deliver(socket, opcode, data)  # type: ignore[arg-type]  # it asks for an Opcode of its own
 
         patch.setattr(RobotSocket, "_deliver", delivered)
 
@@ -44,7 +44,7 @@ async def test_raw_topics_and_services(engine: Engine, monkeypatch: pytest.Monke
         monkeypatch.setattr(gate, "read_features", lambda _query: frozenset())
     got: asyncio.Queue[bytes] = asyncio.Queue()
 
-    async def reverse(request: memoryview) -> bytes:
+    async def reverse(request: Serialized) -> bytes:
         return bytes(request)[::-1]
 
     async def double(payload: bytes) -> bytes:
@@ -54,7 +54,7 @@ async def test_raw_topics_and_services(engine: Engine, monkeypatch: pytest.Monke
         assert conn.takes_single_frames is known
         publisher = await conn.publisher("say", STRING, raw=True)
         await conn.subscriber("hear", STRING, lambda message: got.put_nowait(bytes(message)), raw=True)
-        client: ServiceClient[bytes] = await conn.service_client("ask", ECHO, raw=True)
+        client = await conn.service_client("ask", ECHO, raw=True)
         await conn.service_provider("serve", ECHO, reverse, raw=True)
         for tag in ("say", "hear", "ask", "serve"):
             await conn.wait_active(tag, 30)
@@ -87,7 +87,7 @@ async def test_form_is_agreed_on_again_with_each_connection(
         assert await engine.end("say").received.get() == b"one"
         monkeypatch.setattr(gate, "read_features", lambda _query: frozenset())
         await engine.kick()
-        await conn._until(lambda: not conn.takes_single_frames)
+        await conn._session.until(lambda: not conn.takes_single_frames)
         await publisher.wait_active(30)
         publisher.publish(b"two")
         assert await engine.end("say").received.get() == b"two"

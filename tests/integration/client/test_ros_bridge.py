@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from tests.integration.client.conftest import Engine
+    from integration.client.conftest import Engine
 
 STRING = "std_msgs/String"
 EMPTY = "std_srvs/SetBool"
@@ -97,15 +97,14 @@ async def program(*arguments: str, master: str = "http://127.0.0.1:1/") -> Async
         await finish(process)
 
 
-def write(folder: Path, data: Any) -> str:
+def write(folder: Path, data: object) -> str:
     path = folder / "robot.config"
     path.write_text(json.dumps(data))
     return str(path)
 
 
-async def test_messages_and_calls_pass_both_ways_and_everything_is_removed(
-    engine: Engine, tmp_path: Path
-) -> None:
+async def test_messages_and_calls_pass_both_ways(engine: Engine, tmp_path: Path) -> None:
+    """Messages and calls pass both ways and everything is removed."""
     path = write(tmp_path, config(engine.door.url))
     async with Core(host="127.0.0.1", port=0) as core, program(path, master=core.uri) as bridge:
         assert "rce-ros ready: robot testRobot connected" in await bridge.until("ready")
@@ -174,9 +173,8 @@ async def test_a_refusal_ends_the_program(engine: Engine, tmp_path: Path) -> Non
         assert "Wrong user or password" in "".join(bridge.lines)
 
 
-async def test_a_bad_file_is_refused_with_every_fault_and_nothing_is_sent(
-    engine: Engine, tmp_path: Path
-) -> None:
+async def test_bad_file_is_refused_with_every_fault(engine: Engine, tmp_path: Path) -> None:
+    """A bad file is refused with every fault and nothing is sent."""
     data = config(engine.door.url)
     for number in (1, 2):
         data["interfaces"][number] |= {"iCls": f"no_such/Type{number}"}
@@ -207,7 +205,7 @@ async def test_check_only_tells_what_is_in_the_file(engine: Engine, tmp_path: Pa
 async def test_joined_graph_takes_the_master_when_it_comes() -> None:
     said: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("rce_client.ros_bridge.bridge.MASTER_PATIENCE", 0.05)
+        patch.setattr("rce_client.ros_bridge.bridge.MASTER_TIMEOUT", 0.05)
         async with Core(host="127.0.0.1", port=0) as core:
             uri = core.uri
         waiting = asyncio.Event()

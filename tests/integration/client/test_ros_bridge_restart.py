@@ -6,18 +6,17 @@ import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
+from integration.client.test_ros_bridge import EMPTY, STRING, config, program, ros_string, write
 from support.ports import free_port
 from support.ros_real import GRAPHS
 
 from rce.ros.node import Node
-from tests.integration.client.test_ros_bridge import EMPTY, STRING, config, program, ros_string, write
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from integration.client.conftest import Engine
     from support.ros_real import Graph
-
-    from tests.integration.client.conftest import Engine
 
 
 async def everything_flows(graph: Graph, engine: Engine) -> None:

@@ -11,20 +11,26 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from support.containers import ECHO, Machine, until
-from support.leaks import footprint
 
-from rce.control.model import EndpointState, NodeSpec, NodeState, RestartPolicy
+from rce.control.model import EndpointState, NodeState
+from rce.model.specs import NodeSpec, RestartPolicy
+from tools.leaks import footprint
 
 BOX = "user/box"
 MB = 1 << 20
 
 
-def own(exe: str, args: str = "", tag: str = "node", **parts: Any) -> NodeSpec:
-    return NodeSpec(tag=tag, pkg="own", exe=exe, args=args, **parts)
+def own(
+    exe: str,
+    args: str = "",
+    tag: str = "node",
+    restart: RestartPolicy = RestartPolicy.NEVER,
+    max_restarts: int = 5,
+) -> NodeSpec:
+    return NodeSpec(tag=tag, pkg="own", exe=exe, args=args, restart=restart, max_restarts=max_restarts)
 
 
 async def running(machine: Machine, id_: str = BOX) -> None:
@@ -48,7 +54,7 @@ BROKEN = {
     "imports.py": ("import no_such_module\n", 0o755, "No module named 'no_such_module'"),
     "closed": ("#!/bin/sh\n", 0o644, "may not be executed (chmod +x makes it so)"),
     "stranger": ("#!/no/such/interpreter\n", 0o755, "/no/such/interpreter"),
-    "text": ("this is no program\n", 0o755, "its first line must name"),
+    "text": ("this is not a program\n", 0o755, "its first line must name"),
 }
 
 
@@ -153,7 +159,9 @@ async def test_a_full_disk_is_told_and_nothing_else_is_lost(machine: Machine, sm
         text = await fault(machine, "container box", "cannot be started", os.strerror(errno.ENOSPC))
         assert f"{machine.folder}/state" in text, text
         assert len(machine.containers) == 1, "a container that cannot be started left its folder"
-        assert {cell.name for cell in machine.cells()} <= {path.name for path in machine.containers}
+        assert {control_group.name for control_group in machine.control_groups()} <= {
+            path.name for path in machine.containers
+        }
         assert (await machine.node_is("user/first", "echo", NodeState.RUNNING)).restarts == 0
         ballast.unlink()
         await machine.node_is(BOX, "echo", NodeState.RUNNING)

@@ -14,11 +14,12 @@ import pytest
 from support.containers import Machine, program_of, until
 
 from rce.control.messages import Drop
-from rce.control.model import EndpointState, NodeSpec, NodeState, Resources
+from rce.control.model import EndpointState, NodeState
+from rce.model.specs import NodeSpec, Resources
 from rce_container.environment import proc
 from rce_container.folder import ContainerFolder
+from rce_container.incarnation import Incarnation
 from rce_container.runtimes.namespace import NamespaceRuntime
-from rce_container.unit import Unit
 
 BOX = "user/box"
 MB = 1 << 20
@@ -38,9 +39,9 @@ class Stage:
         self._stopped: list[int] = []
 
     @property
-    def unit(self) -> Unit:
-        (unit,) = self.machine.manager._units.values()
-        return unit
+    def incarnation(self) -> Incarnation:
+        (incarnation,) = self.machine.manager._incarnations.values()
+        return incarnation
 
     async def reach(self, step: str) -> None:
         """Let the container come to a step, and hold it there."""
@@ -49,14 +50,16 @@ class Stage:
             case "spawned":
                 self._hold_bubblewrap()
                 await machine.put(BOX)
-                await until(lambda: self._children(self.unit.handle.process.pid), what="bubblewrap is held")
+                await until(
+                    lambda: self._children(self.incarnation.handle.process.pid), what="bubblewrap is held"
+                )
             case "held":
-                self._stop(self.runtime._nursery.pid)
+                self._stop(self.runtime._fork_server.pid)
                 await machine.put(BOX)
-                await until(lambda: self.unit.handle.namespaces_pid, what="the holder is there")
+                await until(lambda: self.incarnation.handle.namespaces_pid, what="the holder is there")
             case "born":
                 await machine.put(BOX)
-                environment = await until(lambda: self.unit.handle.environment, what="a birth")
+                environment = await until(lambda: self.incarnation.handle.environment, what="its start")
                 self._stop(environment.pid)
             case "running" | "resizing":
                 await machine.put(BOX, nodes=(STUBBORN,))
@@ -67,23 +70,25 @@ class Stage:
             case "stopping":
                 await self.reach("running")
                 await machine.manager.handle(Drop(id=BOX, revision=9))
-                await until(lambda: machine.status(BOX).state is EndpointState.STOPPING)  # type: ignore[union-attr]
+                await until(lambda: machine.reported(BOX).state is EndpointState.STOPPING)
                 await machine.log_holds(BOX, "node", "no ")
+            case _:
+                raise ValueError(step)
         machine.note_processes()
 
     def pid_of(self, part: str) -> int:
-        handle = self.unit.handle
+        handle = self.incarnation.handle
         shim = handle.process.pid
         environment = handle.environment.pid if handle.environment is not None else 0
-        cradles = (pid for pid in self._children(environment) if program_of(pid) == "rce-cradle")
+        node_servers = (pid for pid in self._children(environment) if program_of(pid) == "rce-node-server")
         node = self.machine.node(BOX, "node")
         pids = {
             "shim": shim,
             "bubblewrap": next(iter(self._children(shim)), 0),
             "holder": handle.namespaces_pid,
-            "nursery": self.runtime._nursery.pid,
+            "fork server": self.runtime._fork_server.pid,
             "environment": environment,
-            "cradle": next(cradles, 0),
+            "node fork server": next(node_servers, 0),
             "node": node.pid if node is not None else 0,
         }
         assert pids[part], f"there is no {part}"
@@ -121,7 +126,7 @@ async def stage(folder: Path) -> AsyncIterator[Stage]:
 
 KILLS = [
     *(("spawned", part) for part in ("shim", "bubblewrap")),
-    *(("held", part) for part in ("shim", "bubblewrap", "holder", "nursery")),
+    *(("held", part) for part in ("shim", "bubblewrap", "holder", "fork server")),
     *(("born", part) for part in ("shim", "holder", "environment")),
     *(("resizing", part) for part in ("bubblewrap", "environment")),
 ]
@@ -132,24 +137,27 @@ async def test_what_is_wanted_comes_to_life_again(stage: Stage, step: str, part:
     machine = stage.machine
     async with machine.engine(interrupt_timeout=0.2, terminate_timeout=0.2):
         await stage.reach(step)
-        mark = stage.unit.mark
+        incarnation_id = stage.incarnation.incarnation_id
         old = dict(machine.pids)
         os.kill(stage.pid_of(part), signal.SIGKILL)
         stage.go_on()
-        if part != "nursery":
-            await until(lambda: machine.status(BOX).incarnation not in ("", mark), what="another life")  # type: ignore[union-attr]
+        if part != "fork server":
+            await until(
+                lambda: machine.reported(BOX).incarnation not in ("", incarnation_id),
+                what="another incarnation",
+            )
             assert [pid for pid, start in old.items() if proc.alive(pid, start)] == []
-            assert not [path for path in machine.containers if path.name == mark]
-        await until(lambda: machine.status(BOX).state is EndpointState.RUNNING)  # type: ignore[union-attr]
+            assert not [path for path in machine.containers if path.name == incarnation_id]
+        await until(lambda: machine.reported(BOX).state is EndpointState.RUNNING)
         assert len(machine.containers) == 1
 
 
-@pytest.mark.parametrize("part", ["shim", "holder", "environment", "cradle", "node"])
+@pytest.mark.parametrize("part", ["shim", "holder", "environment", "node fork server", "node"])
 async def test_what_is_not_wanted_any_more_is_gone(
     stage: Stage, part: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machine = stage.machine
-    monkeypatch.setattr("rce_container.unit._SHIM_TIMEOUT_S", 0.5)
+    monkeypatch.setattr("rce_container.incarnation._SHIM_TIMEOUT_S", 0.5)
     async with machine.engine(interrupt_timeout=1.0, terminate_timeout=0.2):
         await stage.reach("stopping")
         os.kill(stage.pid_of(part), signal.SIGKILL)
@@ -190,12 +198,13 @@ async def test_a_manager_may_die_while_it_cleans(stage: Stage, monkeypatch: pyte
         await until(lambda: not machine.containers, what=lambda: machine.containers)
 
 
-async def test_nodes_and_cradle_may_die_while_a_container_is_resized(stage: Stage) -> None:
+async def test_nodes_and_fork_server_may_die_during_resize(stage: Stage) -> None:
+    """Nodes and their fork server may die while a container is resized."""
     machine = stage.machine
     async with machine.engine(interrupt_timeout=0.2, terminate_timeout=0.2):
         await stage.reach("resizing")
-        mark = stage.unit.mark
-        os.kill(stage.pid_of("cradle"), signal.SIGKILL)
+        incarnation_id = stage.incarnation.incarnation_id
+        os.kill(stage.pid_of("node fork server"), signal.SIGKILL)
         os.kill(stage.pid_of("node"), signal.SIGKILL)
         await machine.node_is(BOX, "node", NodeState.FAILED)
-        assert stage.unit.mark == mark
+        assert stage.incarnation.incarnation_id == incarnation_id

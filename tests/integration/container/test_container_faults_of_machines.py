@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 from support.engine import Program, until
-from support.leaks import Traces, sweep_cgroups
 
 from rce_container.environment import proc
+from tools.leaks import Traces, sweep_cgroups
 
 BIN = Path(sys.executable).parent
 WITHOUT_USER_NAMESPACES = (
@@ -111,12 +111,12 @@ async def test_what_a_crash_left_is_removed_and_nobody_else_is_harmed(
     reused = {"id": "u/b", "mark": other, "runtime": "process", "pid": me.pid, "start": 1}
     gone = {"id": "u/b", "mark": third, "runtime": "of old", "pid": 1 << 22, "start": 1}
     records = {one: "", other: json.dumps(reused), third: json.dumps(gone)}
-    for mark, record in records.items():
+    for incarnation_id, record in records.items():
         for parent in (state / "containers", run):
-            (parent / mark / "home").mkdir(parents=True)
-        (state / "containers" / mark / "record.json").write_text(record)
+            (parent / incarnation_id / "home").mkdir(parents=True)
+        (state / "containers" / incarnation_id / "record.json").write_text(record)
         with socket.socket(socket.AF_UNIX) as stale:
-            stale.bind(str(run / mark / "control.sock"))
+            stale.bind(str(run / incarnation_id / "control.sock"))
     (state / "containers" / other / "home").chmod(0)
     (state / "cgroups").write_text("/sys/fs/cgroup/nowhere/rce-x\n\n")
     (state / "name").write_text("\x00")

@@ -7,16 +7,17 @@ import json
 import os
 import signal
 import socket
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
-from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, joined, until
+from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, Peer, is_in, joined, until
 
-from rce.control.model import EndpointState, InterfaceSpec, LinkAddress, NodeSpec, NodeState, ParameterSpec
+from rce.control.model import EndpointState, LinkAddress, NodeState
+from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec
 from rce.ros.types import TypeRegistry
 from rce_container.environment import proc
-from rce_container.runtimes.namespace import HOME
+from rce_container.forkserver.mounts import HOME
 
 BOX = "user/box"
 STRING = TypeRegistry().message("std_msgs/String")
@@ -32,7 +33,7 @@ async def start_echo(machine: Machine) -> LinkAddress:
     return status.address
 
 
-async def echo(peer: Any, text: str) -> None:
+async def echo(peer: Peer, text: str) -> None:
     payload = STRING.serialize(STRING.new(data=text))
     peer.ends["req"].port.send(payload)
     async with asyncio.timeout(10):
@@ -48,10 +49,8 @@ async def test_a_peer_talks_to_a_node(machine: Machine, way: str) -> None:
             await peer.active()
             for number in range(20):
                 await echo(peer, f"number {number}")
-            status = machine.status(BOX)
-            assert status is not None
-            await until(lambda: machine.status(BOX).interfaces == {"req": True, "resp": True, "srv": True})
-            assert machine.status(BOX).connections == (1, 2, 3)
+            await until(lambda: machine.reported(BOX).interfaces == {"req": True, "resp": True, "srv": True})
+            assert machine.reported(BOX).connections == (1, 2, 3)
 
             def counted() -> bool:
                 if not machine.usage:
@@ -66,7 +65,7 @@ async def test_a_peer_talks_to_a_node(machine: Machine, way: str) -> None:
             assert usage.processes >= 3
             payload = usage.interfaces["req"].bytes_in
             assert usage.link_in > payload > 0, "headers count too"
-        await until(lambda: not any(machine.status(BOX).interfaces.values()), what="inactive interfaces")
+        await until(lambda: not any(machine.reported(BOX).interfaces.values()), what="inactive interfaces")
         assert machine.faults == []
         await machine.drop(BOX)
         machine.check_clean()
@@ -77,14 +76,14 @@ async def test_a_killed_environment_is_noticed_and_made_again(machine: Machine) 
         address = await start_echo(machine)
         async with joined(address) as peer:
             await peer.active()
-            first = machine.status(BOX)
+            first = machine.reported(BOX)
             machine.note_processes()
             os.kill(machine.environment().pid, signal.SIGKILL)
-            await until(lambda: machine.status(BOX).incarnation != first.incarnation)
+            await until(lambda: machine.reported(BOX).incarnation != first.incarnation)
             await until(lambda: False in peer.ends["req"].history, what="its peer notices")
-            await until(lambda: machine.status(BOX).state is EndpointState.RUNNING)
+            await until(lambda: machine.reported(BOX).state is EndpointState.RUNNING)
             assert all(not proc.alive(pid, start) for pid, start in machine.pids.items())
-            await peer.wire(machine.status(BOX).address, ECHO_INTERFACES, 2)
+            await peer.wire(machine.reported(BOX).address, ECHO_INTERFACES, 2)
             await peer.active()
             await echo(peer, "again")
             history = peer.ends["req"].history
@@ -98,11 +97,11 @@ async def test_every_outer_process_may_be_killed(machine: Machine) -> None:
         await machine.put(BOX, nodes=(own("talk.py"),))
         for _ in range(2):
             await machine.node_is(BOX, "node", NodeState.STARTING)
-            incarnation = machine.status(BOX).incarnation
+            incarnation = machine.reported(BOX).incarnation
             machine.note_processes()
             old = dict(machine.pids)
             os.kill(machine.shims()[0].pid, signal.SIGKILL)
-            await until(lambda: machine.status(BOX).incarnation not in ("", incarnation))  # noqa: B023
+            await until(lambda: machine.reported(BOX).incarnation not in ("", incarnation))  # noqa: B023
             assert not [pid for pid, start in old.items() if proc.alive(pid, start)]
 
 
@@ -126,7 +125,7 @@ async def test_a_node_that_dies_is_told_and_not_restarted(machine: Machine) -> N
         assert "hello anew" in await machine.log_holds(BOX, "node", "anew")
 
 
-async def test_bad_wishes_are_told_and_spoil_nothing_else(machine: Machine) -> None:
+async def test_invalid_request_is_reported_and_spoils_nothing_else(machine: Machine) -> None:
     async with machine.engine():
         await machine.put(
             BOX,
@@ -136,9 +135,11 @@ async def test_bad_wishes_are_told_and_spoil_nothing_else(machine: Machine) -> N
                 own("talk.py"),
             ),
             interfaces=(
-                InterfaceSpec(tag="bad", type="PublisherInterface", cls="none/Such", addr="x"),
-                InterfaceSpec(tag="conv", type="PublisherConverter", cls="std_msgs/String"),
-                InterfaceSpec(tag="good", type="PublisherInterface", cls="std_msgs/String", addr="y"),
+                InterfaceSpec(tag="bad", type="PublisherInterface", message_type="none/Such", addr="x"),
+                InterfaceSpec(tag="conv", type="PublisherConverter", message_type="std_msgs/String"),
+                InterfaceSpec(
+                    tag="good", type="PublisherInterface", message_type="std_msgs/String", addr="y"
+                ),
             ),
             parameters=(ParameterSpec(name="p", value="$(find nowhere)"),),
         )
@@ -153,8 +154,8 @@ async def test_bad_wishes_are_told_and_spoil_nothing_else(machine: Machine) -> N
             "a container has no PublisherConverter",
         ):
             assert part in text
-        await until(lambda: "good" in machine.status(BOX).interfaces)
-        assert machine.status(BOX).revision == 1
+        await until(lambda: "good" in machine.reported(BOX).interfaces)
+        assert machine.reported(BOX).revision == 1
 
 
 async def test_parameters_arguments_and_environment(machine: Machine) -> None:
@@ -172,7 +173,7 @@ async def test_a_stubborn_node_is_killed(machine: Machine) -> None:
         await machine.put(BOX, nodes=(own("stubborn.py"),))
         await machine.log_holds(BOX, "node", "ready")
         await machine.put(BOX, 2)
-        await until(lambda: not machine.status(BOX).nodes)
+        await until(lambda: not machine.reported(BOX).nodes)
         assert "no " in await machine.log(BOX, "node")
         assert machine.faults == []
 
@@ -184,10 +185,10 @@ async def test_what_a_node_left_behind_dies_with_it(machine: Machine) -> None:
         await machine.log_holds(BOX, "other", "hello")
         before = {one.pid for one in machine.processes()}
         await machine.put(BOX, 2, nodes=(own("talk.py", tag="other"),))
-        await until(lambda: not [n for n in machine.status(BOX).nodes if n.tag == "node"])
+        await until(lambda: not [n for n in machine.reported(BOX).nodes if n.tag == "node"])
         left = {one.pid for one in machine.processes()}
         assert len(before) - len(left) == 2
-        assert machine.node(BOX, "other").pid in left
+        assert machine.reported_node(BOX, "other").pid in left
 
 
 async def test_a_flood_of_output_is_bounded(machine: Machine) -> None:
@@ -205,18 +206,18 @@ async def test_a_new_manager_adopts_its_containers(machine: Machine) -> None:
         address = await start_echo(machine)
         async with joined(address) as peer:
             await peer.active()
-            before = machine.status(BOX)
+            before = machine.reported(BOX)
             node = await machine.node_is(BOX, "echo", NodeState.RUNNING)
     async with machine.engine() as manager:
         assert [status.incarnation for status in manager.hello().endpoints] == [before.incarnation]
         assert manager.hello().endpoints[0].revision == 1
-        assert machine.node(BOX, "echo").pid == node.pid
+        assert machine.reported_node(BOX, "echo").pid == node.pid
         await machine.put(BOX, 2, nodes=(ECHO,), interfaces=ECHO_INTERFACES, peer="user/robot")
-        async with joined(machine.status(BOX).address, "another") as peer:
+        async with joined(machine.reported(BOX).address, "another") as peer:
             await peer.active()
             await echo(peer, "by tcp through the new manager")
-        assert machine.status(BOX).incarnation == before.incarnation
-        assert machine.node(BOX, "echo").pid == node.pid
+        assert machine.reported(BOX).incarnation == before.incarnation
+        assert machine.reported_node(BOX, "echo").pid == node.pid
 
 
 async def test_without_a_manager_a_container_ends_itself(machine: Machine) -> None:
@@ -229,7 +230,8 @@ async def test_without_a_manager_a_container_ends_itself(machine: Machine) -> No
     await until(lambda: not machine.left(), timeout=40, what=machine.left)
 
 
-async def test_an_environment_that_dies_without_a_manager_leaves_nothing(machine: Machine) -> None:
+async def test_environment_dying_unmanaged_leaves_nothing(machine: Machine) -> None:
+    """An environment that dies without a manager leaves nothing."""
     async with machine.managed(grace=1.0):
         await machine.put(BOX, nodes=(own("daemon.py"),))
         await machine.log_holds(BOX, "node", "daemon")
@@ -265,7 +267,7 @@ async def test_a_namespace_hides_the_machine(machine: Machine, monkeypatch: pyte
     assert not [name for name in seen["env"] if name.startswith(("RCE_SECRET", "XDG", "PYTEST"))]
     assert seen["env"]["HOME"] == HOME
     assert seen["host"] == "box"
-    assert len(seen["pids"]) <= 7  # two nodes, what is beside them, and who is between them at a birth
+    assert len(seen["pids"]) <= 7  # two nodes, what is beside them, and who is between them at a start
     assert (seen["home"], seen["tmp"]) == (True, True)
     assert (seen["usr"], seen["slash"], seen["package"]) == (False, False, False)
     assert (seen["loopback"], seen["secret"], seen["environment"]) == (False, False, False)
@@ -274,15 +276,17 @@ async def test_a_namespace_hides_the_machine(machine: Machine, monkeypatch: pyte
 
 async def test_containers_talk_to_each_other(machine: Machine) -> None:
     """One dials the other, which a container without a network can do through its manager only."""
-    request = InterfaceSpec(tag="srv", type="ServiceProviderInterface", cls="Test/StringEcho", addr="far")
+    request = InterfaceSpec(
+        tag="srv", type="ServiceProviderInterface", message_type="Test/StringEcho", addr="far"
+    )
     answer = InterfaceSpec(
-        tag="srv", type="ServiceClientInterface", cls="Test/StringEcho", addr="stringEchoService"
+        tag="srv", type="ServiceClientInterface", message_type="Test/StringEcho", addr="stringEchoService"
     )
     async with machine.engine():
         await machine.put("user/far", nodes=(ECHO,), interfaces=(answer,), peer="user/box")
-        address = machine.status("user/far").address
+        address = machine.reported("user/far").address
         await machine.put(BOX, interfaces=(request,), peer="user/far", dial=address)
-        await until(lambda: machine.status(BOX).interfaces == {"srv": True}, what="connected")
+        await until(lambda: machine.reported(BOX).interfaces == {"srv": True}, what="connected")
 
 
 async def test_only_so_many_containers_start_at_a_time(machine: Machine) -> None:
@@ -294,9 +298,7 @@ async def test_only_so_many_containers_start_at_a_time(machine: Machine) -> None
         assert len(machine.shims()) == 1
         await machine.drop(boxes[1])
         for box in (boxes[0], boxes[2]):
-            await until(
-                lambda box=box: machine.status(box).state is EndpointState.RUNNING, what=f"{box} is running"
-            )
+            await until(partial(is_in, machine, box, EndpointState.RUNNING), what=f"{box} is running")
         assert len(machine.shims()) == 2, "a container was made that was dropped before its turn came"
         assert machine.faults == []
 

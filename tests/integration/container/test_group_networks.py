@@ -14,7 +14,8 @@ import pytest
 from support.containers import Machine, until
 
 from rce.control.messages import Fault
-from rce.control.model import EndpointState, Network, NodeSpec, NodeState, Resources
+from rce.control.model import EndpointState, NodeState
+from rce.model.specs import Network, NodeSpec, Resources
 from rce_container.exceptions import NetworkError
 from rce_container.network.namespaces import open_namespace
 
@@ -98,7 +99,9 @@ async def reached(machine: Machine, id_: str, *targets: str) -> dict[str, Any]:
     spec = own("reach.py", " ".join(targets), tag=f"reach{status.revision}")
     kept = machine.manager._core.containers[id_].desired
     assert kept is not None
-    await machine.put(id_, status.revision + 1, nodes=(*kept.nodes, spec), resources=kept.resources)
+    await machine.put(
+        id_, status.revision + 1, nodes=(*kept.contents.nodes, spec), resources=kept.contents.resources
+    )
     await machine.node_is(id_, spec.tag, NodeState.EXITED)
     lines = (await machine.log(id_, spec.tag)).splitlines()
     found: dict[str, Any] = json.loads(next(line for line in lines if line.startswith("{")))
@@ -183,7 +186,7 @@ async def test_an_address_is_given_out_once_and_again(machine: Machine) -> None:
         fault = await until(lambda: machine.of(Fault), what="a fault")
         assert fault[0].id == "user/b"
         assert "the groupIp 10.0.0.1 belongs to container a of the same group; take another" in fault[0].text
-        assert machine.status("user/b").state is EndpointState.FAILED
+        assert machine.reported("user/b").state is EndpointState.FAILED
         await machine.drop("user/a")
         await until(lambda: machine.node("user/b", "node"), what="b")
         await machine.log_holds("user/b", "node", "serving")
@@ -210,11 +213,11 @@ async def test_a_killed_container_comes_back_to_its_group(machine: Machine) -> N
     async with machine.engine():
         await serving(machine, "user/a", group(address="10.0.0.1"))
         await serving(machine, "user/b", group(address="10.0.0.2"))
-        first = machine.status("user/a").incarnation
+        first = machine.reported("user/a").incarnation
         record = next(one for one in machine.containers if one.name == first)
         machine.note_processes()
         os.kill(json.loads((record / "record.json").read_text())["pid"], 9)
-        await until(lambda: machine.status("user/a").incarnation not in ("", first), what="a new life")
+        await until(lambda: machine.reported("user/a").incarnation not in ("", first), what="a new life")
         await until(lambda: machine.node("user/a", "node"), what="its node")
         await machine.log_holds("user/a", "node", "serving")
         found = await reached(machine, "user/b", f"a:{PORT}")

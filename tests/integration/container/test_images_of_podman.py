@@ -11,17 +11,20 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support.containers import ECHO, ECHO_INTERFACES, Machine, joined, program_of, until
+from support.containers import ECHO, ECHO_INTERFACES, Machine, is_in, joined, program_of, until
 from support.rootfs import image_of, make_rootfs
 
 from rce.control.messages import Fault
-from rce.control.model import EndpointState, Network, NodeSpec, NodeState, Resources
+from rce.control.model import EndpointState, NodeState
+from rce.model.specs import Network, NodeSpec, Resources
 from rce.ros.types import TypeRegistry
 from rce_container.environment import proc
+from rce_container.runtimes.podman import PodmanRuntime
 
 pytestmark = pytest.mark.needs("podman")
 
@@ -164,6 +167,7 @@ NOT_NAMES = ("--privileged", "dir:/", "oci:x", "../x")
 
 async def test_an_image_that_cannot_be_had_is_told(machine: Machine, folder: Path) -> None:
     (folder / "empty").mkdir()
+    assert isinstance(machine.runtime, PodmanRuntime)
     machine.runtime._images += (str(folder / "empty"),)
     reasons = dict.fromkeys(NOT_NAMES, "neither the name of an image nor the path of a folder")
     reasons |= {image: f"the folder {image} is not offered to containers" for image in ("/", "/root")}
@@ -182,9 +186,7 @@ async def test_an_image_that_cannot_be_had_is_told(machine: Machine, folder: Pat
         for number, reason in enumerate(reasons.values()):
             assert reason in faults()[f"user/box{number}"]
             box = f"user/box{number}"
-            await until(
-                lambda box=box: machine.status(box).state is EndpointState.FAILED, what=f"{box} failed"
-            )
+            await until(partial(is_in, machine, box, EndpointState.FAILED), what=f"{box} failed")
 
 
 async def test_a_program_has_the_images_own_python(folder: Path) -> None:
@@ -207,8 +209,8 @@ async def test_a_program_has_the_images_own_python(folder: Path) -> None:
 async def test_whoever_is_killed_nothing_is_left(machine: Machine, victim: str) -> None:
     async with machine.engine(cleanup_timeout=2.0):
         await machine.put(BOX, nodes=(own("talk.py"),))
-        await until(lambda: machine.node(BOX, "node") and machine.node(BOX, "node").pid, what="a node")
-        first = machine.status(BOX).incarnation
+        await until(lambda: (node := machine.node(BOX, "node")) is not None and node.pid, what="a node")
+        first = machine.reported(BOX).incarnation
         machine.note_processes()
         old = dict(machine.pids)
         shims = {one.pid for one in machine.shims()}
@@ -220,7 +222,7 @@ async def test_whoever_is_killed_nothing_is_left(machine: Machine, victim: str) 
         if victim == "conmon":  # only carries the end of the container to podman: the container lives on
             await machine.drop(BOX)
         else:
-            await until(lambda: machine.status(BOX).incarnation not in ("", first), what="a new life")
+            await until(lambda: machine.reported(BOX).incarnation not in ("", first), what="a new life")
         assert not [pid for pid, start in old.items() if proc.alive(pid, start)]
 
 
@@ -228,9 +230,9 @@ async def test_a_container_is_adopted_and_ends_by_itself(machine: Machine) -> No
     async with machine.managed():
         await machine.put(BOX, nodes=(own("talk.py"),))
         await machine.log_holds(BOX, "node", "hello")
-        first = machine.status(BOX).incarnation
+        first = machine.reported(BOX).incarnation
     async with machine.managed(grace=0.3):
-        assert machine.status(BOX).incarnation == first
+        assert machine.reported(BOX).incarnation == first
         await machine.put("user/brief", nodes=(own("talk.py"),))
         await machine.log_holds("user/brief", "node", "hello")
         await machine.drop(BOX)

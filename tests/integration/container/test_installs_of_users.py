@@ -1,4 +1,4 @@
-"""Requirements of several users: one that takes for ever keeps nobody else's from being installed."""
+"""Requirements of several users: one that never ends does not keep others' from being installed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from aiohttp import web
 
 from rce.web.server import HttpServer
-from rce_container.bundles.requirements import Installer, InstallerSettings
+from rce_container.packages.requirements import Installer, InstallerSettings
 
 if TYPE_CHECKING:
     from pathlib import Path

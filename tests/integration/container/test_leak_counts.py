@@ -8,25 +8,26 @@ import time
 from pathlib import Path
 
 import pytest
-from support.leaks import CGROUPS, Traces, sweep_cgroups
 
 from rce_container.environment import proc
+from tools.leaks import CGROUPS, Traces, sweep_cgroups
 
 MARK = "0123456789ab"
 TOKEN = "feedbeef"
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 SLEEP = "import time; time.sleep(600)"
 
 
 def vanish(traces: Traces) -> None:
     """Wait until nothing is left: what was killed needs a moment for its end, and its parent to notice."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while left := traces.left():
         assert time.monotonic() < deadline, left
         time.sleep(0.01)
 
 
-def test_processes_are_found_by_name_and_by_descent_and_remembered(folder: Path) -> None:
+def test_processes_are_found_by_name_and_descent(folder: Path) -> None:
+    """Processes are found by name and by descent and remembered."""
     traces = Traces(folder, "box_of_leaks")
     child = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {SLEEP!r}])"
     with (
@@ -34,7 +35,7 @@ def test_processes_are_found_by_name_and_by_descent_and_remembered(folder: Path)
         subprocess.Popen([sys.executable, "-c", SLEEP, "box_of_leaks"]) as other,
     ):
         try:
-            deadline = time.monotonic() + PATIENCE_S
+            deadline = time.monotonic() + TIMEOUT_S
             while len(found := traces.look()) < 3:
                 assert time.monotonic() < deadline, found
                 time.sleep(0.01)

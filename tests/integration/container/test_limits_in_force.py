@@ -7,13 +7,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 from support.containers import Machine, until
 
 from rce.control.messages import Gone
-from rce.control.model import EndpointState, NodeSpec, NodeState, NodeUsage, Resources
+from rce.control.model import EndpointState, EndpointUsage, NodeState, NodeUsage
+from rce.model.specs import NodeSpec, Resources
 from rce_container.environment import proc
 from rce_container.folder import StateFolder
 from rce_container.limits import Limits, RlimitLimiter, choose_limiter
@@ -72,13 +72,13 @@ def greedy(tag: str, args: str = "") -> NodeSpec:
     return NodeSpec(tag=tag, pkg="greedy", exe=f"{tag}.py", args=args)
 
 
-def usage(machine: Machine, id_: str) -> Any:
-    return machine.usage[-1].endpoints.get(id_) if machine.usage else None
+def usage(machine: Machine, id_: str) -> EndpointUsage:
+    """The newest that a machine told of a container; nothing used if it told nothing yet."""
+    return machine.usage[-1].endpoints.get(id_, EndpointUsage()) if machine.usage else EndpointUsage()
 
 
 def node_usage(machine: Machine, id_: str, tag: str) -> NodeUsage:
-    known = usage(machine, id_)
-    return known.nodes.get(tag, NodeUsage()) if known else NodeUsage()
+    return usage(machine, id_).nodes.get(tag, NodeUsage())
 
 
 async def test_who_takes_too_much_memory_dies_alone(packages: Machine) -> None:
@@ -93,7 +93,8 @@ async def test_who_takes_too_much_memory_dies_alone(packages: Machine) -> None:
         assert any(OUT_OF_MEMORY in fault for fault in machine.faults)
         await machine.log_holds(OTHER, "hog", "has all")
         pid = await machine.node_pid(BOX, "talk")
-        seen = await until(lambda: (one := usage(machine, BOX)) and one.oom_kills and one)
+        await until(lambda: usage(machine, BOX).oom_kills)
+        seen = usage(machine, BOX)
         assert (seen.oom_kills, seen.memory_limit) == (1, 64 * MB)
         assert 50 * MB < seen.memory_peak <= 64 * MB
         await until(lambda: node_usage(machine, OTHER, "hog").memory > 100_000_000)
@@ -107,7 +108,7 @@ async def test_a_process_of_a_node_that_ran_out_of_memory_is_told_of(packages: M
         await packages.put(BOX, resources=SMALL, nodes=(greedy("spawn"),))
         await packages.log_holds(BOX, "spawn", "child ended with -9")
         await until(lambda: any("a process that a node started was killed" in f for f in packages.faults))
-        assert packages.node(BOX, "spawn").state in (NodeState.STARTING, NodeState.RUNNING)
+        assert packages.reported_node(BOX, "spawn").state in (NodeState.STARTING, NodeState.RUNNING)
 
 
 async def test_a_container_that_cannot_live_at_all_says_why(packages: Machine) -> None:
@@ -156,7 +157,7 @@ async def test_limits_change_while_it_runs(packages: Machine) -> None:
         await machine.log_holds(BOX, "hog", "has all")
         before = machine.status(BOX)
         await machine.put(BOX, 2, resources=Resources(memory=200 * MB, cpu=0.5), nodes=nodes)
-        await until(lambda: usage(machine, BOX) and usage(machine, BOX).memory_limit == 200 * MB)
+        await until(lambda: usage(machine, BOX).memory_limit == 200 * MB)
         assert usage(machine, BOX).cpu_limit == pytest.approx(0.5)
         await machine.put(BOX, 3, resources=Resources(memory=64 * MB, cpu=0.25), nodes=nodes)
         fault = await until(lambda: next((f for f in machine.faults if "cannot be limited" in f), None))
@@ -179,23 +180,24 @@ async def test_no_cgroup_is_left_by_a_container_that_ended(packages: Machine) ->
     async with machine.engine():
         await machine.put(BOX, nodes=(NodeSpec(tag="talk", pkg="own", exe="talk.py"),))
         await machine.log_holds(BOX, "talk", "hello")
-        assert machine.cells()
+        assert machine.control_groups()
         await machine.drop(BOX)
-        assert not machine.cells()
+        assert not machine.control_groups()
         assert machine.of(Gone)
     assert not machine.cell_parents()
 
 
-async def test_the_next_manager_removes_the_cgroups_of_all_that_was_killed(packages: Machine) -> None:
+async def test_next_manager_removes_cgroups_of_the_killed(packages: Machine) -> None:
+    """The next manager removes the cgroups of all that was killed."""
     machine = packages
     async with machine.managed():
         await machine.put(BOX, nodes=(NodeSpec(tag="talk", pkg="own", exe="talk.py"),))
         await machine.log_holds(BOX, "talk", "hello")
     for process in machine.processes():
         proc.kill(process)
-    assert machine.cells()
+    assert machine.control_groups()
     async with machine.engine():
-        await until(lambda: not machine.cells(), what=machine.cells)
+        await until(lambda: not machine.control_groups(), what=machine.control_groups)
 
 
 async def test_the_next_manager_keeps_the_limits_of_what_it_adopts(packages: Machine) -> None:
@@ -203,10 +205,11 @@ async def test_the_next_manager_keeps_the_limits_of_what_it_adopts(packages: Mac
     async with machine.managed():
         await machine.put(BOX, resources=SMALL, nodes=(greedy("hog", "10"),))
         await machine.log_holds(BOX, "hog", "has all")
-        cells = machine.cells()
+        control_groups = machine.control_groups()
     async with machine.engine():
-        assert machine.cells() == cells
-        seen = await until(lambda: usage(machine, BOX))
+        assert machine.control_groups() == control_groups
+        await until(lambda: machine.usage and BOX in machine.usage[-1].endpoints)
+        seen = usage(machine, BOX)
         assert seen.memory_limit == 64 * MB
         nodes = (greedy("hog", "200"),)
         await machine.put(BOX, 2, resources=SMALL, nodes=nodes)
@@ -214,21 +217,23 @@ async def test_the_next_manager_keeps_the_limits_of_what_it_adopts(packages: Mac
         assert died.detail.startswith("out of memory")
 
 
-async def test_cells_of_which_nothing_else_is_left_are_swept_with_their_processes(folder: Path) -> None:
+async def test_orphaned_cgroups_are_swept_with_processes(folder: Path) -> None:
+    """Cells of which nothing else is left are swept with their processes."""
     with StateFolder(folder / "state", folder / "run") as state:
         limiter = choose_limiter(state.token, state.cgroups)
         limiter.sweep(())
-        cell = limiter.create("0123456789ab", Limits(memory=64 * MB))
+        control_group = limiter.create("0123456789ab", Limits(memory=64 * MB))
         script = 'for file; do echo $$ >"$file"; done; exec sleep 600'
-        lost = subprocess.Popen(["/bin/sh", "-c", script, "sh", *cell.join])
-        await until(cell.pids)
+        lost = subprocess.Popen(["/bin/sh", "-c", script, "sh", *control_group.join])
+        await until(control_group.pids)
         machine = Machine(folder, "process")
     async with machine.engine():
         assert lost.wait() == -signal.SIGKILL
-        assert not machine.cells()
+        assert not machine.control_groups()
 
 
-async def test_nodes_die_before_their_environment_and_both_before_the_engine(packages: Machine) -> None:
+async def test_memory_kills_nodes_before_environment_and_engine(packages: Machine) -> None:
+    """Nodes die before their environment and both before the engine."""
     machine = packages
     async with machine.engine():
         await machine.put(BOX, nodes=(NodeSpec(tag="talk", pkg="own", exe="talk.py"),))
@@ -249,7 +254,8 @@ async def test_without_cgroups_each_process_is_limited(
         died = await machine.node_is(BOX, "hog", NodeState.FAILED)
         assert "MemoryError" in died.detail
         assert "has 60" in await machine.log(BOX, "hog")
-        seen = await until(lambda: usage(machine, BOX))
+        await until(lambda: machine.usage and BOX in machine.usage[-1].endpoints)
+        seen = usage(machine, BOX)
         assert (seen.memory_limit, seen.memory_peak) == (0, 0)
         assert seen.memory > MB
         await machine.put(BOX, 2, resources=Resources(memory=256 * MB))

@@ -12,7 +12,7 @@ import pytest
 from support.containers import until
 
 from rce_container.limits import files, hierarchy
-from rce_container.limits.cgroup2 import Cell2
+from rce_container.limits.cgroup2 import ControlGroupV2
 
 pytestmark = pytest.mark.needs("root")
 
@@ -31,7 +31,7 @@ def base() -> Iterator[Path]:
     except OSError as error:
         pytest.skip(f"no cgroup of version 2 can be made here: {error}")
     yield base
-    Cell2([base]).remove()
+    ControlGroupV2([base]).remove()
 
 
 def start(*argv: str) -> subprocess.Popen[str]:
@@ -41,18 +41,18 @@ def start(*argv: str) -> subprocess.Popen[str]:
 async def test_the_kernel_kills_all_of_a_cell_at_once(base: Path) -> None:
     files.make(base / "m1")
     files.make(base / "m1" / "inner")
-    cell, inner = Cell2([base / "m1"]), Cell2([base / "m1" / "inner"])
-    victims = [start("/bin/sh", "-c", JOIN, "sh", *one.join) for one in (cell, inner, cell)]
+    control_group, inner = ControlGroupV2([base / "m1"]), ControlGroupV2([base / "m1" / "inner"])
+    victims = [start("/bin/sh", "-c", JOIN, "sh", *one.join) for one in (control_group, inner, control_group)]
     for victim in victims:
         assert victim.stdout is not None
         assert victim.stdout.readline() == "in\n"
-    assert sorted(cell.pids()) == sorted(victim.pid for victim in victims)
-    usage = cell.usage()
+    assert sorted(control_group.pids()) == sorted(victim.pid for victim in victims)
+    usage = control_group.usage()
     assert usage.cpu_s is not None, "the kernel counts time without a controller"
-    cell.kill()
+    control_group.kill()
     for victim in victims:
         victim.communicate()
         assert victim.returncode == -signal.SIGKILL
-    await until(lambda: not cell.pids())
-    cell.remove()
+    await until(lambda: not control_group.pids())
+    control_group.remove()
     assert not (base / "m1").exists()

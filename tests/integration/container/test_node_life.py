@@ -5,14 +5,16 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-from typing import Any
+from typing import TypedDict, Unpack
 
 import pytest
 from support.containers import Machine, joined, until
+from support.parts import NodeLife
 
-from rce.control.logs import LogLevel, LogStream, LogWish
+from rce.control.logs import LogLevel, LogQuery, LogStream
 from rce.control.messages import LogChunk, ReadLog, Status
-from rce.control.model import EndpointState, InterfaceSpec, NodeSpec, NodeState, RestartPolicy
+from rce.control.model import EndpointState, NodeState
+from rce.model.specs import InterfaceSpec, NodeSpec, RestartPolicy
 from rce.ros.types import TypeRegistry
 
 BOX = "user/box"
@@ -22,7 +24,7 @@ NODES = {
     "crash.py": (
         "import sys\nprint('to stdout', flush=True)\nprint('it is broken', file=sys.stderr)\nsys.exit(3)\n"
     ),
-    # Its first life beats for a second, then hangs and does not end on SIGINT; later ones beat for ever.
+    # Its first life beats for a second, then hangs and does not end on SIGINT; later ones beat indefinitely.
     "beat.py": (
         "import asyncio, pathlib, signal, sys, time\n"
         "from rce.ros.node import Node, run\n"
@@ -75,18 +77,28 @@ def _nodes(machine: Machine) -> None:
         (machine.packages / "own" / "nodes" / name).write_text(text)
 
 
-def own(exe: str, args: str = "", tag: str = "node", **options: Any) -> NodeSpec:
-    return NodeSpec(tag=tag, pkg="own", exe=exe, args=args, **options)
+class QueryParts(TypedDict, total=False):
+    level: LogLevel
+    incarnation: str
+    previous: bool
 
 
-async def read(machine: Machine, node: str, *streams: LogStream, id_: str = BOX, **wish: Any) -> LogChunk:
-    request = ReadLog(request=1, id=id_, node=node, limit=1 << 20, wish=LogWish(streams=streams, **wish))
+def own(exe: str, args: str = "", tag: str = "node", **life: Unpack[NodeLife]) -> NodeSpec:
+    return NodeSpec(tag=tag, pkg="own", exe=exe, args=args, **life)
+
+
+async def read(
+    machine: Machine, node: str, *streams: LogStream, id_: str = BOX, **query: Unpack[QueryParts]
+) -> LogChunk:
+    request = ReadLog(request=1, id=id_, node=node, limit=1 << 20, query=LogQuery(streams=streams, **query))
     return await machine.read_log(request)
 
 
-async def holds(machine: Machine, node: str, text: str, *streams: LogStream, **wish: Any) -> str:
+async def holds(
+    machine: Machine, node: str, text: str, *streams: LogStream, **query: Unpack[QueryParts]
+) -> str:
     async with asyncio.timeout(20):
-        while text not in (found := (await read(machine, node, *streams, **wish)).text):
+        while text not in (found := (await read(machine, node, *streams, **query)).text):
             await asyncio.sleep(0.02)
     return found
 
@@ -111,7 +123,7 @@ async def test_a_node_that_crashes_is_restarted_up_to_its_limit(machine: Machine
             "exit code 3; its last words: it is broken; it was started again 2 times"
         )
         assert [one for one in states(machine) if one is NodeState.WAITING] == [NodeState.WAITING] * 2
-        assert machine.status(BOX).state is EndpointState.DEGRADED
+        assert machine.reported(BOX).state is EndpointState.DEGRADED
         text = (await read(machine, "node")).text
         assert text.count("it is broken\n") == text.count("to stdout\n") == 3
         ended = "-- ended: exit code 3; its last words: it is broken --\n"
@@ -119,11 +131,12 @@ async def test_a_node_that_crashes_is_restarted_up_to_its_limit(machine: Machine
         assert (await read(machine, "node", LogStream.ENGINE)).text == pauses + ended
         assert len([text for text in machine.faults if "node node" in text]) == 2
         await machine.put(BOX, 2, nodes=(own("talk.py"), own("talk.py", tag="other")))
-        await until(lambda: machine.status(BOX).state is EndpointState.RUNNING, what="all is well again")
-        assert machine.node(BOX, "node").restarts == 0
+        await until(lambda: machine.reported(BOX).state is EndpointState.RUNNING, what="all is well again")
+        assert machine.reported_node(BOX, "node").restarts == 0
 
 
-async def test_nodes_start_one_after_the_other_and_say_what_they_wait_for(machine: Machine) -> None:
+async def test_nodes_start_in_order_and_say_what_they_await(machine: Machine) -> None:
+    """Nodes start one after the other and say what they wait for."""
     async with machine.engine():
         await machine.put(
             BOX,
@@ -137,13 +150,13 @@ async def test_nodes_start_one_after_the_other_and_say_what_they_wait_for(machin
             ),
         )
         assert (await machine.node_is(BOX, "last", NodeState.WAITING)).detail.startswith("waits for slow")
-        assert machine.node(BOX, "a").detail.startswith("waits for itself (a after b after a)")
-        assert machine.node(BOX, "c").detail.startswith("waits for 'nobody'")
+        assert machine.reported_node(BOX, "a").detail.startswith("waits for itself (a after b after a)")
+        assert machine.reported_node(BOX, "c").detail.startswith("waits for 'nobody'")
         await machine.node_is(BOX, "last", NodeState.RUNNING)
-        assert machine.node(BOX, "slow").state is NodeState.RUNNING
-        assert machine.node(BOX, "once").state is NodeState.EXITED
+        assert machine.reported_node(BOX, "slow").state is NodeState.RUNNING
+        assert machine.reported_node(BOX, "once").state is NodeState.EXITED
         for tag in "abc":
-            assert machine.node(BOX, tag).state is NodeState.WAITING
+            assert machine.reported_node(BOX, tag).state is NodeState.WAITING
             assert any(f"node {tag} waits for" in fault for fault in machine.faults)
 
 
@@ -174,7 +187,7 @@ async def test_a_node_whose_heart_stops_is_restarted(machine: Machine) -> None:
         await until(lambda: NodeState.STUCK in states(machine), what="the node is stuck")
         first = await machine.node_is(BOX, "node", NodeState.RUNNING)
         assert first.restarts == 1
-        await until(lambda: machine.status(BOX).state is EndpointState.RUNNING, what="all is well again")
+        await until(lambda: machine.reported(BOX).state is EndpointState.RUNNING, what="all is well again")
         found = states(machine)
         stuck = found.index(NodeState.STUCK)
         assert found[stuck : stuck + 5] == [
@@ -196,8 +209,11 @@ async def test_a_node_whose_heart_stops_is_restarted(machine: Machine) -> None:
         ]
 
 
-async def test_what_is_sent_when_st_is_true_is_heard_by_nodes_that_start_late(machine: Machine) -> None:
-    interface = InterfaceSpec(tag="req", type="PublisherInterface", cls="std_msgs/String", addr="late")
+async def test_established_connection_reaches_late_nodes(machine: Machine) -> None:
+    """What is sent when st is true is heard by nodes that start late."""
+    interface = InterfaceSpec(
+        tag="req", type="PublisherInterface", message_type="std_msgs/String", addr="late"
+    )
     async with machine.engine():
         await machine.put(
             BOX,
@@ -261,8 +277,7 @@ async def test_a_killed_node_says_by_what(machine: Machine) -> None:
     async with machine.engine():
         await machine.put(BOX, nodes=(own("talk.py"),))
         await machine.log_holds(BOX, "node", "hello")
-        node = await until(lambda: (one := machine.node(BOX, "node")) and one.pid and one)
-        os.kill(node.pid, signal.SIGSEGV)
+        os.kill(await machine.node_pid(BOX, "node"), signal.SIGSEGV)
         await machine.node_is(BOX, "node", NodeState.FAILED)
         text = (await read(machine, "node", LogStream.ENGINE)).text
         assert text.startswith("-- ended: killed by SIGSEGV")
@@ -272,29 +287,30 @@ async def test_logs_outlive_their_container(machine: Machine) -> None:
     async with machine.engine():
         await machine.put(BOX, nodes=(own("talk.py", "one"),))
         await machine.log_holds(BOX, "node", "hello one")
-        first = machine.status(BOX).incarnation
+        first = machine.reported(BOX).incarnation
         machine.note_processes()
         os.kill(machine.environment().pid, signal.SIGKILL)
-        await until(lambda: machine.status(BOX).incarnation not in ("", first))
+        await until(lambda: machine.reported(BOX).incarnation not in ("", first))
         await machine.log_holds(BOX, "node", "hello one")
         before = await read(machine, "node", previous=True)
-        assert (before.life, "hello one" in before.text) == (first, True)
+        assert (before.incarnation, "hello one" in before.text) == (first, True)
         assert before.ended > 0
         assert "its environment died" in before.reason
         machine.told.clear()
         await machine.drop(BOX)
         after = await read(machine, "node")
-        assert after.life not in ("", first)
+        assert after.incarnation not in ("", first)
         assert "hello one" in after.text
         assert after.text.endswith("-- ended: it was told to by SIGINT --\n")
-        assert (await read(machine, "node", life=first)).text == before.text
+        assert (await read(machine, "node", incarnation=first)).text == before.text
         assert "no logs" in (await read(machine, "node", id_="another/box")).error
         machine.check_clean()
 
 
-async def test_logs_outlive_a_manager_that_is_killed_and_a_container_that_nobody_saw_end(
+async def test_logs_outlive_killed_manager_and_unseen_end(
     machine: Machine,
 ) -> None:
+    """Logs outlive a manager that is killed and a container that nobody saw end."""
     async with machine.managed(grace=0.5):
         await machine.put(BOX, nodes=(own("talk.py"),))
         await machine.log_holds(BOX, "node", "hello")
@@ -307,7 +323,9 @@ async def test_logs_outlive_a_manager_that_is_killed_and_a_container_that_nobody
         assert "no manager for 0.5 s" in chunk.reason
 
 
-async def test_the_logs_of_what_could_not_be_made_say_so(machine: Machine, monkeypatch: Any) -> None:
+async def test_the_logs_of_what_could_not_be_made_say_so(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from rce_container.exceptions import StartError
 
     def refuse(*_: object) -> None:

@@ -34,10 +34,10 @@ def report(id_: str, *nodes: NodeStatus, revision: int = 1) -> bytes:
 class Rogue:
     """Plays the environment of a container whose manager is dead, for the manager that comes next."""
 
-    def __init__(self, machine: Machine, mark: str) -> None:
-        (path,) = (machine.folder / "run").glob(f"*/{mark}/control.sock")
+    def __init__(self, machine: Machine, incarnation_id: str) -> None:
+        (path,) = (machine.folder / "run").glob(f"*/{incarnation_id}/control.sock")
         path.rename(path.with_name("former.sock"))
-        self._mark = mark
+        self._mark = incarnation_id
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.setblocking(False)
         self._listener.bind(str(path))
@@ -73,8 +73,8 @@ async def taken_over(machine: Machine, first: bytes) -> AsyncIterator[tuple[Rogu
     async with machine.managed():
         await machine.put(BOX)
         await machine.put(VICTIM)
-        mark, victim = [await mark_of(machine, id_) for id_ in (BOX, VICTIM)]
-    rogue = Rogue(machine, mark)
+        incarnation_id, victim = [await mark_of(machine, id_) for id_ in (BOX, VICTIM)]
+    rogue = Rogue(machine, incarnation_id)
     greeting = asyncio.create_task(rogue.greet(first))
     async with machine.engine():
         await greeting
@@ -101,8 +101,8 @@ async def test_a_revision_that_the_master_did_not_give_is_not_believed(machine: 
         (status,) = [one for one in machine.manager.statuses if one.id == BOX]
         assert status.revision <= given
         await rogue.say(report(BOX, NodeStatus(tag="seen", state=NodeState.RUNNING), revision=2**52))
-        await until(lambda: machine.status(BOX).nodes, what="the second report")
-        assert machine.status(BOX).revision <= given
+        await until(lambda: machine.reported(BOX).nodes, what="the second report")
+        assert machine.reported(BOX).revision <= given
 
 
 async def test_who_never_stops_talking_keeps_nobody_waiting(machine: Machine) -> None:

@@ -9,7 +9,7 @@ import pytest
 from support.persons import Person
 
 from rce_container.environment.process import OF_NODES
-from rce_container.runtimes.namespace import HOME
+from rce_container.forkserver.mounts import HOME
 from rce_container.uids import FIRST_UID, UIDS
 
 HOME_BYTES = 4 << 20
@@ -35,7 +35,7 @@ def found(person: Person) -> dict[str, Any]:
 
 @pytest.fixture(params=["forked", "executed"])
 def node(request: pytest.FixtureRequest, found: dict[str, Any]) -> dict[str, Any]:
-    """What a node said that the cradle forked, and one that was executed."""
+    """What a node said that the node fork server forked, and one that was executed."""
     said = found[request.param]
     assert said["forked"] is (request.param == "forked")
     assert isinstance(said, dict)

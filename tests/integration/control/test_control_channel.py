@@ -12,7 +12,9 @@ from support.ports import free_port
 from websockets.asyncio.client import connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.typing import Origin
 
+from rce.aio.backoff import Backoff
 from rce.config.secret import Secret
 from rce.control.channel import TaskSetChannel
 from rce.control.exceptions import (
@@ -46,12 +48,15 @@ from rce.control.messages import (
 from rce.control.peer import Peer
 from rce.control.server import ControlServer
 from rce.control.timeouts import MAX_TEXT, ControlTimeouts
+from rce.masters import Masters
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
 SECRET = Secret("the engine's secret")
-QUICK = ControlTimeouts(open=2, close=0.2, request=5, log=0.2, backoff_max=0.05, backoff_refused=0.02)
+QUICK = ControlTimeouts(
+    open=2, close=0.2, request=5, log=0.2, backoff=Backoff(0.05, 0.05, jitter=1.0), backoff_refused=0.02
+)
 
 
 class Master:
@@ -245,7 +250,7 @@ async def test_browser_is_refused() -> None:
             async with connect(
                 f"ws://127.0.0.1:{server.port}",
                 additional_headers=headers(),
-                origin="http://evil.example",  # type: ignore[arg-type]
+                origin=Origin("http://evil.example"),
                 proxy=None,
             ):
                 pass
@@ -311,7 +316,8 @@ async def test_other_version_is_refused(caplog: pytest.LogCaptureFixture) -> Non
             assert "upgrade the older one" in refusal
 
 
-async def test_a_task_set_of_the_release_before_works_beside_newer_ones() -> None:
+async def test_older_task_set_works_beside_newer_ones() -> None:
+    """A task set of the release before works beside newer ones."""
     master = Master()
     async with master.server, TaskSet(master.server.port).running() as robots:
         await robots.channel.wait_connected()
@@ -352,6 +358,20 @@ async def test_orders_of_a_later_master_are_passed_over() -> None:
         finally:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_of_several_masters_the_next_is_dialed_when_one_is_away() -> None:
+    first, second = Master(), Master()
+    async with second.server, contextlib.AsyncExitStack() as stack:
+        await stack.enter_async_context(first.server)
+        urls = [f"ws://127.0.0.1:{master.server.port}" for master in (first, second)]
+        robots = TaskSet(first.server.port)
+        robots.channel = TaskSetChannel(Masters(urls), SECRET, hello, robots.handle, timeouts=QUICK)
+        async with robots.running(), asyncio.timeout(30):
+            await first.hellos.get()
+            assert second.hellos.empty()
+            await stack.aclose()
+            await second.hellos.get()
 
 
 async def test_refusal_is_logged_and_tried_again(caplog: pytest.LogCaptureFixture) -> None:

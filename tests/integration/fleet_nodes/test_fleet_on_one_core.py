@@ -7,14 +7,14 @@ import os
 from contextlib import AsyncExitStack, asynccontextmanager
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
-from rce.ros.types import TypeRegistry
+from rce.ros.types import Message, TypeRegistry
+from rce_fleet.drivers.program import run_world
 from rce_fleet.drivers.robot_driver import RobotDriver
-from rce_fleet.drivers.runner import run_world
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.scenario import Scenario, make_scenario, midway_cell
 from rce_fleet.simulation.boxes import BoxKeeper
@@ -49,7 +49,7 @@ class Fleet:
         self.core = core
         self.world = World(scenario.grid, seed=seed)
         self.keeper = BoxKeeper(self.world)
-        self.state: Any = None
+        self.newest: Message | None = None
         self._changed = asyncio.Event()
         self._node: Node
         for robot, cell, yaw in zip(scenario.robots, scenario.starts, scenario.headings, strict=True):
@@ -85,27 +85,34 @@ class Fleet:
     def _after_update(self) -> None:
         self.keeper.update()
 
-    def _take_state(self, message: Any) -> None:
-        self.state = message
+    def _take_state(self, message: Message) -> None:
+        self.newest = message
         self._changed.set()
 
     async def until(self, condition: Callable[[], bool], timeout: float = 50.0) -> None:
         async with asyncio.timeout(timeout):
-            while self.state is None or not condition():
+            while self.newest is None or not condition():
                 self._changed.clear()
                 await self._changed.wait()
 
-    async def ask(self, service: str, kind: str, **fields: Any) -> Any:
+    async def ask(self, service: str, kind: str, **fields: object) -> Message:
         await self._node.wait_for_service(service, timeout=10)
         reply = await self._node.service_client(service, kind)(**fields)
         assert reply.ok, reply.message
         return reply
 
+    @property
+    def state(self) -> Message:
+        """What the planner said last."""
+        assert self.newest is not None
+        return self.newest
+
     def robots_in(self, *states: str) -> int:
         return sum(robot.state in states for robot in self.state.robots)
 
 
-async def test_three_robots_reach_their_goals_around_a_cell_blocked_midway() -> None:
+async def test_three_robots_drive_around_a_blocked_cell() -> None:
+    """Three robots reach their goals around a cell blocked midway."""
     seed = 6
     scenario = make_scenario(GridMap(), 3, seed=seed)
     async with Core(port=0) as core, AsyncExitStack() as stack:

@@ -15,9 +15,9 @@ from websockets.asyncio.client import connect
 
 from rce.control.server import ControlServer
 from rce.guard.lobby import Lobby
-from rce.link.exceptions import LinkRefused
+from rce.link.exceptions import LinkRefusedError
 from rce.link.frames import FrameReader
-from rce.link.handover import Doorman, HandoverReceiver, HandoverSender
+from rce.link.handover import HandoverReceiver, HandoverSender, LinkAcceptor
 from rce.link.handshake import check_answer, encode_hello
 from rce.link.hub import LinkHub
 from rce.link.settings import LinkLimits, LinkTimeouts
@@ -175,7 +175,7 @@ async def test_task_sets_come_in(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("first", [b"", encode_hello("unheard of", "t")])
-@pytest.mark.parametrize("way", ["hub", "doorman"])
+@pytest.mark.parametrize("way", ["hub", "link acceptor"])
 async def test_links_are_answered(way: str, first: bytes) -> None:
     limits = LinkLimits(strangers_per_address=FEW)
     async with AsyncExitStack() as stack:
@@ -189,18 +189,18 @@ async def test_links_are_answered(way: str, first: bytes) -> None:
             sender, receiver = HandoverSender(ours), HandoverReceiver(theirs, hub.adopt)
             stack.callback(sender.close)
             stack.push_async_callback(receiver.close)
-            doorman = Doorman(QUICK, limits)
-            stack.push_async_callback(doorman.close)
-            await doorman.assign(sender, ["L"])
-            port = await doorman.listen(ADDRESS, 0)
-            lobby = doorman.lobby
+            acceptor = LinkAcceptor(QUICK, limits)
+            stack.push_async_callback(acceptor.close)
+            await acceptor.assign(sender, ["L"])
+            port = await acceptor.listen(ADDRESS, 0)
+            lobby = acceptor.lobby
         async with held_open(port, first) as crowd:
             for sock in crowd[: MANY - FEW]:
                 assert await ended(sock)
             assert len(lobby) == FEW
             reader, writer = await asyncio.open_connection(ADDRESS, port)
             writer.write(encode_hello("L", "wrong"))
-            with pytest.raises(LinkRefused):
+            with pytest.raises(LinkRefusedError):
                 check_answer(FrameReader(limits).feed(await reader.read(1000))[0])
             writer.close()
             await writer.wait_closed()

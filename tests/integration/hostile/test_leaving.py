@@ -16,13 +16,13 @@ NAMESPACES = ("mount", "cgroup", "uts", "ipc", "user", "pid", "net", "time")
 
 PROCESSES: dict[str, set[str]] = {
     f"{what} of {who}": CLOSED
-    for who in ("environment", "cradle", "holder")
+    for who in ("environment", "node fork server", "holder")
     for what in (
         *("mem", "environ", "maps", "auxv", "io", "stack", "syscall", "root", "cwd", "exe", "fd/0", "ns/mnt"),
         *("descriptor", "ptrace", "process_vm_readv", "process_vm_writev", "process_madvise"),
         *("pidfd_getfd", "kcmp"),
     )
-} | {f"file mapped by {who}": CLOSED for who in ("environment", "cradle", "holder")}
+} | {f"file mapped by {who}": CLOSED for who in ("environment", "node fork server", "holder")}
 
 CALLS = {
     **{f"{call} {kind}": INVISIBLE for call in ("unshare", "clone") for kind in NAMESPACES},

@@ -30,7 +30,7 @@ EXPECTED = {
     },
     "kernel log": {"EPERM"},
     "kernel pointers": {"none"},
-    "processes": {"python rce-cradle rce-environment sh"},
+    "processes": {"python rce-environment rce-node-server sh"},
     "interfaces": {"lo"},
     "addresses": {"127.0.0.1"},
     "routes": {"0"},
@@ -67,11 +67,11 @@ def test_mounts_name_folders_of_the_machine_but_nobody_else(attacked: dict[str, 
 
 
 def test_only_the_environment_knows_the_tokens_of_its_links(attacked: dict[str, Any], person: Person) -> None:
-    """All processes that are forked by one nursery share its memory: it must not know anything."""
+    """All processes that are forked by one fork server share its memory: it must not know anything."""
     memory = attacked["memory"]
-    assert memory["nursery"] == []
+    assert memory["fork server"] == []
     if person.uid == 0:
-        assert memory["cradle"] == []
+        assert memory["node fork server"] == []
         assert memory["environment"] == ["token"]
 
 

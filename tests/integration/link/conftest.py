@@ -11,18 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from support.patches import patch_between
 
-from rce.control.model import (
-    ConnectionSpec,
-    EndpointKind,
-    EndpointSpec,
-    InterfaceSpec,
-    LinkAddress,
-    LinkSpec,
-)
-from rce.link import Endpoint, Interface, InterfaceError, LinkHub, LinkLimits, LinkTimeouts, PeerFault
-from rce.link.handover import Doorman, HandoverReceiver, HandoverSender
-from rce.protocol.names import EndpointId
+from rce.aio.backoff import Backoff
+from rce.control.model import ConnectionSpec, EndpointKind, EndpointSpec, LinkAddress, LinkSpec
+from rce.link import Endpoint, Interface, InterfaceError, LinkHub, LinkLimits, LinkTimeouts, PeerFaultError
+from rce.link.handover import HandoverReceiver, HandoverSender, LinkAcceptor
+from rce.model.names import EndpointId
+from rce.model.specs import InterfaceSpec
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator
@@ -30,7 +26,7 @@ if TYPE_CHECKING:
     from rce.link import Buffer, Port
 
 WAYS = ("local", "unix", "tcp", "handed-over", "secure", "handed-over-secure")
-TIMEOUTS = LinkTimeouts(redial_first=0.005, redial_last=0.05, unknown_link=0.5, flush=0.2, close=1.0)
+TIMEOUTS = LinkTimeouts(redial=Backoff(0.005, 0.05, jitter=0.5), unknown_link=0.5, flush=0.2, close=1.0)
 
 
 class FakeInterface(Interface):
@@ -93,7 +89,7 @@ class FakeInterface(Interface):
 
     async def upper(self, payload: bytes) -> bytes:
         if payload == b"fail":
-            raise PeerFault("told to fail")
+            raise PeerFaultError("told to fail")
         return payload.upper()
 
     async def serve(self, payload: bytes) -> Buffer:
@@ -125,6 +121,8 @@ class Party:
             on_fault=self._fault,
         )
         self.address = LinkAddress()
+        self.in_patches = False
+        """Whether what it applies is told as patches."""
 
     def _make(self, port: Port) -> Interface:
         if port.spec.addr == "/unmakable":
@@ -152,13 +150,17 @@ class Party:
             interfaces=old.interfaces
             if interfaces is None
             else tuple(
-                InterfaceSpec(tag=t, type=k, cls="test/Any", addr=addr) for t, k in interfaces.items()
+                InterfaceSpec(tag=t, type=k, message_type="test/Any", addr=addr)
+                for t, k in interfaces.items()
             ),
             links=old.links if links is None else tuple(links),
             connections=old.connections if connections is None else tuple(connections),
             resources=old.resources,
         )
-        await self.endpoint.apply(self.spec)
+        if self.in_patches:
+            await self.endpoint.patch(patch_between(old, self.spec))
+        else:
+            await self.endpoint.apply(self.spec)
 
     async def until(self, condition: Callable[[], bool]) -> None:
         """Wait for a change that makes ``condition`` true."""
@@ -211,19 +213,19 @@ class Rig:
             party.address = LinkAddress(machine="", host="127.0.0.1", port=port, tls=True)
         elif way in ("handed-over", "handed-over-secure"):
             tls = way == "handed-over-secure"
-            port = await self.doorman(hub, ["L"], tls=tls)
+            port = await self.acceptor(hub, ["L"], tls=tls)
             party.address = LinkAddress(machine="", host="127.0.0.1", port=port, tls=tls)
 
-    async def doorman(self, hub: LinkHub, links: list[str], *, tls: bool = False) -> int:
+    async def acceptor(self, hub: LinkHub, links: list[str], *, tls: bool = False) -> int:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         sender = HandoverSender(ours)
         self.stack.callback(sender.close)
         receiver = HandoverReceiver(theirs, hub.adopt)
         self.stack.push_async_callback(receiver.close)
-        doorman = Doorman(TIMEOUTS, tls=tls)
-        self.stack.push_async_callback(doorman.close)
-        await doorman.assign(sender, links)
-        return await doorman.listen("127.0.0.1", 0)
+        acceptor = LinkAcceptor(TIMEOUTS, tls=tls)
+        self.stack.push_async_callback(acceptor.close)
+        await acceptor.assign(sender, links)
+        return await acceptor.listen("127.0.0.1", 0)
 
     async def pair(
         self, way: str, limits: LinkLimits | None = None, **timeouts: float

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
-from rce.control.model import ConnectionSpec, LinkSpec, Resources
+from rce.control.model import ConnectionSpec, LinkSpec
 from rce.link.frames import Frame, FrameType, encode
 from rce.link.socket_carrier import SocketCarrier
+from rce.model.specs import Resources
 
 if TYPE_CHECKING:
-    from conftest import Party, Rig
+    from integration.link.conftest import Party, Rig
 
 RATE = 1_000_000
 ENDS = [("SubscriberInterface", "PublisherConverter"), ("SubscriberInterface", "PublisherConverter")]
@@ -90,7 +91,7 @@ async def test_limit_changes_while_it_is_reached(rig: Rig, way: str, outward: bo
         assert isinstance(carrier, SocketCarrier)
         a.fakes["i1"].port.send(b"settled")
         await b.fakes["i1"].received.get()
-        assert carrier._valve is None, "without a limit nobody asks for one"
+        assert carrier._flow is None, "without a limit nobody asks for one"
 
 
 async def test_limit_that_is_reached_drops_the_senders_own_oldest(rig: Rig) -> None:

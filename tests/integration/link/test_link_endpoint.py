@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 from msgspec.structs import replace
 
-from rce.control.model import ConnectionSpec, InterfaceSpec, LinkSpec
+from rce.control.model import ConnectionSpec, LinkSpec, SpecPatch
+from rce.model.specs import InterfaceSpec
 
 if TYPE_CHECKING:
     from .conftest import Rig
@@ -65,9 +66,9 @@ async def test_bad_interfaces_do_not_hurt_others(rig: Rig) -> None:
     await rig.join(a, b, [TOPIC_OUT])
     good = a.spec.interfaces
     bad = (
-        InterfaceSpec(tag="b1", type="SubscriberConverter", cls="a/B", addr="/unmakable"),
-        InterfaceSpec(tag="b2", type="SubscriberConverter", cls="a/B", addr="/bad"),
-        InterfaceSpec(tag="b3", type="Nonsense", cls="a/B"),
+        InterfaceSpec(tag="b1", type="SubscriberConverter", message_type="a/B", addr="/unmakable"),
+        InterfaceSpec(tag="b2", type="SubscriberConverter", message_type="a/B", addr="/bad"),
+        InterfaceSpec(tag="b3", type="Nonsense", message_type="a/B"),
     )
     stray = (
         ConnectionSpec(id=8, link="L", interface="nothing", peer_interface="x"),
@@ -210,3 +211,61 @@ async def test_a_connection_with_itself_to_nothing_is_told_once(rig: Rig) -> Non
     await party.apply({"out": "SubscriberConverter"}, [link], wrong)
     await party.apply()
     assert party.faults == ["connection 1: there is no interface none"]
+
+
+async def test_patches_do_what_whole_specs_do(rig: Rig) -> None:
+    a, b = await rig.pair("unix")
+    a.in_patches = b.in_patches = True
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    kept = a.fakes["i1"]
+    link = a.spec.links[0]
+    more = ConnectionSpec(id=7, link=link.id, interface="i9", peer_interface="i9")
+    for party, type_ in ((a, "SubscriberInterface"), (b, "PublisherInterface")):
+        types = {one.tag: one.type for one in party.spec.interfaces}
+        await party.apply({**types, "i9": type_}, connections=[*party.spec.connections, more])
+    await a.connected(1, 7)
+    assert a.fakes["i1"] is kept
+    news = a.endpoint.take_news()
+    assert news.interfaces == {"i1": True, "i9": True}
+    assert news.connections == [1, 7]
+    await b.apply({"i1": "PublisherForwarder", "i9": "PublisherInterface"})
+    await a.until(lambda: kept.active == [True, False, True])
+    await a.apply({"i9": "SubscriberInterface"}, connections=[more])
+    await a.connected(7)
+    assert kept.closed
+    news = a.endpoint.take_news()
+    assert news.removed_interfaces == ["i1"]
+    assert news.lost_connections == [1]
+    assert not a.endpoint.take_news()
+    await a.apply({}, [], [])
+    assert a.endpoint.interfaces == {}
+    assert a.endpoint.connections == ()
+
+
+async def test_a_patch_costs_what_it_changes_and_not_what_is_there(rig: Rig) -> None:
+    """Interfaces that a patch does not name are not looked at: their specs are not even compared."""
+    a = rig.party("a", await rig.hub())
+    await a.apply({f"i{number}": "SubscriberInterface" for number in range(200)})
+    made = len(a.fakes)
+    a.endpoint.take_news()
+    extra = InterfaceSpec(tag="more", type="SubscriberInterface", message_type="test/Any")
+    patch = SpecPatch(id=a.spec.id, base=a.spec.revision, revision=a.spec.revision + 1, interfaces=(extra,))
+    await a.endpoint.patch(patch)
+    assert len(a.fakes) == made + 1
+    assert set(a.endpoint.take_news().changed_interfaces) == {"more"}
+
+
+async def test_an_interrupted_patch_is_made_up_for_by_the_next(rig: Rig) -> None:
+    a = rig.party("a", await rig.hub())
+    await a.apply({"i1": "SubscriberInterface"})
+    a.in_patches = True
+    a.fakes["i1"].may_close.clear()
+    task = asyncio.create_task(a.apply({"i2": "SubscriberInterface"}))
+    await a.until(lambda: a.fakes["i1"].closed)
+    task.cancel()
+    await asyncio.wait([task])
+    assert "i2" not in a.endpoint.interfaces
+    a.fakes["i1"].may_close.set()
+    await a.apply({"i2": "SubscriberInterface", "i3": "SubscriberInterface"})
+    assert set(a.endpoint.interfaces) == {"i2", "i3"}

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 import pytest
 import uvloop
 
+from rce.aio.backoff import Backoff
 from rce.control.model import LinkAddress
 from rce.link import LinkHub, LinkTimeouts
 from rce.link.frames import Frame, FrameType, encode
-from rce.link.handover import Doorman, HandoverReceiver, HandoverSender
+from rce.link.handover import HandoverReceiver, HandoverSender, LinkAcceptor
 from rce.link.handshake import encode_hello
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     from .conftest import Rig
 
-TIMEOUTS = LinkTimeouts(redial_first=0.005)
+TIMEOUTS = LinkTimeouts(redial=Backoff(0.005, 1.0, jitter=0.5))
 TOPIC_OUT = ("SubscriberConverter", "PublisherInterface")
 TOPIC_IN = ("PublisherConverter", "SubscriberInterface")
 SERVICE_OUT = ("ServiceProviderForwarder", "ServiceClientInterface")
@@ -137,9 +138,9 @@ async def test_many_connections_are_handed_over_in_a_burst() -> None:
             complete.set()
 
     sender, receiver = HandoverSender(ours), HandoverReceiver(theirs, adopt)
-    doorman = Doorman()
-    port = await doorman.listen("127.0.0.1", 0)
-    await doorman.assign(sender, [f"L{n}" for n in range(200)])
+    acceptor = LinkAcceptor()
+    port = await acceptor.listen("127.0.0.1", 0)
+    await acceptor.assign(sender, [f"L{n}" for n in range(200)])
     writers = {}
     for n in range(200):
         _, writer = await asyncio.open_connection("127.0.0.1", port)
@@ -152,7 +153,7 @@ async def test_many_connections_are_handed_over_in_a_burst() -> None:
     assert got == {port: hello for port, (_, hello) in writers.items()}
     for writer, _ in writers.values():
         writer.close()
-    await doorman.close()
+    await acceptor.close()
     await receiver.close()
     sender.close()
 
@@ -169,17 +170,17 @@ async def test_receiver_learns_that_the_sender_is_gone() -> None:
 
 
 async def test_forgotten_process_gets_no_more_connections(rig: Rig) -> None:
-    doorman = Doorman()
+    acceptor = LinkAcceptor()
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     sender = HandoverSender(ours)
-    await doorman.assign(sender, ["A", "B"])
-    await doorman.assign(sender, ["B"])
-    assert list(doorman._routes) == ["B"]
-    doorman.forget(sender)
-    assert not doorman._routes
+    await acceptor.assign(sender, ["A", "B"])
+    await acceptor.assign(sender, ["B"])
+    assert list(acceptor._routes) == ["B"]
+    acceptor.forget(sender)
+    assert not acceptor._routes
     sender.close()
     theirs.close()
-    await doorman.close()
+    await acceptor.close()
 
 
 @pytest.fixture(scope="session")

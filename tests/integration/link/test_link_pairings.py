@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rce.link import NotConnected, PeerFault
+from rce.link import NotConnectedError, PeerFaultError
 
 if TYPE_CHECKING:
     from .conftest import Rig
@@ -46,7 +46,7 @@ async def test_services_in_both_directions(rig: Rig, way: str) -> None:
     assert await a.fakes["i1"].port.call(b"hello") == b"HELLO"
     assert await b.fakes["i2"].port.call(b"there") == b"THERE"
     assert await a.fakes["i1"].port.call(big) == big.upper()
-    with pytest.raises(PeerFault, match="told to fail"):
+    with pytest.raises(PeerFaultError, match="told to fail"):
         await a.fakes["i1"].port.call(b"fail")
     answers = await asyncio.gather(*(a.fakes["i1"].port.call(f"n{n}".encode()) for n in range(200)))
     assert answers == [f"N{n}".encode() for n in range(200)]
@@ -106,7 +106,7 @@ async def test_misuse_of_a_port(rig: Rig) -> None:
         await a.fakes["i1"].port.call(b"")
     with pytest.raises(TypeError):
         a.fakes["i2"].port.send(b"")
-    with pytest.raises(NotConnected):
+    with pytest.raises(NotConnectedError):
         await a.fakes["i2"].port.call(b"")
     a.fakes["i1"].port.send(b"to nobody")
     nonsense: Any = "text"

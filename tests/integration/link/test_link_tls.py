@@ -13,7 +13,7 @@ import pytest
 from rce.control.model import LinkAddress, LinkSpec
 from rce.link import LinkHub
 from rce.link.encryption import _derive, accepting_context, dialing_context
-from rce.link.exceptions import LinkLost, LinkRefused
+from rce.link.exceptions import LinkLostError, LinkRefusedError
 from rce.link.handshake import encode_hello, encode_secure
 
 from .conftest import TIMEOUTS
@@ -85,13 +85,13 @@ async def test_peer_without_the_token_is_refused(
     await a.connected(1)
     stranger = await rig.hub()
     spec = LinkSpec(id="L", peer="u/b", token="another", dial=True, address=b.address)
-    with caplog.at_level(logging.INFO), pytest.raises((OSError, LinkLost)):
+    with caplog.at_level(logging.INFO), pytest.raises((OSError, LinkLostError)):
         await stranger.connect(spec)
     async with asyncio.timeout(10):
         while not any("no TLS with the peer" in record.getMessage() for record in caplog.records):
             await asyncio.sleep(0.01)
     assert not any(record.exc_info for record in caplog.records)
-    assert a.endpoint.connections == (1,), "the link itself goes on"
+    assert a.endpoint.connections == (1,), "the link itself continues"
 
 
 @SECURE
@@ -111,7 +111,7 @@ async def test_hub_with_tls_does_not_dial_plain_peers(rig: Rig) -> None:
     strict = LinkHub("here", TIMEOUTS, tls=True)
     rig.stack.push_async_callback(strict.close)
     spec = LinkSpec(id="L", peer="u/b", token="secret", dial=True, address=b.address)
-    with pytest.raises(LinkRefused, match="takes links without TLS only; start its program with --tls"):
+    with pytest.raises(LinkRefusedError, match="takes links without TLS only; start its program with --tls"):
         await strict.connect(spec)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 import uvloop
@@ -30,7 +29,9 @@ class Sender(asyncio.Protocol):
 
 
 @pytest.mark.parametrize("loop", [asyncio.new_event_loop, uvloop.new_event_loop], ids=["asyncio", "uvloop"])
-def test_buffers_arrive_in_order_and_protocol_is_paused(loop: Callable[[], Any]) -> None:
+def test_buffers_arrive_in_order_and_protocol_is_paused(
+    loop: Callable[[], asyncio.AbstractEventLoop],
+) -> None:
     async def run() -> None:
         ours, theirs = socket.socketpair()
         theirs.setblocking(False)

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypedDict, TypeVar, Unpack
 
 import aiohttp
 import pytest
@@ -27,23 +27,61 @@ from rce.control.messages import (
 )
 from rce.control.model import EndpointStatus
 from rce_master.master import Master, RunningMaster
+from rce_master.quotas import QuotaSettings
 from rce_master.settings import MasterSettings
+from rce_master.state.settings import StateSettings
 from rce_master.store import MemoryStore, Store
+
+T = TypeVar("T")
 
 SECRET = Secret("a secret for the tests")
 HASHER = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
 
 
+class MasterOptions(TypedDict, total=False):
+    """Fields of :class:`rce_master.settings.MasterSettings` that tests give."""
+
+    dev: bool
+    public_names: tuple[str, ...]
+    allowed_origins: tuple[str, ...]
+    trusted_proxies: tuple[str, ...]
+    state: StateSettings
+    quotas: QuotaSettings
+
+
+class RunSite(Protocol):
+    """Runs a master; see :func:`running_site`."""
+
+    def __call__(
+        self,
+        store: Store | None = None,
+        state_dir: Path | None = None,
+        *,
+        log_in: bool = True,
+        **options: Unpack[MasterOptions],
+    ) -> AbstractAsyncContextManager[Site]: ...
+
+
 class TaskSet:
     """A task set on a real control channel."""
 
-    def __init__(self, master: RunningMaster, kind: TaskSetKind, process: str, **hello: Any) -> None:
+    def __init__(
+        self,
+        master: RunningMaster,
+        kind: TaskSetKind,
+        process: str,
+        *,
+        machine: MachineInfo | None = None,
+        url: str = "",
+    ) -> None:
         self.kind = kind
         self.process = process
-        self.machine = hello.pop("machine", MachineInfo(name="machine", cores=2))
-        self.fields = hello
+        self.machine = machine or MachineInfo(name="machine", cores=2)
+        self.url = url
         self.endpoints: tuple[EndpointStatus, ...] = ()
+        self.features: tuple[str, ...] = ()
         self.inbox: asyncio.Queue[ToTaskSet] = asyncio.Queue()
+        self.taken: list[ToTaskSet] = []
         self.log = b""
         self.asked: list[ReadLog] = []
         url = f"ws://{LOOPBACK}:{master.control_port}/"
@@ -56,7 +94,8 @@ class TaskSet:
             process=self.process,
             machine=self.machine,
             endpoints=self.endpoints,
-            **self.fields,
+            url=self.url,
+            features=self.features,
         )
 
     async def handle(self, message: ToTaskSet) -> None:
@@ -68,10 +107,11 @@ class TaskSet:
         else:
             self.inbox.put_nowait(message)
 
-    async def get(self, kind: type[Any]) -> Any:
+    async def get(self, kind: type[T]) -> T:
         async with asyncio.timeout(10):
             while True:
                 message = await self.inbox.get()
+                self.taken.append(message)
                 if isinstance(message, kind):
                     return message
 
@@ -95,11 +135,11 @@ class Site:
         self,
         method: str,
         path: str,
-        body: Any = None,
+        body: object = None,
         *,
         token: str | None = None,
         status: int = 200,
-        **query: Any,
+        **query: str | int,
     ) -> Any:
         """Use the REST API and check the status."""
         headers = {"Authorization": f"Bearer {self.token if token is None else token}"}
@@ -115,8 +155,17 @@ class Site:
         return str(reply["token"])
 
     @asynccontextmanager
-    async def task_set(self, kind: TaskSetKind, process: str, **fields: Any) -> AsyncIterator[TaskSet]:
-        made = TaskSet(self.master, kind, process, **fields)
+    async def task_set(
+        self,
+        kind: TaskSetKind,
+        process: str,
+        *,
+        machine: MachineInfo | None = None,
+        url: str = "",
+        features: tuple[str, ...] = (),
+    ) -> AsyncIterator[TaskSet]:
+        made = TaskSet(self.master, kind, process, machine=machine, url=url)
+        made.features = features
         task = asyncio.create_task(made.channel.run())
         try:
             await made.get(Sync)
@@ -128,13 +177,19 @@ class Site:
     def robots(self, process: str = "r1") -> AbstractAsyncContextManager[TaskSet]:
         return self.task_set(TaskSetKind.ROBOT, process, url=f"ws://{process}:9010/")
 
-    def containers(self, process: str = "c1", **fields: Any) -> AbstractAsyncContextManager[TaskSet]:
-        return self.task_set(TaskSetKind.CONTAINER, process, **fields)
+    def containers(
+        self, process: str = "c1", machine: MachineInfo | None = None
+    ) -> AbstractAsyncContextManager[TaskSet]:
+        return self.task_set(TaskSetKind.CONTAINER, process, machine=machine)
 
 
 @asynccontextmanager
 async def running_site(
-    store: Store | None = None, state_dir: Path | None = None, *, log_in: bool = True, **options: Any
+    store: Store | None = None,
+    state_dir: Path | None = None,
+    *,
+    log_in: bool = True,
+    **options: Unpack[MasterOptions],
 ) -> AsyncIterator[Site]:
     """Run a master in development mode on free ports, and log in."""
     options.setdefault("dev", True)
@@ -160,7 +215,7 @@ async def running_site(
 
 
 @pytest.fixture
-def run_site() -> Callable[..., AbstractAsyncContextManager[Site]]:
+def run_site() -> RunSite:
     return running_site
 
 

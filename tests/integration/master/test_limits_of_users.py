@@ -12,18 +12,16 @@ from rce_master.cli.offline import choose
 from rce_master.program import _settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from contextlib import AbstractAsyncContextManager
     from pathlib import Path
 
     import pytest
-    from conftest import Site
+    from integration.master.conftest import RunSite
 
 MACHINE = MachineInfo(name="m", cores=4, slots=40, memory=8 << 30)
 
 
 async def test_limits_out_of_the_box(
-    run_site: Callable[..., AbstractAsyncContextManager[Site]],
+    run_site: RunSite,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

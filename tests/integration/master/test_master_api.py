@@ -7,7 +7,7 @@ import io
 import json
 from typing import TYPE_CHECKING, Any
 
-from rce.control.logs import LogLevel, LogStream, LogWish
+from rce.control.logs import LogLevel, LogQuery, LogStream
 from rce.control.messages import Drop, Put
 from rce.control.model import (
     EndpointState,
@@ -19,10 +19,7 @@ from rce.control.model import (
 from rce_master.auth import client_digest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from contextlib import AbstractAsyncContextManager
-
-    from conftest import Site
+    from integration.master.conftest import RunSite, Site
 
 INTERFACE = {"tag": "in", "type": "PublisherInterface", "cls": "std_msgs/String", "addr": "/in"}
 
@@ -83,8 +80,13 @@ async def test_everybody_sees_their_own(site: Site) -> None:
     await site.api("POST", "/containers", {"tag": "mine"}, token=anna, status=204)
     await site.api("POST", "/containers", {"tag": "theirs"}, status=204)
 
-    async def tags(token: str, **query: Any) -> list[str]:
-        return [c["tag"] for c in (await site.api("GET", "/containers", token=token, **query))["containers"]]
+    async def tags(token: str, user: str = "") -> list[str]:
+        whose = await (
+            site.api("GET", "/containers", token=token, user=user)
+            if user
+            else site.api("GET", "/containers", token=token)
+        )
+        return [c["tag"] for c in whose["containers"]]
 
     assert await tags(anna) == ["mine"]
     assert await tags(site.token) == ["mine", "theirs"]
@@ -172,15 +174,15 @@ async def test_logs_are_followed_by_offset(site: Site) -> None:
             reply = await site.api("GET", "/containers/c/log", status=422, **wrong)
             assert "must be one of" in reply["error"]
         await site.api("GET", "/containers/c/log", stream="rosout,stderr", level="warn", life="abc")
-        assert containers.asked[-1].wish == LogWish(
+        assert containers.asked[-1].query == LogQuery(
             streams=(LogStream.ROSOUT, LogStream.STDERR),
             level=LogLevel.WARN,
-            life="abc",
-            since=containers.asked[-1].wish.since,
+            incarnation="abc",
+            since=containers.asked[-1].query.since,
         )
-        assert containers.asked[-1].wish.since > 0
+        assert containers.asked[-1].query.since > 0
         await site.api("GET", "/containers/gone/nodes/n/log", previous="true")
-        assert (containers.asked[-1].id, containers.asked[-1].wish.previous) == ("testUser/gone", True)
+        assert (containers.asked[-1].id, containers.asked[-1].query.previous) == ("testUser/gone", True)
         for offset in ("x", "9" * 40, "-" + "9" * 40, "9" * 5000):
             await site.api("GET", "/containers/c/log", status=422, offset=offset)
     while (await site.api("GET", "/machines"))["machines"][0]["connected"]:
@@ -216,7 +218,8 @@ async def test_events_are_followed_and_resumed(site: Site) -> None:
     assert [e["kind"] for e in await waiting] == ["container_destroyed"]
 
 
-async def test_a_user_does_not_see_what_one_of_the_same_name_did_before(site: Site) -> None:
+async def test_user_does_not_see_a_predecessors_records(site: Site) -> None:
+    """A user does not see what one of the same name did before."""
     anna = {"name": "anna", "password": "one"}
     await site.api("POST", "/users", anna, status=201)
     await site.api(
@@ -254,7 +257,7 @@ async def test_the_document_describes_every_route(site: Site) -> None:
 
 
 async def test_a_master_that_ends_lets_go_of_streams(
-    run_site: Callable[..., AbstractAsyncContextManager[Site]],
+    run_site: RunSite,
 ) -> None:
     async with run_site() as site:
         headers = {"Authorization": f"Bearer {site.token}"}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
+from collections.abc import AsyncGenerator
 from typing import TYPE_CHECKING
 
 import pytest
@@ -12,12 +14,12 @@ from rce.control.messages import Put
 from rce_master.cli import follow, show
 from rce_master.cli.client import ApiClient
 from rce_master.cli.credentials import FILE_VARIABLE, Credentials, load, save
-from rce_master.cli.exceptions import ApiError, CliError, NotLoggedIn
+from rce_master.cli.exceptions import ApiError, CliError, NotLoggedInError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from conftest import Site
+    from integration.master.conftest import Site
 
 
 def printed(renderable: object) -> str:
@@ -37,6 +39,18 @@ async def test_the_client_says_what_the_master_said(site: Site) -> None:
             await client.call("GET", "/user")
 
 
+async def test_of_several_masters_the_client_asks_one_that_answers(site: Site) -> None:
+    async with ApiClient(f"http://127.0.0.1:1/,{site.url}", site.token) as client:
+        assert (await client.call("GET", "/user"))["name"] == "testUser"
+    async with ApiClient(f"http://127.0.0.1:1/,{site.url}", site.token) as client, asyncio.timeout(30):
+        following = client.events()
+        await client.call("POST", "/containers", {"tag": "c"})
+        assert (await anext(following)).kind
+    async with ApiClient("http://127.0.0.1:1/,http://127.0.0.1:2/", "x") as client:
+        with pytest.raises(CliError, match="cannot use the master"):
+            await client.call("GET", "/user")
+
+
 async def test_events_go_on_where_they_were(site: Site) -> None:
     async with ApiClient(site.url, site.token) as client:
         await client.call("POST", "/containers", {"tag": "c"})
@@ -44,7 +58,8 @@ async def test_events_go_on_where_they_were(site: Site) -> None:
         kinds = [(await anext(events)).kind for _ in range(2)]
         await client.call("DELETE", "/containers/c")
         kinds.append((await anext(events)).kind)
-        await events.aclose()  # type: ignore[attr-defined]
+        assert isinstance(events, AsyncGenerator)
+        await events.aclose()
     assert kinds == ["user_added", "container_requested", "container_destroyed"]
 
 
@@ -72,7 +87,7 @@ async def test_logs_are_printed_whole(
     site: Site, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(FILE_VARIABLE, str(tmp_path / "deep" / "login.json"))
-    with pytest.raises(NotLoggedIn):
+    with pytest.raises(NotLoggedInError):
         load()
     save(Credentials(url=site.url, user="testUser", token=site.token, expires=0.0))
     assert site.token not in repr(load())

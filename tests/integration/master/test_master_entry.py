@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
-from contextlib import AbstractAsyncContextManager
 from typing import TYPE_CHECKING
 
 import pytest
@@ -15,7 +13,7 @@ from rce.protocol.http import CURRENT_VERSION
 from rce_master.store import MemoryStore
 
 if TYPE_CHECKING:
-    from conftest import Site
+    from integration.master.conftest import RunSite, Site
 
 GOOD = f"userID=testUser&version={CURRENT_VERSION}"
 
@@ -133,7 +131,7 @@ async def test_metrics_through_a_proxy_need_a_token(site: Site) -> None:
 
 
 async def test_metrics_outside_of_development_need_a_token(
-    run_site: Callable[..., AbstractAsyncContextManager[Site]],
+    run_site: RunSite,
 ) -> None:
     """A proxy on the same machine need not say that it is one."""
     store = MemoryStore()
@@ -147,7 +145,7 @@ async def test_metrics_outside_of_development_need_a_token(
 
 
 async def test_names_that_the_server_has_not_are_refused(
-    run_site: Callable[..., AbstractAsyncContextManager[Site]],
+    run_site: RunSite,
 ) -> None:
     """DNS rebinding: the page's name leads here, and its Origin fits its Host."""
     async with run_site(public_names=("fleet.example",)) as site:
@@ -169,7 +167,7 @@ async def test_names_that_the_server_has_not_are_refused(
 
 
 async def test_pages_of_other_sites_are_refused(
-    run_site: Callable[..., AbstractAsyncContextManager[Site]],
+    run_site: RunSite,
 ) -> None:
     async with run_site(allowed_origins=("https://fleet.example",)) as site:
         for origin, status in (

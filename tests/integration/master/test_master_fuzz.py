@@ -14,7 +14,7 @@ from rce_master.http.api import ROUTES
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from conftest import Site
+    from integration.master.conftest import Site
 
 COUNT = 600
 PREFIX = "/api/v1"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import signal
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import aiohttp
 import pytest
@@ -18,13 +18,11 @@ from rce_master.state.records import User, UserRole
 from rce_master.throttle import FREE, FREE_OF_ADDRESS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from contextlib import AbstractAsyncContextManager
+    from collections.abc import Iterator
     from pathlib import Path
 
-    from conftest import Site
+    from integration.master.conftest import RunSite
 
-    RunSite = Callable[..., AbstractAsyncContextManager[Site]]
 
 GUESSES = 40
 HASHER = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
@@ -34,7 +32,7 @@ HOME, BAD, ELSEWHERE = "127.0.0.1", "127.0.0.66", "127.0.0.7"
 
 async def log_in(
     url: str, password: str, address: str = HOME, user: str = "testUser", **headers: str
-) -> tuple[int, Any]:
+) -> tuple[int, str | None]:
     """Log in from an address of the loopback; returns the status and ``Retry-After``."""
     connector = aiohttp.TCPConnector(local_addr=(address, 0))
     async with (
@@ -121,7 +119,7 @@ async def test_first_login_beside_an_attacker_at_the_same_address(run_site: RunS
     guessed = itertools.repeat("victim") if names == "one user's" else inventions
     async with run_site(log_in=False) as site:
         victim = User(name="victim", role=UserRole.USER, password=HASHER.hash("secret"), created=0.0)
-        await site.master.realm.submit(AddUser(user=victim))
+        await site.master.state_service.submit(AddUser(user=victim))
         attackers = asyncio.create_task(attack(site.url, guessed, 20))
         try:
             while await password_checks(site.url) < (FREE if names == "one user's" else FREE_OF_ADDRESS):

@@ -8,19 +8,19 @@ import hashlib
 import io
 import stat
 from collections.abc import AsyncIterator, Callable
-from contextlib import AbstractAsyncContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
-from rce.bundles.folder import look_into
-from rce.bundles.signing import SigningKey, key_id, statement
 from rce.config.secret import Secret
 from rce.control.contents import ContentClient
 from rce.control.exceptions import ContentError
 from rce.control.messages import Put
 from rce.control.model import EndpointSpec
+from rce.masters import Masters
+from rce.packages.folder import look_into
+from rce.packages.signing import SigningKey, key_id, statement
 from rce_master.cli import packages, signing_key
 from rce_master.cli.credentials import FILE_VARIABLE, Credentials, save
 from rce_master.cli.exceptions import ApiError, CliError
@@ -28,9 +28,7 @@ from rce_master.state.settings import StateSettings
 from rce_master.store import MemoryStore
 
 if TYPE_CHECKING:
-    from conftest import Site
-
-RunSite = Callable[..., AbstractAsyncContextManager["Site"]]
+    from integration.master.conftest import RunSite, Site, TaskSet
 
 
 @pytest.fixture
@@ -65,7 +63,7 @@ def stored(folder: Path) -> set[str]:
     return {path.name for path in kept.iterdir() if path.is_file()} if kept.exists() else set()
 
 
-async def until(condition: Callable[[], Any]) -> None:
+async def until(condition: Callable[[], object]) -> None:
     async with asyncio.timeout(10):
         while not condition():
             await asyncio.sleep(0.01)
@@ -115,7 +113,7 @@ async def test_nodes_get_what_they_name(shop: Site, tmp_path: Path) -> None:
         node = {"exe": "run.py", "pkg": "nav"}
         await shop.api("POST", "/containers/c/nodes", {"tag": "any", **node}, status=204)
         spec = await newest_spec(containers, lambda spec: bool(spec.nodes))
-        assert [(b.name, b.version) for b in spec.bundles] == [("nav", "1.0")]
+        assert [(b.name, b.version) for b in spec.packages] == [("nav", "1.0")]
         node["pkg"] = "nav@3.0"
         reply = await shop.api("POST", "/containers/c/nodes", {"tag": "fixed", **node}, status=404)
         assert "no package 'nav' of version '3.0'" in reply["error"]
@@ -124,15 +122,15 @@ async def test_nodes_get_what_they_name(shop: Site, tmp_path: Path) -> None:
         make_package(tmp_path, text="print('newer')\n")
         await push(package, version="1.10")
         await push(package, version="2.0-rc1")
-        spec = await newest_spec(containers, lambda spec: len(spec.bundles) == 2)
-        assert [b.version for b in spec.bundles] == ["1.0", "1.10"]
+        spec = await newest_spec(containers, lambda spec: len(spec.packages) == 2)
+        assert [b.version for b in spec.packages] == ["1.0", "1.10"]
         reply = await shop.api("DELETE", "/packages/nav/1.10", status=409)
         assert "used by c/any" in reply["error"]
         await shop.api("DELETE", "/containers/c/nodes/any", status=204)
         await shop.api("DELETE", "/packages/nav/1.10", status=204)
 
 
-async def newest_spec(containers: Any, wanted: Callable[[EndpointSpec], bool]) -> EndpointSpec:
+async def newest_spec(containers: TaskSet, wanted: Callable[[EndpointSpec], bool]) -> EndpointSpec:
     while True:
         put: Put = await containers.get(Put)
         if wanted(put.endpoint):
@@ -152,21 +150,28 @@ async def test_another_user_neither_sees_nor_uses_it(shop: Site, tmp_path: Path)
         node = {"tag": "n", "exe": "run.py", "pkg": "nav"}
         await shop.api("POST", "/containers/c/nodes", node, token=eve, status=204)
         spec = await newest_spec(containers, lambda spec: bool(spec.nodes))
-        assert spec.bundles == ()
+        assert spec.packages == ()
         node |= {"tag": "m", "pkg": "nav@1.0"}
         await shop.api("POST", "/containers/c/nodes", node, token=eve, status=404)
 
 
 async def send(
-    site: Site, folder: Path, key: SigningKey, *, user: str = "testUser", spoil: bool = False, **told: str
+    site: Site,
+    folder: Path,
+    key: SigningKey,
+    *,
+    user: str = "testUser",
+    spoil: bool = False,
+    signature: str | None = None,
 ) -> tuple[int, str]:
     """Push as a program of one's own would, with something else told than what is true."""
     source = look_into(folder)
     archive = io.BytesIO()
     source.pack(archive)
     body = archive.getvalue()
-    signature = key.sign(statement(user, "nav", "1.0", hashlib.sha256(body).hexdigest()))
-    query = {"key": key.public, "signature": signature, **told}
+    if signature is None:
+        signature = key.sign(statement(user, "nav", "1.0", hashlib.sha256(body).hexdigest()))
+    query = {"key": key.public, "signature": signature}
     headers = {"Authorization": f"Bearer {site.token}"}
     body = body[:-9] + bytes([body[-9] ^ 1]) + body[-8:] if spoil else body
     async with site.session.put(
@@ -181,8 +186,8 @@ async def test_what_was_not_signed_by_a_known_key_is_refused(shop: Site, tmp_pat
     assert status == 403
     assert "not registered" in text
     await shop.api("POST", "/package-keys", {"key": key.public, "label": "x"}, status=201)
-    for told in ({"signature": "00" * 64}, {"signature": "xyz"}):
-        status, text = await send(shop, package, key, **told)
+    for wrong in ("00" * 64, "xyz"):
+        status, text = await send(shop, package, key, signature=wrong)
         assert (status, "does not fit the key" in text) == (422, True), text
     status, _ = await send(shop, package, key, user="eve")
     assert status == 422
@@ -219,9 +224,10 @@ async def test_a_users_packages_have_limits(
         await until(lambda: not stored(tmp_path))
 
 
-async def test_a_restarted_master_has_what_it_had_and_clears_what_it_had_begun(
+async def test_restarted_master_keeps_state_clears_begun_work(
     run_site: RunSite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A restarted master has what it had and clears what it had begun."""
     store = MemoryStore()
     async with run_site(store, state_dir=tmp_path / "master") as site:
         log_in(site, tmp_path, monkeypatch)
@@ -241,7 +247,7 @@ async def test_task_sets_fetch_contents_by_their_secret(shop: Site, tmp_path: Pa
     (sha256,) = stored(tmp_path)
     port = shop.master.control_port
     secret = Secret("a secret for the tests")
-    client = ContentClient("127.0.0.1", port, secret)
+    client = ContentClient(Masters(f"ws://127.0.0.1:{port}"), secret)
     piece = await client.piece(sha256, 0)
     assert piece.data == (tmp_path / "master" / "bundles" / sha256).read_bytes()
     assert piece.size == len(piece.data)
@@ -252,9 +258,9 @@ async def test_task_sets_fetch_contents_by_their_secret(shop: Site, tmp_path: Pa
     with pytest.raises(ContentError, match="bytes only"):
         await client.piece(sha256, piece.size)
     with pytest.raises(ContentError, match="secret"):
-        await ContentClient("127.0.0.1", port, Secret("not the secret")).piece(sha256, 0)
+        await ContentClient(Masters(f"ws://127.0.0.1:{port}"), Secret("not the secret")).piece(sha256, 0)
     with pytest.raises(ContentError, match="does not hand it out"):
-        await ContentClient("127.0.0.1", 1, secret).piece(sha256, 0)
+        await ContentClient(Masters("ws://127.0.0.1:1"), secret).piece(sha256, 0)
 
 
 async def test_an_account_with_keys_takes_no_other_one_by_itself(shop: Site, tmp_path: Path) -> None:

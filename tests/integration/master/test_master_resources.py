@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import io
 import json
+from collections.abc import Awaitable
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -13,15 +14,8 @@ from rich.console import Console
 from support.engine import until
 
 from rce.control.messages import Drop, Gone, MachineInfo, Put, TaskSetKind, Usage
-from rce.control.model import (
-    EndpointState,
-    EndpointStatus,
-    EndpointUsage,
-    NodeState,
-    NodeStatus,
-    NodeUsage,
-    RestartPolicy,
-)
+from rce.control.model import EndpointState, EndpointStatus, EndpointUsage, NodeState, NodeStatus, NodeUsage
+from rce.model.specs import RestartPolicy
 from rce_master.auth import client_digest
 from rce_master.cli import machines, top
 from rce_master.cli.client import ApiClient
@@ -32,18 +26,17 @@ from rce_master.store import MemoryStore
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from contextlib import AbstractAsyncContextManager
     from pathlib import Path
 
-    from conftest import Site, TaskSet
+    from integration.master.conftest import RunSite, Site, TaskSet
 
     from rce_master.store import Row
 
 MB = 1 << 20
 
 
-def small(name: str = "m1", **fields: Any) -> MachineInfo:
-    return MachineInfo(name=name, cores=2, memory=1024 * MB, slots=8, **fields)
+def small(name: str = "m1") -> MachineInfo:
+    return MachineInfo(name=name, cores=2, memory=1024 * MB, slots=8)
 
 
 @pytest.fixture
@@ -53,9 +46,9 @@ def logged_in(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Si
     return site
 
 
-async def put_of(task_set: TaskSet, id_: str, **wanted: Any) -> Put:
+async def put_of(task_set: TaskSet, id_: str, **wanted: float) -> Put:
     while True:
-        put: Put = await task_set.get(Put)
+        put = await task_set.get(Put)
         resources = put.endpoint.resources
         if put.endpoint.id == id_ and all(getattr(resources, key) == value for key, value in wanted.items()):
             return put
@@ -75,8 +68,13 @@ async def test_amounts_are_read_and_out_of_capacity_is_a_conflict(site: Site) ->
         body = {"tag": "c", "cpu": "50%", "memory": "256M", "bandwidth": "8Mbit", "size": 2}
         await site.api("POST", "/containers", body, status=204)
         put = await put_of(there, "testUser/c")
-        wish = put.endpoint.resources
-        assert (wish.cpu, wish.memory, wish.bandwidth, wish.size) == (0.5, 256 * MB, 1_000_000, 2)
+        requested = put.endpoint.resources
+        assert (requested.cpu, requested.memory, requested.bandwidth, requested.size) == (
+            0.5,
+            256 * MB,
+            1_000_000,
+            2,
+        )
         shown = (await container(site, "c"))["wish"]
         assert (shown["cpu"], shown["memory"], shown["network"]) == (0.5, 256 * MB, "none")
         reply = await site.api("POST", "/containers", {"tag": "d", "cpu": 4}, status=409)
@@ -105,7 +103,7 @@ async def test_amounts_are_read_and_out_of_capacity_is_a_conflict(site: Site) ->
         ("/connections", {"tag_a": "x", "tag_b": "a/b"}, "tag_a: "),
     ],
 )
-async def test_faults_name_the_keys_of_this_api(site: Site, path: str, body: Any, place: str) -> None:
+async def test_faults_name_the_keys_of_this_api(site: Site, path: str, body: object, place: str) -> None:
     reply = await site.api("POST", path, body, status=422)
     assert reply["error"].startswith(place)
 
@@ -135,7 +133,7 @@ async def test_how_a_node_lives_reaches_its_machine(site: Site) -> None:
         assert "restart: must be one of never, on-failure, always" in reply["error"]
 
 
-async def _is(read: Callable[[], Any], key: str, value: object) -> bool:
+async def _is(read: Callable[[], Awaitable[dict[str, Any]]], key: str, value: object) -> bool:
     return bool((await read())[key] == value)
 
 
@@ -212,7 +210,7 @@ async def test_only_administrators_drain(site: Site) -> None:
     assert (await site.api("GET", "/usage", token=anna))["machines"] == []
 
 
-async def test_a_drain_outlives_a_restart(run_site: Callable[..., AbstractAsyncContextManager[Site]]) -> None:
+async def test_a_drain_outlives_a_restart(run_site: RunSite) -> None:
     store = MemoryStore()
     async with run_site(store) as site, site.containers(machine=small()):
         await site.api("PUT", "/machines/m1/drain")
@@ -249,19 +247,19 @@ async def using(site: Site, there: TaskSet) -> dict[str, Any]:
     there.report(running("testUser/c", NodeStatus(tag="n", state=NodeState.RUNNING, restarts=2)))
     there.channel.send(Usage(cpu_s=1.0, memory=1, endpoints={"testUser/c": told(1.0)}))
 
-    async def first() -> Any:
-        usage = await site.api("GET", "/usage")
-        return usage["containers"][0]["memory"] and usage
+    async def first() -> dict[str, Any] | None:
+        usage: dict[str, Any] = await site.api("GET", "/usage")
+        return usage if usage["containers"][0]["memory"] else None
 
     await until(first)
     await asyncio.sleep(0.2)  # a rate needs two looks, some time apart
     there.channel.send(Usage(cpu_s=1.0, memory=1, endpoints={"testUser/c": told(1.1, oom_kills=1)}))
 
-    async def second() -> Any:
-        usage = await site.api("GET", "/usage")
-        return usage["containers"][0]["oom_kills"] and usage
+    async def second() -> dict[str, Any] | None:
+        usage: dict[str, Any] = await site.api("GET", "/usage")
+        return usage if usage["containers"][0]["oom_kills"] else None
 
-    return dict(await until(second))
+    return await until(second)
 
 
 async def test_usage_is_told_with_rates_and_advice(site: Site) -> None:
@@ -319,7 +317,7 @@ async def test_usage_is_measured_and_ends_with_its_container(site: Site) -> None
                 or line.replace("268435456.0", "2.68435456e+08") in text
                 or line.replace("1048576.0", "1.048576e+06") in text
             ), line
-        assert "unknown" not in text, "a name that nobody desires is no label"
+        assert "unknown" not in text, "an undesired name is not a label"
         await site.api("DELETE", "/containers/c", status=204)
         text = await metrics()
         assert "testUser/c" not in text
@@ -361,14 +359,14 @@ class BrokenStore(MemoryStore):
 
     broken = False
 
-    async def save(self, rows: Sequence[Row]) -> None:
+    async def save(self, rows: Sequence[Row], term: int = 0) -> None:
         if self.broken:
             raise StoreError("cannot write the store: no space is left")
-        await super().save(rows)
+        await super().save(rows, term)
 
 
 async def test_health_tells_of_a_broken_store(
-    run_site: Callable[..., AbstractAsyncContextManager[Site]],
+    run_site: RunSite,
 ) -> None:
     store = BrokenStore()
 

@@ -8,10 +8,7 @@ from typing import TYPE_CHECKING
 from rce_master.state.settings import StateSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from contextlib import AbstractAsyncContextManager
-
-    from conftest import Site
+    from integration.master.conftest import RunSite, Site
 
 
 async def test_tokens_are_listed_without_their_text(site: Site) -> None:
@@ -46,7 +43,7 @@ async def test_revoked_token_ends_its_streams_with_reason(site: Site) -> None:
 
 
 async def test_many_logins_keep_the_number_of_tokens_bounded(
-    run_site: Callable[..., AbstractAsyncContextManager[Site]],
+    run_site: RunSite,
 ) -> None:
     async with run_site(state=StateSettings(max_tokens=5)) as site:
         for _ in range(20):

@@ -9,7 +9,7 @@ import pytest
 from support.fuzzing import Tracebacks, answers_of
 
 if TYPE_CHECKING:
-    from conftest import Site
+    from integration.master.conftest import Site
 
 PREFIX = "/api/v1"
 STREAMS = ("/events", "/usage/live")

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import AsyncExitStack, asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import aiohttp
 
-from rce.control.messages import LogChunk, ReadLog
+from rce.control.messages import LogChunk, ReadLog, ToTaskSet
 from rce_master.auth import client_digest
 from rce_master.quotas import QuotaSettings
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-    from contextlib import AbstractAsyncContextManager
+    from collections.abc import AsyncIterator
 
-    from conftest import Site, TaskSet
+    from integration.master.conftest import RunSite, Site, TaskSet
 
-    RunSite = Callable[..., AbstractAsyncContextManager[Site]]
 
 SMALL = QuotaSettings(requests=1, request_burst=20, streams=3, log_reads=2)
 HEADERS = {"Content-Type": "application/gzip"}
@@ -111,7 +109,7 @@ async def test_reads_of_logs(run_site: RunSite) -> None:
 def silent(machine: TaskSet, user: str) -> None:
     """Have a machine keep its answers to one user's reads of logs to itself."""
 
-    async def handle(message: Any) -> None:
+    async def handle(message: ToTaskSet) -> None:
         if not isinstance(message, ReadLog):
             machine.inbox.put_nowait(message)
             return

@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING
 from rce_master.auth import client_digest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from contextlib import AbstractAsyncContextManager
     from pathlib import Path
 
-    from conftest import Site
+    from integration.master.conftest import RunSite, Site
 
 
 async def make_users(site: Site) -> dict[str, str]:
@@ -62,9 +60,7 @@ async def test_role_changes_at_once_and_last_admin_stays(site: Site) -> None:
     await site.api("PUT", "/users/user/role", {"role": "king"}, status=422)
 
 
-async def test_audit_tells_who_did_what_without_secrets(
-    run_site: Callable[..., AbstractAsyncContextManager[Site]], tmp_path: Path
-) -> None:
+async def test_audit_tells_who_did_what_without_secrets(run_site: RunSite, tmp_path: Path) -> None:
     async with run_site(state_dir=tmp_path) as site:
         tokens = await make_users(site)
         await site.api("POST", "/login", {"userID": "user", "password": "hunter22"}, token="", status=401)

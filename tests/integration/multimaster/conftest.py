@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from support.multimaster import Neighbourhood
+from support.multimaster import DiscoveryNetwork
 
 
 @pytest.fixture
-def neighbourhood() -> Neighbourhood:
-    return Neighbourhood()
+def network() -> DiscoveryNetwork:
+    return DiscoveryNetwork()

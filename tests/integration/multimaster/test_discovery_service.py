@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 from support.engine import Program
-from support.multimaster import STRING, Neighbourhood, node
+from support.multimaster import STRING, DiscoveryNetwork, node
 from support.ports import free_ports
 
 from rce.ros.core import Core
-from rce.ros.errors import MasterUnreachable
+from rce.ros.errors import MasterUnreachableError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.discovery import Discovery
-from rce.ros.multimaster.errors import NoDiscovery
+from rce.ros.multimaster.errors import NoDiscoveryError
 from rce.ros.multimaster.listing import list_masters
 from rce.ros.xmlrpc import RpcClient
 
@@ -26,9 +26,9 @@ def program(name: str, *arguments: str, folder: Path) -> Program:
     return Program(name, [sys.executable, "-c", text, *arguments], {"ROS_IP": "127.0.0.1"}, folder)
 
 
-async def test_a_core_of_the_same_process_is_watched(neighbourhood: Neighbourhood) -> None:
+async def test_a_core_of_the_same_process_is_watched(network: DiscoveryNetwork) -> None:
     async with Core(port=0) as core:
-        settings = neighbourhood.settings(core.uri, rosmaster_hz=0.01)
+        settings = network.settings(core.uri, rosmaster_hz=0.01)
         async with Discovery(settings, core=core) as discovery, node("n", core.uri) as talker:
             with discovery.watch() as events:
                 await talker.advertise("said", STRING)
@@ -36,20 +36,21 @@ async def test_a_core_of_the_same_process_is_watched(neighbourhood: Neighbourhoo
                     async for _ in events:
                         if discovery.info is not None and "/said" in discovery.info.publishers:
                             break
+            assert discovery.info is not None
             assert discovery.info.nodes["/n"].is_local
 
 
-async def test_masters_and_changes_are_shown_in_the_graph(neighbourhood: Neighbourhood) -> None:
+async def test_masters_and_changes_are_shown_in_the_graph(network: DiscoveryNetwork) -> None:
     async with Core(port=0) as a, Core(port=0) as b:
-        with pytest.raises(NoDiscovery):
+        with pytest.raises(NoDiscoveryError):
             await list_masters(a.uri)
-        async with Discovery(neighbourhood.settings(a.uri, name="a")) as discovery:
+        async with Discovery(network.settings(a.uri, name="a")) as discovery:
             watcher = node("watcher", a.uri, types=messages.registry())
             async with watcher as watching, RpcClient() as rpc:
                 changes = await watching.subscribe("/master_discovery/changes", messages.MASTER_STATE)
                 links = await watching.subscribe("/master_discovery/linkstats", messages.LINK_STATES)
                 await changes.wait_for_publishers(timeout=20)
-                async with asyncio.timeout(20), Discovery(neighbourhood.settings(b.uri, name="b")):
+                async with asyncio.timeout(20), Discovery(network.settings(b.uri, name="b")):
                     async for change in changes:
                         if change.state == "new" and change.master.name == "b":
                             break
@@ -71,12 +72,12 @@ async def test_masters_and_changes_are_shown_in_the_graph(neighbourhood: Neighbo
                 assert (await rpc.call(discovery.monitor_uri, "getCurrentTime", ()))[0] == a.uri
                 (pair,) = await rpc.call(discovery.monitor_uri, "getTopicsMd5sum", ([STRING, "no/Such"],))
                 assert pair == [STRING, "992ce8a1687cec8c8bd883ec73ca41d1"]
-    with pytest.raises(MasterUnreachable):
+    with pytest.raises(MasterUnreachableError):
         await list_masters(a.uri)
 
 
 async def test_installed_messages_of_fkie_win(
-    neighbourhood: Neighbourhood, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    network: DiscoveryNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Later ones may have a field more: a program that has them would not understand ours."""
     package = tmp_path / "fkie_multimaster_msgs"
@@ -86,7 +87,7 @@ async def test_installed_messages_of_fkie_win(
     monkeypatch.setenv("RCE_PACKAGE_PATH", str(tmp_path))
     async with (
         Core(port=0) as core,
-        Discovery(neighbourhood.settings(core.uri, name="a")),
+        Discovery(network.settings(core.uri, name="a")),
         node("watcher", core.uri, types=messages.registry()) as watching,
         asyncio.timeout(20),
     ):
@@ -99,11 +100,11 @@ async def test_installed_messages_of_fkie_win(
         assert stats.links[0].more == 0
 
 
-async def test_robot_hosts_find_each_other_without_multicast(neighbourhood: Neighbourhood) -> None:
+async def test_robot_hosts_find_each_other_without_multicast(network: DiscoveryNetwork) -> None:
     ports = free_ports(2)
     async with Core(port=0) as a, Core(port=0) as b:
         first, second = (
-            neighbourhood.settings(
+            network.settings(
                 core.uri,
                 name=name,
                 mcast_port=own,
@@ -111,7 +112,7 @@ async def test_robot_hosts_find_each_other_without_multicast(neighbourhood: Neig
                 listen_mcast=False,
                 robot_hosts=(f"127.0.0.1:{other}",),
             )
-            for core, name, own, other in ((a, "a", *ports), (b, "b", *reversed(ports)))
+            for core, name, own, other in ((a, "a", ports[0], ports[1]), (b, "b", ports[1], ports[0]))
         )
         async with Discovery(first) as one, Discovery(second) as two, asyncio.timeout(20):
             for discovery in (one, two):
@@ -119,18 +120,16 @@ async def test_robot_hosts_find_each_other_without_multicast(neighbourhood: Neig
                     await asyncio.sleep(0.02)
 
 
-async def test_a_robot_host_may_be_a_name(neighbourhood: Neighbourhood, tmp_path: Path) -> None:
+async def test_a_robot_host_may_be_a_name(network: DiscoveryNetwork, tmp_path: Path) -> None:
     """uvloop's sockets send to addresses only; a name that cannot be resolved is told of and does no harm."""
     (port,) = free_ports(1)
     async with Core(port=0) as a, Core(port=0) as b:
-        settings = neighbourhood.settings(
-            b.uri, name="b", mcast_port=port, send_mcast=False, listen_mcast=False
-        )
+        settings = network.settings(b.uri, name="b", mcast_port=port, send_mcast=False, listen_mcast=False)
         running = program(
             "discovery",
             *("--master-uri", a.uri, "--name", "a", "--heartbeat-hz", "10", "--no-listen-mcast"),
             *("--no-send-mcast", "--mcast-group", "226.0.0.0@127.0.0.1"),
-            *("--mcast-port", str(neighbourhood.port), "--robot-host", f"localhost:{port}"),
+            *("--mcast-port", str(network.port), "--robot-host", f"localhost:{port}"),
             *("--robot-host", "no-such-robot.invalid"),
             folder=tmp_path,
         )
@@ -164,7 +163,7 @@ async def test_the_relay_program(tmp_path: Path) -> None:
     [
         ("relay", ("/a", "/a"), "to itself"),
         ("relay", ("/a", "/b", "--throttle", "0"), "above 0 Hz"),
-        ("sync", ("--as", "no way"), "is no namespace"),
+        ("sync", ("--as", "no way"), "is not a namespace"),
         ("sync", ("--relay", ":5"), "HOST:PORT"),
         ("discovery", ("--heartbeat-hz", "30"), "at most 25.5"),
         ("discovery", ("--list", "--master-uri", "http://127.0.0.1:1/"), "does not answer"),

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from support.engine import Program
-from support.multimaster import STRING, Neighbourhood, node, process, ros_environment
+from support.multimaster import STRING, DiscoveryNetwork, node, process, ros_environment
 
 from rce.ros.core import Core
 from rce.ros.multimaster.discovery import Discovery
@@ -46,21 +46,21 @@ def cli(name: str, folder: Path, *arguments: str) -> Program:
     return Program(name, [sys.executable, "-c", text, *arguments], {"ROS_IP": "127.0.0.1"}, folder)
 
 
-async def test_fkie_hears_our_discovery(neighbourhood: Neighbourhood, tmp_path: Path) -> None:
+async def test_fkie_hears_our_discovery(network: DiscoveryNetwork, tmp_path: Path) -> None:
     """``rce discovery`` says ``new``, ``changed`` and ``removed`` as releases 1.1.0 to 1.3.2 expect it."""
     async with Core(port=0) as core, Core(port=0) as other:
         ours = cli(
             "discovery",
             tmp_path,
             *("--master-uri", core.uri, "--name", "ours", "--rpc-port", "0", "--heartbeat-hz", "10"),
-            *("--mcast-group", "226.0.0.0@127.0.0.1", "--mcast-port", str(neighbourhood.port)),
+            *("--mcast-group", "226.0.0.0@127.0.0.1", "--mcast-port", str(network.port)),
         )
         await ours.start(ready="")
         try:
             async with fkie(core.uri, tmp_path, "listen") as output:
                 assert (await words_that(output, "md5"))[1:] == [MASTER_STATE_MD5, LINK_STATES_MD5]
                 assert abs(float((await words_that(output, "link", "ours"))[2])) < 60
-                async with Discovery(neighbourhood.settings(other.uri, name="other")):
+                async with Discovery(network.settings(other.uri, name="other")):
                     await words_that(output, "change", "new", "other")
                     async with node("n", other.uri) as talker:
                         await talker.advertise("said", STRING)
@@ -78,13 +78,13 @@ async def test_fkie_hears_our_discovery(neighbourhood: Neighbourhood, tmp_path: 
     ],
 )
 async def test_our_sync_hears_fkie_without_its_messages(
-    neighbourhood: Neighbourhood, tmp_path: Path, state: str, quoted: tuple[str, ...]
+    network: DiscoveryNetwork, tmp_path: Path, state: str, quoted: tuple[str, ...]
 ) -> None:
     """Its list is empty and told once: what ``rce sync`` registers, it knows from ``changes`` alone."""
     async with Core(port=0) as here, Core(port=0) as there, node("n", there.uri) as talker:
         await talker.advertise("said", STRING)
         async with Discovery(
-            neighbourhood.settings(there.uri, name="there", send_mcast=False, listen_mcast=False)
+            network.settings(there.uri, name="there", send_mcast=False, listen_mcast=False)
         ) as discovery:
             about = (state, "there", there.uri, discovery.monitor_uri)
             async with fkie(here.uri, tmp_path, "discover", *about, *quoted) as output:

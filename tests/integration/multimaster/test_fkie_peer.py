@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-from support.multimaster import STRING, Neighbourhood, node
+from support.multimaster import STRING, DiscoveryNetwork, node
 from support.ports import free_ports
 
 from rce.ros.core import Core
@@ -39,11 +39,11 @@ async def line(peer: asyncio.subprocess.Process) -> list[str]:
         return (await peer.stdout.readline()).decode().split()
 
 
-async def test_it_and_ours_find_and_synchronize_each_other(neighbourhood: Neighbourhood) -> None:
+async def test_it_and_ours_find_and_synchronize_each_other(network: DiscoveryNetwork) -> None:
     async with (
         Core(port=0) as theirs,
-        neighbourhood.machine(name="ours") as ours,
-        fkie_peer(theirs.uri, neighbourhood.port) as peer,
+        network.machine(name="ours") as ours,
+        fkie_peer(theirs.uri, network.port) as peer,
         node("their_node", theirs.uri) as their_node,
         node("our_node", ours.uri) as our_node,
     ):
@@ -77,11 +77,11 @@ async def test_it_and_ours_find_and_synchronize_each_other(neighbourhood: Neighb
         assert all(master.name != "fkie" for master in ours.discovery.masters)
 
 
-async def test_it_learns_that_ours_leaves(neighbourhood: Neighbourhood) -> None:
+async def test_it_learns_that_ours_leaves(network: DiscoveryNetwork) -> None:
     async with (
         Core(port=0) as theirs,
-        neighbourhood.machine(name="ours") as ours,
-        fkie_peer(theirs.uri, neighbourhood.port) as peer,
+        network.machine(name="ours") as ours,
+        fkie_peer(theirs.uri, network.port) as peer,
         node("our_node", ours.uri) as our_node,
     ):
         await our_node.advertise("answered", STRING)
@@ -92,14 +92,14 @@ async def test_it_learns_that_ours_leaves(neighbourhood: Neighbourhood) -> None:
         await theirs.wait_until(lambda graph: "/answered" not in graph.topic_types, timeout=20)
 
 
-async def test_its_silence_is_noticed(neighbourhood: Neighbourhood) -> None:
+async def test_its_silence_is_noticed(network: DiscoveryNetwork) -> None:
     async with (
         Core(port=0) as theirs,
-        neighbourhood.machine() as ours,
+        network.machine() as ours,
         node("their_node", theirs.uri) as their_node,
     ):
         await their_node.advertise("said", STRING)
-        async with fkie_peer(theirs.uri, neighbourhood.port) as peer:
+        async with fkie_peer(theirs.uri, network.port) as peer:
             await ours.until(lambda graph: "/said" in graph.topic_types)
             os.kill(peer.pid, signal.SIGKILL)
             await ours.until(lambda graph: "/said" not in graph.topic_types)

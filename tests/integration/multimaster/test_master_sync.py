@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from support.multimaster import STRING, Neighbourhood, node
+from support.multimaster import STRING, DiscoveryNetwork, node
 
 from rce.ros.multimaster.filters import SyncLists
 
 
-async def test_a_topic_reaches_the_other_master(neighbourhood: Neighbourhood) -> None:
-    async with neighbourhood.machine() as a, neighbourhood.machine() as b:
+async def test_a_topic_reaches_the_other_master(network: DiscoveryNetwork) -> None:
+    async with network.machine() as a, network.machine() as b:
         async with node("talker", a.uri) as talker, node("listener", b.uri) as listener:
             heard = await listener.subscribe("chatter", STRING)
             publisher = await talker.advertise("chatter", STRING)
@@ -24,8 +24,8 @@ async def test_a_topic_reaches_the_other_master(neighbourhood: Neighbourhood) ->
         await a.until(lambda graph: "/chatter" not in graph.topic_types)
 
 
-async def test_a_service_can_be_called_from_the_other_master(neighbourhood: Neighbourhood) -> None:
-    async with neighbourhood.machine() as a, neighbourhood.machine() as b:
+async def test_a_service_can_be_called_from_the_other_master(network: DiscoveryNetwork) -> None:
+    async with network.machine() as a, network.machine() as b:
         async with node("server", a.uri) as server, node("caller", b.uri) as caller:
             await server.advertise_service("add", "roscpp/GetLoggers", lambda _: {"loggers": [{"name": "x"}]})
             await b.until(lambda graph: graph.service("/add") is not None)
@@ -34,11 +34,11 @@ async def test_a_service_can_be_called_from_the_other_master(neighbourhood: Neig
         await b.until(lambda graph: graph.service("/add") is None)
 
 
-async def test_only_what_was_chosen_is_synchronized(neighbourhood: Neighbourhood) -> None:
+async def test_only_what_was_chosen_is_synchronized(network: DiscoveryNetwork) -> None:
     lists = SyncLists.read({"sync_topics": ["/robot/*"], "ignore_topics": ["/robot/secret"]})
     async with (
-        neighbourhood.machine() as a,
-        neighbourhood.machine(lists=lists) as b,
+        network.machine() as a,
+        network.machine(lists=lists) as b,
         node("talker", a.uri) as talker,
     ):
         for topic in ("/robot/secret", "/other", "/rosout_agg", "/robot/pose"):
@@ -48,11 +48,11 @@ async def test_only_what_was_chosen_is_synchronized(neighbourhood: Neighbourhood
         assert topics == {"/robot/pose", "/rosout"}
 
 
-async def test_three_masters_do_not_pass_things_on_in_a_circle(neighbourhood: Neighbourhood) -> None:
+async def test_three_masters_do_not_pass_things_on_in_a_circle(network: DiscoveryNetwork) -> None:
     async with (
-        neighbourhood.machine() as a,
-        neighbourhood.machine() as b,
-        neighbourhood.machine() as c,
+        network.machine() as a,
+        network.machine() as b,
+        network.machine() as c,
         node("talker", a.uri) as talker,
     ):
         await talker.advertise("chatter", STRING)
@@ -70,25 +70,25 @@ async def test_three_masters_do_not_pass_things_on_in_a_circle(neighbourhood: Ne
         assert b.discovery.info.nodes["/talker"].master_uri == a.uri
 
 
-async def test_what_a_vanished_master_had_is_taken_back(neighbourhood: Neighbourhood) -> None:
+async def test_what_a_vanished_master_had_is_taken_back(network: DiscoveryNetwork) -> None:
     async with (
-        neighbourhood.machine() as b,
-        neighbourhood.machine() as a,
+        network.machine() as b,
+        network.machine() as a,
         node("talker", a.uri) as talker,
     ):
         await talker.advertise("chatter", STRING)
         await b.until(lambda graph: "/chatter" in graph.topic_types)
-        a.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign] # no good-bye either
+        a.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign]  # no good-bye either
         await b.until(lambda graph: "/chatter" not in graph.topic_types)
         assert [master.online for master in b.discovery.masters if master.uri == a.uri] == [False]
 
 
 async def test_nodes_of_one_name_do_not_kill_each_other(
-    neighbourhood: Neighbourhood, caplog: pytest.LogCaptureFixture
+    network: DiscoveryNetwork, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with (
-        neighbourhood.machine() as a,
-        neighbourhood.machine() as b,
+        network.machine() as a,
+        network.machine() as b,
         node("camera", a.uri) as one,
         node("camera", b.uri) as other,
         node("talker", a.uri) as talker,
@@ -104,10 +104,10 @@ async def test_nodes_of_one_name_do_not_kill_each_other(
         assert "node /camera" in caplog.text
 
 
-async def test_nodes_of_one_name_can_be_told_apart(neighbourhood: Neighbourhood) -> None:
+async def test_nodes_of_one_name_can_be_told_apart(network: DiscoveryNetwork) -> None:
     async with (
-        neighbourhood.machine() as a,
-        neighbourhood.machine(distinct_names=True) as b,
+        network.machine() as a,
+        network.machine(distinct_names=True) as b,
         node("camera", a.uri) as one,
         node("camera", b.uri) as other,
     ):
@@ -120,10 +120,10 @@ async def test_nodes_of_one_name_can_be_told_apart(neighbourhood: Neighbourhood)
         assert not other.is_shutdown
 
 
-async def test_a_restarted_node_is_registered_anew(neighbourhood: Neighbourhood) -> None:
+async def test_a_restarted_node_is_registered_anew(network: DiscoveryNetwork) -> None:
     async with (
-        neighbourhood.machine() as a,
-        neighbourhood.machine() as b,
+        network.machine() as a,
+        network.machine() as b,
         node("listener", b.uri) as listener,
     ):
         heard = await listener.subscribe("chatter", STRING)
@@ -136,13 +136,14 @@ async def test_a_restarted_node_is_registered_anew(neighbourhood: Neighbourhood)
                     assert (await anext(aiter(heard))).data == word
 
 
-async def test_what_a_killed_synchronization_left_is_taken_back_by_the_next(
-    neighbourhood: Neighbourhood,
+async def test_next_synchronization_cleans_up_after_killed_one(
+    network: DiscoveryNetwork,
 ) -> None:
+    """What a killed synchronization left is taken back by the next."""
     from rce.ros.multimaster.sync import MasterSync, SyncSettings
 
-    async with neighbourhood.machine() as b:
-        async with neighbourhood.machine() as a, node("talker", a.uri) as talker:
+    async with network.machine() as b:
+        async with network.machine() as a, node("talker", a.uri) as talker:
             await talker.advertise("chatter", STRING)
             await b.until(lambda graph: "/chatter" in graph.topic_types)
             b.sync.registrar.held.clear()  # as if it were killed: it takes nothing back

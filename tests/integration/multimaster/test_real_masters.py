@@ -7,14 +7,18 @@ import signal
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 
 import psutil
 import pytest
 from support.engine import command_line
-from support.multimaster import STRING, Neighbourhood, node, process, real_master, ros_environment
+from support.multimaster import STRING, DiscoveryNetwork, node, process, real_master, ros_environment
 from support.ports import free_port, free_ports
 
+from rce.ros.core import Graph
+from rce.ros.multimaster.events import EventQueue
+from rce.ros.multimaster.peer_table import PeerEvent
 from rce.ros.node import Publisher
 
 TALKER = """
@@ -64,13 +68,13 @@ async def say_until_heard(orders: Publisher, program: asyncio.subprocess.Process
 @pytest.mark.needs("rospy")
 @pytest.mark.parametrize("both_real", [False, True])
 async def test_rospy_nodes_at_a_real_master(
-    neighbourhood: Neighbourhood, tmp_path: Path, both_real: bool
+    network: DiscoveryNetwork, tmp_path: Path, both_real: bool
 ) -> None:
     async with (
         real_master(tmp_path) as real,
         _second(both_real, tmp_path) as second,
-        neighbourhood.machine(real, name="real"),
-        neighbourhood.machine(second, name="second") as other,
+        network.machine(real, name="real"),
+        network.machine(second, name="second") as other,
         rospy_program(TALKER, real, tmp_path),
         rospy_program(LISTENER, real, tmp_path) as listener,
         node("ours", other.uri) as ours,
@@ -93,13 +97,12 @@ async def _second(is_real: bool, folder: Path) -> AsyncIterator[str | None]:
 
 
 @pytest.mark.needs("rospy")
-async def test_rospy_listens_again_after_its_talker_was_lost_for_a_while(
-    neighbourhood: Neighbourhood, tmp_path: Path
-) -> None:
+async def test_rospy_listens_again_after_lost_talker(network: DiscoveryNetwork, tmp_path: Path) -> None:
+    """Rospy listens again after its talker was lost for a while."""
     async with (
         real_master(tmp_path) as real,
-        neighbourhood.machine(real, name="real") as far,
-        neighbourhood.machine(name="near") as near,
+        network.machine(real, name="real") as far,
+        network.machine(name="near") as near,
         rospy_program(LISTENER, real, tmp_path) as listener,
         node("ours", near.uri) as ours,
     ):
@@ -108,14 +111,14 @@ async def test_rospy_listens_again_after_its_talker_was_lost_for_a_while(
         await say_until_heard(orders, listener, "one")
         with far.discovery.watch() as events:
             send = near.discovery._socket.send_to
-            near.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign] # the network is gone
+            near.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign]  # the network is gone
             async with asyncio.timeout(20):
                 async for event in events:
                     if event.master.name == "near" and not event.master.online:
                         break
                 while far.sync.registrar.held:
                     await asyncio.sleep(0.05)
-                near.discovery._socket.send_to = send  # type: ignore[method-assign]
+                near.discovery._socket.send_to = send  # type: ignore[method-assign]  # the network is back
                 while not far.sync.registrar.held:
                     await asyncio.sleep(0.05)
                 await orders.wait_for_subscribers()
@@ -123,12 +126,12 @@ async def test_rospy_listens_again_after_its_talker_was_lost_for_a_while(
 
 
 @pytest.mark.needs("rospy")
-async def test_a_killed_master_is_left_and_found_again(neighbourhood: Neighbourhood, tmp_path: Path) -> None:
+async def test_a_killed_master_is_left_and_found_again(network: DiscoveryNetwork, tmp_path: Path) -> None:
     (port,) = free_ports(1)
     async with (
-        neighbourhood.machine(name="near") as near,
+        network.machine(name="near") as near,
         real_master(tmp_path, port) as real,
-        neighbourhood.machine(real, name="far"),
+        network.machine(real, name="far"),
         node("near_node", near.uri) as near_node,
     ):
         async with node("far_node", real) as far_node:
@@ -154,40 +157,40 @@ def _kill_master(port: int) -> None:
     found.send_signal(signal.SIGKILL)
 
 
-async def _until(events: object, name: str, change: str) -> None:
+async def _until(events: EventQueue[PeerEvent], name: str, change: str) -> None:
     async with asyncio.timeout(30):
-        async for event in events:  # type: ignore[attr-defined]
+        async for event in events:
             if (event.master.name, event.change.value) == (name, change):
                 return
 
 
-async def test_a_killed_discovery_is_noticed_and_taken_back(neighbourhood: Neighbourhood) -> None:
+async def test_a_killed_discovery_is_noticed_and_taken_back(network: DiscoveryNetwork) -> None:
     from rce.ros.core import Core
 
-    async with neighbourhood.machine(name="near") as near, Core(port=0) as core, node("n", core.uri) as far:
+    async with network.machine(name="near") as near, Core(port=0) as core, node("n", core.uri) as far:
         await far.advertise("said", STRING)
         for _ in range(2):
-            async with _discovery_process(core.uri, neighbourhood.port) as program:
+            async with _discovery_process(core.uri, network.port) as program:
                 await near.until(lambda graph: "/said" in graph.topic_types)
                 program.kill()
                 await near.until(lambda graph: "/said" not in graph.topic_types)
 
 
-async def test_a_machine_that_vanished_comes_back_at_other_ports(neighbourhood: Neighbourhood) -> None:
+async def test_a_machine_that_vanished_comes_back_at_other_ports(network: DiscoveryNetwork) -> None:
     """Its master, its discovery and its nodes are others then; of the earlier ones, nothing is left."""
     from rce.ros.core import Core
 
-    async with neighbourhood.machine(name="near") as near, node("ours", near.uri) as ours:
+    async with network.machine(name="near") as near, node("ours", near.uri) as ours:
         heard = await ours.subscribe("said", STRING)
         seen = set()
         for life in ("first", "second"):
             async with (
                 Core(port=0) as core,
                 node("n", core.uri) as far,
-                _discovery_process(core.uri, neighbourhood.port, "--name", "far") as program,
+                _discovery_process(core.uri, network.port, "--name", "far") as program,
             ):
                 publisher = await far.advertise("said", STRING)
-                await near.until(lambda graph, uri=far.uri: graph.publishers("/said") == {"/n": uri})  # type: ignore[misc]
+                await near.until(partial(_is_published_by, far.uri))
                 await publisher.wait_for_subscribers(timeout=20)
                 publisher.publish(data=life)
                 async with asyncio.timeout(20):
@@ -197,6 +200,10 @@ async def test_a_machine_that_vanished_comes_back_at_other_ports(neighbourhood: 
             await near.until(lambda graph: "/n" not in graph.nodes)
         assert len(seen) == 2
         assert not any(master.online for master in near.discovery.masters if master.name == "far")
+
+
+def _is_published_by(uri: str, graph: Graph) -> bool:
+    return graph.publishers("/said") == {"/n": uri}
 
 
 @asynccontextmanager

@@ -8,18 +8,20 @@ import struct
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any
 
 import pytest
-from support.multimaster import STRING, Neighbourhood, node
+from support.multimaster import STRING, DiscoveryNetwork, node
 
-from rce.ros.core import Core
-from rce.ros.errors import ServiceFault
+from rce.ros.core import Core, Graph
+from rce.ros.errors import ServiceFaultError
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.relay.link import STRANGERS_PER_ADDRESS
 from rce.ros.multimaster.relay.throttle import MessageThrottle
 from rce.ros.multimaster.relay.topic import TopicRelay
 from rce.ros.multimaster.sync import MasterSync, SyncSettings
+from rce.ros.node import Publisher, Subscriber
 
 
 @pytest.fixture
@@ -112,11 +114,11 @@ async def test_a_throttled_relay_holds_back(core: Core) -> None:
         assert relay.passed == 1
 
 
-async def test_a_namespace_for_a_master(neighbourhood: Neighbourhood) -> None:
+async def test_a_namespace_for_a_master(network: DiscoveryNetwork) -> None:
     lists = SyncLists.read({"ignore_topics": ["/secret"]})
     async with (
-        neighbourhood.machine(name="robot") as robot,
-        neighbourhood.machine(namespaces={"robot": "Robot1"}, lists=lists) as station,
+        network.machine(name="robot") as robot,
+        network.machine(namespaces={"robot": "Robot1"}, lists=lists) as station,
         node("amcl", robot.uri) as amcl,
         node("planner", station.uri) as planner,
     ):
@@ -144,7 +146,11 @@ async def test_a_namespace_for_a_master(neighbourhood: Neighbourhood) -> None:
         assert {"/Robot1/secret", "/amcl_pose", "/secret"} & station.graph.topic_types.keys() == set()
 
 
-async def heard_within(subscriber: Any, publisher: Any) -> bool:
+def _has_subscribers(topic: str, graph: Graph) -> bool:
+    return bool(graph.subscribers(topic))
+
+
+async def heard_within(subscriber: Subscriber, publisher: Publisher) -> bool:
     """Publish once; tell whether it arrived soon. A relay takes a moment until it is wanted."""
     publisher.publish(data="go")
     try:
@@ -155,7 +161,9 @@ async def heard_within(subscriber: Any, publisher: Any) -> bool:
 
 
 @asynccontextmanager
-async def linked(token: str = "", **lists: Any) -> AsyncIterator[tuple[Core, Core, MasterSync, MasterSync]]:
+async def linked(
+    token: str = "", **lists: list[str]
+) -> AsyncIterator[tuple[Core, Core, MasterSync, MasterSync]]:
     """Two cores that know each other by one connection only: no discovery, no direct way."""
     chosen = SyncLists.read(lists)
     async with Core(port=0) as cloud, Core(port=0) as robot:
@@ -185,7 +193,7 @@ async def test_one_connection_carries_topics_and_services_both_ways() -> None:
         heard, got = await planner.subscribe("said", STRING), await base.subscribe("answered", STRING)
         for publisher, subscriber, core in ((said, heard, robot), (answered, got, cloud)):
             topic = publisher.topic
-            await core.wait_until(lambda graph, topic=topic: graph.subscribers(topic), timeout=20)  # type: ignore[misc]
+            await core.wait_until(partial(_has_subscribers, topic), timeout=20)
             await publisher.wait_for_subscribers(timeout=20)
             body = "x" * 3_000_000
             publisher.publish(data=body)
@@ -195,13 +203,15 @@ async def test_one_connection_carries_topics_and_services_both_ways() -> None:
         assert "/secret" not in cloud.graph.topic_types
 
         def refuse(_: object) -> None:
-            raise ServiceFault("/add", "not today")
+            raise ServiceFaultError("/add", "not today")
 
         await planner.advertise_service("add", "roscpp/GetLoggers", lambda _: {"loggers": []})
         await planner.advertise_service("refuse", "roscpp/Empty", refuse)
-        await robot.wait_until(lambda graph: graph.service("/refuse") and graph.service("/add"), timeout=20)  # type: ignore[arg-type,return-value]
+        await robot.wait_until(
+            lambda graph: None not in (graph.service("/refuse"), graph.service("/add")), timeout=20
+        )
         assert (await base.service_client("add", "roscpp/GetLoggers").call({}, timeout=20)).loggers == []
-        with pytest.raises(ServiceFault, match="not today"):
+        with pytest.raises(ServiceFaultError, match="not today"):
             await base.service_client("refuse", "roscpp/Empty").call({}, timeout=20)
 
 
@@ -233,6 +243,7 @@ async def test_a_broken_link_takes_back_and_comes_back() -> None:
         await cloud.wait_until(lambda graph: "/said" in graph.topic_types, timeout=20)
         with cloud.watch() as events:
             (link,) = one._links._running
+            assert link._transport is not None
             link._transport.abort()
             gone = back = False
             async with asyncio.timeout(20):
@@ -320,7 +331,7 @@ async def test_strangers_are_bounded_in_number() -> None:
             while one._links._lobby.turned_away < 60 - STRANGERS_PER_ADDRESS:
                 await asyncio.sleep(0.02)
         assert len(one._links._lobby) <= STRANGERS_PER_ADDRESS
-        assert one._links.connected == {"robot"}, "who is known goes on"
+        assert one._links.connected == {"robot"}, "who is known continues"
         for _, writer in connections:
             writer.close()
 

@@ -12,7 +12,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from support.engine import free_ports
+from support.ports import free_ports
 
 ROOT = Path(__file__).parents[3]
 FLAW = {

@@ -17,7 +17,8 @@ from typing import Any
 
 import aiohttp
 import pytest
-from support.engine import Program, free_ports
+from support.engine import Program
+from support.ports import free_ports
 
 from rce_master.backup import MANIFEST
 from rce_master.store.sqlite import SCHEMA_VERSION
@@ -151,7 +152,7 @@ async def copy(tmp_path: Path) -> Path:
 def change(file: Path, edit: Callable[[str, bytes], bytes | None]) -> None:
     """Write a copy anew with other contents."""
     with tarfile.open(file) as tar:
-        old = [(member, tar.extractfile(member).read()) for member in tar if member.isreg()]  # type: ignore[union-attr]
+        old = [(member, opened.read()) for member in tar if (opened := tar.extractfile(member)) is not None]
     with tarfile.open(file, "w") as tar:
         for member, data in old:
             content = edit(member.name, data)

@@ -14,7 +14,7 @@ from support.resolvers import silent_resolver
 pytestmark = pytest.mark.needs("netns")
 
 HOST = "engine.example"
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 """Also on a busy machine; the name server answers none of its questions in twice this time."""
 
 OWN_PORTS = ("--dev", "--ws-port", "0", "--link-port", "0", HOST)
@@ -55,7 +55,7 @@ async def test_program_ends_while_a_name_is_looked_up(name: str, tmp_path: Path)
         process.stdin.write(b"secret\n")
         talk = asyncio.create_task(process.communicate())
         try:
-            async with asyncio.timeout(PATIENCE_S):
+            async with asyncio.timeout(TIMEOUT_S):
                 await resolver.asked.wait()
                 process.send_signal(signal.SIGINT)
                 output, _ = await asyncio.shield(talk)

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import aiohttp
 import pytest
-from support.engine import Program, free_ports, until
+from support.engine import Program, until
+from support.ports import free_ports
 
 pytestmark = pytest.mark.timeout(200)
 BIN = Path(sys.executable).parent

@@ -103,7 +103,7 @@ async def test_user_unit_is_installed_and_removed(tmp_path: Path) -> None:
     told = await asyncio.to_thread(rce, tmp_path, "uninstall-service", "engine", "--user")
     assert "systemctl --user disable --now rce-engine.service" in told
     assert not file.exists()
-    assert "there is no" in await asyncio.to_thread(
+    assert "does not exist" in await asyncio.to_thread(
         rce, tmp_path, "uninstall-service", "engine", "--user", code=1
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlencode
 
 import pytest
@@ -12,9 +12,10 @@ from support.cloud import DIGEST, Cloud, running_cloud
 from websockets.asyncio.client import connect
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
 
     from websockets.asyncio.client import ClientConnection
+    from websockets.typing import Origin
 
 
 class Robot:
@@ -24,10 +25,10 @@ class Robot:
         self.socket = socket
         self._kept: list[dict[str, Any]] = []
 
-    async def send(self, type_: str, data: Any) -> None:
+    async def send(self, type_: str, data: object) -> None:
         await self.socket.send(json.dumps({"type": type_, "data": data}))
 
-    async def say(self, tag: str, cls: str, msg: Any, msg_id: str = "nil", key: str = "msg") -> None:
+    async def say(self, tag: str, cls: str, msg: object, msg_id: str = "nil", key: str = "msg") -> None:
         await self.send("DM", {"iTag": tag, "type": cls, "msgID": msg_id, key: msg})
 
     async def get(self, type_: str) -> Any:
@@ -52,9 +53,19 @@ class Robot:
         return frame
 
 
-def dial(cloud: Cloud, robot: str = "testRobot", password: str = DIGEST, **options: Any) -> connect:
+class Dial(Protocol):
+    """Connects a robot to a cloud; see :func:`dial`."""
+
+    def __call__(
+        self, cloud: Cloud, robot: str = ..., password: str = ..., origin: Origin | None = ...
+    ) -> connect: ...
+
+
+def dial(
+    cloud: Cloud, robot: str = "testRobot", password: str = DIGEST, origin: Origin | None = None
+) -> connect:
     query = urlencode({"userID": "testUser", "robotID": robot, "password": password})
-    return connect(f"{cloud.ws_url}?{query}", proxy=None, compression=None, **options)
+    return connect(f"{cloud.ws_url}?{query}", proxy=None, compression=None, origin=origin)
 
 
 @pytest.fixture
@@ -70,15 +81,15 @@ async def robot(cloud: Cloud) -> AsyncIterator[Robot]:
 
 
 @pytest.fixture(name="dial")
-def _dial() -> Any:
+def _dial() -> Dial:
     return dial
 
 
 @pytest.fixture
-def robot_of() -> Any:
+def robot_of() -> type[Robot]:
     return Robot
 
 
 @pytest.fixture
-def connect_to() -> Any:
+def connect_to() -> Callable[[str], connect]:
     return lambda url: connect(url, proxy=None)

@@ -12,7 +12,7 @@ from rce_robot.conversion.jobs import ReadText
 from rce_robot.conversion.pool import ConversionPool, ConversionSettings
 
 STRING = "std_msgs/String"
-JOB = ReadText(i_tag="tag", type=STRING, cls="SubscriberConverter", interface_type=STRING)
+JOB = ReadText(i_tag="tag", stated_type=STRING, message_type="SubscriberConverter", interface_type=STRING)
 PARTS = [b'{"data":"hello"}']
 
 

@@ -64,7 +64,7 @@ async def test_many_small_frames_of_one_user_leave_room_for_another() -> None:
         cloud.master.users.add("flood")
         end = await cloud.joined("tag", "SubscriberConverter", STRING)
         async with dial(cloud, "flood", "f") as flood, dial(cloud, "testUser", "testRobot") as good:
-            await end.active.until(lambda: end.is_active)
+            await end.until_active()
             handled: list[str] = []
 
             async def count() -> None:
@@ -83,11 +83,12 @@ async def test_many_small_frames_of_one_user_leave_room_for_another() -> None:
                 await (await good.ping())
 
 
-async def test_a_large_message_takes_a_process_that_ends_when_it_has_nothing_to_do() -> None:
+async def test_large_message_uses_a_process_that_ends_when_idle() -> None:
+    """A large message takes a process that ends when it has nothing to do."""
     async with running_cloud(PATIENT, conversion=ConversionSettings(idle=0.1)) as cloud:
         end = await cloud.wire("tag", "SubscriberConverter", STRING)
         async with dial(cloud, "testUser", "testRobot") as robot:
-            await end.active.until(lambda: end.is_active)
+            await end.until_active()
             assert not workers()
             text = "\xe4" * 1_000_000
             await robot.send(say(json.dumps({"data": text})))
@@ -120,7 +121,7 @@ async def test_what_is_too_much_is_refused_with_what_to_do() -> None:
     async with running_cloud(PATIENT) as cloud:
         end = await cloud.wire("tag", "SubscriberConverter", STRING)
         async with dial(cloud, "testUser", "testRobot") as robot:
-            await end.active.until(lambda: end.is_active)
+            await end.until_active()
             bombs = {
                 "[" + "[]," * 5_000_000 + "[]]": "tag: a message of 5000010 objects, lists and members",
                 "{" + ",".join(f'"k{n}":1' for n in range(300_000)) + "}": "tag: a message of 300",
@@ -140,7 +141,7 @@ async def test_a_conversion_that_takes_too_long_is_ended() -> None:
     async with running_cloud(PATIENT, conversion=ConversionSettings(timeout=0.0)) as cloud:
         end = await cloud.wire("tag", "SubscriberConverter", STRING)
         async with dial(cloud, "testUser", "testRobot") as robot:
-            await end.active.until(lambda: end.is_active)
+            await end.until_active()
             await robot.send(say(json.dumps({"data": "\xe4" * 1_000_000})))
             assert await errors(robot, 1) == ["tag: converting the message takes more than 0 s"]
             await until(lambda: not workers(), what="the worker is gone")
@@ -153,7 +154,7 @@ async def test_a_conversion_that_needs_too_much_memory_is_refused() -> None:
     async with running_cloud(PATIENT, conversion=ConversionSettings(memory=160 << 20)) as cloud:
         end = await cloud.wire("tag", "PublisherConverter", "std_msgs/Int8MultiArray")
         async with dial(cloud, "testUser", "testRobot") as robot:
-            await end.active.until(lambda: end.is_active)
+            await end.until_active()
             size = 32_000_000
             end.port.send(struct.pack("<III", 0, 0, size) + os.urandom(size))
             (error,) = await errors(robot, 1)
@@ -183,7 +184,7 @@ async def test_a_large_message_in_fragments_is_put_together() -> None:
     async with running_cloud(PATIENT) as cloud:
         end = await cloud.joined("tag", "SubscriberConverter", STRING)
         async with dial(cloud, "testUser", "testRobot") as robot:
-            await end.active.until(lambda: end.is_active)
+            await end.until_active()
             text = "x" * 5_000_000
             whole = say(json.dumps({"data": text}))
 

@@ -5,18 +5,21 @@ from __future__ import annotations
 import asyncio
 import json
 from contextlib import AsyncExitStack, asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Unpack
 
 import pytest
-from support.cloud import DIGEST, Cloud, running_cloud
+from support.cloud import DIGEST, Cloud, RobotOptions, running_cloud
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
-from rce.link import Overloaded
+from rce.link import OverloadedError
 from rce_robot.settings import SessionSettings
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+
+    from integration.robot.conftest import Robot
 
 MIB = 1 << 20
 STRING = "std_msgs/String"
@@ -29,7 +32,9 @@ def dial(cloud: Cloud, user: str, robot: str) -> connect:
 
 
 @asynccontextmanager
-async def small_cloud(**settings: Any) -> AsyncIterator[tuple[Cloud, ClientConnection, AsyncExitStack]]:
+async def small_cloud(
+    **settings: Unpack[RobotOptions],
+) -> AsyncIterator[tuple[Cloud, ClientConnection, AsyncExitStack]]:
     """A cloud with little memory, and the robot of a user who does nothing wrong."""
     async with running_cloud(PATIENT, **settings) as cloud, AsyncExitStack() as stack:
         cloud.master.users.add("flood")
@@ -53,7 +58,7 @@ async def close_of(socket: ClientConnection) -> tuple[int, str]:
     return ended.value.rcvd.code, ended.value.rcvd.reason
 
 
-async def test_unclaimed_values_are_dropped_oldest_first(robot_of: Any) -> None:
+async def test_unclaimed_values_are_dropped_oldest_first(robot_of: type[Robot]) -> None:
     async with small_cloud(user_memory=4 * MIB) as (cloud, good, stack):
         sockets = [await stack.enter_async_context(dial(cloud, "flood", f"f{n}")) for n in range(3)]
         for number in range(4):
@@ -67,7 +72,7 @@ async def test_unclaimed_values_are_dropped_oldest_first(robot_of: Any) -> None:
         assert cloud.master.usage.held <= 5 * MIB
 
 
-async def test_endless_messages_end_the_connection(robot_of: Any) -> None:
+async def test_endless_messages_end_the_connection(robot_of: type[Robot]) -> None:
     async with small_cloud(user_memory=4 * MIB) as (cloud, good, stack):
         sockets = [await stack.enter_async_context(dial(cloud, "flood", f"f{n}")) for n in range(2)]
 
@@ -95,7 +100,7 @@ async def test_endless_messages_end_the_connection(robot_of: Any) -> None:
         await still_served(again)
 
 
-async def test_robots_that_do_not_read_lose_their_own_messages(robot_of: Any) -> None:
+async def test_robots_that_do_not_read_lose_their_own_messages(robot_of: type[Robot]) -> None:
     async with small_cloud(user_memory=6 * MIB) as (cloud, good, stack):
         stalled = [await stack.enter_async_context(dial(cloud, "testUser", f"s{n}")) for n in range(3)]
         ends = [await cloud.joined("image", "PublisherForwarder", STRING, robot=f"s{n}") for n in range(3)]
@@ -119,7 +124,7 @@ async def test_robots_that_do_not_read_lose_their_own_messages(robot_of: Any) ->
             assert await robot_of(socket).get("DM")
 
 
-async def test_all_users_together_have_a_bound_too(robot_of: Any) -> None:
+async def test_all_users_together_have_a_bound_too(robot_of: type[Robot]) -> None:
     async with small_cloud(memory=4 * MIB) as (cloud, good, stack):
         flood = await stack.enter_async_context(dial(cloud, "flood", "f"))
         await good.send(b"%032x" % 1 + bytes(MIB))
@@ -132,25 +137,26 @@ async def test_all_users_together_have_a_bound_too(robot_of: Any) -> None:
         assert "none" in (await robot_of(good).get("ER")), "what the other user sent first is still there"
 
 
-async def test_latched_messages_over_the_limit_are_given_up_oldest_first() -> None:
+async def test_latched_over_limit_are_dropped_oldest_first() -> None:
     """The robot is away; 60 latched topics bring 60 MB, of which its user may hold 20."""
     async with running_cloud(PATIENT, user_memory=20 * MIB) as cloud:
         ends = [await cloud.wire(f"map{number}", "PublisherForwarder", STRING) for number in range(60)]
         async with dial(cloud, "testUser", "testRobot"):
             for end in ends:
-                await end.active.until(lambda end=end: end.is_active)
+                await end.until_active()
 
-        def arrived() -> int:
+        def have_arrived(count: int) -> bool:
             usage = cloud.master.usage
             found = {} if usage is None else usage.endpoints["testUser/testRobot"].interfaces
-            return sum(interface.messages_in for interface in found.values())
+            return sum(interface.messages_in for interface in found.values()) >= count
 
         for count in range(10, 61, 10):
             for end in ends[count - 10 : count]:
                 end.port.send(bytes(MIB), latched=True)
-            await cloud.master.changed.until(lambda count=count: arrived() >= count)
+            await cloud.master.changed.until(partial(have_arrived, count))
             assert cloud.master.usage is not None
             assert cloud.master.usage.held <= 20 * MIB
+        assert cloud.master.usage is not None
         assert cloud.master.usage.held > 15 * MIB
 
 
@@ -161,7 +167,7 @@ async def test_a_burst_of_latched_messages_reaches_a_robot_that_reads() -> None:
         ends = [await cloud.wire(f"map{number}", "PublisherForwarder", STRING) for number in range(count)]
         async with dial(cloud, "testUser", "testRobot"):
             for end in ends:
-                await end.active.until(lambda end=end: end.is_active)
+                await end.until_active()
         for end in ends:
             end.port.send(bytes(size), latched=True)
         await cloud.master.changed.until(
@@ -169,7 +175,7 @@ async def test_a_burst_of_latched_messages_reaches_a_robot_that_reads() -> None:
         )
         query = f"userID=testUser&robotID=testRobot&password={DIGEST}"
         async with connect(f"{cloud.ws_url}?{query}", proxy=None, compression=None, max_size=None) as robot:
-            tags = set()
+            tags: set[str] = set()
             binaries = 0
             async with asyncio.timeout(60):
                 while len(tags) < count or binaries < count:
@@ -190,7 +196,7 @@ async def test_a_latched_burst_over_the_limit_does_not_end_the_link() -> None:
         after = await cloud.wire("after", "PublisherForwarder", STRING)
         async with dial(cloud, "testUser", "testRobot") as robot:
             for end in (*ends, after):
-                await end.active.until(lambda end=end: end.is_active)
+                await end.until_active()
             for end in ends:
                 end.port.send(bytes(size), latched=True)
 
@@ -199,10 +205,8 @@ async def test_a_latched_burst_over_the_limit_does_not_end_the_link() -> None:
                 if usage is None or usage.held > limit or "testUser/testRobot" not in usage.endpoints:
                     return False
                 interfaces = usage.endpoints["testUser/testRobot"].interfaces
-                came, dropped = (
-                    sum(getattr(interface, name) for interface in interfaces.values())
-                    for name in ("messages_in", "dropped")
-                )
+                came = sum(interface.messages_in for interface in interfaces.values())
+                dropped = sum(interface.dropped for interface in interfaces.values())
                 return came > 0 and dropped > 0 and came + dropped >= count
 
             await cloud.master.changed.until(moved)
@@ -221,7 +225,7 @@ async def test_a_call_dropped_while_it_comes_in_ends_at_its_caller() -> None:
     async with running_cloud(PATIENT, user_memory=16 * MIB) as cloud:
         end = await cloud.wire("serve", "ServiceClientForwarder", "std_srvs/SetBool")
         async with dial(cloud, "testUser", "testRobot"):
-            await end.active.until(lambda: end.is_active)
-            with pytest.raises(Overloaded, match="the request was dropped: memory is short"):
+            await end.until_active()
+            with pytest.raises(OverloadedError, match="the request was dropped: memory is short"):
                 await end.port.call(bytes(30 * MIB))
             assert end.losses == 0

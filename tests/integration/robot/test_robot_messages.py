@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce.link import PeerFault
+from rce.link import PeerFaultError
 
 if TYPE_CHECKING:
+    from integration.robot.conftest import Robot
     from support.cloud import Cloud
-
-    from tests.integration.robot.conftest import Robot
 
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"
@@ -106,7 +105,7 @@ async def test_the_robots_failure_reaches_the_caller(cloud: Cloud, robot: Robot)
         call = asyncio.create_task(end.port.call(ros_string("x")))
         request = await robot.get("DM")
         await robot.say("serve", ECHO, answer, request["msgID"])
-        with pytest.raises(PeerFault, match=expected):
+        with pytest.raises(PeerFaultError, match=expected):
             await call
 
 
@@ -116,7 +115,7 @@ async def test_a_robot_that_leaves_fails_its_callers(cloud: Cloud, robot: Robot)
     await robot.get("DM")
     await robot.socket.close()
     for waiting in (call, asyncio.create_task(end.port.call(ros_string("y")))):
-        with pytest.raises(PeerFault, match="robot"):
+        with pytest.raises(PeerFaultError, match="robot"):
             await waiting
 
 
@@ -211,5 +210,5 @@ async def test_a_refused_answer_fails_its_caller(cloud: Cloud, robot: Robot, ans
     request = await robot.get("DM")
     await robot.send("DM", {"iTag": "serve", "msgID": request["msgID"], **answer})
     async with asyncio.timeout(10):  # far less than a call may take
-        with pytest.raises(PeerFault, match="the robot's answer was refused: serve, msgID"):
+        with pytest.raises(PeerFaultError, match="the robot's answer was refused: serve, msgID"):
             await call

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import struct
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import pytest
 from support.cloud import DIGEST, running_cloud
+from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.typing import Origin
 
 from rce.control.messages import Probe
 from rce.control.model import EndpointState
-from rce_robot.outbox import OutboxLimits
+from rce_robot.doors.client.outbox import OutboxLimits
 from rce_robot.settings import SessionSettings
 
 if TYPE_CHECKING:
+    from integration.robot.conftest import Dial, Robot
     from support.cloud import Cloud
 
     from rce.control.messages import ClientRequest
@@ -29,7 +33,7 @@ def ros_string(text: str) -> bytes:
     return struct.pack("<I", len(data)) + data
 
 
-async def refused(attempt: Any) -> tuple[int, str]:
+async def refused(attempt: connect) -> tuple[int, str]:
     with pytest.raises(InvalidStatus) as caught:
         async with attempt:
             pass
@@ -49,20 +53,20 @@ async def refused(attempt: Any) -> tuple[int, str]:
         (f"userID=testUser&robotID=1r&password={DIGEST}", "robotID"),
     ],
 )
-async def test_bad_query(cloud: Cloud, query: str, word: str, connect_to: Any) -> None:
+async def test_bad_query(cloud: Cloud, query: str, word: str, connect_to: Callable[[str], connect]) -> None:
     status, reason = await refused(connect_to(f"{cloud.ws_url}?{query}"))
     assert status == 400
     assert word in reason
 
 
-async def test_wrong_password(cloud: Cloud, dial: Any) -> None:
+async def test_wrong_password(cloud: Cloud, dial: Dial) -> None:
     status, reason = await refused(dial(cloud, password="0" * 64))
     assert status == 401
     assert "Wrong" in reason
     assert cloud.master.inside == set()
 
 
-async def test_second_connection_of_a_robot(cloud: Cloud, dial: Any) -> None:
+async def test_second_connection_of_a_robot(cloud: Cloud, dial: Dial) -> None:
     async with dial(cloud):
         status, reason = await refused(dial(cloud))
         assert status == 409
@@ -74,16 +78,16 @@ async def test_second_connection_of_a_robot(cloud: Cloud, dial: Any) -> None:
         pass
 
 
-async def test_pages_of_other_sites_are_refused(dial: Any) -> None:
+async def test_pages_of_other_sites_are_refused(dial: Dial) -> None:
     async with running_cloud(origins=("https://fleet.example",)) as cloud:
-        status, reason = await refused(dial(cloud, origin="https://evil.example"))
+        status, reason = await refused(dial(cloud, origin=Origin("https://evil.example")))
         assert status == 403
         assert "evil" in reason
-        async with dial(cloud, origin="https://fleet.example"):
+        async with dial(cloud, origin=Origin("https://fleet.example")):
             pass
 
 
-async def test_no_login_while_the_master_is_away(dial: Any) -> None:
+async def test_no_login_while_the_master_is_away(dial: Dial) -> None:
     async with running_cloud(login_timeout=0.05) as cloud:
         cloud.master.silent = True
         status, reason = await refused(dial(cloud))
@@ -91,7 +95,7 @@ async def test_no_login_while_the_master_is_away(dial: Any) -> None:
         assert "master" in reason
 
 
-async def test_a_dead_connection_makes_room_for_the_robots_new_one(dial: Any) -> None:
+async def test_a_dead_connection_makes_room_for_the_robots_new_one(dial: Dial) -> None:
     settings = SessionSettings(probe_timeout=0.2, drain_timeout=1.0)
     async with running_cloud(settings) as cloud, dial(cloud) as dead:
         dead.transport.pause_reading()  # like a Wi-Fi that is gone: no pong will come
@@ -103,7 +107,8 @@ async def test_a_dead_connection_makes_room_for_the_robots_new_one(dial: Any) ->
             await dead.recv()
 
 
-async def test_a_dead_connection_is_ended_when_its_robot_comes_elsewhere(dial: Any) -> None:
+async def test_dead_connection_ends_when_robot_moves(dial: Dial) -> None:
+    """A dead connection is ended when its robot comes elsewhere."""
     settings = SessionSettings(probe_timeout=0.2, drain_timeout=1.0)
     async with running_cloud(settings) as cloud, dial(cloud) as alive, dial(cloud, robot="other") as dead:
         dead.transport.pause_reading()
@@ -121,7 +126,7 @@ async def test_a_dead_connection_is_ended_when_its_robot_comes_elsewhere(dial: A
 # What the master hears
 
 
-async def test_the_master_hears_of_coming_and_going(cloud: Cloud, dial: Any) -> None:
+async def test_the_master_hears_of_coming_and_going(cloud: Cloud, dial: Dial) -> None:
     assert cloud.master.url == cloud.ws_url
     async with dial(cloud):
         await cloud.master.changed.until(lambda: cloud.master.running(ROBOT))
@@ -134,7 +139,7 @@ async def test_the_master_hears_of_coming_and_going(cloud: Cloud, dial: Any) -> 
     assert end.is_active  # a robot that is away keeps its connections
 
 
-async def test_usage_is_reported(cloud: Cloud, robot: Any) -> None:
+async def test_usage_is_reported(cloud: Cloud, robot: Robot) -> None:
     end = await cloud.joined("say", "SubscriberConverter", STRING)
     await robot.say("say", STRING, {"data": "x"})
     await end.received.get()
@@ -149,7 +154,20 @@ async def test_usage_is_reported(cloud: Cloud, robot: Any) -> None:
     assert cloud.master.usage.memory > 0
 
 
-async def test_requests_go_to_the_master_in_order_and_errors_come_back(cloud: Cloud, robot: Any) -> None:
+@pytest.mark.parametrize("current", [False, True])
+async def test_requests_reach_masters_of_both_releases(
+    dial: Dial, robot_of: type[Robot], current: bool
+) -> None:
+    """A master of the release before gets what the client wrote, a current one what was read of it."""
+    async with running_cloud(in_patches=current) as cloud, dial(cloud) as socket:
+        robot = robot_of(socket)
+        await robot.send("CC", {"containerTag": "c1", "containerData": {"memory": "5M", "cpu": "50%"}})
+        await cloud.master.changed.until(lambda: len(cloud.master.requests) == 1)
+        sent = {"containerTag": "c1", "containerData": {"memory": 5, "cpu": 0.5}}
+        assert cloud.master.requests == [(ROBOT, "CC", sent)]
+
+
+async def test_requests_go_to_the_master_in_order_and_errors_come_back(cloud: Cloud, robot: Robot) -> None:
     async def refuse(request: ClientRequest) -> tuple[str, ...]:
         return ("no room", "no luck") if request.type == "CC" else ()
 
@@ -168,7 +186,7 @@ async def test_requests_go_to_the_master_in_order_and_errors_come_back(cloud: Cl
     assert cloud.master.requests[2][2] == {"removeNodes": [{"containerTag": "c1", "nodeTag": "n"}]}
 
 
-async def test_a_leaving_robots_last_requests_are_carried_out(cloud: Cloud, robot: Any) -> None:
+async def test_a_leaving_robots_last_requests_are_carried_out(cloud: Cloud, robot: Robot) -> None:
     for number in range(20):
         await robot.send("DC", {"containerTag": f"c{number}"})
     await robot.socket.close()
@@ -176,7 +194,7 @@ async def test_a_leaving_robots_last_requests_are_carried_out(cloud: Cloud, robo
     assert len(cloud.master.requests) == 20
 
 
-async def test_everything_goes_on_while_the_master_is_away(cloud: Cloud, robot: Any) -> None:
+async def test_everything_goes_on_while_the_master_is_away(cloud: Cloud, robot: Robot) -> None:
     end = await cloud.joined("say", "SubscriberConverter", STRING)
     assert cloud.master.peer is not None
     cloud.master.peer.abort()
@@ -192,7 +210,9 @@ async def test_everything_goes_on_while_the_master_is_away(cloud: Cloud, robot: 
 # Coming back
 
 
-async def test_a_robot_that_comes_back_finds_its_interfaces(cloud: Cloud, dial: Any, robot_of: Any) -> None:
+async def test_a_robot_that_comes_back_finds_its_interfaces(
+    cloud: Cloud, dial: Dial, robot_of: type[Robot]
+) -> None:
     async with dial(cloud):
         say = await cloud.joined("say", "SubscriberConverter", STRING)
         hear = await cloud.joined("hear", "PublisherConverter", STRING)
@@ -211,14 +231,14 @@ async def test_a_robot_that_comes_back_finds_its_interfaces(cloud: Cloud, dial: 
         assert await say.received.get() == ros_string("back")
 
 
-async def test_status_follows_the_connection(cloud: Cloud, robot: Any) -> None:
+async def test_status_follows_the_connection(cloud: Cloud, robot: Robot) -> None:
     await cloud.joined("say", "SubscriberConverter", STRING)
     assert (await robot.get("ST"))["status"] is True
     cloud.master.put(ROBOT, connections=())
     assert await robot.get("ST") == {"topic": "iu", "iTag": "say", "status": False}
 
 
-async def test_a_dropped_robot_is_told_why_and_is_gone(cloud: Cloud, robot: Any) -> None:
+async def test_a_dropped_robot_is_told_why_and_is_gone(cloud: Cloud, robot: Robot) -> None:
     await cloud.joined("say", "SubscriberConverter", STRING)
     await robot.get("ST")
     cloud.master.drop(ROBOT, "user was removed")
@@ -232,7 +252,7 @@ async def test_a_dropped_robot_is_told_why_and_is_gone(cloud: Cloud, robot: Any)
 # Abuse
 
 
-async def test_too_large_a_message_ends_the_connection(dial: Any) -> None:
+async def test_too_large_a_message_ends_the_connection(dial: Dial) -> None:
     async with (
         running_cloud(SessionSettings(max_message=1000, drain_timeout=1.0)) as cloud,
         dial(cloud) as socket,
@@ -244,7 +264,7 @@ async def test_too_large_a_message_ends_the_connection(dial: Any) -> None:
         assert caught.value.rcvd.code == 1009
 
 
-async def test_text_that_is_not_utf8_ends_the_connection(cloud: Cloud, robot: Any) -> None:
+async def test_text_that_is_not_utf8_ends_the_connection(cloud: Cloud, robot: Robot) -> None:
     await robot.socket.send(b'{"type": "\xff"}', text=True)
     with pytest.raises(ConnectionClosed) as caught:
         await robot.socket.recv()
@@ -252,7 +272,7 @@ async def test_text_that_is_not_utf8_ends_the_connection(cloud: Cloud, robot: An
     assert caught.value.rcvd.code == 1007
 
 
-async def test_requests_that_wait_are_bounded_by_their_bytes(dial: Any, robot_of: Any) -> None:
+async def test_requests_that_wait_are_bounded_by_their_bytes(dial: Dial, robot_of: type[Robot]) -> None:
     settings = SessionSettings(max_request_bytes=3000, drain_timeout=1.0)
     async with running_cloud(settings) as cloud, dial(cloud) as socket:
         released = asyncio.Event()
@@ -274,7 +294,7 @@ async def test_requests_that_wait_are_bounded_by_their_bytes(dial: Any, robot_of
         assert [kind for _, kind, _ in cloud.master.requests] == ["CN", "CN", "CC"]
 
 
-async def test_a_robot_that_stops_reading_harms_itself_only(dial: Any, robot_of: Any) -> None:
+async def test_a_robot_that_stops_reading_harms_itself_only(dial: Dial, robot_of: type[Robot]) -> None:
     settings = SessionSettings(
         outbox=OutboxLimits(queue_bytes=2 << 20, total_bytes=4 << 20), ping_interval=None, drain_timeout=1.0
     )
@@ -297,7 +317,7 @@ async def test_a_robot_that_stops_reading_harms_itself_only(dial: Any, robot_of:
 
         def dropped() -> bool:
             usage = cloud.master.usage
-            found = usage.endpoints["testUser/stalled"].interfaces["image"] if usage else None
+            found = usage.endpoints["testUser/stalled"].interfaces.get("image") if usage else None
             return found is not None and found.dropped > 10
 
         await cloud.master.changed.until(dropped)

@@ -17,10 +17,9 @@ from websockets.asyncio.client import connect
 from rce.protocol.single import MAX_PAYLOAD
 
 if TYPE_CHECKING:
+    from integration.robot.conftest import Robot
     from support.cloud import Cloud
     from websockets.asyncio.client import ClientConnection
-
-    from tests.integration.robot.conftest import Robot
 
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"
@@ -142,8 +141,8 @@ async def test_what_is_wrong_is_told_and_harms_nothing_else(cloud: Cloud, single
     ):
         await single.socket.send(frame)
         assert words in await single.get("ER")
-    await single.socket.send(frame_of("say", STRING, b"goes on"))
-    assert await end.received.get() == b"goes on"
+    await single.socket.send(frame_of("say", STRING, b"continues"))
+    assert await end.received.get() == b"continues"
 
 
 async def test_robot_that_did_not_ask_is_refused_one_frame(cloud: Cloud, robot: Robot) -> None:

@@ -14,7 +14,7 @@ from websockets.frames import Frame, Opcode
 from rce.guard.lobby import Lobby
 from rce.guard.loop_share import LoopShare
 from rce.guard.websocket import guarded
-from rce_robot.websocket import RobotSocket
+from rce_robot.doors.client.websocket import RobotSocket
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator

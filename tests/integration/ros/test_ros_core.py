@@ -8,17 +8,16 @@ import signal
 import socket
 import sys
 from collections.abc import Callable
-from typing import Any
 
 import pytest
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Change, Core, GraphEvent
-from rce.ros.errors import MasterRefused, ParameterMissing, RemoteFault
+from rce.ros.errors import MasterRefusedError, ParameterMissingError, RemoteFaultError
 from rce.ros.node import Node
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
 from rce.ros.xmlrpc.codec import encode_call
 
-MakeNode = Callable[..., Node]
 STRING = "std_msgs/String"
 
 
@@ -33,9 +32,9 @@ async def test_parameters(core: Core, make_node: MakeNode) -> None:
         await a.delete_param("rel/list")
         assert not await a.has_param("rel/list")
         assert await a.get_param("rel/list", "default") == "default"
-        with pytest.raises(ParameterMissing, match="/ns/rel/list"):
+        with pytest.raises(ParameterMissingError, match="/ns/rel/list"):
             await a.get_param("rel/list")
-        with pytest.raises(ParameterMissing):
+        with pytest.raises(ParameterMissingError):
             await a.delete_param("rel/list")
         names = {name for name in await a.get_param_names() if not name.startswith("/roslaunch/uris/host_")}
         assert names == {
@@ -46,7 +45,7 @@ async def test_parameters(core: Core, make_node: MakeNode) -> None:
         assert await a.get_param("/host") == 1
         assert core.delete_param("/host")
         assert not core.delete_param("/host")
-        with pytest.raises(ParameterMissing):
+        with pytest.raises(ParameterMissingError):
             core.get_param("/host")
 
 
@@ -160,7 +159,7 @@ async def test_questions_to_the_core(core: Core, make_node: MakeNode) -> None:
         assert await ask("getPublishedTopics", "") == [["/rosout", "rosgraph_msgs/Log"], ["/ns/t", STRING]]
         assert await ask("getPublishedTopics", "/ns") == [["/ns/t", STRING]]
         assert await ask("unregisterPublisher", "/ns/t", "http://other:1/") == 0
-        with pytest.raises(MasterRefused, match="unknown node"):
+        with pytest.raises(MasterRefusedError, match="unknown node"):
             await ask("lookupNode", "/nobody")
 
 
@@ -195,12 +194,13 @@ async def test_http_is_spoken_as_clients_do(core: Core) -> None:
 
 async def test_unknown_methods_are_faults(core: Core) -> None:
     async with RpcClient() as rpc:
-        with pytest.raises(RemoteFault):
+        with pytest.raises(RemoteFaultError):
             await rpc.call(core.uri, "noSuchThing", ("/x",))
         assert "registerPublisher" in await rpc.call(core.uri, "system.listMethods", ())
 
 
-async def test_a_node_that_knows_nothing_of_a_subscription_is_left_alone(core: Core) -> None:
+async def test_node_without_subscription_is_left_alone(core: Core) -> None:
+    """A node that knows nothing of a subscription is left alone."""
     calls: list[str] = []
     answers = [1, -1]
 
@@ -233,7 +233,7 @@ async def test_a_large_graph(core: Core) -> None:
     nodes, parameters = 200, 5000
     async with RpcClient() as rpc:
 
-        async def call(method: str, *arguments: Any) -> None:
+        async def call(method: str, *arguments: object) -> None:
             await rpc.call(core.uri, method, arguments, timeout=120)
 
         async def join(number: int) -> None:

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support.processes import finish
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
-from rce.ros.errors import ServiceFault
-from rce.ros.node import Node
+from rce.ros.errors import ServiceFaultError
+from rce.ros.types import Message
 
 pytestmark = pytest.mark.needs("rospy")
 
-MakeNode = Callable[..., Node]
 STRING = "std_msgs/String"
 
 ROSPY_NODE = """
@@ -105,7 +105,7 @@ async def test_a_rospy_node_and_ours(core: Core, make_node: MakeNode, tmp_path: 
         client = ours.service_client("set_level", "roscpp/SetLoggerLevel")
         await client.call({"logger": "x", "level": "warn"}, timeout=20)
         assert await ours.get_param("/level") == "warn"
-        with pytest.raises(ServiceFault, match="as asked"):
+        with pytest.raises(ServiceFaultError, match="as asked"):
             await client.call({"logger": "fail"}, timeout=20)
         loggers = await ours.service_client("/real/get_loggers", "roscpp/GetLoggers", persistent=False)()
         assert "rosout" in {logger.name for logger in loggers.loggers}
@@ -152,11 +152,11 @@ async def test_topic_tools_see_our_nodes(core: Core, make_node: MakeNode) -> Non
 async def test_service_tools_call_our_nodes(core: Core, make_node: MakeNode) -> None:
     async with make_node("ours") as ours:
 
-        async def loggers(request: Any) -> dict[str, Any]:
+        async def loggers(request: Message) -> dict[str, Any]:
             return {"loggers": [{"name": "a", "level": "info"}, {"name": "b", "level": "debug"}]}
 
-        def refuse(request: Any) -> None:
-            raise ServiceFault("/refuse", "never")
+        def refuse(request: Message) -> None:
+            raise ServiceFaultError("/refuse", "never")
 
         await ours.advertise_service("get", "roscpp/GetLoggers", loggers)
         await ours.advertise_service("refuse", "roscpp/Empty", refuse)

@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import pytest
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
 from rce.ros.node import Node
-from rce.ros.types import TypeRegistry
+from rce.ros.types import Message, TypeRegistry
 from rce.ros.xmlrpc import RpcClient
 
 STRING = "std_msgs/String"
 
 
 @pytest.fixture
-def near(core: Core) -> Callable[..., Node]:
+def near(core: Core) -> MakeNode:
     return partial(Node, argv=[], master_uri=core.uri)
 
 
-async def test_the_object_itself_is_delivered(near: Callable[..., Node]) -> None:
+async def test_the_object_itself_is_delivered(near: MakeNode) -> None:
     types = TypeRegistry()
     async with near("a", types=types) as a, near("b", types=types) as b:
-        got: asyncio.Queue[Any] = asyncio.Queue()
+        got: asyncio.Queue[Message] = asyncio.Queue()
         raw: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
         await b.subscribe("t", STRING, got.put_nowait)
         publisher = await a.advertise("t", STRING)
@@ -45,7 +44,7 @@ async def test_the_object_itself_is_delivered(near: Callable[..., Node]) -> None
         assert (await asyncio.wait_for(got.get(), 10)).data == "mapping"
 
 
-async def test_near_and_far_subscribers_get_the_same(core: Core, near: Callable[..., Node]) -> None:
+async def test_near_and_far_subscribers_get_the_same(core: Core, near: MakeNode) -> None:
     async with near("a") as a, near("b") as b, near("far", intra_process=False) as far:
         publisher = await a.advertise("t", STRING, latch=True)
         nearby, distant = await b.subscribe("t", STRING), await far.subscribe("t", STRING)
@@ -66,7 +65,7 @@ async def test_near_and_far_subscribers_get_the_same(core: Core, near: Callable[
             assert [[link[2] for link in entry[2]] for entry in published if entry[0] == "/t"] == [[2, 2]]
 
 
-async def test_a_late_node_gets_the_latched_message(near: Callable[..., Node]) -> None:
+async def test_a_late_node_gets_the_latched_message(near: MakeNode) -> None:
     async with near("a") as a, near("b") as b:
         publisher = await a.advertise("t", STRING, latch=True)
         publisher.publish(data="kept")
@@ -75,7 +74,7 @@ async def test_a_late_node_gets_the_latched_message(near: Callable[..., Node]) -
         assert await asyncio.wait_for(heard.get(), 10) == (b"\x04\0\0\0kept", True)
 
 
-async def test_too_many_at_once_lose_the_oldest(near: Callable[..., Node]) -> None:
+async def test_too_many_at_once_lose_the_oldest(near: MakeNode) -> None:
     async with near("a") as a:
         publisher = await a.advertise("t", STRING, queue_size=3)
         subscriber = await a.subscribe("t", STRING)
@@ -87,7 +86,7 @@ async def test_too_many_at_once_lose_the_oldest(near: Callable[..., Node]) -> No
         assert publisher.dropped == 7
 
 
-async def test_types_must_agree(near: Callable[..., Node], caplog: pytest.LogCaptureFixture) -> None:
+async def test_types_must_agree(near: MakeNode, caplog: pytest.LogCaptureFixture) -> None:
     async with near("a") as a, near("b") as b:
         publisher = await a.advertise("t", STRING)
         wrong = await b.subscribe("t", "std_msgs/Bool")
@@ -97,7 +96,7 @@ async def test_types_must_agree(near: Callable[..., Node], caplog: pytest.LogCap
         assert publisher.connections == 0
 
 
-async def test_publishers_come_and_go(near: Callable[..., Node]) -> None:
+async def test_publishers_come_and_go(near: MakeNode) -> None:
     async with near("b") as b:
         subscriber = await b.subscribe("t", STRING)
         for incarnation in ("first", "second"):

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rce.ros.core import Core
-from rce.ros.errors import ServiceFault
+from rce.ros.errors import ServiceFaultError
 from rce.ros.logfiles import LogFile, log_folder
 from rce.ros.node import Node
 from rce.ros.node.rosout import KIND, MD5SUM
@@ -140,9 +140,9 @@ async def test_levels_are_read_and_set(core: Core) -> None:
         await set_level.call({"logger": "rosout", "level": "Debug"}, timeout=10)
         loggers = {entry.name: entry.level for entry in (await get.call({}, timeout=10)).loggers}
         assert loggers["rosout"] == "debug"
-        with pytest.raises(ServiceFault, match="no logger"):
+        with pytest.raises(ServiceFaultError, match="no logger"):
             await set_level.call({"logger": "other", "level": "info"}, timeout=10)
-        with pytest.raises(ServiceFault, match="not one of"):
+        with pytest.raises(ServiceFaultError, match="not one of"):
             await set_level.call({"logger": "rosout", "level": "loud"}, timeout=10)
 
 

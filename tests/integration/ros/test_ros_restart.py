@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
 
 import pytest
 
@@ -34,7 +33,7 @@ async def test_a_restarted_core_is_told_everything_again() -> None:
             await a.subscribe_serialized("v", "*", lambda *_: None)
             await a.advertise_service("s", "std_srvs/Empty", lambda request: None)
             heard = await b.subscribe("t", STRING)
-            told: asyncio.Queue[tuple[str, Any]] = asyncio.Queue()
+            told: asyncio.Queue[tuple[str, object]] = asyncio.Queue()
             assert await a.watch_param("/watched", lambda *change: told.put_nowait(change)) == 1
             await publisher.wait_for_subscribers(timeout=10)
         except BaseException:

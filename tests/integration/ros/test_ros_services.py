@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
-from rce.ros.errors import ServiceFault, ServiceLost, ServiceNotFound, ServiceTimeout, TypeMismatch
-from rce.ros.node import Node
+from rce.ros.errors import (
+    ServiceFaultError,
+    ServiceLostError,
+    ServiceNotFoundError,
+    ServiceTimeoutError,
+    TypeMismatchError,
+)
 from rce.ros.tcpros.header import decode_header, encode_header
-from rce.ros.types import SerializationError
+from rce.ros.types import Message, SerializationError
 
-MakeNode = Callable[..., Node]
 SET_BOOL = "std_srvs/SetBool"
 
 
-def switch(request: Any) -> dict[str, Any]:
+def switch(request: Message) -> dict[str, Any]:
     return {"success": request.data, "message": "on" if request.data else "off"}
 
 
@@ -39,7 +43,7 @@ async def test_bursts_make_no_new_connections(make_node: MakeNode, core: Core) -
     async with make_node("a") as a, make_node("b") as b:
         all_there = asyncio.Barrier(40)
 
-        async def meet(request: Any) -> dict[str, Any]:
+        async def meet(request: Message) -> dict[str, Any]:
             await all_there.wait()
             return switch(request)
 
@@ -76,7 +80,7 @@ async def test_calls_run_side_by_side(make_node: MakeNode) -> None:
         waiting = 0
         all_there = asyncio.Event()
 
-        async def meet(request: Any) -> dict[str, Any]:
+        async def meet(request: Message) -> dict[str, Any]:
             nonlocal waiting
             waiting += 1
             if waiting == 20:
@@ -94,7 +98,7 @@ async def test_calls_run_side_by_side(make_node: MakeNode) -> None:
 async def test_each_call_has_its_own_time_limit(make_node: MakeNode) -> None:
     async with make_node("a") as a, make_node("b") as b:
 
-        async def maybe(request: Any) -> dict[str, Any]:
+        async def maybe(request: Message) -> dict[str, Any]:
             if request.data:
                 await asyncio.Event().wait()
             return switch(request)
@@ -103,7 +107,7 @@ async def test_each_call_has_its_own_time_limit(make_node: MakeNode) -> None:
         client = b.service_client("maybe", SET_BOOL)
         stuck = asyncio.create_task(client.call({"data": True}, timeout=0.3))
         assert (await client.call({"data": False}, timeout=10)).message == "off"
-        with pytest.raises(ServiceTimeout):
+        with pytest.raises(ServiceTimeoutError):
             await stuck
         assert (await client.call({"data": False}, timeout=10)).message == "off"
 
@@ -112,22 +116,22 @@ async def test_each_call_has_its_own_time_limit(make_node: MakeNode) -> None:
 async def test_a_handler_that_fails_answers_with_an_error(
     make_node: MakeNode, is_async: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def handle(request: Any) -> dict[str, Any]:
+    def handle(request: Message) -> dict[str, Any]:
         if request.data:
-            raise ServiceFault("/f", "not today")
+            raise ServiceFaultError("/f", "not today")
         raise ZeroDivisionError("oops")
 
-    async def handle_later(request: Any) -> dict[str, Any]:
+    async def handle_later(request: Message) -> dict[str, Any]:
         await asyncio.sleep(0)
         return handle(request)
 
     async with make_node("a") as a, make_node("b") as b:
         await a.advertise_service("f", SET_BOOL, handle_later if is_async else handle)
         client = b.service_client("f", SET_BOOL)
-        with pytest.raises(ServiceFault, match="not today"):
+        with pytest.raises(ServiceFaultError, match="not today"):
             await client(data=True)
         assert "not today" not in caplog.text
-        with pytest.raises(ServiceFault, match="oops"):
+        with pytest.raises(ServiceFaultError, match="oops"):
             await client(data=False)
         assert "ZeroDivisionError" in caplog.text
 
@@ -135,11 +139,11 @@ async def test_a_handler_that_fails_answers_with_an_error(
 async def test_a_provider_that_dies_ends_its_calls_and_may_come_back(make_node: MakeNode) -> None:
     async with make_node("b") as b:
         client = b.service_client("s", SET_BOOL)
-        with pytest.raises(ServiceNotFound):
+        with pytest.raises(ServiceNotFoundError):
             await client(data=True)
         called = asyncio.Event()
 
-        async def hang(request: Any) -> None:
+        async def hang(request: Message) -> None:
             called.set()
             await asyncio.Event().wait()
 
@@ -147,19 +151,19 @@ async def test_a_provider_that_dies_ends_its_calls_and_may_come_back(make_node: 
             await a.advertise_service("s", SET_BOOL, hang)
             call = asyncio.create_task(client(data=True))
             await asyncio.wait_for(called.wait(), 10)
-        with pytest.raises(ServiceLost):
+        with pytest.raises(ServiceLostError):
             await call
         async with make_node("a") as a:
             await a.advertise_service("s", SET_BOOL, switch)
             assert (await client(data=True)).message == "on"
-        with pytest.raises(ServiceNotFound):
+        with pytest.raises(ServiceNotFoundError):
             await client(data=True)
 
 
 async def test_a_dead_registration_is_reported_as_lost(core: Core, make_node: MakeNode) -> None:
     async with make_node("b") as b:
         await b._running.master.call("registerService", "/s", "rosrpc://127.0.0.1:1", "http://127.0.0.1:1/")
-        with pytest.raises(ServiceLost):
+        with pytest.raises(ServiceLostError):
             await b.service_client("s", SET_BOOL)(data=True)
         with pytest.raises(TimeoutError):
             await b.wait_for_service("s", timeout=0.3)
@@ -169,9 +173,9 @@ async def test_a_dead_registration_is_reported_as_lost(core: Core, make_node: Ma
 async def test_types_must_agree(make_node: MakeNode) -> None:
     async with make_node("a") as a, make_node("b") as b:
         await a.advertise_service("s", SET_BOOL, switch)
-        with pytest.raises(ServiceFault, match="md5 sum"):
+        with pytest.raises(ServiceFaultError, match="md5 sum"):
             await b.service_client("s", "std_srvs/Trigger")()
-        with pytest.raises(TypeMismatch):
+        with pytest.raises(TypeMismatchError):
             await a.advertise_service("s", SET_BOOL, switch)
         with pytest.raises(SerializationError):
             await b.service_client("s", SET_BOOL)(data="x")
@@ -192,7 +196,7 @@ async def test_a_closed_service_is_gone(make_node: MakeNode) -> None:
         kept = next(iter(client._open)).connection
         await service.close()
         await asyncio.wait_for(kept.gone.wait(), 10)
-        with pytest.raises(ServiceNotFound):
+        with pytest.raises(ServiceNotFoundError):
             await client(data=True)
 
 

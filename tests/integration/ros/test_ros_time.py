@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
 from rce.ros.node import Node, Publisher, TimerEvent
 from rce.ros.node.clock import CLOCK
 from rce.ros.types import Time, TypeRegistry
-
-MakeNode = Callable[..., Node]
 
 
 def test_the_clock_has_the_checksum_of_its_type() -> None:
@@ -83,7 +82,7 @@ async def test_timers_and_rates_when_time_jumps_back(core: Core, make_node: Make
         await publisher.wait_for_subscribers(2, timeout=10)
         await tick(publisher, a, 100.0)
         calls: list[tuple[float, float, float | None]] = []
-        a.timer(2.0, lambda event: calls.append(tuple(event)))
+        a.timer(2.0, lambda event: calls.append((event.expected, event.now, event.last)))
         once = a.timer(3.0, lambda event: None, oneshot=True)
         beats: list[float] = []
 

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 
 import pytest
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
-from rce.ros.errors import MasterUnreachable, NodeClosed, TypeMismatch
+from rce.ros.errors import MasterUnreachableError, NodeClosedError, TypeMismatchError
 from rce.ros.node import Node, Subscriber
 from rce.ros.tcpros.header import encode_header
-from rce.ros.types import TypeRegistry
+from rce.ros.types import Message, TypeRegistry
 from rce.ros.xmlrpc import RpcClient
 
-MakeNode = Callable[..., Node]
 STRING = "std_msgs/String"
 
 
@@ -67,7 +66,8 @@ async def test_a_latched_message_reaches_later_subscribers(make_node: MakeNode) 
         assert await asyncio.wait_for(received.get(), 10) == (b"\x03\0\0\0new", True)
 
 
-async def test_a_latched_message_reaches_a_second_subscriber_of_the_same_node(make_node: MakeNode) -> None:
+async def test_latched_message_reaches_second_subscriber_of_node(make_node: MakeNode) -> None:
+    """A latched message reaches a second subscriber of the same node."""
     async with make_node("a") as a, make_node("b") as b:
         publisher = await a.advertise("t", STRING, latch=True)
         publisher.publish(data="kept")
@@ -199,8 +199,8 @@ async def test_callbacks_are_called_in_order_and_may_fail(
         seen: list[str] = []
         done = asyncio.Event()
 
-        async def slowly(message: object) -> None:
-            text = message.data  # type: ignore[attr-defined]
+        async def slowly(message: Message) -> None:
+            text = message.data
             await asyncio.sleep(0.02 if text == "0" else 0)
             seen.append(text)
             if text == "1":
@@ -218,7 +218,8 @@ async def test_callbacks_are_called_in_order_and_may_fail(
         assert "as planned" in caplog.text
 
 
-async def test_a_subscriber_that_stops_reading_loses_its_own_oldest_messages(make_node: MakeNode) -> None:
+async def test_stalled_subscriber_loses_its_oldest_messages(make_node: MakeNode) -> None:
+    """A subscriber that stops reading loses its own oldest messages."""
     async with make_node("a") as a, make_node("quick") as quick, RpcClient() as rpc:
         publisher = await a.advertise("t", STRING, queue_size=3)
         good = await quick.subscribe("t", STRING)
@@ -289,16 +290,16 @@ async def test_a_lost_connection_is_made_again(make_node: MakeNode) -> None:
 async def test_types_must_agree(core: Core, make_node: MakeNode, caplog: pytest.LogCaptureFixture) -> None:
     async with make_node("a") as a, make_node("b") as b:
         publisher = await a.advertise("t", STRING)
-        with pytest.raises(TypeMismatch):
+        with pytest.raises(TypeMismatchError):
             await a.advertise("t", "std_msgs/Bool")
         wrong = await b.subscribe("t", "std_msgs/Bool")
-        with pytest.raises(TypeMismatch):
+        with pytest.raises(TypeMismatchError):
             await b.subscribe("t", STRING)
         with pytest.raises(TimeoutError):
             await wrong.wait_for_publishers(timeout=0.3)
         assert "md5 sum" in caplog.text
         assert publisher.connections == 0
-        with pytest.raises(TypeMismatch):
+        with pytest.raises(TypeMismatchError):
             publisher.publish(TypeRegistry().message("std_msgs/Bool").new(data=True))
 
 
@@ -311,7 +312,7 @@ async def test_handles_share_a_topic_until_the_last_is_closed(core: Core, make_n
         await one.close()
         second.publish(data="still here")
         assert await collect(two, 1) == ["still here"]
-        with pytest.raises(NodeClosed):
+        with pytest.raises(NodeClosedError):
             first.publish(data="no")
         assert [message async for message in one] == []
         await second.close()
@@ -326,7 +327,7 @@ async def test_leaving_unregisters_everything(core: Core, make_node: MakeNode) -
         await a.advertise_service("s", "std_srvs/Empty", lambda request: None)
         assert ["/s", ["/a"]] in core.graph.system_state()[2]
     assert core.graph.system_state() == [[], [], []]
-    with pytest.raises(NodeClosed):
+    with pytest.raises(NodeClosedError):
         await a.advertise("t", STRING)
 
 
@@ -345,7 +346,7 @@ async def test_log_records_are_published(make_node: MakeNode) -> None:
 
 
 async def test_a_node_without_master_says_so() -> None:
-    with pytest.raises(MasterUnreachable, match=r"127\.0\.0\.1:1/"):
+    with pytest.raises(MasterUnreachableError, match=r"127\.0\.0\.1:1/"):
         async with Node("a", argv=[], master_uri="http://127.0.0.1:1/", master_timeout=0):
             pass
 

@@ -8,6 +8,7 @@ from functools import partial
 
 import pytest
 import uvloop
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
 from rce.ros.node import Node
@@ -25,7 +26,7 @@ async def core() -> AsyncIterator[Core]:
 
 
 @pytest.fixture(params=[True, False], ids=["local", "tcp"])
-def make_node(core: Core, request: pytest.FixtureRequest) -> Callable[..., Node]:
+def make_node(core: Core, request: pytest.FixtureRequest) -> MakeNode:
     return partial(Node, argv=[], master_uri=core.uri, intra_process=request.param)
 
 

@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, AsyncIterator, Callable
+from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import pytest
+from support.ros_nodes import MakeNode
 
 from rce.ros.actions import (
     ActionClient,
     ActionServer,
     ClientGoal,
     CommState,
-    GoalFailed,
+    GoalFailedError,
     GoalId,
     GoalState,
     ServerGoal,
     SimpleActionServer,
 )
 from rce.ros.actions.ledger import Arrival
+from rce.ros.actions.work import Handler
 from rce.ros.core import Core
-from rce.ros.node import Node
 from rce.ros.types import Message, SerializationError, Time
 
-MakeNode = Callable[..., Node]
 FIBONACCI = "actionlib_tutorials/FibonacciAction"
 
 
@@ -43,9 +43,18 @@ async def until_cancelled(goal: ServerGoal) -> None:
     await goal.wait_for_cancel()
 
 
+class ServerOptions(TypedDict, total=False):
+    max_goals: int
+    auto_accept: bool
+
+
 @asynccontextmanager
 async def pair(
-    make_node: MakeNode, handler: Any, *, server: type[ActionServer] = ActionServer, **options: Any
+    make_node: MakeNode,
+    handler: Handler,
+    *,
+    server: type[ActionServer] = ActionServer,
+    **options: Unpack[ServerOptions],
 ) -> AsyncIterator[tuple[ActionServer, ActionClient]]:
     async with (
         make_node("server") as a,
@@ -108,7 +117,7 @@ async def test_many_goals_at_the_same_time(make_node: MakeNode) -> None:
             assert list((await anext(aiter(goal))).sequence) == [order]
         assert [goal.request.order for goal in server.goals] == [0, 1, 2]
         refused = await client.send(order=3)
-        with pytest.raises(GoalFailed, match="rejected: the server works on 3 goals already"):
+        with pytest.raises(GoalFailedError, match="rejected: the server works on 3 goals already"):
             await refused.result()
         goals[1].cancel()
         assert await goals[1].wait() is GoalState.PREEMPTED
@@ -129,10 +138,11 @@ async def test_a_cancelled_goal_keeps_its_result(make_node: MakeNode) -> None:
         goal = await client.send(order=1)
         await anext(aiter(goal))
         goal.cancel()
-        with pytest.raises(GoalFailed, match="preempted: enough") as caught:
+        with pytest.raises(GoalFailedError, match="preempted: enough") as caught:
             await goal.result()
         assert caught.value.state is GoalState.PREEMPTED
-        assert list(caught.value.result.sequence) == [1]  # type: ignore[union-attr]
+        assert caught.value.result is not None
+        assert list(caught.value.result.sequence) == [1]
         goal.cancel()
 
 
@@ -170,9 +180,9 @@ async def test_a_handler_that_fails_aborts_its_goal(
         return {"sequence": "no numbers"}
 
     async with pair(make_node, fail) as (_, client):
-        with pytest.raises(GoalFailed, match="aborted: ZeroDivisionError: by nothing"):
+        with pytest.raises(GoalFailedError, match="aborted: ZeroDivisionError: by nothing"):
             await (await client.send(order=1)).result()
-        with pytest.raises(GoalFailed, match=r"aborted: SerializationError: .*sequence"):
+        with pytest.raises(GoalFailedError, match=r"aborted: SerializationError: .*sequence"):
             await (await client.send(order=0)).result()
         assert "the handler of /job failed" in caplog.text
         with pytest.raises(SerializationError):
@@ -189,7 +199,8 @@ async def test_a_simple_server_works_on_the_newest_goal(make_node: MakeNode) -> 
         assert [goal.request.order for goal in server.goals] == [2]
 
 
-async def test_goals_that_wait_at_a_simple_server_are_replaced_and_recalled(make_node: MakeNode) -> None:
+async def test_waiting_goals_are_replaced_and_recalled(make_node: MakeNode) -> None:
+    """Goals that wait at a simple server are replaced and recalled."""
     release = asyncio.Event()
 
     async def slow(goal: ServerGoal) -> dict[str, Any]:
@@ -216,7 +227,7 @@ async def test_a_server_that_stops_aborts_its_goals(make_node: MakeNode) -> None
         async with make_node("server") as a, SimpleActionServer(a, "job", FIBONACCI, until_cancelled):
             goal = await client.send(order=1)
             await anext(aiter(goal))
-        with pytest.raises(GoalFailed, match="aborted: the server stopped"):
+        with pytest.raises(GoalFailedError, match="aborted: the server stopped"):
             await goal.result(20)
 
 
@@ -242,7 +253,7 @@ async def test_a_server_that_starts_anew_has_lost_the_goal(core: Core, make_node
                 status.publish(status_list=[{"goal_id": {"id": received.goal_id.id}, "status": 1}])
                 await active.wait()
             async with make_node("server") as a, ActionServer(a, "job", FIBONACCI, fibonacci):
-                with pytest.raises(GoalFailed, match="does not list the goal any longer"):
+                with pytest.raises(GoalFailedError, match="does not list the goal any longer"):
                     await goal.result()
                 assert goal.state is GoalState.LOST
 
@@ -255,7 +266,7 @@ async def test_a_silent_server_loses_the_goal(make_node: MakeNode) -> None:
         ActionClient(b, "job", FIBONACCI, patience=0.01) as client,
     ):
         goal = await client.send(order=1)
-        with pytest.raises(GoalFailed, match="the server is silent"):
+        with pytest.raises(GoalFailedError, match="the server is silent"):
             await goal.result(20)
 
 
@@ -293,11 +304,11 @@ async def test_goals_end_for_a_client_that_leaves_or_whose_node_stops(make_node:
     async with pair(make_node, until_cancelled) as (_, client):
         goal = await client.send(order=1)
         client._node.shutdown("test")
-        with pytest.raises(GoalFailed, match="the node stops"):
+        with pytest.raises(GoalFailedError, match="the node stops"):
             await goal.result()
     async with pair(make_node, until_cancelled) as (_, client):
         goal = await client.send(order=1)
-    with pytest.raises(GoalFailed, match="the client was closed"):
+    with pytest.raises(GoalFailedError, match="the client was closed"):
         await goal.result()
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import pytest
+from support.ros_nodes import MakeNode
 
 from rce.ros.actions import ActionClient, ActionServer, GoalState, ServerGoal
 from rce.ros.actions.patience import PatientClock
@@ -14,7 +15,6 @@ from rce.ros.core import Core
 from rce.ros.node import Node, Publisher
 from rce.ros.types import Time
 
-MakeNode = Callable[..., Node]
 FIBONACCI = "actionlib_tutorials/FibonacciAction"
 
 
@@ -85,7 +85,7 @@ async def test_a_server_is_not_missed_while_time_stands_still(core: Core, make_n
             await goal.wait(timeout=1.0)
         assert goal.state is GoalState.ACTIVE
         seconds = 100.0
-        while not goal.is_done:  # it goes on, and the server says nothing
+        while not goal.is_done:  # it continues, and the server says nothing
             seconds += 0.0625
             await world.set(seconds)
             await asyncio.sleep(0.05)

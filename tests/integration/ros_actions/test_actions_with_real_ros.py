@@ -14,7 +14,14 @@ from typing import Any
 
 import pytest
 
-from rce.ros.actions import ActionClient, ActionServer, GoalFailed, GoalState, ServerGoal, SimpleActionServer
+from rce.ros.actions import (
+    ActionClient,
+    ActionServer,
+    GoalFailedError,
+    GoalState,
+    ServerGoal,
+    SimpleActionServer,
+)
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.types import Time
@@ -210,7 +217,7 @@ async def test_our_client_at_a_simple_server(node: Node, peer: Peer) -> None:
         assert (await goal.result()).result == 6
         assert goal.text == "doubled"
 
-        with pytest.raises(GoalFailed, match="aborted: negative") as caught:
+        with pytest.raises(GoalFailedError, match="aborted: negative") as caught:
             await (await client.send(goal=-5)).result()
         assert caught.value.result is not None
         assert caught.value.result.result == -5
@@ -250,7 +257,7 @@ async def test_our_client_at_a_full_server(node: Node, peer: Peer) -> None:
 
         dying = await client.send(goal=5)
         process.kill()
-        with pytest.raises(GoalFailed, match="the server is silent"):
+        with pytest.raises(GoalFailedError, match="the server is silent"):
             await dying.result()
         assert dying.state is GoalState.LOST
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import AsyncIterator, Callable
-from functools import partial
+from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Unpack
 
 import pytest
+from support.ros_nodes import MakeGraphNode, NodeOptions
 from support.ros_real import GRAPHS, Graph, our_graph
 
 from rce.ros.node import Node
@@ -30,11 +31,12 @@ async def graph(request: pytest.FixtureRequest, tmp_path: Path) -> AsyncIterator
 
 
 @pytest.fixture
-def make_node() -> Callable[..., Node]:
+def make_node() -> MakeGraphNode:
     """Nodes of ours: ``make_node(graph, "name")``."""
 
-    def make(graph: Graph, name: str, **options: object) -> Node:
-        return partial(Node, argv=[], master_uri=graph.uri, signals=False)(name, **options)  # type: ignore[arg-type]
+    def make(graph: Graph, name: str, **options: Unpack[NodeOptions]) -> Node:
+        options.setdefault("argv", [])
+        return Node(name, master_uri=graph.uri, signals=False, **options)
 
     return make
 

@@ -27,7 +27,7 @@ from rce.ros.core import Graph
 
 pytestmark = [pytest.mark.needs("rospy", "roslaunch")]
 
-PATIENCE_S = 20.0
+TIMEOUT_S = 20.0
 
 Call = tuple[str, tuple[Any, ...]]
 
@@ -63,7 +63,7 @@ def comparable(method: str, answer: Any) -> Any:
 def master(*argv: str, uri: str, home: Path) -> Iterator[Side]:
     process = Popen(argv, env=ros_environment(uri, home), stdout=DEVNULL, stderr=DEVNULL)
     try:
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while True:
             try:
                 with ServerProxy(uri) as proxy:
@@ -150,7 +150,7 @@ METHODS: dict[str, tuple[st.SearchStrategy[Any] | None, ...]] = {
 }
 
 
-def below(prefix: str, value: Any) -> Any:
+def below(prefix: str, value: object) -> Any:
     """Move a value into an example's own namespace."""
     return prefix + value[2:] if isinstance(value, str) and value.startswith("/P") else value
 
@@ -190,7 +190,7 @@ def test_random_calls_have_equal_answers_and_effects(sides: tuple[Side, Side], s
     script = [
         (method, tuple(below(prefix, value) for value in arguments))
         for method, arguments in script
-        if "/P" not in arguments[1:2] or method != "setParam"  # a whole namespace is no dictionary then
+        if "/P" not in arguments[1:2] or method != "setParam"  # a whole namespace is not a dictionary then
     ]
     expected, found = (side.play(script) for side in sides)
     for call, theirs, mine in zip(script, expected, found, strict=True):
@@ -280,7 +280,7 @@ def parameter_server() -> Iterator[Popen[str]]:
         process.stdin.close()
 
 
-def perform(graph: Graph, node: str, method: str, key: str, *value: Any) -> list[Any]:
+def perform(graph: Graph, node: str, method: str, key: str, *value: object) -> list[Any]:
     """Do a step to a graph of ours; return whom it tells what."""
     if method == "subscribe":
         graph.subscribe_parameter(key, node, f"http://{node}")

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support.ports import free_port
+from support.ros_nodes import MakeGraphNode
 from support.ros_real import Graph
 
 from rce.ros.core import Core
-from rce.ros.errors import RemoteFault
-from rce.ros.node import Node
+from rce.ros.errors import RemoteFaultError
 from rce.ros.xmlrpc import RpcClient
 
 pytestmark = [pytest.mark.needs("rospy", "roslaunch")]
@@ -102,7 +101,7 @@ async def play(uri: str, calls: list[tuple[str, tuple[Any, ...]]]) -> list[Any]:
         for method, arguments in calls:
             try:
                 found.append(comparable(method, await rpc.call(uri, method, arguments)))
-            except RemoteFault:
+            except RemoteFaultError:
                 found.append("fault")
     return found
 
@@ -121,6 +120,19 @@ async def test_the_core_answers_as_a_real_one(tmp_path: Path) -> None:
     assert differences == [], "\n".join(map(str, differences))
 
 
+ENTRIES: tuple[object, ...] = (
+    "",
+    "nothing",
+    "host:1234",
+    "/path",
+    "http://",
+    "http:/host",
+    "//host:1",
+    "://host",
+    7,
+    [],
+)
+
 SLAVE_CALLS: list[tuple[str, tuple[Any, ...]]] = [
     ("getPid", ("/x",)),
     ("getName", ("/x",)),
@@ -131,21 +143,7 @@ SLAVE_CALLS: list[tuple[str, tuple[Any, ...]]] = [
     ("requestTopic", ("/x", "/peer_out", "TCPROS")),
     ("publisherUpdate", ("/master", "/nothing", [])),
     ("publisherUpdate", ("/master", "/peer_in", "no list")),
-    *(
-        ("publisherUpdate", ("/master", "/peer_in", [entry]))
-        for entry in (
-            "",
-            "nothing",
-            "host:1234",
-            "/path",
-            "http://",
-            "http:/host",
-            "//host:1",
-            "://host",
-            7,
-            [],
-        )
-    ),
+    *(("publisherUpdate", ("/master", "/peer_in", [entry])) for entry in ENTRIES),
     ("publisherUpdate", ("/master", "/peer_in", ["http://127.0.0.1:1/", "nothing"])),
     ("publisherUpdate", ("/master", "/peer_in", ["any://127.0.0.1:1"])),
     ("publisherUpdate", ("/master", "/peer_in", {})),
@@ -169,7 +167,7 @@ SLAVE_CALLS: list[tuple[str, tuple[Any, ...]]] = [
 
 
 async def test_a_node_answers_as_a_real_one(
-    ours: Graph, make_node: Callable[..., Node], rospy_peer: tuple[str, str]
+    ours: Graph, make_node: MakeGraphNode, rospy_peer: tuple[str, str]
 ) -> None:
     async with make_node(ours, "mine") as node, ours.program(*rospy_peer):
         await ours.until(lambda: ours.service("/peer_ask"), what="the rospy node is up")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from support.ros_nodes import MakeGraphNode
 from support.ros_real import Graph
 
-from rce.ros.node import Node
 from rce.ros.tcpros.header import decode_header, encode_header
 from rce.ros.types import TypeRegistry
 from rce.ros.xmlrpc import RpcClient
@@ -49,7 +49,7 @@ TOPIC_HEADERS = {
     "no type": without(RIGHT, "type"),
     "neither topic nor service": without(RIGHT, "topic"),
 }
-SERVICE_HEADERS = {
+SERVICE_HEADERS: dict[str, dict[str, str]] = {
     "right": ASKING,
     "kept": ASKING | {"persistent": "1"},
     "any checksum": ASKING | {"md5sum": "*"},
@@ -86,15 +86,16 @@ async def topic_answers(uri: str) -> dict[str, Any]:
 
 
 async def service_answers(graph: Graph) -> dict[str, Any]:
-    where = urlsplit(await graph.service("/peer_set"))
+    where = urlsplit(str(await graph.service("/peer_set")))
     assert where.hostname
     assert where.port
-    return {case: await answer(where.hostname, where.port, it) for case, it in SERVICE_HEADERS.items()}
+    host, port = where.hostname, where.port
+    return {case: await answer(host, port, fields) for case, fields in SERVICE_HEADERS.items()}
 
 
 @pytest.mark.parametrize("language", ["rospy", pytest.param("roscpp", marks=pytest.mark.needs("roscpp"))])
 async def test_headers_are_answered_as_real_nodes_do(
-    ours: Graph, make_node: Callable[..., Node], language: str, request: pytest.FixtureRequest
+    ours: Graph, make_node: MakeGraphNode, language: str, request: pytest.FixtureRequest
 ) -> None:
     peer = request.getfixturevalue(f"{language}_peer")
     async with ours.program(*peer):

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from support.ports import free_port
+from support.ros_nodes import MakeGraphNode
 from support.ros_real import Graph
-
-from rce.ros.node import Node
 
 pytestmark = [pytest.mark.needs("rospy", "roslaunch")]
 
@@ -28,7 +26,7 @@ def log_of(home: Path) -> str:
     return "".join(path.read_text() for path in home.glob(".ros/log/*-*/rosout.log"))
 
 
-async def written(kind: str, make_node: Callable[..., Node], home: Path) -> dict[str, str]:
+async def written(kind: str, make_node: MakeGraphNode, home: Path) -> dict[str, str]:
     """Have a node of ours and a rospy one log; return their lines, by node, without times."""
     port = free_port()
     home.mkdir()
@@ -55,7 +53,7 @@ def _sorted_topics(line: str) -> str:
     return re.sub(r"\[topics: (.*?)\]", lambda found: str(sorted(found[1].split(", "))), line)
 
 
-async def test_the_file_is_the_same(make_node: Callable[..., Node], tmp_path: Path) -> None:
+async def test_the_file_is_the_same(make_node: MakeGraphNode, tmp_path: Path) -> None:
     real = await written("roscore", make_node, tmp_path / "real")
     ours = await written("ours", make_node, tmp_path / "ours")
     assert real.keys() == {"/ours", "/talker"}

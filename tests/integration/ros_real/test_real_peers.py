@@ -6,25 +6,35 @@ import asyncio
 import contextlib
 import os
 import signal
-from collections.abc import AsyncIterator, Callable
-from typing import Any
+from collections.abc import AsyncIterator
+from contextlib import AbstractAsyncContextManager
+from pathlib import Path
+from typing import Protocol
 
 import pytest
 from support.ports import free_port
+from support.ros_nodes import MakeGraphNode
 from support.ros_real import Graph, our_graph
 
-from rce.ros.errors import ServiceFault
+from rce.ros.errors import ServiceFaultError
 from rce.ros.node import Node
 
 pytestmark = [pytest.mark.needs("rospy"), pytest.mark.timeout(300)]
 
-MakeNode = Callable[..., Node]
 STRING = "std_msgs/String"
 LANGUAGES = ["rospy", pytest.param("roscpp", marks=pytest.mark.needs("roscpp"))]
 
 
+class Start(Protocol):
+    """Starts a peer; see :func:`start`."""
+
+    def __call__(
+        self, graph: Graph, *arguments: str
+    ) -> AbstractAsyncContextManager[tuple[asyncio.subprocess.Process, str]]: ...
+
+
 @pytest.fixture
-def start(request: pytest.FixtureRequest, language: str) -> Callable[..., Any]:
+def start(request: pytest.FixtureRequest, language: str) -> Start:
     """Start the peer: ``async with start(graph, "_word:=x") as (process, name): ...``."""
     argv = request.getfixturevalue(f"{language}_peer")
 
@@ -39,7 +49,7 @@ def start(request: pytest.FixtureRequest, language: str) -> Callable[..., Any]:
 
 @pytest.mark.parametrize("language", LANGUAGES)
 async def test_topics_services_and_parameters(
-    graph: Graph, make_node: MakeNode, start: Callable[..., Any], language: str
+    graph: Graph, make_node: MakeGraphNode, start: Start, language: str
 ) -> None:
     async with make_node(graph, "ours") as node, start(graph, "_word:=word") as (process, name):
         latched: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
@@ -52,7 +62,7 @@ async def test_topics_services_and_parameters(
         client = node.service_client("peer_set", "std_srvs/SetBool")
         assert (await client.call({"data": True}, timeout=20)).message == "done"
         assert await node.get_param(f"{name}/set") is True
-        with pytest.raises(ServiceFault, match="as asked" if language == "rospy" else None):
+        with pytest.raises(ServiceFaultError, match="as asked" if language == "rospy" else None):
             await client.call({"data": False}, timeout=20)
         await node.advertise_service(
             "ours_trigger", "std_srvs/Trigger", lambda _: {"success": True, "message": "ü"}
@@ -93,7 +103,7 @@ async def echoes(node: Node) -> None:
 
 
 async def is_gone(graph: Graph, name: str) -> bool:
-    """Whether a node has no topic or service; a real master may remember its name for ever."""
+    """Whether a node has no topic or service; a real master may remember its name indefinitely."""
     state = await graph.ask("getSystemState")
     return not any(name in nodes for part in state for _, nodes in part)
 
@@ -101,7 +111,7 @@ async def is_gone(graph: Graph, name: str) -> bool:
 @pytest.mark.needs("roscpp")
 @pytest.mark.parametrize("language", ["roscpp"])
 async def test_a_subscriber_that_offers_udp_first_gets_tcp(
-    ours: Graph, make_node: MakeNode, start: Callable[..., Any]
+    ours: Graph, make_node: MakeGraphNode, start: Start
 ) -> None:
     async with make_node(ours, "ours") as node, start(ours, "_udp:=true"):
         await echoes(node)
@@ -110,7 +120,7 @@ async def test_a_subscriber_that_offers_udp_first_gets_tcp(
 
 @pytest.mark.parametrize("language", LANGUAGES)
 async def test_a_killed_node_comes_back(
-    graph: Graph, make_node: MakeNode, start: Callable[..., Any], language: str
+    graph: Graph, make_node: MakeGraphNode, start: Start, language: str
 ) -> None:
     async with make_node(graph, "ours") as node:
         for _ in range(2):
@@ -125,7 +135,7 @@ async def test_a_killed_node_comes_back(
 
 
 @pytest.mark.parametrize("language", LANGUAGES)
-async def test_nodes_of_one_name(graph: Graph, start: Callable[..., Any], language: str) -> None:
+async def test_nodes_of_one_name(graph: Graph, start: Start, language: str) -> None:
     async with start(graph, "_word:=one") as (older, name):
         uri = await graph.node(name)
         async with graph.program(*older_argv(older)):
@@ -145,7 +155,7 @@ def older_argv(process: asyncio.subprocess.Process) -> list[str]:
 
 @pytest.mark.parametrize("language", ["rospy"])
 async def test_any_message_carries_its_type(
-    ours: Graph, make_node: MakeNode, start: Callable[..., Any], language: str
+    ours: Graph, make_node: MakeGraphNode, start: Start, language: str
 ) -> None:
     async with make_node(ours, "ours") as node, start(ours):
         kinds = await node.subscribe("peer_kinds", STRING)
@@ -157,7 +167,7 @@ async def test_any_message_carries_its_type(
 
 @pytest.mark.parametrize("language", LANGUAGES)
 async def test_our_core_is_killed_and_restarted(
-    make_node: MakeNode, start: Callable[..., Any], language: str, tmp_path: Any
+    make_node: MakeGraphNode, start: Start, language: str, tmp_path: Path
 ) -> None:
     """Connections live on without a core; our nodes register again at the next one, real nodes do not."""
     port = free_port()

@@ -1,18 +1,15 @@
-"""A core is killed with -9 and started again; nodes of ours go on, and are known to the next core."""
+"""A core is killed with -9 and started again; nodes of ours continue, and are known to the next core."""
 
 from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from support.ports import free_port
+from support.ros_nodes import MakeGraphNode
 from support.ros_real import Graph
-
-from rce.ros.node import Node
 
 pytestmark = [pytest.mark.needs("rospy", "rostopic", "roslaunch")]
 
@@ -27,12 +24,12 @@ def command(kind: str, port: int) -> list[str]:
 
 @pytest.mark.parametrize("kind", ["ours", "rosmaster"])
 async def test_a_core_is_killed_and_started_again(
-    kind: str, make_node: Callable[..., Node], tmp_path: Path
+    kind: str, make_node: MakeGraphNode, tmp_path: Path
 ) -> None:
     port = free_port()
     graph = Graph(f"http://127.0.0.1:{port}/", tmp_path, kind)
 
-    async def up() -> Any:
+    async def up() -> object:
         return await graph.ask("getPid")
 
     async def restored() -> bool:

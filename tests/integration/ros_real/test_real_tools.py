@@ -7,24 +7,23 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support.ros_nodes import MakeGraphNode
 from support.ros_real import Graph
 
-from rce.ros.errors import ServiceFault
-from rce.ros.node import Node
+from rce.ros.errors import ServiceFaultError
+from rce.ros.types import Message
 
 pytestmark = [pytest.mark.needs("rospy", "rostopic")]
 
-MakeNode = Callable[..., Node]
 STRING = "std_msgs/String"
 RCE = str(Path(sys.executable).parent / "rce")
 
 
-async def test_rostopic(graph: Graph, make_node: MakeNode) -> None:
+async def test_rostopic(graph: Graph, make_node: MakeGraphNode) -> None:
     async with make_node(graph, "ours", namespace="robot") as ours:
         said: asyncio.Queue[str] = asyncio.Queue()
         await ours.subscribe("heard", STRING, lambda message: said.put_nowait(message.data))
@@ -43,7 +42,7 @@ async def test_rostopic(graph: Graph, make_node: MakeNode) -> None:
         assert await asyncio.wait_for(said.get(), 30) == "hi"
 
 
-async def test_rostopic_measures(graph: Graph, make_node: MakeNode) -> None:
+async def test_rostopic_measures(graph: Graph, make_node: MakeGraphNode) -> None:
     async with make_node(graph, "ours") as node:
         publisher = await node.advertise("t", STRING)
         node.timer(0.02, lambda _: publisher.publish(data="x" * 996))
@@ -53,7 +52,7 @@ async def test_rostopic_measures(graph: Graph, make_node: MakeNode) -> None:
         assert "mean: 1.00KB" in bandwidth
 
 
-async def test_rosnode(graph: Graph, make_node: MakeNode) -> None:
+async def test_rosnode(graph: Graph, make_node: MakeGraphNode) -> None:
     async with (
         make_node(graph, "ours") as ours,
         make_node(graph, "victim", intra_process=False) as victim,
@@ -75,14 +74,14 @@ async def test_rosnode(graph: Graph, make_node: MakeNode) -> None:
     assert "/victim" not in await graph.tool("rosnode", "list")
 
 
-async def test_rosservice(graph: Graph, make_node: MakeNode) -> None:
+async def test_rosservice(graph: Graph, make_node: MakeGraphNode) -> None:
     async with make_node(graph, "ours") as ours:
 
-        async def loggers(request: Any) -> dict[str, Any]:
+        async def loggers(request: Message) -> dict[str, Any]:
             return {"loggers": [{"name": "a", "level": "info"}, {"name": "b", "level": "debug"}]}
 
-        def refuse(request: Any) -> None:
-            raise ServiceFault("/refuse", "never")
+        def refuse(request: Message) -> None:
+            raise ServiceFaultError("/refuse", "never")
 
         await ours.advertise_service("get", "roscpp/GetLoggers", loggers)
         await ours.advertise_service("set", "std_srvs/SetBool", lambda request: {"success": request.data})
@@ -106,9 +105,9 @@ async def test_rosservice(graph: Graph, make_node: MakeNode) -> None:
         ours.log.setLevel("INFO")
 
 
-async def test_rosparam(graph: Graph, make_node: MakeNode) -> None:
+async def test_rosparam(graph: Graph, make_node: MakeGraphNode) -> None:
     async with make_node(graph, "ours") as ours:
-        told: asyncio.Queue[tuple[str, Any]] = asyncio.Queue()
+        told: asyncio.Queue[tuple[str, object]] = asyncio.Queue()
         await ours.watch_param("/tree", lambda *change: told.put_nowait(change))
         assert await ours.get_param_cached("/tree/a", "not yet") == "not yet"
         await graph.tool("rosparam", "set", "/tree", "{a: 1, b: [1, 2.5, x], c: {d: true}}")
@@ -136,7 +135,7 @@ async def test_rosparam(graph: Graph, make_node: MakeNode) -> None:
 
 
 @pytest.mark.needs("rosmsg")
-async def test_rosmsg_agrees_on_types(ours: Graph, make_node: MakeNode) -> None:
+async def test_rosmsg_agrees_on_types(ours: Graph, make_node: MakeGraphNode) -> None:
     async with make_node(ours, "ours") as node:
         publisher = await node.advertise("pose", "geometry_msgs/PoseStamped")
         md5 = await ours.tool("rosmsg", "md5", "geometry_msgs/PoseStamped")
@@ -148,7 +147,7 @@ async def test_rosmsg_agrees_on_types(ours: Graph, make_node: MakeNode) -> None:
 
 
 @pytest.mark.needs("topic_tools")
-async def test_topic_tools(graph: Graph, make_node: MakeNode) -> None:
+async def test_topic_tools(graph: Graph, make_node: MakeGraphNode) -> None:
     async with make_node(graph, "ours") as node:
         got: dict[str, asyncio.Queue[str]] = {}
 
@@ -183,7 +182,7 @@ async def test_topic_tools(graph: Graph, make_node: MakeNode) -> None:
 
 
 @pytest.mark.needs("rosbag")
-async def test_rosbag(graph: Graph, make_node: MakeNode) -> None:
+async def test_rosbag(graph: Graph, make_node: MakeGraphNode) -> None:
     bag = graph.home / "test.bag"
     async with make_node(graph, "ours") as node:
         pose = await node.advertise("pose", "geometry_msgs/PoseStamped", latch=True)
@@ -225,7 +224,7 @@ async def test_rosbag(graph: Graph, make_node: MakeNode) -> None:
 
 
 @pytest.mark.needs("rosbag")
-async def test_rosbag_plays_the_clock(graph: Graph, make_node: MakeNode) -> None:
+async def test_rosbag_plays_the_clock(graph: Graph, make_node: MakeGraphNode) -> None:
     async with make_node(graph, "setter") as setter:
         await setter.set_param("/use_sim_time", True)
     bag = graph.home / "clock.bag"
@@ -258,14 +257,14 @@ LAUNCH = """<launch>
 
 
 @pytest.mark.needs("roslaunch", "topic_tools")
-async def test_roslaunch(graph: Graph, make_node: MakeNode) -> None:
+async def test_roslaunch(graph: Graph, make_node: MakeGraphNode) -> None:
     (graph.home / "a.launch").write_text(LAUNCH)
     async with make_node(graph, "ours") as node:
         out = await node.subscribe("launched_out", STRING)
         publisher = await node.advertise("launched_in", STRING)
         async with graph.program("roslaunch", "--wait", str(graph.home / "a.launch"), node="/robot/relay"):
             await publisher.wait_for_subscribers(timeout=40)
-            heard = asyncio.create_task(anext(aiter(out)))  # type: ignore[arg-type]
+            heard = asyncio.create_task(out.__anext__())
             async with asyncio.timeout(40):
                 while not heard.done():
                     publisher.publish(data="through it")
@@ -304,7 +303,7 @@ OUR_LAUNCH = """<launch>
 
 
 @pytest.mark.needs("roslaunch")
-async def test_roslaunch_starts_our_node(graph: Graph, make_node: MakeNode) -> None:
+async def test_roslaunch_starts_our_node(graph: Graph, make_node: MakeGraphNode) -> None:
     package = graph.home / "launched"
     package.mkdir()
     (package / "package.xml").write_text("<package><name>launched</name></package>")
@@ -329,7 +328,7 @@ async def test_roslaunch_starts_our_node(graph: Graph, make_node: MakeNode) -> N
     assert log.read_text().count("[WARNING]") == 2
 
 
-async def test_rce_relay(graph: Graph, make_node: MakeNode) -> None:
+async def test_rce_relay(graph: Graph, make_node: MakeGraphNode) -> None:
     relay = (RCE, "relay", "/from", "/to", "--name", "relay")
     slow = (RCE, "relay", "/from", "/slow", "--name", "slow", "--throttle", "0.01")
     async with (
@@ -370,7 +369,7 @@ ROSTEST = """<launch>
 
 
 @pytest.mark.needs("roslaunch")
-async def test_rostest(ours: Graph, make_node: MakeNode) -> None:
+async def test_rostest(ours: Graph, make_node: MakeGraphNode) -> None:
     (ours.home / "package.xml").write_text("<package><name>tests_of_ours</name></package>")
     (ours.home / "hz.test").write_text(ROSTEST)
     async with make_node(ours, "ours") as node:
@@ -381,7 +380,7 @@ async def test_rostest(ours: Graph, make_node: MakeNode) -> None:
 
 
 @pytest.mark.needs("roslaunch")
-async def test_roswtf_finds_no_fault_in_the_graph(ours: Graph, make_node: MakeNode) -> None:
+async def test_roswtf_finds_no_fault_in_the_graph(ours: Graph, make_node: MakeGraphNode) -> None:
     async with (
         make_node(ours, "talker") as talker,
         make_node(ours, "listener", intra_process=False) as listener,

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable
 from typing import Any
 
 import pytest
-from support.ros_real import PATIENCE_S, Graph, interrupt
+from support.ros_nodes import MakeGraphNode
+from support.ros_real import TIMEOUT_S, Graph, interrupt
 
-from rce.ros.errors import ServiceFault
+from rce.ros.errors import ServiceFaultError
 from rce.ros.node import Node, Publisher
-from rce.ros.types import Time
+from rce.ros.types import Message, Time
 
 pytestmark = [pytest.mark.needs("roscpp", "roslaunch"), pytest.mark.timeout(180)]
 
@@ -20,8 +21,6 @@ STRING = "std_msgs/String"
 SET_BOOL = "std_srvs/SetBool"
 CLOCK_STEP = 0.02
 """Seconds of simulated time between ticks."""
-
-MakeNode = Callable[..., Node]
 
 
 class Program:
@@ -33,7 +32,7 @@ class Program:
 
     async def says(self, words: str = "done") -> list[str]:
         """Wait for a line; return all lines until then."""
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(TIMEOUT_S):
             while words not in self.lines:
                 line = await self._output.readline()
                 assert line, f"it ended and said {self.lines}"
@@ -53,14 +52,14 @@ async def running(graph: Graph, program: str, part: str) -> AsyncIterator[Progra
         await interrupt(process)
 
 
-async def until_set(node: Node, name: str, value: Any) -> None:
+async def until_set(node: Node, name: str, value: object) -> None:
     """Wait until the program has set a parameter."""
-    async with asyncio.timeout(PATIENCE_S):
+    async with asyncio.timeout(TIMEOUT_S):
         while await node.get_param(name, None) != value:
             await asyncio.sleep(0.01)
 
 
-async def test_parameters(graph: Graph, make_node: MakeNode, roscpp_library: str) -> None:
+async def test_parameters(graph: Graph, make_node: MakeGraphNode, roscpp_library: str) -> None:
     """Of all types, cached ones too: those that another node changes or deletes."""
     async with make_node(graph, "ours") as node:
         await node.set_param("/lib/cached", 1)
@@ -97,7 +96,7 @@ async def test_parameters(graph: Graph, make_node: MakeNode, roscpp_library: str
             ]
 
 
-async def test_latching(graph: Graph, make_node: MakeNode, roscpp_library: str) -> None:
+async def test_latching(graph: Graph, make_node: MakeGraphNode, roscpp_library: str) -> None:
     """In both directions, to those that come late and those that come again."""
     async with make_node(graph, "ours") as node:
         latched = await node.advertise("our_latched", STRING, latch=True)
@@ -106,13 +105,15 @@ async def test_latching(graph: Graph, make_node: MakeNode, roscpp_library: str) 
         async with running(graph, roscpp_library, "latching") as program:
             await program.says("says so 1")
             late = await node.subscribe("cpp_latched", STRING)
-            async with asyncio.timeout(PATIENCE_S):
+            async with asyncio.timeout(TIMEOUT_S):
                 assert (await anext(aiter(late))).data == "two"
             latched.publish(data="newer")
             assert await program.says() == ["near two", "late kept 5", "says so 1", "kept newer", "done"]
 
 
-async def test_a_publisher_leaves_under_load(graph: Graph, make_node: MakeNode, roscpp_library: str) -> None:
+async def test_a_publisher_leaves_under_load(
+    graph: Graph, make_node: MakeGraphNode, roscpp_library: str
+) -> None:
     """Twenty times, while its messages wait to be sent; our subscriber finds it each time."""
     epochs: set[str] = set()
     async with make_node(graph, "ours") as node:
@@ -127,7 +128,9 @@ async def nothing(found: Awaitable[list[str]]) -> bool:
     return not await found
 
 
-async def test_a_subscriber_leaves_under_load(graph: Graph, make_node: MakeNode, roscpp_library: str) -> None:
+async def test_a_subscriber_leaves_under_load(
+    graph: Graph, make_node: MakeGraphNode, roscpp_library: str
+) -> None:
     """Twenty times, while our node publishes without a pause."""
     async with make_node(graph, "ours") as node:
         load = await node.advertise("our_load", STRING, queue_size=10)
@@ -135,7 +138,7 @@ async def test_a_subscriber_leaves_under_load(graph: Graph, make_node: MakeNode,
             publishing = tasks.create_task(publish(load))
             assert await program.says() == ["heard epochs", "done"]
             publishing.cancel()
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(TIMEOUT_S):
             while load.connections:
                 await asyncio.sleep(0.01)
 
@@ -146,18 +149,18 @@ async def publish(load: Publisher) -> None:
         await asyncio.sleep(0.0005)
 
 
-async def test_services(graph: Graph, make_node: MakeNode, roscpp_library: str) -> None:
+async def test_services(graph: Graph, make_node: MakeGraphNode, roscpp_library: str) -> None:
     """Single and persistent calls, refused ones, services that are closed and opened again."""
 
-    def set_bool(request: Any) -> dict[str, Any]:
+    def set_bool(request: Message) -> dict[str, Any]:
         if not request.data:
-            raise ServiceFault("/our_set", "no")
+            raise ServiceFaultError("/our_set", "no")
         return {"success": True, "message": "ours"}
 
     async with make_node(graph, "ours") as node:
         services = {"set": await node.advertise_service("our_set", SET_BOOL, set_bool)}
 
-        async def switch(request: Any) -> dict[str, Any]:
+        async def switch(request: Message) -> dict[str, Any]:
             if request.data:
                 services["set"] = await node.advertise_service("our_set", SET_BOOL, set_bool)
             else:
@@ -169,9 +172,9 @@ async def test_services(graph: Graph, make_node: MakeNode, roscpp_library: str) 
             await until_set(node, "/lib/served", 0)
             client = node.service_client("cpp_set", SET_BOOL)
             for _ in range(200):
-                assert (await client.call({"data": True}, timeout=PATIENCE_S)).message == "cpp"
-            with pytest.raises(ServiceFault):
-                await client.call({"data": False}, timeout=PATIENCE_S)
+                assert (await client.call({"data": True}, timeout=TIMEOUT_S)).message == "cpp"
+            with pytest.raises(ServiceFaultError):
+                await client.call({"data": False}, timeout=TIMEOUT_S)
             await until_set(node, "/lib/served", 1)
             assert await graph.service("/cpp_set") is None
             assert await program.says() == [
@@ -196,7 +199,7 @@ async def test_services(graph: Graph, make_node: MakeNode, roscpp_library: str) 
             ]
 
 
-async def test_timers_in_simulated_time(graph: Graph, make_node: MakeNode, roscpp_library: str) -> None:
+async def test_timers_in_simulated_time(graph: Graph, make_node: MakeGraphNode, roscpp_library: str) -> None:
     """A node of ours is the clock; it jumps back once."""
     async with make_node(graph, "ours") as node:
         await node.set_param("/use_sim_time", True)

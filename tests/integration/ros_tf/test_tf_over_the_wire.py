@@ -6,15 +6,15 @@ import asyncio
 import json
 import logging
 import os
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
+from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
-from rce.ros.errors import NodeClosed
-from rce.ros.node import Node
+from rce.ros.errors import NodeClosedError
 from rce.ros.tf import (
     BadTransformError,
     ExtrapolationError,
@@ -23,11 +23,9 @@ from rce.ros.tf import (
     Transform,
     TransformBroadcaster,
     TransformListener,
-    TransformTimeout,
+    TransformTimeoutError,
 )
 from rce.ros.types import Time
-
-MakeNode = Callable[..., Node]
 
 
 def at(seconds: float) -> Time:
@@ -62,7 +60,8 @@ async def test_what_is_told_is_heard(make_node: MakeNode) -> None:
         assert abs(now.stamp.to_sec() - Time.now().to_sec()) < 60
 
 
-async def test_static_transforms_are_there_for_later_listeners_all_of_them(make_node: MakeNode) -> None:
+async def test_late_listeners_get_all_static_transforms(make_node: MakeNode) -> None:
+    """Static transforms are there for later listeners all of them."""
     async with (
         make_node("robot") as robot,
         make_node("planner") as planner,
@@ -96,7 +95,7 @@ async def test_robots_with_prefixes_share_a_map(core: Core, make_node: MakeNode)
             tf.send("/map", "base_link", Transform.make(x=x), at(10 + x))
         assert x_of(await at_one.wait_for("/map", "base_link")) == 1
         assert x_of(await everything.wait_for("map", "robot2/base_link")) == 2
-        with pytest.raises(TransformTimeout, match="before the first"):
+        with pytest.raises(TransformTimeoutError, match="before the first"):
             await everything.wait_for("robot1/base_link", "robot2/base_link", timeout=0.01)
         tf_one.send("/map", "base_link", Transform.make(x=1.5), at(12))
         assert x_of(await everything.wait_for("robot1/base_link", "robot2/base_link")) == 0.5
@@ -113,12 +112,12 @@ async def test_waiting_ends_with_a_reason(make_node: MakeNode) -> None:
         TransformBroadcaster(robot) as tf,
         TransformListener(robot) as listener,
     ):
-        with pytest.raises(TransformTimeout, match=r"waited 0\.01 s: there is no frame 'map'"):
+        with pytest.raises(TransformTimeoutError, match=r"waited 0\.01 s: there is no frame 'map'"):
             await listener.wait_for("map", "base", timeout=0.01)
         await tf._publisher.wait_for_subscribers(timeout=20)
         tf.send("map", "base", Transform(), at(10))
         await listener.wait_for("map", "base", timeout=20)
-        with pytest.raises(TransformTimeout, match="after the last") as caught:
+        with pytest.raises(TransformTimeoutError, match="after the last") as caught:
             await listener.wait_for("map", "base", at(11), timeout=0.01)
         assert isinstance(caught.value.reason, ExtrapolationError)
         with pytest.raises(ExtrapolationError, match="before the first"):
@@ -126,7 +125,7 @@ async def test_waiting_ends_with_a_reason(make_node: MakeNode) -> None:
         waiting = asyncio.create_task(listener.wait_for("map", "base", at(11)))
         await asyncio.sleep(0)
         robot.shutdown("test")
-        with pytest.raises(NodeClosed):
+        with pytest.raises(NodeClosedError):
             await asyncio.wait_for(waiting, 20)
 
 
@@ -147,9 +146,8 @@ async def test_bad_transforms_do_not_get_far(make_node: MakeNode, caplog: pytest
             assert set(listener.buffer.frames) == {"map", "good"}
 
 
-async def test_a_simulation_that_begins_anew_begins_with_an_empty_buffer(
-    core: Core, make_node: MakeNode
-) -> None:
+async def test_restarted_simulation_has_an_empty_buffer(core: Core, make_node: MakeNode) -> None:
+    """A simulation that begins anew begins with an empty buffer."""
     core.set_param("/use_sim_time", value=True)
     async with make_node("robot") as robot, TransformBroadcaster(robot) as tf:
         clock = await robot.advertise("/clock", "rosgraph_msgs/Clock")

@@ -111,7 +111,7 @@ async def test_services_and_parameters() -> None:
         await tool(core, "param", "delete", "/a/b")
         assert await tool(core, "param", "get", "/a") == "{c: x}\n"
         assert "not set" in await tool(core, "param", "get", "/a/b", code=1)
-        assert "no value" in await tool(core, "param", "set", "/a", "", code=1)
+        assert "is not a value" in await tool(core, "param", "set", "/a", "", code=1)
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,8 @@ async def test_each_robot_is_a_graph_of_its_own_and_drives_to_goals(tmp_path: Pa
     assert last.robot("Robot2").distance_m == 0
 
 
-async def test_robots_that_share_a_graph_have_namespaces_and_frames_of_their_own(tmp_path: Path) -> None:
+async def test_robots_in_one_graph_have_own_namespaces(tmp_path: Path) -> None:
+    """Robots that share a graph have namespaces and frames of their own."""
     (tmp_path / "scene.json").write_text(SCENE.model_dump_json())
     argv = [sys.executable, "-m", "rce_fleet.drivers", str(tmp_path / "scene.json")]
     async with Core(port=0) as core:

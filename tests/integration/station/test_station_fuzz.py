@@ -6,9 +6,9 @@ import pytest
 from support.fuzzing import Tracebacks, exchange, requests
 
 from rce.web.server import HttpServer
+from rce_fleet.station.authentication import TokenAuthenticator
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.live import Broadcast
-from rce_fleet.station.persons import SharedToken
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 
@@ -42,7 +42,7 @@ class Planner(FleetLink):
 
 @pytest.mark.parametrize("login", [*LOGINS, [*LOGINS[0], *UPGRADE]])
 async def test_raw_requests_to_the_station(login: list[bytes]) -> None:
-    app = Station(FleetView(), Planner(), Broadcast(), entrance=SharedToken("token")).make_app()
+    app = Station(FleetView(), Planner(), Broadcast(), authenticator=TokenAuthenticator("token")).make_app()
     async with HttpServer(app, "127.0.0.1", 0) as server:
         port = int(server.url.rpartition(":")[2].rstrip("/"))
         with Tracebacks().watching() as log:

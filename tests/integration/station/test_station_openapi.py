@@ -11,8 +11,8 @@ from support.fuzzing import Tracebacks, answers_of
 from support.master_program import master
 
 from rce.web.server import HttpServer
-from rce_fleet.station.engine_entrance import EngineAccount, EngineEntrance
-from rce_fleet.station.fleet_link import FleetError, FleetLink
+from rce_fleet.station.engine_authenticator import EngineAuthenticator, StationAccount
+from rce_fleet.station.fleet_link import FleetLink, PlannerError
 from rce_fleet.station.live import Broadcast
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
@@ -60,7 +60,7 @@ class Planner(FleetLink):
     def _answer(self) -> str:
         self._asked += 1
         if self._asked % 2:
-            raise FleetError("refused")
+            raise PlannerError("refused")
         return "done"
 
 
@@ -71,12 +71,12 @@ async def test_answers_are_those_of_the_document(tmp_path: Path) -> None:
     async with (
         master(tmp_path, "--dev") as url,
         aiohttp.ClientSession() as session,
-        EngineEntrance(EngineAccount(url, "testUser", "testUser")) as entrance,
+        EngineAuthenticator(StationAccount(url, "testUser", "testUser")) as authenticator,
     ):
-        token = await entrance.log_in("testUser", "testUser", "")
+        token = await authenticator.log_in("testUser", "testUser", "")
         view = FleetView()
         view.on_state(STATE)
-        app = Station(view, Planner(), Broadcast(), entrance=entrance).make_app()
+        app = Station(view, Planner(), Broadcast(), authenticator=authenticator).make_app()
         async with HttpServer(app, "127.0.0.1", 0) as server:
             async with session.get(f"{server.url}api/v1/openapi.json") as reply:
                 document: dict[str, Any] = await reply.json()
@@ -91,7 +91,7 @@ async def test_answers_are_those_of_the_document(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", ["9" * 5000, "2147483648", "-1", "²", "1e3"])
-async def test_number_that_no_cell_has_is_not_found(number: str) -> None:
+async def test_unknown_cell_number_is_not_found(number: str) -> None:
     app = Station(FleetView(), Planner(), Broadcast()).make_app()
     async with HttpServer(app, "127.0.0.1", 0) as server, aiohttp.ClientSession() as session:
         with Tracebacks().watching() as log:

@@ -15,7 +15,7 @@ from support.engine import until
 from support.master_program import master
 
 from rce_fleet.station import server as station_server
-from rce_fleet.station.engine_entrance import FRESH_S, EngineAccount, EngineEntrance
+from rce_fleet.station.engine_authenticator import CACHE_S, EngineAuthenticator, StationAccount
 from rce_fleet.station.live import Broadcast
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
@@ -27,17 +27,17 @@ ROLES = ("viewer", "user", "operator", "admin")
 
 
 class RecordingFleet:
-    """Takes wishes in place of a planner."""
+    """Takes requests in place of a planner."""
 
     def __init__(self) -> None:
-        self.wishes: list[tuple[Any, ...]] = []
+        self.desired: list[tuple[Any, ...]] = []
 
     async def set_goal(self, robot: str, cell: int | None) -> str:
-        self.wishes.append((robot, cell))
+        self.desired.append((robot, cell))
         return "done"
 
     async def block_cell(self, cell: int, *, blocked: bool) -> str:
-        self.wishes.append((cell, blocked))
+        self.desired.append((cell, blocked))
         return "done"
 
 
@@ -52,7 +52,7 @@ class Site:
         self.tokens: dict[str, str] = {}
 
     async def master(
-        self, method: str, path: str, body: Any = None, *, token: str = "", status: int = 200
+        self, method: str, path: str, body: object = None, *, token: str = "", status: int = 200
     ) -> Any:
         headers = {"Authorization": f"Bearer {token or self.tokens['testUser']}"} if self.tokens else {}
         async with self.session.request(
@@ -82,14 +82,16 @@ async def running_site(folder: Path, *, open_: bool = False) -> AsyncIterator[Si
     async with (
         master(folder, "--dev") as url,
         aiohttp.ClientSession(cookie_jar=aiohttp.DummyCookieJar()) as session,
-        EngineEntrance(EngineAccount(url, "testUser", "testUser"), open=open_) as entrance,
+        EngineAuthenticator(
+            StationAccount(url, "testUser", "testUser"), allow_anonymous=open_
+        ) as authenticator,
     ):
         site = Site(url, session)
         await site.log_in("testUser", "testUser")
         for role in ROLES:
             await site.master("POST", "/users", {"name": role, "password": "pw", "role": role}, status=201)
             await site.log_in(role, "pw")
-        app = Station(FleetView(), site.fleet, Broadcast(), entrance=entrance).make_app()  # type: ignore[arg-type]  # as wide as what is called
+        app = Station(FleetView(), site.fleet, Broadcast(), authenticator=authenticator).make_app()  # type: ignore[arg-type]  # as wide as what is called
         async with TestServer(app) as server:
             site.station = str(server.make_url("/"))
             yield site
@@ -107,7 +109,7 @@ async def test_roles_at_station_and_audit(tmp_path: Path) -> None:
         found = {who: (await site.look(token), await site.steer(token)) for who, token in site.tokens.items()}
         assert found == expected
         assert await site.look("") == await site.look("rce_guess") == 401
-        assert site.fleet.wishes == [("Robot1", 7)] * 3
+        assert site.fleet.desired == [("Robot1", 7)] * 3
         robot = (await site.master("POST", "/robot-tokens", {"robot": "R1"}, status=201))["token"]
         assert await site.look(robot) == 401, "a robot's token is for robots"
 
@@ -135,9 +137,9 @@ async def test_revoked_token_ends_open_page(tmp_path: Path, monkeypatch: pytest.
         async with site.session.ws_connect(f"{site.station}api/v1/live", headers=headers) as socket:
             (token,) = (await site.master("GET", "/tokens?user=operator"))["tokens"]
             await site.master("DELETE", f"/tokens/{token['id']}?user=operator", status=204)
-            while (message := await socket.receive(timeout=FRESH_S + 60)).type != aiohttp.WSMsgType.CLOSE:
+            while (message := await socket.receive(timeout=CACHE_S + 60)).type != aiohttp.WSMsgType.CLOSE:
                 assert message.type is aiohttp.WSMsgType.TEXT
-        assert (message.data, message.extra) == (1008, "your login ended; log in again")
+        assert (message.data, message.extra) == (1008, "your login has ended; log in again")
         assert await site.steer(site.tokens["operator"]) == 401
 
 
@@ -190,4 +192,4 @@ async def test_page_asks_for_login(tmp_path: Path) -> None:
             assert await page.evaluate("fetch('/api/v1/fleet').then(r => r.status)") == 401
         finally:
             await browser.close()
-    assert site.fleet.wishes == []
+    assert site.fleet.desired == []

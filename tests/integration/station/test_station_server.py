@@ -6,21 +6,22 @@ import json
 from collections.abc import AsyncIterator
 
 import pytest
+from aiohttp import web
 from aiohttp.test_utils import TestClient, TestServer
 
-from rce_fleet.station.fleet_link import FleetError, FleetLink, PlannerAwayError
+from rce_fleet.station.authentication import TokenAuthenticator
+from rce_fleet.station.fleet_link import FleetLink, PlannerError, PlannerUnavailableError
 from rce_fleet.station.live import Broadcast
-from rce_fleet.station.persons import SharedToken
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 
 
 class RecordingFleet(FleetLink):
-    """Takes wishes in place of the planner."""
+    """Takes requests in place of the planner."""
 
     def __init__(self) -> None:
-        self.wishes: list[tuple[object, ...]] = []
-        self.fault: FleetError | None = None
+        self.desired: list[tuple[object, ...]] = []
+        self.fault: PlannerError | None = None
 
     async def set_goal(self, robot: str, cell: int | None) -> str:
         return self._note("goal", robot, cell)
@@ -28,29 +29,32 @@ class RecordingFleet(FleetLink):
     async def block_cell(self, cell: int, *, blocked: bool) -> str:
         return self._note("cell", cell, blocked)
 
-    def _note(self, *wish: object) -> str:
+    def _note(self, *requested: object) -> str:
         if self.fault is not None:
             raise self.fault
-        self.wishes.append(wish)
+        self.desired.append(requested)
         return "done"
 
 
-class House:
+class RunningStation:
     """A station with its parts at hand."""
 
     def __init__(self) -> None:
-        self.view, self.fleet, self.pages = FleetView(), RecordingFleet(), Broadcast()
-        self.client: TestClient
+        self.view, self.fleet, self.pages = FleetView(), RecordingFleet(), Broadcast(self.everything)
+        self.client: TestClient[web.Request, web.Application]
+
+    def everything(self) -> list[str]:
+        return [json.dumps({"type": "everything"})]
 
     async def start(self, token: str = "") -> None:
-        app = Station(self.view, self.fleet, self.pages, entrance=SharedToken(token)).make_app()
+        app = Station(self.view, self.fleet, self.pages, authenticator=TokenAuthenticator(token)).make_app()
         self.client = TestClient(TestServer(app))
         await self.client.start_server()
 
 
 @pytest.fixture
-async def house() -> AsyncIterator[House]:
-    made = House()
+async def running() -> AsyncIterator[RunningStation]:
+    made = RunningStation()
     yield made
     await made.client.close()
 
@@ -79,25 +83,25 @@ STATE = {
 }
 
 
-async def test_reads_the_fleet(house: House) -> None:
-    await house.start()
-    house.view.on_state(STATE)
-    fleet = await (await house.client.get("/api/v1/fleet")).json()
+async def test_reads_the_fleet(running: RunningStation) -> None:
+    await running.start()
+    running.view.on_state(STATE)
+    fleet = await (await running.client.get("/api/v1/fleet")).json()
     assert fleet["map"]["rows"] == 2
     assert (fleet["blocked"], fleet["pending"]) == ([3], [1])
-    robot = await (await house.client.get("/api/v1/robots/Robot1")).json()
+    robot = await (await running.client.get("/api/v1/robots/Robot1")).json()
     assert (robot["goal"], robot["plan"], robot["pose"]) == (2, [0, 2], None)
-    missing = await house.client.get("/api/v1/robots/Robot9")
+    missing = await running.client.get("/api/v1/robots/Robot9")
     assert missing.status == 404
     assert "Robot1" in (await missing.json())["error"]
 
 
-async def test_sets_goals_and_blocks_cells(house: House) -> None:
-    await house.start()
-    assert (await house.client.put("/api/v1/robots/Robot1/goal", json={"cell": 5})).status == 200
-    assert (await house.client.put("/api/v1/robots/Robot1/goal", json={"cell": None})).status == 200
-    assert (await house.client.put("/api/v1/cells/7", json={"blocked": True})).status == 200
-    assert house.fleet.wishes == [("goal", "Robot1", 5), ("goal", "Robot1", None), ("cell", 7, True)]
+async def test_sets_goals_and_blocks_cells(running: RunningStation) -> None:
+    await running.start()
+    assert (await running.client.put("/api/v1/robots/Robot1/goal", json={"cell": 5})).status == 200
+    assert (await running.client.put("/api/v1/robots/Robot1/goal", json={"cell": None})).status == 200
+    assert (await running.client.put("/api/v1/cells/7", json={"blocked": True})).status == 200
+    assert running.fleet.desired == [("goal", "Robot1", 5), ("goal", "Robot1", None), ("cell", 7, True)]
 
 
 @pytest.mark.parametrize(
@@ -110,67 +114,86 @@ async def test_sets_goals_and_blocks_cells(house: House) -> None:
         ("/api/v1/cells/seven", '{"blocked": true}', "seven"),
     ],
 )
-async def test_bad_input_names_the_place(house: House, path: str, body: str, words: str) -> None:
-    await house.start()
-    reply = await house.client.put(path, data=body)
+async def test_bad_input_names_the_place(running: RunningStation, path: str, body: str, words: str) -> None:
+    await running.start()
+    reply = await running.client.put(path, data=body)
     assert reply.status in (400, 404)
     assert words in (await reply.json())["error"]
-    assert house.fleet.wishes == []
+    assert running.fleet.desired == []
 
 
 @pytest.mark.parametrize(
-    ("fault", "status"), [(FleetError("cell 7 is a wall"), 409), (PlannerAwayError("away"), 503)]
+    ("fault", "status"), [(PlannerError("cell 7 is a wall"), 409), (PlannerUnavailableError("away"), 503)]
 )
-async def test_says_what_the_planner_says(house: House, fault: FleetError, status: int) -> None:
-    await house.start()
-    house.fleet.fault = fault
-    reply = await house.client.put("/api/v1/cells/7", json={"blocked": True})
+async def test_planners_refusal_is_returned(
+    running: RunningStation, fault: PlannerError, status: int
+) -> None:
+    await running.start()
+    running.fleet.fault = fault
+    reply = await running.client.put("/api/v1/cells/7", json={"blocked": True})
     assert (reply.status, (await reply.json())["error"]) == (status, str(fault))
 
 
-async def test_pages_of_other_sites_are_refused(house: House) -> None:
-    await house.start()
+async def test_pages_of_other_sites_are_refused(running: RunningStation) -> None:
+    await running.start()
     evil = {"Origin": "http://evil.example"}
-    assert (await house.client.put("/api/v1/cells/7", json={"blocked": True}, headers=evil)).status == 403
-    own = {"Origin": str(house.client.make_url("/").origin())}
-    assert (await house.client.put("/api/v1/cells/7", json={"blocked": True}, headers=own)).status == 200
+    assert (await running.client.put("/api/v1/cells/7", json={"blocked": True}, headers=evil)).status == 403
+    own = {"Origin": str(running.client.make_url("/").origin())}
+    assert (await running.client.put("/api/v1/cells/7", json={"blocked": True}, headers=own)).status == 200
 
 
-async def test_names_that_the_station_has_not_are_refused(house: House) -> None:
+async def test_unknown_host_name_is_refused(running: RunningStation) -> None:
     """A page whose name was made to lead here (DNS rebinding) steers nothing."""
-    await house.start()
+    await running.start()
     evil = {"Host": "evil.example:9080", "Origin": "http://evil.example:9080"}
-    reply = await house.client.put("/api/v1/cells/7", json={"blocked": True}, headers=evil)
+    reply = await running.client.put("/api/v1/cells/7", json={"blocked": True}, headers=evil)
     assert reply.status == 421
     assert "--public-name" in (await reply.json())["error"]
     for path in ("/", "/api/v1/fleet", "/api/v1/live"):
-        assert (await house.client.get(path, headers={"Host": "evil.example"})).status == 421
-    assert house.fleet.wishes == []
+        assert (await running.client.get(path, headers={"Host": "evil.example"})).status == 421
+    assert running.fleet.desired == []
 
 
-async def test_a_token_is_asked_for_where_one_is_set(house: House) -> None:
-    await house.start(token="open sesame")
-    assert (await house.client.get("/api/v1/fleet")).status == 401
+async def test_token_is_required_if_one_is_set(running: RunningStation) -> None:
+    await running.start(token="open sesame")
+    assert (await running.client.get("/api/v1/fleet")).status == 401
     bearer = {"Authorization": "Bearer open sesame"}
-    assert (await house.client.get("/api/v1/fleet", headers=bearer)).status == 200
-    assert (await house.client.get("/?token=wrong")).status == 401
-    assert (await house.client.get("/", params={"token": "open sesame"})).status == 200
-    assert (await house.client.get("/static/main.js")).status == 200, "the page's cookie lets its parts in"
+    assert (await running.client.get("/api/v1/fleet", headers=bearer)).status == 200
+    assert (await running.client.get("/?token=wrong")).status == 401
+    assert (await running.client.get("/", params={"token": "open sesame"})).status == 200
+    assert (await running.client.get("/static/main.js")).status == 200, "the page's cookie lets its parts in"
 
 
-async def test_the_live_socket_tells_news(house: House) -> None:
-    await house.start()
-    house.pages.send("state", json.dumps({"type": "state"}))
-    async with house.client.ws_connect("/api/v1/live") as socket:
+async def test_live_socket_sends_changes(running: RunningStation) -> None:
+    await running.start()
+    running.pages.send("state", json.dumps({"type": "state"}))
+    async with running.client.ws_connect("/api/v1/live") as socket:
+        assert (await socket.receive_json())["type"] == "everything"
         assert (await socket.receive_json())["type"] == "state"
-        house.pages.send_event(json.dumps({"type": "event", "text": "news"}))
+        running.pages.send_event(json.dumps({"type": "event", "text": "news"}))
         assert (await socket.receive_json())["text"] == "news"
-    assert (await house.client.get("/")).status == 200
+    assert (await running.client.get("/")).status == 200
 
 
-async def test_the_document_describes_every_route(house: House) -> None:
-    await house.start()
-    document = await (await house.client.get("/api/v1/openapi.json")).json()
+async def test_a_page_that_takes_changes_gets_them(running: RunningStation) -> None:
+    await running.start()
+    async with running.client.ws_connect("/api/v1/live?changes=1") as socket:
+        assert (await socket.receive_json())["type"] == "everything"
+        running.pages.send_change(json.dumps({"type": "changes"}))
+        assert (await socket.receive_json())["type"] == "changes"
+
+
+async def test_a_page_of_an_earlier_release_gets_everything(running: RunningStation) -> None:
+    await running.start()
+    async with running.client.ws_connect("/api/v1/live") as socket:
+        assert (await socket.receive_json())["type"] == "everything"
+        running.pages.send_change(json.dumps({"type": "changes"}))
+        assert (await socket.receive_json())["type"] == "everything"
+
+
+async def test_the_document_describes_every_route(running: RunningStation) -> None:
+    await running.start()
+    document = await (await running.client.get("/api/v1/openapi.json")).json()
     assert document["openapi"].startswith("3.1")
     assert set(document["paths"]) == {
         "/api/v1/login",

@@ -7,9 +7,9 @@ import json
 import os
 import signal
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import psutil
 import pytest
@@ -48,11 +48,11 @@ if __name__ == "__main__":
 """
 SHARED = "import os; open(os.environ['LOADED'], 'a').write(f'{os.getpid()}\\n')"
 SUPERVISOR = """
-import asyncio, json, sys
+import asyncio, json, os, signal, sys
 from rce.supervision.__main__ import run
 from rce.supervision.plan import Plan
 from rce.supervision.prefork import prepare
-from rce.supervision.program import Program
+from rce.supervision.plan import Program
 import uvloop
 
 wanted = json.loads(sys.argv[1])
@@ -61,10 +61,10 @@ prepared = prepare(programs, ["shared"])
 print("prepared", *[fork.pid for fork in prepared.values()], flush=True)
 if sys.argv[2:] == ["wait"]:
     sys.stdin.read()
+if sys.argv[2:] == ["kill the last"]:
+    os.kill(list(prepared.values())[-1].pid, signal.SIGKILL)
 sys.exit(uvloop.run(run(Plan(programs=programs, ready=("all",)), prepared)))
 """
-
-Start = Callable[..., Any]
 
 
 class Supervised:
@@ -84,6 +84,12 @@ class Supervised:
     async def forks(self) -> list[psutil.Process]:
         """Return the forks that wait to begin."""
         return [psutil.Process(int(word)) for word in (await self.until("prepared")).split()[1:]]
+
+
+class Start(Protocol):
+    """Starts a supervisor; see :func:`start`."""
+
+    async def __call__(self, programs: list[list[str]], *words: str) -> Supervised: ...
 
 
 @pytest.fixture
@@ -140,12 +146,13 @@ async def test_forks_that_wait_end_with_their_supervisor(start: Start) -> None:
 
 
 async def test_a_fork_that_was_killed_before_it_began_fails_the_start(start: Start) -> None:
-    supervised = await start([["one"], ["two"]])
-    one, two = await supervised.forks()
-    os.kill(two.pid, signal.SIGKILL)
+    supervised = await start([["one"], ["two"]], "kill the last")
+    pids = [int(word) for word in (await supervised.until("prepared")).split()[1:]]
     assert "rce up: two ended with exit code -9 before it was ready" in await supervised.until("rce up")
     assert await supervised.child.wait() == 1
-    await gone([one, two])
+    async with asyncio.timeout(60):
+        while any(psutil.pid_exists(pid) for pid in pids):
+            await asyncio.sleep(0.02)
 
 
 async def test_forks_end_when_their_supervisor_is_told_to(start: Start) -> None:

@@ -14,8 +14,8 @@ import pytest
 from support.engine import until
 
 from rce.supervision.final import FinalCommand
+from rce.supervision.plan import Program
 from rce.supervision.process import Child
-from rce.supervision.program import Program
 from rce.supervision.supervisor import StartError, Supervisor
 
 READY = "import time; print('x ready: now', flush=True); time.sleep(1000)"
@@ -126,7 +126,7 @@ async def test_what_a_killed_program_leaves_is_removed_at_the_end(tmp_path: Path
     assert note.read_text() == "once\n"
 
 
-async def test_what_another_killed_program_leaves_is_removed_at_the_end(tmp_path: Path) -> None:
+async def test_leftovers_of_killed_program_are_removed(tmp_path: Path) -> None:
     """One program's command also removes what is left of another one that ends before it has begun."""
     note, gone = tmp_path / "note", asyncio.Event()
     proper = (
@@ -204,7 +204,8 @@ def _is_dead(process: psutil.Process) -> bool:
         return True
 
 
-async def test_a_final_command_runs_though_what_waits_for_it_was_killed(tmp_path: Path) -> None:
+async def test_final_command_runs_after_its_waiter_was_killed(tmp_path: Path) -> None:
+    """A final command runs though what waits for it was killed."""
     others = set(psutil.Process().children())
     final = await FinalCommand.arm(["touch", str(tmp_path / "note")])
     (shell,) = set(psutil.Process().children()) - others

@@ -9,8 +9,8 @@ import pytest
 
 from rce.config.client import ClientConfig, loads
 from rce.config.exceptions import ConfigError
-from rce.protocol.messages import ConfigureComponents, ConfigureConnections, CreateContainer
-from rce.protocol.names import Role
+from rce.model.names import Role
+from rce.model.requests import ConfigureComponents, ConfigureConnections, CreateContainer
 from rce.ros.types import TypeRegistry
 from rce_client.ros_bridge.plan import check, make_plan
 
@@ -21,7 +21,7 @@ def own(tag: str, type_: str, addr: str = "", cls: str = STRING) -> dict[str, An
     return {"eTag": "robot", "iTag": tag, "iType": type_, "iCls": cls} | ({"addr": addr} if addr else {})
 
 
-def config(*interfaces: dict[str, Any], **parts: Any) -> ClientConfig:
+def config(*interfaces: dict[str, Any], **parts: object) -> ClientConfig:
     base = {"url": "http://m/", "userID": "u", "password": "p", "robotID": "robot"}
     return loads(json.dumps({**base, "interfaces": list(interfaces), **parts}))
 
@@ -34,7 +34,8 @@ def test_converters_become_forwarders() -> None:
     ]
 
 
-def test_containers_come_first_and_own_interfaces_are_left_to_the_spans() -> None:
+def test_containers_first_own_interfaces_left_to_spans() -> None:
+    """Containers come first and own interfaces are left to the spans."""
     other = own("in", "PublisherInterface", "/in") | {"eTag": "c1"}
     read = config(
         own("a", "SubscriberConverter", "/a"),
@@ -47,7 +48,7 @@ def test_containers_come_first_and_own_interfaces_are_left_to_the_spans() -> Non
     assert plan.first == 1
     assert isinstance(first, CreateContainer)
     assert isinstance(second, ConfigureComponents)
-    assert [item.interface_tag for item in second.add_interfaces] == ["in"]
+    assert [item.interface.tag for item in second.add_interfaces] == ["in"]
     assert isinstance(third, ConfigureConnections)
     assert plan.awaited == {"a"}
 
@@ -58,7 +59,7 @@ def test_interfaces_without_addr_are_made_as_they_are() -> None:
     assert plan.unbridged == ("a",)
     (request,) = plan.requests
     assert isinstance(request, ConfigureComponents)
-    assert request.add_interfaces[0].interface_type == "SubscriberConverter"
+    assert request.add_interfaces[0].interface.type == "SubscriberConverter"
 
 
 def test_a_topic_may_be_bridged_in_both_directions() -> None:

@@ -5,22 +5,22 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.protocol.messages import (
+from rce.model.requests import (
     AddInterface,
     AddNode,
     ConfigureComponents,
     ConfigureConnections,
     Connection,
     CreateContainer,
-    DeleteParam,
+    DeleteParameter,
     DestroyContainer,
     RemoveInterface,
     RemoveNode,
     Request,
     ResizeContainer,
-    ResizeData,
-    SetParam,
+    SetParameter,
 )
+from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec, ResourceChanges
 from rce_client.desired import Desired
 
 TAGS = st.sampled_from(["a", "b", "robot"])
@@ -29,36 +29,49 @@ PATHS = st.builds("{}/{}".format, TAGS, NAMES)
 
 
 def components(**items: object) -> ConfigureComponents:
-    return ConfigureComponents(**{key: (item,) for key, item in items.items()})  # type: ignore[arg-type]
+    return ConfigureComponents(**{key: (item,) for key, item in items.items()})  # type: ignore[arg-type]  # each key has items of its own
 
 
 def interface(endpoint: str, tag: str) -> AddInterface:
     return AddInterface(
-        endpoint_tag=endpoint, interface_tag=tag, interface_type="PublisherConverter", class_name="p/T"
+        endpoint=endpoint,
+        interface=InterfaceSpec(tag=tag, type="PublisherConverter", message_type="p/T"),
     )
 
 
+def node(container: str, tag: str) -> AddNode:
+    return AddNode(container=container, node=NodeSpec(tag=tag, pkg="p", exe="e"))
+
+
 REQUESTS: st.SearchStrategy[Request] = st.one_of(
-    st.builds(lambda tag: CreateContainer(container_tag=tag), TAGS),
-    st.builds(lambda tag: DestroyContainer(container_tag=tag), TAGS),
+    st.builds(lambda tag: CreateContainer(tag=tag), TAGS),
+    st.builds(lambda tag: DestroyContainer(tag=tag), TAGS),
     st.builds(
-        lambda tag, **data: ResizeContainer(container_tag=tag, container_data=ResizeData(**data)),
+        lambda tag, **data: ResizeContainer(tag=tag, changes=ResourceChanges(**data)),
         TAGS,
-        cpu=st.sampled_from([None, 1, "50%"]),
+        cpu=st.sampled_from([None, 1.0, 0.5]),
         memory=st.sampled_from([None, 5]),
     ),
     st.builds(
-        lambda c, n: components(add_nodes=AddNode(container_tag=c, node_tag=n, pkg="p", exe="e")), TAGS, NAMES
-    ),
-    st.builds(lambda c, n: components(remove_nodes=RemoveNode(container_tag=c, node_tag=n)), TAGS, NAMES),
-    st.builds(lambda e, i: components(add_interfaces=interface(e, i)), TAGS, NAMES),
-    st.builds(
-        lambda e, i: components(remove_interfaces=RemoveInterface(endpoint_tag=e, interface_tag=i)),
+        lambda c, n: components(add_nodes=node(c, n)),
         TAGS,
         NAMES,
     ),
-    st.builds(lambda c, n: components(set_param=SetParam(container_tag=c, name=n, value=1)), TAGS, NAMES),
-    st.builds(lambda c, n: components(delete_param=DeleteParam(container_tag=c, name=n)), TAGS, NAMES),
+    st.builds(lambda c, n: components(remove_nodes=RemoveNode(container=c, tag=n)), TAGS, NAMES),
+    st.builds(lambda e, i: components(add_interfaces=interface(e, i)), TAGS, NAMES),
+    st.builds(
+        lambda e, i: components(remove_interfaces=RemoveInterface(endpoint=e, tag=i)),
+        TAGS,
+        NAMES,
+    ),
+    st.builds(
+        lambda c, n: components(
+            set_param=SetParameter(container=c, parameter=ParameterSpec(name=n, value=1))
+        ),
+        TAGS,
+        NAMES,
+    ),
+    st.builds(lambda c, n: components(delete_param=DeleteParameter(container=c, name=n)), TAGS, NAMES),
     st.builds(lambda a, b: ConfigureConnections(connect=(Connection(tag_a=a, tag_b=b),)), PATHS, PATHS),
     st.builds(lambda a, b: ConfigureConnections(disconnect=(Connection(tag_a=a, tag_b=b),)), PATHS, PATHS),
 )
@@ -95,13 +108,13 @@ def test_undoing_leaves_nothing(requests: list[Request]) -> None:
 def test_a_destroyed_container_takes_what_is_in_it_along() -> None:
     desired = Desired()
     for request in (
-        CreateContainer(container_tag="c"),
-        components(add_nodes=AddNode(container_tag="c", node_tag="n", pkg="p", exe="e")),
+        CreateContainer(tag="c"),
+        components(add_nodes=node("c", "n")),
         components(add_interfaces=interface("c", "x")),
         components(add_interfaces=interface("cc", "x")),
         ConfigureConnections(connect=(Connection(tag_a="c/x", tag_b="cc/x"),)),
         ConfigureConnections(connect=(Connection(tag_a="cc/x", tag_b="robot/x"),)),
-        DestroyContainer(container_tag="c"),
+        DestroyContainer(tag="c"),
     ):
         desired.apply(request)
     assert not desired.nodes
@@ -111,14 +124,14 @@ def test_a_destroyed_container_takes_what_is_in_it_along() -> None:
 
 def test_undoing_disconnects_first_and_destroys_last() -> None:
     desired = Desired()
-    desired.apply(CreateContainer(container_tag="c"))
+    desired.apply(CreateContainer(tag="c"))
     desired.apply(components(add_interfaces=interface("robot", "x")))
     desired.apply(components(add_interfaces=interface("c", "x")))
     desired.apply(ConfigureConnections(connect=(Connection(tag_a="c/x", tag_b="robot/x"),)))
     first, second, third = desired.undo()
     assert isinstance(first, ConfigureConnections)
-    assert second == components(remove_interfaces=RemoveInterface(endpoint_tag="robot", interface_tag="x"))
-    assert third == DestroyContainer(container_tag="c")
+    assert second == components(remove_interfaces=RemoveInterface(endpoint="robot", tag="x"))
+    assert third == DestroyContainer(tag="c")
 
 
 def test_who_is_named_first_in_a_connection_means_nothing() -> None:
@@ -130,9 +143,9 @@ def test_who_is_named_first_in_a_connection_means_nothing() -> None:
 
 def test_a_container_is_made_again_as_it_was_and_then_resized() -> None:
     desired = Desired()
-    made = CreateContainer(container_tag="a")
+    made = CreateContainer(tag="a")
     desired.apply(made)
-    for data in (ResizeData(cpu=1), ResizeData(memory="1G"), ResizeData(cpu="50%")):
-        desired.apply(ResizeContainer(container_tag="a", container_data=data))
-    resized = ResizeContainer(container_tag="a", container_data=ResizeData(cpu="50%", memory="1G"))
+    for data in (ResourceChanges(cpu=1.0), ResourceChanges(memory=1 << 30), ResourceChanges(cpu=0.5)):
+        desired.apply(ResizeContainer(tag="a", changes=data))
+    resized = ResizeContainer(tag="a", changes=ResourceChanges(cpu=0.5, memory=1 << 30))
     assert desired.restore() == [made, resized]

@@ -8,9 +8,9 @@ import pytest
 
 from rce.config.client import ClientConfig, load, loads
 from rce.config.documents import write_items
-from rce.protocol.names import Role
+from rce.model.names import Role
 from rce_client.ros_bridge.explain import wires
-from rce_fleet.wiring import Account, fleet_config, robot_config
+from rce_fleet.wiring import FleetAccount, fleet_config, robot_config
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 
@@ -37,15 +37,15 @@ def test_the_long_form_says_the_same_as_the_short_one() -> None:
 
 
 def made(number: int) -> ClientConfig:
-    return loads(write_items(robot_config(number, Account(url="http://cloud:1/", user="u"))))
+    return loads(write_items(robot_config(number, FleetAccount(url="http://cloud:1/", user="u"))))
 
 
 @pytest.mark.parametrize("number", [1, 12, 100])
 def test_any_number_of_robots(number: int) -> None:
     config = made(number)
     assert config.robot == f"testRobot_{number}"
-    assert config.nodes[0].namespace == f"Robot{number}"
-    assert {item.addr for item in config.interfaces if item.endpoint == "cTag_fleet"} == {
+    assert config.nodes[0].node.namespace == f"Robot{number}"
+    assert {item.interface.addr for item in config.interfaces if item.endpoint == "cTag_fleet"} == {
         "/map",
         *(
             f"/Robot{number}/{topic}"
@@ -62,11 +62,11 @@ def test_robots_do_not_get_in_each_others_way() -> None:
 
 def test_every_interface_is_connected_with_its_complement() -> None:
     config = made(1)
-    interfaces = {item.path: item for item in config.interfaces}
+    interfaces = {item.path: item.interface for item in config.interfaces}
     used = set()
     for link in config.connections:
-        a, b = interfaces[link.a], interfaces[link.b]
+        a, b = interfaces[link.tag_a], interfaces[link.tag_b]
         assert (a.kind.role, b.kind.role) == (Role.SUBSCRIBER, Role.PUBLISHER)
-        assert a.cls == b.cls
-        used |= {link.a, link.b}
+        assert a.message_type == b.message_type
+        used |= {link.tag_a, link.tag_b}
     assert used == set(interfaces)

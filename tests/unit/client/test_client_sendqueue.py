@@ -7,11 +7,11 @@ import asyncio
 import pytest
 
 from rce_client.exceptions import LostError
-from rce_client.sendqueue import Parcel, QueueLimits, SendQueue
+from rce_client.sendqueue import QueuedMessage, QueueLimits, SendQueue
 
 
-def parcel(text: str) -> Parcel:
-    return Parcel.of([text])
+def queued(text: str) -> QueuedMessage:
+    return QueuedMessage.of([text])
 
 
 def drain(queue: SendQueue) -> list[str]:
@@ -24,9 +24,9 @@ def drain(queue: SendQueue) -> list[str]:
 async def test_requests_go_first_and_topics_take_turns() -> None:
     queue = SendQueue(QueueLimits())
     for text in ("a1", "a2", "a3"):
-        queue.put_data("a", parcel(text))
-    queue.put_data("b", parcel("b1"))
-    queue.put_control(parcel("request"))
+        queue.put_data("a", queued(text))
+    queue.put_data("b", queued("b1"))
+    queue.put_control(queued("request"))
     assert drain(queue) == ["request", "a1", "b1", "a2", "a3"]
     assert not queue
 
@@ -34,7 +34,7 @@ async def test_requests_go_first_and_topics_take_turns() -> None:
 async def test_a_full_topic_forgets_its_oldest_and_counts() -> None:
     queue = SendQueue(QueueLimits(topic_messages=2))
     for text in ("1", "2", "3"):
-        queue.put_data("a", parcel(text))
+        queue.put_data("a", queued(text))
     assert drain(queue) == ["2", "3"]
     assert queue.dropped == {"a": 1}
 
@@ -42,7 +42,7 @@ async def test_a_full_topic_forgets_its_oldest_and_counts() -> None:
 async def test_bytes_are_limited_too_but_one_message_is_always_taken() -> None:
     queue = SendQueue(QueueLimits(topic_bytes=10))
     for text in ("x" * 6, "y" * 6, "z" * 100):
-        queue.put_data("a", parcel(text))
+        queue.put_data("a", queued(text))
     assert drain(queue) == ["z" * 100]
     assert queue.dropped == {"a": 2}
 
@@ -52,16 +52,16 @@ async def test_get_waits() -> None:
     waiting = asyncio.ensure_future(queue.get())
     await asyncio.sleep(0)
     assert not waiting.done()
-    queue.put_data("a", parcel("x"))
+    queue.put_data("a", queued("x"))
     assert (await waiting).frames == ["x"]
 
 
 async def test_clearing_tells_who_waits() -> None:
     queue = SendQueue(QueueLimits())
-    item = parcel("x")
+    item = queued("x")
     item.sent = asyncio.get_running_loop().create_future()
     queue.put_control(item)
-    queue.put_data("a", parcel("y"))
+    queue.put_data("a", queued("y"))
     queue.clear()
     with pytest.raises(LostError):
         await item.sent
@@ -71,5 +71,5 @@ async def test_clearing_tells_who_waits() -> None:
 async def test_full_is_about_control() -> None:
     queue = SendQueue(QueueLimits(control_messages=1))
     assert not queue.full
-    queue.put_control(parcel("x"))
+    queue.put_control(queued("x"))
     assert queue.full

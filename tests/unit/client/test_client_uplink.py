@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from rce_client.ends import Publisher
+from rce_client import Serialized
 from rce_client.ros_bridge.bridge import Downlink, Uplink
+from rce_client.topics import Publisher
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,18 +36,18 @@ class PlayedWay:
         if message["type"] == "LT":
             self.sent.append(("LT", ",".join(data.get("sources", ()))))
         else:
-            self.sent.append((data.get("latch", ""), bytes(frames[1])[32:].decode()))  # type: ignore[arg-type]
+            self.sent.append((data.get("latch", ""), bytes(frames[1])[32:].decode()))  # type: ignore[arg-type]  # a binary frame
         return True
 
-    def join(self, publisher: Publisher[bytes], *, active: bool = True) -> None:
+    def join(self, publisher: Publisher[Serialized], *, active: bool = True) -> None:
         self.active[TAG] = active
         if active:
             publisher.on_active()
 
 
-def uplink() -> tuple[PlayedWay, Publisher[bytes], Uplink]:
+def uplink() -> tuple[PlayedWay, Publisher[Serialized], Uplink]:
     way: Any = PlayedWay()
-    publisher = Publisher[bytes](way, TAG, STRING, raw=True)
+    publisher = Publisher[Serialized](way, TAG, STRING, raw=True)
     return way, publisher, Uplink(way, publisher)
 
 

@@ -22,7 +22,7 @@ HEAD: dict[str, Any] = {
 }
 
 
-def read(*bridges: dict[str, Any], types: dict[int, str] | None = None, **more: Any) -> ClientConfig:
+def read(*bridges: dict[str, Any], types: dict[int, str] | None = None, **more: object) -> ClientConfig:
     return loads(json.dumps({**HEAD, "bridges": bridges, **more}), types=types)
 
 
@@ -33,11 +33,14 @@ def faults(*bridges: dict[str, Any], **more: Any) -> list[str]:
 
 
 def interfaces(config: ClientConfig) -> dict[str, tuple[str, str, str]]:
-    return {one.path: (one.type, one.cls, one.addr) for one in config.interfaces}
+    return {
+        one.path: (one.interface.type, one.interface.message_type, one.interface.addr)
+        for one in config.interfaces
+    }
 
 
 def connections(config: ClientConfig) -> list[tuple[str, str]]:
-    return [(one.a, one.b) for one in config.connections]
+    return [(one.tag_a, one.tag_b) for one in config.connections]
 
 
 def test_topic_from_the_robot_to_two_containers() -> None:
@@ -90,7 +93,7 @@ def test_action_is_five_topics(type_: str) -> None:
 
 def test_interfaces_of_the_file_are_used_again() -> None:
     own = {"eTag": "R1", "iTag": "mine", "iType": "SubscriberConverter", "iCls": POSE, "addr": "/pose"}
-    bridges = [
+    bridges: list[dict[str, Any]] = [
         {"topic": "/pose", "type": POSE, "from": "robot", "to": "c1"},
         {"topic": "pose", "type": POSE, "from": "robot", "to": ["c1", "c2"]},
     ]
@@ -173,7 +176,7 @@ def test_names_that_make_the_same_tag_are_told_apart() -> None:
         {"topic": "/" + "x" * 200, "type": POSE, "from": "robot", "to": "c1"},
     )
     assert len(interfaces(config)) == 6
-    assert all(len(one.tag) <= 128 for one in config.interfaces)
+    assert all(len(one.interface.tag) <= 128 for one in config.interfaces)
 
 
 _names = st.from_regex(r"/[a-z][a-z0-9_]{0,3}(/[a-z0-9_]{1,3}){0,2}", fullmatch=True)
@@ -183,7 +186,7 @@ _names = st.from_regex(r"/[a-z][a-z0-9_]{0,3}(/[a-z0-9_]{1,3}){0,2}", fullmatch=
 def test_every_bridge_has_its_connections_in_any_order(names: list[str]) -> None:
     bridges = [{"topic": name, "type": POSE, "from": "robot", "to": ["c1", "c2"]} for name in names]
     config = read(*bridges)
-    addresses = {one.path: one.addr for one in config.interfaces}
+    addresses = {one.path: one.interface.addr for one in config.interfaces}
     assert {(addresses[a], addresses[b], b.partition("/")[0]) for a, b in connections(config)} == {
         (name, name, container) for name in names for container in ("c1", "c2")
     }

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from rce.config.client import ClientConfig, load, loads
 from rce.config.exceptions import ConfigError
-from rce.protocol.messages import (
+from rce.model.requests import (
     AddInterface,
     AddNode,
     ConfigureComponents,
@@ -21,8 +21,9 @@ from rce.protocol.messages import (
     Connection,
     CreateContainer,
     DestroyContainer,
-    SetParam,
+    SetParameter,
 )
+from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec, Resources, RestartPolicy
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -66,7 +67,7 @@ def good() -> dict[str, Any]:
     }
 
 
-def faults(data: Any) -> list[str]:
+def faults(data: object) -> list[str]:
     with pytest.raises(ConfigError) as caught:
         loads(json.dumps(data))
     return [str(fault) for fault in caught.value.faults]
@@ -96,7 +97,7 @@ def test_yaml_file(tmp_path: Path, name: str) -> None:
 def test_setup_makes_containers_then_components_then_connections() -> None:
     create, components, connections = loads(json.dumps(good())).setup()
     assert isinstance(create, CreateContainer)
-    assert (create.container_tag, create.container_data.cpu, create.container_data.features) == (
+    assert (create.tag, create.resources.cpu, create.resources.special_features) == (
         "cTag_01",
         1.0,
         ("gpu",),
@@ -104,23 +105,27 @@ def test_setup_makes_containers_then_components_then_connections() -> None:
     assert isinstance(components, ConfigureComponents)
     assert components.add_nodes == (
         AddNode(
-            container_tag="cTag_01",
-            node_tag="move",
-            pkg="fleet",
-            exe="move_client.py",
-            args="-v $(find fleet)/map.yaml",
-            namespace="Robot1",
+            container="cTag_01",
+            node=NodeSpec(
+                tag="move",
+                pkg="fleet",
+                exe="move_client.py",
+                args="-v $(find fleet)/map.yaml",
+                namespace="Robot1",
+            ),
         ),
     )
     assert components.set_param == (
-        SetParam(container_tag="cTag_01", name="cells", value=[1, 2.5, "x", True]),
+        SetParameter(container="cTag_01", parameter=ParameterSpec(name="cells", value=[1, 2.5, "x", True])),
     )
     assert components.add_interfaces[1] == AddInterface(
-        endpoint_tag="testRobot_1",
-        interface_tag="amclPoseSender_1",
-        interface_type="SubscriberForwarder",
-        class_name="geometry_msgs/PoseWithCovarianceStamped",
-        addr="/amcl_pose",
+        endpoint="testRobot_1",
+        interface=InterfaceSpec(
+            tag="amclPoseSender_1",
+            type="SubscriberForwarder",
+            message_type="geometry_msgs/PoseWithCovarianceStamped",
+            addr="/amcl_pose",
+        ),
     )
     assert connections == ConfigureConnections(
         connect=(Connection(tag_a="testRobot_1/amclPoseSender_1", tag_b="cTag_01/amclPoseReceiver_1"),)
@@ -137,7 +142,7 @@ def test_teardown_removes_the_same_in_reverse() -> None:
         len(components.remove_interfaces),
         len(components.delete_param),
     ) == (1, 2, 1)
-    assert destroy == DestroyContainer(container_tag="cTag_01")
+    assert destroy == DestroyContainer(tag="cTag_01")
 
 
 def test_empty_config_asks_for_nothing() -> None:
@@ -198,7 +203,8 @@ def test_unknown_key_gets_a_suggestion() -> None:
     ]
 
 
-def test_faults_of_items_and_of_their_relations_are_listed_together() -> None:
+def test_faults_of_items_and_relations_are_listed() -> None:
+    """Faults of items and of their relations are listed together."""
     data = good()
     data["url"] = ""
     data["containers"].append({"cTag": "cTag_01"})
@@ -292,13 +298,13 @@ def test_robot_is_no_container() -> None:
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ('{"url": 1,\n  "userID" 2}', "line 2, column 12: no valid JSON: Expecting ':' delimiter"),
+        ('{"url": 1,\n  "userID" 2}', "line 2, column 12: not valid JSON: Expecting ':' delimiter"),
         ('{"nodes": [{"cTag": "a", "cTag": "b"}]}', "nodes[0].cTag: is given more than once"),
         ("url: 1\nuserID: [\n", "line 3, column 1: no valid YAML"),
         ("url: 1\nurl: 2\n", "line 2, column 1: no valid YAML: key 'url' is given more than once"),
         ("? [a]\n: 1\n", "line 1, column 3: no valid YAML"),
         ("a: !!python/object/apply:os.system [id]\n", "line 1, column 4: no valid YAML"),
-        ("[" * 100_000, "no valid JSON"),
+        ("[" * 100_000, "not valid JSON"),
         ("[]", "must be an object"),
         ("", "must be an object"),
     ],
@@ -351,7 +357,7 @@ def test_any_text_is_refused(text: str) -> None:
 
 def test_amounts_are_read_as_the_protocol_reads_them() -> None:
     data = good()
-    wishes = {
+    requested = {
         "cpu": "50%",
         "memory": "256M",
         "bandwidth": "10Mbit",
@@ -359,13 +365,22 @@ def test_amounts_are_read_as_the_protocol_reads_them() -> None:
         "network": "none",
         "image": "debian:12",
     }
-    data["containers"][0] |= wishes
+    data["containers"][0] |= requested
     (made,) = [r for r in loads(json.dumps(data)).setup() if isinstance(r, CreateContainer)]
-    for key, value in wishes.items():
-        assert getattr(made.container_data, key) == value
+    assert made.wait
+    assert made.resources == Resources(
+        cpu=0.5,
+        memory=256 << 20,
+        bandwidth=1_250_000,
+        image="debian:12",
+        group=made.resources.group,
+        group_ip=made.resources.group_ip,
+        special_features=("gpu",),
+        size=made.resources.size,
+    )
 
 
-def test_faults_of_wishes_are_named_by_their_keys() -> None:
+def test_faults_of_requests_are_named_by_their_keys() -> None:
     data = good()
     data["containers"] = [
         {"cTag": "a", "memory": "lots", "network": "all"},
@@ -377,13 +392,13 @@ def test_faults_of_wishes_are_named_by_their_keys() -> None:
     data["nodes"] = []
     found = faults(data)
     assert [fault.split(": ")[0] for fault in found] == [
-        "containers[0].network",
         "containers[0].memory",
+        "containers[0].network",
         "containers[4].memory",
         "containers[1].group",
         "containers[3].groupIp",
     ]
-    assert "must be one of none, group, host" in found[0]
+    assert "must be one of none, group, host" in found[1]
     assert "is the address of containers[2] in the group 'g'" in found[-1]
 
 
@@ -398,9 +413,10 @@ def test_how_a_node_lives_is_passed_on() -> None:
     }
     data["nodes"][0] |= life
     (made,) = [r for r in loads(json.dumps(data)).setup() if isinstance(r, ConfigureComponents)]
-    (node,) = made.add_nodes
+    (add,) = made.add_nodes
+    node = add.node
     assert (node.restart, node.max_restarts, node.after, node.heartbeat, node.heartbeat_timeout) == (
-        "always", 2, ("map",), "/beat", 1.0,
+        RestartPolicy.ALWAYS, 2, ("map",), "/beat", 1.0,
     )  # fmt: skip
     data["nodes"][0] |= {"restart": "often", "heartbeatTimeout": 0}
     assert [fault.split(": ")[0] for fault in faults(data)] == [

@@ -31,7 +31,7 @@ demo: {mode: single, robots: 5, auto: false}
 
 def command(name: str) -> Any:
     app = build_app([point for point in entry_points(group=GROUP) if point.name in (name, "ps")])
-    return typer.main.get_command(app).commands[name]  # type: ignore[attr-defined]
+    return typer.main.get_command(app).commands[name]  # type: ignore[attr-defined]  # it is a group of commands
 
 
 def read(name: str, *arguments: str) -> dict[str, Any]:

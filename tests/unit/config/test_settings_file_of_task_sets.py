@@ -137,7 +137,7 @@ def test_a_bad_file_is_refused_with_its_place(app: typer.Typer, text: str, told:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["--settings", "{"], "--settings: line 1, column 2: no valid JSON"),
+        (["--settings", "{"], "--settings: line 1, column 2: not valid JSON"),
         (["--settings", '{"robot": {"wsport": 1}}'], "did you mean 'ws_port'?"),
         (["--ws-port", "many"], "--ws-port must be an integer, found 'many'"),
         (["--user-memory", "1X"], "--user-memory must be a number of MB"),

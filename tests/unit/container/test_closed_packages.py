@@ -35,6 +35,6 @@ def test_a_private_folder_is_named(
 
 
 def test_a_container_without_an_environment_was_never_born(runtime: NamespaceRuntime) -> None:
-    record = Record(id="user/box", mark="0" * 12, runtime="namespace", pid=1, start=1)
-    assert runtime.is_unborn(record)
-    assert not ProcessRuntime().is_unborn(record)
+    record = Record(id="user/box", incarnation_id="0" * 12, runtime="namespace", pid=1, start=1)
+    assert runtime.is_starting(record)
+    assert not ProcessRuntime().is_starting(record)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rce.control.model import ParameterSpec
+from rce.model.specs import ParameterSpec
 from rce.ros.packages import PackageIndex
 from rce_container.environment.parameters import difference, evaluate_all
 
@@ -28,8 +28,8 @@ def test_only_differences_are_done() -> None:
 
 @pytest.mark.parametrize(("now", "then"), [(1, True), (1, 1.0), ([1], [True]), ([1], [1, 2])])
 def test_another_type_is_a_difference(now: object, then: object) -> None:
-    assert difference({"/a": now}, {"/a": then}).set == {"/a": then}  # type: ignore[dict-item]
-    assert not difference({"/a": now}, {"/a": now}).set  # type: ignore[dict-item]
+    assert difference({"/a": now}, {"/a": then}).set == {"/a": then}  # type: ignore[dict-item]  # parameters of each type
+    assert not difference({"/a": now}, {"/a": now}).set  # type: ignore[dict-item]  # parameters of each type
 
 
 def test_strings_are_substituted(packages: PackageIndex, tmp_path: Path) -> None:
@@ -58,4 +58,4 @@ def test_a_bad_one_leaves_the_others_alone(packages: PackageIndex) -> None:
     )
     assert values == {"/good": 1}
     assert "nothing" in str(faults[0])
-    assert "no ROS name" in str(faults[1])
+    assert "not a ROS name" in str(faults[1])

@@ -33,7 +33,7 @@ def test_a_prefix_of_24_is_understood(text: str, network: str) -> None:
     ["", "x", "10.0.0", "10.0.0.256", "fe80::1", "10.0.0.1/33", "10.0.0.1/", "10.0.0.1/24/24", "10.0.0.1 "],
 )
 def test_what_is_no_address_is_told(text: str) -> None:
-    with pytest.raises(NetworkError, match="is no IPv4 address"):
+    with pytest.raises(NetworkError, match="is not an IPv4 address"):
         parse_address(text)
 
 
@@ -55,7 +55,7 @@ def test_an_address_that_no_container_can_have_is_told(text: str, why: str) -> N
         parse_address(text)
 
 
-def test_a_wish_is_granted_or_its_reason_told() -> None:
+def test_requested_address_is_granted_or_the_reason_given() -> None:
     assert choose("10.0.0.3", TAKEN) == IPv4Interface("10.0.0.3/24")
     with pytest.raises(NetworkError, match="belongs to container two of the same group"):
         choose("10.0.0.2", TAKEN)
@@ -65,7 +65,7 @@ def test_a_wish_is_granted_or_its_reason_told() -> None:
         choose("10.0.0.3/16", TAKEN)
 
 
-def test_without_a_wish_a_free_one_of_the_group_is_found() -> None:
+def test_without_a_request_a_free_address_is_found() -> None:
     assert choose("", {}) == IPv4Interface("10.77.0.1/24")
     assert choose("", TAKEN) == IPv4Interface("10.0.0.3/24")
     both = {IPv4Interface("10.0.0.1/30"): "one", IPv4Interface("10.0.0.2/30"): "two"}

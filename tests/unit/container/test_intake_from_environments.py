@@ -19,7 +19,7 @@ from rce_container.environment import messages as m
 
 def status(**fields: object) -> EndpointStatus:
     told = {"id": "anna/c", "revision": 3, "state": EndpointState.RUNNING, **fields}
-    return intake.sound_status("anna/c", msgspec.convert(told, EndpointStatus), 2**53)
+    return intake.sanitize_status("anna/c", msgspec.convert(told, EndpointStatus), 2**53)
 
 
 def test_a_sound_report_stays_as_it_is() -> None:
@@ -31,25 +31,25 @@ def test_a_sound_report_stays_as_it_is() -> None:
         interfaces={"i": True},
         connections=(4, 5),
     )
-    assert intake.sound_status("anna/c", said, said.revision) == said
+    assert intake.sanitize_status("anna/c", said, said.revision) == said
 
 
 def test_a_container_speaks_of_itself_only() -> None:
     found = status(id="bob/c", incarnation="x", detail="y", address=LinkAddress(host="evil", port=1))
     assert found == EndpointStatus(id="anna/c", revision=3, state=EndpointState.RUNNING)
     assert status(state=EndpointState.ABSENT).state is EndpointState.RUNNING
-    assert intake.sound_status("anna/c", status(revision=10), 4).revision == 4, "it was told of no more"
+    assert intake.sanitize_status("anna/c", status(revision=10), 4).revision == 4, "it was told of no more"
 
 
 def test_sizes_are_those_of_containers() -> None:
     node = NodeStatus(tag="n", state=NodeState.FAILED, pid=10**30, exit_code=-(10**30), detail="x" * 10**6)
     found = status(
         nodes=(node, *(NodeStatus(tag=f"n{i}", state=NodeState.RUNNING) for i in range(10_000))),
-        interfaces={"no name": True, **{f"i{i}": True for i in range(10_000)}},
+        interfaces={"no name": True, **{f"i{i}": True for i in range(20_000)}},
         connections=tuple(range(100_000)),
     )
     assert len(found.nodes) == intake.MAX_ITEMS
-    assert len(found.interfaces) < intake.MAX_ITEMS
+    assert len(found.interfaces) < intake.MAX_INTERFACES
     assert "no name" not in found.interfaces
     assert len(found.connections) == intake.MAX_CONNECTIONS
     first = found.nodes[0]
@@ -63,7 +63,7 @@ def test_counters_can_be_told_on() -> None:
         interfaces={"i": InterfaceUsage(bytes_in=10**400, dropped=-5), "../i": InterfaceUsage()},
         traffic=(10**400, 7),
     )
-    found = intake.sound_counters(said)
+    found = intake.sanitize_counters(said)
     assert found.interfaces == {"i": InterfaceUsage(bytes_in=2**53)}
     assert found.traffic == (2**53, 7)
 

@@ -12,7 +12,7 @@ from support.cgroup_trees import Tree2
 from rce_container.exceptions import LimitError, LimitsUnavailableError
 from rce_container.limits import Limits, choose_limiter
 from rce_container.limits.base import Troubles
-from rce_container.limits.cgroup2 import Cell2, Cgroup2
+from rce_container.limits.cgroup2 import Cgroup2, ControlGroupV2
 
 MB = 1 << 20
 ALL = "cpuset cpu io memory hugetlb pids"
@@ -35,22 +35,22 @@ def text(path: Path, name: str) -> str:
 
 
 def test_a_container_gets_a_cgroup_with_its_limits(tree: Tree2) -> None:
-    cell = limiter(tree).create("m1", LIMITS)
+    control_group = limiter(tree).create("m1", LIMITS)
     folder = tree.own / "rce-t0" / "m1"
-    assert cell.join == (str(folder / "cgroup.procs"),)
+    assert control_group.join == (str(folder / "cgroup.procs"),)
     assert text(folder, "memory.max") == str(64 * MB)
     assert text(folder, "memory.swap.max") == "0"
     assert text(folder, "memory.oom.group") == "0\n", "the kernel kills one process, not the container"
     assert text(folder, "pids.max") == "32"
     assert text(folder, "cpu.max") == "50000 100000"
     assert text(folder, "cpu.weight") == "200"
-    assert cell.rlimits == {}
+    assert control_group.rlimits == {}
     assert text(tree.own, "cgroup.subtree_control").split() == ["memory", "pids", "cpu", "io"]
 
 
 def test_no_limit_is_written_as_such(tree: Tree2) -> None:
-    cell = limiter(tree).create("m1", LIMITS)
-    cell.apply(Limits())
+    control_group = limiter(tree).create("m1", LIMITS)
+    control_group.apply(Limits())
     folder = tree.own / "rce-t0" / "m1"
     assert [text(folder, name) for name in ("memory.max", "memory.swap.max", "pids.max", "cpu.max")] == [
         "max",
@@ -71,56 +71,56 @@ def test_a_program_that_made_room_before_works_beside_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tree = Tree2(tmp_path, monkeypatch, controllers=ALL, own="system.slice/rce.service/rce-engine")
-    cell = limiter(tree).create("m1", LIMITS)
-    assert cell.join == (str(tree.own.parent / "rce-t0" / "m1" / "cgroup.procs"),)
+    control_group = limiter(tree).create("m1", LIMITS)
+    assert control_group.join == (str(tree.own.parent / "rce-t0" / "m1" / "cgroup.procs"),)
 
 
 def test_usage_and_troubles_are_read(tree: Tree2) -> None:
-    cell = limiter(tree).create("m1", LIMITS)
-    usage = cell.usage()
+    control_group = limiter(tree).create("m1", LIMITS)
+    usage = control_group.usage()
     assert (usage.cpu_s, usage.throttled_s) == (2.5, 0.75)
     assert usage.memory == 31457280 - 4194304, "files that are only cached do not count"
     assert usage.memory_peak == 41943040
     assert (usage.io_read, usage.io_written) == (4097, 8194)
-    assert cell.troubles() == Troubles(oom_kills=2, refused_forks=7)
+    assert control_group.troubles() == Troubles(oom_kills=2, refused_forks=7)
 
 
 def test_memory_is_not_limited_to_less_than_is_needed(tree: Tree2) -> None:
-    cell = limiter(tree).create("m1", LIMITS)
+    control_group = limiter(tree).create("m1", LIMITS)
     with pytest.raises(LimitError, match=r"cannot be limited to 20 MB: it needs 24 MB now; stop some of its"):
-        cell.apply(LIMITS._replace(memory=20 * MB))
-    assert cell.limits == LIMITS
+        control_group.apply(LIMITS._replace(memory=20 * MB))
+    assert control_group.limits == LIMITS
     assert text(tree.own / "rce-t0" / "m1", "memory.max") == str(64 * MB)
-    cell.apply(LIMITS._replace(memory=25 * MB))
+    control_group.apply(LIMITS._replace(memory=25 * MB))
     assert text(tree.own / "rce-t0" / "m1", "memory.max") == str(25 * MB)
 
 
 def test_a_refused_limit_leaves_the_old_ones(tree: Tree2) -> None:
-    cell = limiter(tree).create("m1", LIMITS)
+    control_group = limiter(tree).create("m1", LIMITS)
     folder = tree.own / "rce-t0" / "m1"
     (folder / "cpu.weight").unlink()
     with pytest.raises(LimitError, match=r"the kernel refuses its limits: .*cpu.weight"):
-        cell.apply(LIMITS._replace(cpu=1.0))
+        control_group.apply(LIMITS._replace(cpu=1.0))
     assert text(folder, "cpu.max") == "50000 100000"
 
 
 def test_the_kernel_kills(tree: Tree2) -> None:
-    cell = limiter(tree).create("m1", LIMITS)
+    control_group = limiter(tree).create("m1", LIMITS)
     folder = tree.own / "rce-t0" / "m1"
-    cell.kill()
+    control_group.kill()
     assert text(folder, "cgroup.kill") == "", "nothing to kill"
     (folder / "cgroup.procs").write_text(f"{os.getpid()}\n")
-    cell.kill()
+    control_group.kill()
     assert text(folder, "cgroup.kill") == "", "never this program itself"
 
 
 def test_a_cell_is_removed_with_what_is_below_it(tree: Tree2) -> None:
     made = limiter(tree)
-    cell = made.create("m1", LIMITS)
+    control_group = made.create("m1", LIMITS)
     tree.make(tree.own / "rce-t0" / "m1" / "inner")
-    cell.remove()
+    control_group.remove()
     assert not (tree.own / "rce-t0" / "m1").exists()
-    cell.remove()
+    control_group.remove()
     made.close()
     assert not (tree.own / "rce-t0").exists()
 
@@ -128,19 +128,20 @@ def test_a_cell_is_removed_with_what_is_below_it(tree: Tree2) -> None:
 def test_a_cell_with_a_process_is_not_removed(tree: Tree2, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rce_container.limits.cgroup._REMOVE_TIMEOUT_S", 0.0)
     made = limiter(tree)
-    cell = made.create("m1", LIMITS)
+    control_group = made.create("m1", LIMITS)
     (tree.own / "rce-t0" / "m1" / "cgroup.procs").write_text("1\n")
     with pytest.raises(LimitError, match="cannot be removed"):
-        cell.remove()
+        control_group.remove()
     made.close()
     assert (tree.own / "rce-t0").is_dir()
 
 
-def test_the_next_manager_adopts_and_sweeps_wherever_it_is_started(tree: Tree2) -> None:
+def test_next_manager_adopts_and_sweeps_from_anywhere(tree: Tree2) -> None:
+    """The next manager adopts and sweeps wherever it is started."""
     first = limiter(tree)
     first.sweep(())
-    for mark in ("m1", "m2"):
-        first.create(mark, LIMITS)
+    for incarnation_id in ("m1", "m2"):
+        first.create(incarnation_id, LIMITS)
     tree.make(tree.own / "rce-other")
     tree.make(tree.own / "rce-other" / "m3")
     before = tree.own
@@ -160,20 +161,20 @@ def test_the_next_manager_adopts_and_sweeps_wherever_it_is_started(tree: Tree2) 
 
 
 def test_a_container_without_a_cgroup_cannot_be_resized(tree: Tree2) -> None:
-    cell = limiter(tree).adopt("unknown")
-    assert (cell.join, cell.pids()) == ((), [])
+    control_group = limiter(tree).adopt("unknown")
+    assert (control_group.join, control_group.pids()) == ((), [])
     with pytest.raises(LimitError, match="destroy it and create it again"):
-        cell.apply(LIMITS)
-    cell.kill()
-    cell.remove()
+        control_group.apply(LIMITS)
+    control_group.kill()
+    control_group.remove()
 
 
 def test_the_task_set_s_folder_is_there_while_it_has_containers(tree: Tree2) -> None:
     made = limiter(tree)
-    cells = [made.create(mark, LIMITS) for mark in ("m1", "m2")]
-    for cell in cells:
+    control_groups = [made.create(incarnation_id, LIMITS) for incarnation_id in ("m1", "m2")]
+    for control_group in control_groups:
         assert (tree.own / "rce-t0").is_dir()
-        cell.remove()
+        control_group.remove()
     assert not (tree.own / "rce-t0").exists()
     made.create("m3", LIMITS)
     assert text(tree.own / "rce-t0" / "m3", "pids.max") == "32"
@@ -181,7 +182,8 @@ def test_the_task_set_s_folder_is_there_while_it_has_containers(tree: Tree2) -> 
 
 def test_a_folder_that_vanishes_meanwhile_is_made_again(tree: Tree2, monkeypatch: pytest.MonkeyPatch) -> None:
     made = limiter(tree)
-    make, spoiled = tree.make, []
+    make = tree.make
+    spoiled: list[Path] = []
 
     def spoil(folder: Path) -> None:
         if folder.name == "m1" and not spoiled:
@@ -201,9 +203,9 @@ def test_missing_controllers_are_said_and_replaced(tmp_path: Path, monkeypatch: 
     made = limiter(tree)
     assert made.missing == {"memory", "io"}
     assert made.detail.startswith("of containers' io, memory no limit holds")
-    cell = made.create("m1", LIMITS)
-    assert cell.rlimits == {resource.RLIMIT_DATA: 64 * MB}
-    assert cell.usage().memory is None
+    control_group = made.create("m1", LIMITS)
+    assert control_group.rlimits == {resource.RLIMIT_DATA: 64 * MB}
+    assert control_group.usage().memory is None
 
 
 @pytest.mark.parametrize("controllers", ["", "cpuset hugetlb"])
@@ -218,9 +220,8 @@ def test_a_cgroup_without_controllers_is_refused(
     assert "no controllers" in chosen.detail
 
 
-def test_a_machine_with_all_controllers_in_the_first_version_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_machine_with_cgroup1_controllers_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine with all controllers in the first version says so."""
     tree = Tree2(tmp_path, monkeypatch, controllers="", own="user.slice", of_root="hugetlb")
     with pytest.raises(LimitsUnavailableError, match="all controllers belong to version 1"):
         limiter(tree)
@@ -255,6 +256,7 @@ def test_the_root_needs_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert int(text(tree.root / "rce-t0", "cpu.weight")) == min(10_000, 400 * (os.cpu_count() or 1))
 
 
-def test_fractions_of_a_period_are_at_least_what_the_kernel_takes(tree: Tree2) -> None:
+def test_cpu_quota_is_at_least_the_kernels_minimum(tree: Tree2) -> None:
+    """Fractions of a period are at least what the kernel takes."""
     limiter(tree).create("m1", Limits(cpu=0.001))
-    assert Cell2([tree.own / "rce-t0" / "m1"]).limits.cpu == 0.01
+    assert ControlGroupV2([tree.own / "rce-t0" / "m1"]).limits.cpu == 0.01

@@ -8,12 +8,12 @@ from types import MappingProxyType
 
 import pytest
 
-from rce.control.model import Resources
+from rce.model.specs import Resources
 from rce_container.exceptions import LimitError
-from rce_container.limits import Cell, CellUsage, Limits, RlimitLimiter, limits_of
+from rce_container.limits import ControlGroup, ControlGroupUsage, Limits, RlimitLimiter, limits_of
 from rce_container.limits.base import Troubles, in_megabytes
 from rce_container.limits.cgroup1 import parse_io
-from rce_container.limits.warden import Warden
+from rce_container.limits.enforcer import LimitEnforcer
 from rce_container.settings import ContainerSettings
 
 MB = 1 << 20
@@ -44,22 +44,23 @@ def test_io_is_summed_over_disks() -> None:
 
 
 def test_without_cgroups_each_process_limits_itself() -> None:
-    cell = RlimitLimiter("no cgroups").create("m", Limits(1.0, 64 * MB, 32, 100))
-    assert cell.rlimits == {resource.RLIMIT_DATA: 64 * MB, resource.RLIMIT_NPROC: 32}
-    assert (cell.join, cell.usage()) == ((), CellUsage())
-    cell.apply(Limits(1.0, 64 * MB, 32, 100))
+    control_group = RlimitLimiter("no cgroups").create("m", Limits(1.0, 64 * MB, 32, 100))
+    assert control_group.rlimits == {resource.RLIMIT_DATA: 64 * MB, resource.RLIMIT_NPROC: 32}
+    assert (control_group.join, control_group.usage()) == ((), ControlGroupUsage())
+    control_group.apply(Limits(1.0, 64 * MB, 32, 100))
     with pytest.raises(LimitError, match="destroy it and create it again"):
-        cell.apply(Limits(1.0, 65 * MB, 32, 100))
-    assert cell.limits.memory == 64 * MB
+        control_group.apply(Limits(1.0, 65 * MB, 32, 100))
+    assert control_group.limits.memory == 64 * MB
 
 
-def test_an_adopted_container_without_cgroups_has_the_limits_that_are_desired() -> None:
-    cell = RlimitLimiter().adopt("m")
-    cell.apply(Limits(0.0, 64 * MB, 32, 100))
-    assert cell.limits.memory == 64 * MB
+def test_adopted_container_gets_desired_limits_sans_cgroup() -> None:
+    """An adopted container without cgroups has the limits that are desired."""
+    control_group = RlimitLimiter().adopt("m")
+    control_group.apply(Limits(0.0, 64 * MB, 32, 100))
+    assert control_group.limits.memory == 64 * MB
 
 
-class PaperCell(Cell):
+class PaperCell(ControlGroup):
     """A cell on which a test plays."""
 
     join = ()
@@ -76,8 +77,8 @@ class PaperCell(Cell):
             raise LimitError(self.refusal)
         self.limits = limits
 
-    def usage(self) -> CellUsage:
-        return CellUsage(memory_peak=self.peak)
+    def usage(self) -> ControlGroupUsage:
+        return ControlGroupUsage(memory_peak=self.peak)
 
     def troubles(self) -> Troubles:
         return self.struck
@@ -91,7 +92,7 @@ class PaperCell(Cell):
 
 
 @pytest.fixture
-def cell() -> PaperCell:
+def control_group() -> PaperCell:
     return PaperCell()
 
 
@@ -100,50 +101,51 @@ OUT_OF_MEMORY = (
 )
 
 
-def test_a_kill_is_claimed_once(cell: PaperCell) -> None:
-    warden = Warden("box", cell, SETTINGS)
-    assert warden.claim() == ""
-    cell.struck = Troubles(oom_kills=2)
-    assert [warden.claim() for _ in range(3)] == [OUT_OF_MEMORY, OUT_OF_MEMORY, ""]
-    assert [warden.review() for _ in range(3)] == [[], [], []]
+def test_a_kill_is_claimed_once(control_group: PaperCell) -> None:
+    enforcer = LimitEnforcer("box", control_group, SETTINGS)
+    assert enforcer.claim() == ""
+    control_group.struck = Troubles(oom_kills=2)
+    assert [enforcer.claim() for _ in range(3)] == [OUT_OF_MEMORY, OUT_OF_MEMORY, ""]
+    assert [enforcer.review() for _ in range(3)] == [[], [], []]
 
 
-def test_kills_before_an_adoption_are_nobodys(cell: PaperCell) -> None:
-    cell.struck = Troubles(oom_kills=2)
-    assert Warden("box", cell, SETTINGS).claim() == ""
+def test_kills_before_an_adoption_are_nobodys(control_group: PaperCell) -> None:
+    control_group.struck = Troubles(oom_kills=2)
+    assert LimitEnforcer("box", control_group, SETTINGS).claim() == ""
 
 
-def test_a_kill_that_nobody_claims_is_told_after_a_while(cell: PaperCell) -> None:
-    warden = Warden("box", cell, SETTINGS)
-    cell.struck = Troubles(oom_kills=1)
-    assert warden.review() == [], "the node's end may be reported yet"
-    assert warden.review() == [f"a process that a node started was killed: {OUT_OF_MEMORY}"]
-    assert warden.review() == []
-    assert warden.claim() == ""
+def test_a_kill_that_nobody_claims_is_told_after_a_while(control_group: PaperCell) -> None:
+    enforcer = LimitEnforcer("box", control_group, SETTINGS)
+    control_group.struck = Troubles(oom_kills=1)
+    assert enforcer.review() == [], "the node's end may be reported yet"
+    assert enforcer.review() == [f"a process that a node started was killed: {OUT_OF_MEMORY}"]
+    assert enforcer.review() == []
+    assert enforcer.claim() == ""
 
 
-def test_a_claim_in_the_meantime_is_not_told_twice(cell: PaperCell) -> None:
-    warden = Warden("box", cell, SETTINGS)
-    cell.struck = Troubles(oom_kills=1)
-    warden.review()
-    assert warden.claim() == OUT_OF_MEMORY
-    assert warden.review() == []
+def test_a_claim_in_the_meantime_is_not_told_twice(control_group: PaperCell) -> None:
+    enforcer = LimitEnforcer("box", control_group, SETTINGS)
+    control_group.struck = Troubles(oom_kills=1)
+    enforcer.review()
+    assert enforcer.claim() == OUT_OF_MEMORY
+    assert enforcer.review() == []
 
 
-def test_memory_of_the_machine_is_told_from_that_of_the_container(cell: PaperCell) -> None:
-    cell.peak = 10 * MB
-    warden = Warden("box", cell, SETTINGS)
-    cell.struck = Troubles(oom_kills=3)
-    assert warden.claim_all() == "out of memory: its machine has no more"
-    assert warden.claim() == ""
+def test_memory_of_machine_and_container_differ(control_group: PaperCell) -> None:
+    """Memory of the machine is told from that of the container."""
+    control_group.peak = 10 * MB
+    enforcer = LimitEnforcer("box", control_group, SETTINGS)
+    control_group.struck = Troubles(oom_kills=3)
+    assert enforcer.claim_all() == "out of memory: its machine has no more"
+    assert enforcer.claim() == ""
 
 
-def test_refused_processes_are_told_once_for_each_spell(cell: PaperCell) -> None:
-    warden = Warden("box", cell, SETTINGS)
+def test_refused_processes_are_told_once_for_each_spell(control_group: PaperCell) -> None:
+    enforcer = LimitEnforcer("box", control_group, SETTINGS)
     texts = []
     for count in (0, 5, 9, 9, 10):
-        cell.struck = Troubles(refused_forks=count)
-        texts.append(warden.review())
+        control_group.struck = Troubles(refused_forks=count)
+        texts.append(enforcer.review())
     text = (
         "its limit of 50 processes and threads is reached, so it cannot start more; "
         "ask for more slots with `rce resize box --size 2`"
@@ -151,20 +153,20 @@ def test_refused_processes_are_told_once_for_each_spell(cell: PaperCell) -> None
     assert texts == [[], [text], [], [], [text]]
 
 
-async def test_limits_that_cannot_be_are_told_once(cell: PaperCell) -> None:
-    warden = Warden("box", cell, SETTINGS)
-    cell.refusal = "it is too full"
-    assert await warden.apply(Resources()) == "it is too full; the limits stay as they were"
-    assert await warden.apply(Resources()) == ""
-    assert cell.limits.memory == 64 * MB
-    cell.refusal = ""
-    assert await warden.apply(Resources()) == ""
-    assert cell.limits == limits_of(Resources(), SETTINGS)
+async def test_limits_that_cannot_be_are_told_once(control_group: PaperCell) -> None:
+    enforcer = LimitEnforcer("box", control_group, SETTINGS)
+    control_group.refusal = "it is too full"
+    assert await enforcer.apply(Resources()) == "it is too full; the limits stay as they were"
+    assert await enforcer.apply(Resources()) == ""
+    assert control_group.limits.memory == 64 * MB
+    control_group.refusal = ""
+    assert await enforcer.apply(Resources()) == ""
+    assert control_group.limits == limits_of(Resources(), SETTINGS)
 
 
-async def test_the_newest_limits_win(cell: PaperCell) -> None:
-    warden = Warden("box", cell, SETTINGS)
+async def test_the_newest_limits_win(control_group: PaperCell) -> None:
+    enforcer = LimitEnforcer("box", control_group, SETTINGS)
     async with asyncio.TaskGroup() as tasks:
         for size in (1, 2, 3):
-            tasks.create_task(warden.apply(Resources(size=size)))
-    assert cell.limits.memory == 300 * MB
+            tasks.create_task(enforcer.apply(Resources(size=size)))
+    assert control_group.limits.memory == 300 * MB

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from rce.control.logs import LogStream, LogWish
+from rce.control.logs import LogQuery, LogStream
 from rce.control.messages import ReadLog
-from rce_container.archive import MAX_LIVES, LogArchive
+from rce_container.archive import MAX_INCARNATIONS, LogArchive
 from rce_container.environment.logs.files import ENVIRONMENT_LOG, ROSOUT_LOG, LogWriter
 from rce_container.environment.logs.node_log import NodeLog
 from rce_container.exceptions import StateError
@@ -25,12 +25,12 @@ def archive(tmp_path: Path) -> LogArchive:
     return LogArchive(tmp_path / "logs", days=3.0, space=10_000)
 
 
-def live(archive: LogArchive, mark: str, text: str = "hello", id_: str = BOX) -> None:
+def live(archive: LogArchive, incarnation_id: str, text: str = "hello", id_: str = BOX) -> None:
     """Begin a life and write its logs."""
-    folder = archive.begin(id_, mark, 1.0)
+    folder = archive.begin(id_, incarnation_id, 1.0)
     for name in (ENVIRONMENT_LOG, ROSOUT_LOG):
         writer = LogWriter(folder, name)
-        writer.write(f"{name} of {mark}\n".encode())
+        writer.write(f"{name} of {incarnation_id}\n".encode())
         writer.close()
     log = NodeLog(folder, "node")
     log.stdout(f"{text}\n".encode())
@@ -38,13 +38,13 @@ def live(archive: LogArchive, mark: str, text: str = "hello", id_: str = BOX) ->
     log.close()
 
 
-def read(archive: LogArchive, node: str = "node", living: str = "", id_: str = BOX, **wish: object) -> str:
-    message = ReadLog(request=1, id=id_, node=node, wish=LogWish(**wish))  # type: ignore[arg-type]
+def read(archive: LogArchive, node: str = "node", living: str = "", id_: str = BOX, **query: object) -> str:
+    message = ReadLog(request=1, id=id_, node=node, query=LogQuery(**query))  # type: ignore[arg-type]  # any of its fields
     return read_for(archive, message, living).text
 
 
-def marks(archive: LogArchive, id_: str = BOX) -> list[str]:
-    return [kept.life.mark for kept in archive.ended(id_)]
+def incarnation_ids(archive: LogArchive, id_: str = BOX) -> list[str]:
+    return [kept.record.incarnation_id for kept in archive.ended(id_)]
 
 
 def test_a_life_is_read_while_it_lives_and_after_it(archive: LogArchive) -> None:
@@ -56,14 +56,14 @@ def test_a_life_is_read_while_it_lives_and_after_it(archive: LogArchive) -> None
     archive.end(BOX, "one", "something else", 11.0)
     assert read(archive) == "hello\n-- ended: exit code 3 --\n"
     chunk = read_for(archive, ReadLog(request=1, id=BOX, node="node"), "")
-    assert (chunk.life, chunk.ended, chunk.reason) == ("one", 10.0, "destroyed by its user")
+    assert (chunk.incarnation, chunk.ended, chunk.reason) == ("one", 10.0, "destroyed by its user")
     live(archive, "two", "again")
     assert read(archive, living="two", streams=(LogStream.STDOUT,)) == "again\n"
     assert read(archive, living="two", previous=True).startswith("hello")
-    assert read(archive, living="two", life="one").startswith("hello")
-    assert read(archive, living="two", life="two").startswith("again")
+    assert read(archive, living="two", incarnation="one").startswith("hello")
+    assert read(archive, living="two", incarnation="two").startswith("again")
     with pytest.raises(FileNotFoundError, match="not kept any more"):
-        read(archive, living="two", life="three")
+        read(archive, living="two", incarnation="three")
 
 
 def test_the_environment_has_two_logs(archive: LogArchive) -> None:
@@ -75,9 +75,9 @@ def test_the_environment_has_two_logs(archive: LogArchive) -> None:
 def test_nobody_reads_what_is_another_ones(archive: LogArchive) -> None:
     live(archive, "one", id_="bob/box")
     archive.end("bob/box", "one", "", 10.0)
-    for wish in ({}, {"life": "one"}, {"previous": True}):
+    for query in ({}, {"incarnation": "one"}, {"previous": True}):
         with pytest.raises(FileNotFoundError):
-            read(archive, **wish)
+            read(archive, **query)
     for node in ("../one/node", "_environment", "", "*"):
         with pytest.raises(FileNotFoundError):
             read(archive, node)
@@ -86,19 +86,20 @@ def test_nobody_reads_what_is_another_ones(archive: LogArchive) -> None:
     assert read(archive, id_="bob/box", since=1.0)
 
 
-def test_what_still_ends_of_a_user_who_was_removed_is_not_another_ones(archive: LogArchive) -> None:
+def test_ending_parts_of_removed_user_stay_theirs(archive: LogArchive) -> None:
+    """What still ends of a user who was removed is not another ones."""
     live(archive, "one")
     assert read(archive, living="one", since=1.0)
-    for wish in ({}, {"life": "one"}):
+    for query in ({}, {"incarnation": "one"}):
         with pytest.raises(FileNotFoundError):
-            read(archive, living="one", since=1.5, **wish)
+            read(archive, living="one", since=1.5, **query)
 
 
 def test_the_last_life_that_ended_counts(archive: LogArchive) -> None:
-    for number, mark in enumerate(("b", "a", "c")):
-        live(archive, mark, mark)
-        archive.end(BOX, mark, "", 10.0 + number)
-    assert marks(archive) == ["c", "a", "b"]
+    for number, incarnation_id in enumerate(("b", "a", "c")):
+        live(archive, incarnation_id, incarnation_id)
+        archive.end(BOX, incarnation_id, "", 10.0 + number)
+    assert incarnation_ids(archive) == ["c", "a", "b"]
     assert read(archive).startswith("c\n")
 
 
@@ -109,11 +110,11 @@ def test_old_lives_are_removed_with_all_that_was_theirs(archive: LogArchive, tmp
     live(archive, "new")
     archive.end(BOX, "new", "", 10.0 + 2 * DAY)
     archive.prune(10.0 + 3 * DAY)
-    assert marks(archive, "bob/box") == ["old"]
+    assert incarnation_ids(archive, "bob/box") == ["old"]
     archive.prune(11.0 + 3 * DAY)
-    assert marks(archive, "bob/box") == []
+    assert incarnation_ids(archive, "bob/box") == []
     assert not (tmp_path / "logs" / "bob").exists()
-    assert marks(archive) == ["new"]
+    assert incarnation_ids(archive) == ["new"]
     assert archive.find("alive") is not None
 
 
@@ -123,16 +124,17 @@ def test_the_oldest_go_when_there_is_too_much(archive: LogArchive) -> None:
         live(archive, f"m{number}", "x" * 3000)
         archive.end(BOX, f"m{number}", "", 10.0 + number)
     archive.prune(20.0)
-    assert marks(archive) == ["m3", "m2", "m1"]
+    assert incarnation_ids(archive) == ["m3", "m2", "m1"]
     assert archive.find("alive") is not None, "what lives does not count"
 
 
-def test_a_container_that_dies_again_and_again_does_not_fill_the_archive(archive: LogArchive) -> None:
-    for number in range(MAX_LIVES + 5):
+def test_dying_container_does_not_fill_the_archive(archive: LogArchive) -> None:
+    """A container that dies again and again does not fill the archive."""
+    for number in range(MAX_INCARNATIONS + 5):
         live(archive, f"m{number}")
         archive.end(BOX, f"m{number}", "", 10.0 + number)
     archive.prune(20.0)
-    assert marks(archive) == [f"m{number}" for number in reversed(range(5, MAX_LIVES + 5))]
+    assert incarnation_ids(archive) == [f"m{number}" for number in reversed(range(5, MAX_INCARNATIONS + 5))]
 
 
 def test_the_end_of_what_nobody_saw_end_is_noted_later(archive: LogArchive) -> None:
@@ -140,11 +142,11 @@ def test_the_end_of_what_nobody_saw_end_is_noted_later(archive: LogArchive) -> N
     live(archive, "gone")
     archive.settle({"there"}, 10.0)
     (kept,) = archive.ended(BOX)
-    assert (kept.life.mark, kept.life.ended) == ("gone", 10.0)
-    assert kept.life.reason == "no manager saw it end; its last words: _environment of gone"
+    assert (kept.record.incarnation_id, kept.record.ended) == ("gone", 10.0)
+    assert kept.record.reason == "no manager saw it end; its last words: _environment of gone"
     archive.settle_one("there", 11.0)
     archive.settle_one("unknown", 11.0)
-    assert marks(archive) == ["there", "gone"]
+    assert incarnation_ids(archive) == ["there", "gone"]
 
 
 def test_a_disk_that_cannot_be_written_is_told(tmp_path: Path) -> None:
@@ -158,7 +160,7 @@ def test_a_records_text_is_not_believed(archive: LogArchive, tmp_path: Path) -> 
     record = tmp_path / "logs" / BOX / "one.json"
     for text in ("", "{}", '{"id": "anna/box", "mark": "two", "began": 1, "ended": 2}'):
         record.write_text(text)
-        assert marks(archive) == []
+        assert incarnation_ids(archive) == []
 
 
 def test_what_vanishes_while_it_is_looked_at_is_passed_over(
@@ -188,7 +190,7 @@ def test_the_logs_of_a_state_folder_outlive_the_container(tmp_path: Path) -> Non
         (folder.logs / "node.000000000000.log").write_bytes(b"ohello\n")
         assert [one.logs for one in state.existing()] == [folder.logs]
         folder.remove()
-        state.archive.end(BOX, folder.mark, "destroyed", 10.0)
+        state.archive.end(BOX, folder.incarnation_id, "destroyed", 10.0)
     with StateFolder(tmp_path / "state", tmp_path / "run") as state:
         assert read(state.archive) == "hello\n"
         assert (tmp_path / "state" / "logs").stat().st_mode & 0o077 == 0

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.control.messages import Fault, Gone, Status
-from rce.control.model import EndpointKind, EndpointSpec, EndpointState, EndpointStatus, LinkAddress
+from rce.control.messages import Fault, Gone, PatchStatus, SpecWanted, Status
+from rce.control.model import (
+    EndpointKind,
+    EndpointSpec,
+    EndpointState,
+    EndpointStatus,
+    LinkAddress,
+    SpecPatch,
+    StatusPatch,
+)
+from rce.model.specs import InterfaceSpec
 from rce_container import core, events
 from rce_container.core import ManagerCore
-from rce_container.life import NEXT, Phase
+from rce_container.life import CONTAINER_LIFE, Phase
+
+T = TypeVar("T")
 
 ID = "user/box"
 ADDRESS = LinkAddress(machine="m", unix="/run/x")
@@ -24,15 +37,15 @@ def status(revision: int = 1, id_: str = ID) -> EndpointStatus:
     return EndpointStatus(id=id_, revision=revision, state=EndpointState.RUNNING)
 
 
-def running(mark: str = "one", revision: int = 1) -> ManagerCore:
+def running(incarnation_id: str = "one", revision: int = 1) -> ManagerCore:
     manager = ManagerCore()
     manager.handle(events.Put(spec(revision)), 0.0)
-    manager.handle(events.Made(ID, mark, ADDRESS), 0.0)
-    manager.handle(events.Reported(ID, mark, status(revision)), 0.0)
+    manager.handle(events.Made(ID, incarnation_id, ADDRESS), 0.0)
+    manager.handle(events.Reported(ID, incarnation_id, status(revision)), 0.0)
     return manager
 
 
-def told(out: list[events.Instruction], kind: type) -> list:
+def told(out: list[events.Instruction], kind: type[T]) -> list[T]:
     return [one.message for one in out if isinstance(one, events.Tell) and isinstance(one.message, kind)]
 
 
@@ -78,15 +91,16 @@ def test_put_while_it_stops_starts_it_anew_and_never_says_gone() -> None:
     assert out == [events.Start(ID)]
 
 
-def test_an_unexpected_end_is_told_and_mended_with_growing_pauses() -> None:
+def test_unexpected_end_is_repaired_with_growing_pauses() -> None:
+    """An unexpected end is told and mended with growing pauses."""
     manager = running()
     pauses = []
     faults = []
-    for number, mark in enumerate(("one", "two", "three", "four")):
-        out = manager.handle(events.Lost(ID, mark, "killed"), number + 1.0)
+    for number, incarnation_id in enumerate(("one", "two", "three", "four")):
+        out = manager.handle(events.Lost(ID, incarnation_id, "killed"), number + 1.0)
         faults += told(out, Fault)
         assert told(out, Status)[-1].status.state is EndpointState.FAILED
-        out = manager.handle(events.Removed(ID, mark), number + 1.0)
+        out = manager.handle(events.Removed(ID, incarnation_id), number + 1.0)
         (wait,) = (one for one in out if isinstance(one, events.Wait))
         pauses.append(wait.delay)
         assert manager.handle(events.Due(ID, wait.ticket - 1), 2.0) == []
@@ -101,9 +115,9 @@ def test_an_unexpected_end_is_told_and_mended_with_growing_pauses() -> None:
 
 def test_a_stable_container_is_mended_at_once_again() -> None:
     manager = running()
-    for mark, now in (("one", 1.0), ("two", 2.0 + core.STABLE_S)):
-        manager.handle(events.Lost(ID, mark, "killed"), now)
-        out = manager.handle(events.Removed(ID, mark), now)
+    for incarnation_id, now in (("one", 1.0), ("two", 2.0 + core.STABLE_S)):
+        manager.handle(events.Lost(ID, incarnation_id, "killed"), now)
+        out = manager.handle(events.Removed(ID, incarnation_id), now)
         (wait,) = (one for one in out if isinstance(one, events.Wait))
         assert wait.delay == 0.0
         manager.handle(events.Due(ID, wait.ticket), now)
@@ -175,7 +189,7 @@ def test_every_phase_can_end() -> None:
     for phase in Phase:
         reached, edge = {phase}, [phase]
         while edge:
-            new = {after for after in NEXT[edge.pop()].values() if after not in reached}
+            new = {after for after in CONTAINER_LIFE.table[edge.pop()].values() if after not in reached}
             reached |= new
             edge += new
         assert Phase.GONE in reached
@@ -232,3 +246,62 @@ def test_any_order_of_events_keeps_the_invariants(  # noqa: C901, PLR0912 - a sm
             elif isinstance(one, events.Wait):
                 tickets.append(one.ticket)
         manager.validate()
+
+
+def patch(base: int, revision: int, **parts: object) -> SpecPatch:
+    return SpecPatch(id=ID, base=base, revision=revision, **parts)  # type: ignore[arg-type]  # any of its fields
+
+
+INTERFACE = InterfaceSpec(tag="i", type="PublisherInterface", message_type="p/T", addr="/i")
+
+
+def test_a_patch_goes_on_to_the_environment() -> None:
+    manager = running(revision=5)
+    one = patch(5, 6, interfaces=(INTERFACE,))
+    assert manager.handle(events.Patch(one), 1.0) == [events.ApplyPatch(ID, "one", one)]
+    assert manager.handle(events.Patch(one), 1.0) == [], "it is known already"
+    out = manager.handle(events.Patch(patch(7, 8)), 1.0)
+    assert told(out, SpecWanted) == [SpecWanted(id=ID)]
+    assert manager.handle(events.Put(spec(8)), 1.0) == [events.Apply(ID, "one", spec(8))]
+
+
+def test_a_patch_of_what_is_not_there_asks_for_the_whole() -> None:
+    out = ManagerCore().handle(events.Patch(patch(1, 2)), 0.0)
+    assert out == [events.Tell(SpecWanted(id=ID))]
+    manager = ManagerCore()
+    manager.handle(events.Adopted("one", status(4), ADDRESS), 0.0)
+    assert told(manager.handle(events.Patch(patch(4, 5)), 1.0), SpecWanted)
+
+
+def test_a_life_that_begins_gets_the_whole_with_all_patches() -> None:
+    manager = ManagerCore()
+    manager.handle(events.Put(spec(1)), 0.0)
+    assert manager.handle(events.Patch(patch(1, 2, interfaces=(INTERFACE,))), 0.0) == []
+    out = manager.handle(events.Made(ID, "one", ADDRESS), 0.0)
+    assert out[0] == events.Apply(ID, "one", msgspec.structs.replace(spec(2), interfaces=(INTERFACE,)))
+
+
+def test_reports_are_numbered_and_changes_are_told_as_changes() -> None:
+    manager = running()
+    before = manager.statuses[0].number
+    said = msgspec.structs.replace(status(2), interfaces={"i": True}, connections=(7,))
+    out = manager.handle(events.Changed(ID, "one", StatusPatch(status=said)), 1.0)
+    (change,) = told(out, PatchStatus)
+    assert change.patch.status.number == before + 1
+    assert (change.patch.status.incarnation, change.patch.status.address) == ("one", ADDRESS)
+    assert change.patch.status.interfaces == {"i": True}
+    assert manager.statuses[0].interfaces == {"i": True}
+    assert manager.statuses[0].number == before + 1
+    (whole,) = told(manager.handle(events.StatusWanted(ID), 1.0), Status)
+    assert (whole.status.number, whole.status.connections) == (before + 2, (7,))
+    assert manager.handle(events.StatusWanted("user/none"), 1.0) == []
+
+
+def test_changes_before_a_report_or_of_another_life_are_ignored() -> None:
+    manager = ManagerCore()
+    manager.handle(events.Put(spec()), 0.0)
+    manager.handle(events.Made(ID, "one", ADDRESS), 0.0)
+    change = StatusPatch(status=msgspec.structs.replace(status(), interfaces={"i": True}))
+    assert manager.handle(events.Changed(ID, "one", change), 0.0) == []
+    manager = running()
+    assert manager.handle(events.Changed(ID, "two", change), 0.0) == []

@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, Unpack
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.parts import NodeLife
 
-from rce.control.model import NodeSpec, NodeState, NodeStatus, RestartPolicy
+from rce.control.model import NodeState, NodeStatus
+from rce.lifecycle import InvalidTransitionError
+from rce.model.specs import NodeSpec, RestartPolicy
 from rce_container.environment.nodes import events as e
-from rce_container.environment.nodes.core import BACKOFF_S, FIRST_BEAT_WITHIN_S, NodesCore
-from rce_container.environment.nodes.life import NEXT, WITH_PROCESS, Happening, after
+from rce_container.environment.nodes.core import FIRST_BEAT_WITHIN_S, NodesCore
+from rce_container.environment.nodes.life import NODE_LIFE, WITH_PROCESS, LifeEvent
 from rce_container.environment.nodes.order import StartOrder, levels, ready_to_end
 from rce_container.environment.nodes.record import LAST_CHANCE_S, WELL_S
 
 FAILED = "exit code 3"
 
 
-def spec(tag: str = "a", **options: Any) -> NodeSpec:
-    return NodeSpec(tag=tag, pkg="own", exe="x.py", **options)
+def spec(tag: str = "a", args: str = "", **life: Unpack[NodeLife]) -> NodeSpec:
+    return NodeSpec(tag=tag, pkg="own", exe="x.py", args=args, **life)
 
 
 class World:
@@ -33,7 +36,7 @@ class World:
         """Lives that have a process, by tag."""
         self.halting: dict[str, float] = {}
         self.done: set[str] = set()
-        """Nodes whose last life ended by itself with exit code 0."""
+        """Nodes whose last life ended with exit code 0."""
         self.desired: dict[str, NodeSpec] = {}
         self.told: list[str] = []
         self.notes: list[str] = []
@@ -96,7 +99,7 @@ class World:
             self.now = max(self.now, deadline)
             self.do(e.Tick())
         else:
-            raise AssertionError("ticks for ever")
+            raise AssertionError("ticks indefinitely")
         self.now = end
 
     def status(self, tag: str = "a") -> NodeStatus:
@@ -114,9 +117,7 @@ def test_a_node_is_started_registers_and_ends() -> None:
     world.register()
     assert world.status() == NodeStatus(tag="a", state=NodeState.RUNNING, pid=101)
     world.end(code=0)
-    assert world.status() == NodeStatus(
-        tag="a", state=NodeState.EXITED, exit_code=0, detail="ended by itself"
-    )
+    assert world.status() == NodeStatus(tag="a", state=NodeState.EXITED, exit_code=0, detail="ended")
     assert (world.told, world.notes) == ([], ["ended: exit code 0"])
     assert not world.core.is_degraded
 
@@ -151,7 +152,7 @@ def test_the_restart_policy(policy: RestartPolicy, code: int, again: bool) -> No
     status = world.status()
     assert (status.state, status.exit_code) == (NodeState.WAITING, code)
     assert status.detail.endswith("starts again after 0.5 s")
-    assert world.core.is_degraded is (code != 0), "a pause after a proper end is no failure"
+    assert world.core.is_degraded is (code != 0), "a pause after a proper end is not a failure"
     world.wait(0.4)
     assert not world.alive
     world.wait(0.1)
@@ -168,12 +169,12 @@ def test_pauses_grow_and_the_limit_ends_them() -> None:
         pauses.append(world.core.deadline - world.now)
         world.wait(pauses[-1])
     world.end()
-    assert pauses == [*BACKOFF_S, 30.0, 30.0]
+    assert pauses == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0, 30.0]
     status = world.status()
     assert (status.state, status.restarts, status.exit_code) == (NodeState.FAILED, 9, 3)
     assert status.detail == (
         "exit code 3; it was started again 9 times in a row, which is its limit: "
-        "to start it anew, remove it and add it again, or change it"
+        "to start it again, remove it and add it again, or change it"
     )
     assert world.told == [
         "node a failed: exit code 3; it is started again",
@@ -205,7 +206,8 @@ def test_a_node_that_ran_well_counts_anew() -> None:
     assert world.status().state is NodeState.FAILED
 
 
-def test_what_cannot_be_started_is_not_tried_again_if_that_would_not_help() -> None:
+def test_unstartable_node_is_not_retried_in_vain() -> None:
+    """What cannot be started is not tried again if that would not help."""
     world = World(spec(restart=RestartPolicy.ALWAYS))
     world.refuse()
     assert world.status().state is NodeState.FAILED
@@ -227,7 +229,8 @@ def test_a_changed_node_is_ended_and_started_anew() -> None:
     assert world.launched == ["a", "a"]
 
 
-def test_a_change_that_is_taken_back_while_it_ends_still_starts_it_anew() -> None:
+def test_change_taken_back_while_ending_restarts_node() -> None:
+    """A change that is taken back while it ends still starts it anew."""
     world = World(spec())
     world.desire(spec(args="new"))
     world.desire(spec())
@@ -328,7 +331,8 @@ def test_an_impossible_order_is_told_once_and_can_be_mended(specs: list[NodeSpec
     assert "a" in world.launched
 
 
-def test_nodes_end_in_the_reverse_of_their_order_and_together_where_there_is_none() -> None:
+def test_nodes_end_in_reverse_order() -> None:
+    """Nodes end in the reverse of their order and together where there is none."""
     world = World(spec("a"), spec("b", after=("a",)), spec("c", after=("a",)), spec("d", after=("b", "c")))
     for tag in "abcd":
         world.register(tag)
@@ -389,8 +393,9 @@ def test_what_is_not_at_fault_can_start_and_everything_can_end(specs: list[NodeS
 # Health
 
 
-def beating(**options: Any) -> World:
-    world = World(spec(heartbeat="/beat", heartbeat_timeout=2.0, **options))
+def beating(**life: Unpack[NodeLife]) -> World:
+    life["heartbeat"], life["heartbeat_timeout"] = "/beat", 2.0
+    world = World(spec(**life))
     world.register()
     world.do(e.Beat("a"))
     return world
@@ -509,11 +514,12 @@ def test_a_node_that_comes_back_soon_is_waited_for() -> None:
 
 
 def test_the_table_knows_every_state_and_leads_out_of_each() -> None:
-    assert set(NEXT) == set(NodeState)
+    assert set(NODE_LIFE.table) == set(NodeState)
     for state in NodeState:
-        with pytest.raises(ValueError, match=state.value):
-            after(state, next(one for one in Happening if one not in NEXT[state]))
-        assert NEXT[state]
+        impossible = next(one for one in LifeEvent if not NODE_LIFE.allows(state, one))
+        with pytest.raises(InvalidTransitionError, match=f"node is {state.value}"):
+            NODE_LIFE.advance(state, impossible)
+        assert NODE_LIFE.table[state]
     assert {state.value for state in WITH_PROCESS} == {"starting", "running", "stuck", "stopping"}
 
 
@@ -596,7 +602,8 @@ def test_the_limit_of_restarts_is_never_exceeded(steps: list[str], limit: int) -
             break
 
 
-def test_a_node_that_lacks_its_package_waits_and_one_that_runs_is_left_alone() -> None:
+def test_node_without_package_waits_running_one_stays() -> None:
+    """A node that lacks its package waits and one that runs is left alone."""
     world = World()
     world.do(e.Lack({"a": "waits for its package nav 1.0"}))
     world.desire(spec("a"), spec("b"), spec("c", after=("a",)))

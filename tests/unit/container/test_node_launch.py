@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from rce.control.model import NodeSpec
+from rce.model.specs import NodeSpec
 from rce.ros.packages import PackageIndex
-from rce_container.environment.bundles import Outfit
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.nodes import system
 from rce_container.environment.nodes.launch import NODE_MARK, prepare
 from rce_container.environment.nodes.node_life import describe_exit
+from rce_container.environment.user_packages import LaunchEnvironment
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def test_arguments_name_and_namespace(packages: PackageIndex) -> None:
         name="server",
         namespace="Robot1",
     )
-    launch = prepare(Outfit(spec, packages, {"HOME": "/h"}), "mark")
+    launch = prepare(LaunchEnvironment(spec, packages, {"HOME": "/h"}), "mark")
     folder = packages.find("maps").path
     assert launch.argv[:2] == [sys.executable, str(folder / "serve.py")]
     assert launch.argv[2:] == [
@@ -47,7 +47,7 @@ def test_arguments_name_and_namespace(packages: PackageIndex) -> None:
 
 
 def test_a_node_may_choose_its_name(packages: PackageIndex) -> None:
-    launch = prepare(Outfit(NodeSpec(tag="n", pkg="maps", exe="serve.py"), packages, {}), "mark")
+    launch = prepare(LaunchEnvironment(NodeSpec(tag="n", pkg="maps", exe="serve.py"), packages, {}), "mark")
     assert launch.ros_name == ""
     assert not any("__" in word for word in launch.argv)
 
@@ -64,7 +64,7 @@ def test_a_node_may_choose_its_name(packages: PackageIndex) -> None:
 )
 def test_faults_say_what_is_wrong(packages: PackageIndex, spec: NodeSpec, text: str) -> None:
     with pytest.raises(NodeError, match=text):
-        prepare(Outfit(spec, packages, {}), "mark")
+        prepare(LaunchEnvironment(spec, packages, {}), "mark")
 
 
 def test_a_node_of_a_ros_package_gets_the_machines_python(
@@ -78,10 +78,10 @@ def test_a_node_of_a_ros_package_gets_the_machines_python(
         (tmp_path / name / "scripts" / "node.py").touch(0o755)
     packages = PackageIndex([tmp_path])
     monkeypatch.setattr(system, "ROS_PREFIXES", tmp_path / "none")
-    real = prepare(Outfit(NodeSpec(tag="n", pkg="real", exe="node.py"), packages, environ), "mark")
+    real = prepare(LaunchEnvironment(NodeSpec(tag="n", pkg="real", exe="node.py"), packages, environ), "mark")
     assert real.argv == [str(tmp_path / "real" / "scripts" / "node.py")]
     assert real.env == {"PATH": "/usr/bin", "HOME": "/h", NODE_MARK: "mark"}
-    ours = prepare(Outfit(NodeSpec(tag="n", pkg="maps", exe="node.py"), packages, environ), "mark")
+    ours = prepare(LaunchEnvironment(NodeSpec(tag="n", pkg="maps", exe="node.py"), packages, environ), "mark")
     assert ours.env == {**environ, NODE_MARK: "mark"}
 
 
@@ -106,6 +106,6 @@ def test_exits_in_words() -> None:
 def test_no_node_takes_the_name_of_the_containers_own(packages: PackageIndex, namespace: str) -> None:
     spec = NodeSpec(tag="n", pkg="maps", exe="serve.py", name="rce_environment", namespace=namespace)
     with pytest.raises(NodeError, match="another name"):
-        prepare(Outfit(spec, packages, {}), "mark")
+        prepare(LaunchEnvironment(spec, packages, {}), "mark")
     elsewhere = NodeSpec(tag="n", pkg="maps", exe="serve.py", name="rce_environment", namespace="/robot")
-    assert prepare(Outfit(elsewhere, packages, {}), "mark").ros_name == "/robot/rce_environment"
+    assert prepare(LaunchEnvironment(elsewhere, packages, {}), "mark").ros_name == "/robot/rce_environment"

@@ -4,28 +4,29 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
-from typing import Any
+from typing import NoReturn
 
 import pytest
 
-from rce.control.model import NodeSpec, NodeState
+from rce.control.model import NodeState
+from rce.model.specs import NodeSpec
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.nodes import node_set
-from rce_container.environment.nodes.node_life import Workshop
+from rce_container.environment.nodes.node_life import NodeContext
 from rce_container.environment.nodes.node_set import NodeSet
 from rce_container.environment.nodes.reaper import Reaper
 
 
-def workshop(folder: Path, faults: list[str]) -> Workshop:
-    def outfit(_: NodeSpec) -> Any:
+def context(folder: Path, faults: list[str]) -> NodeContext:
+    def launch_environment(_: NodeSpec) -> NoReturn:
         raise NodeError("no package 'x'")
 
     async def why_killed() -> str:
         return ""
 
-    return Workshop(
+    return NodeContext(
         reaper=Reaper(),
-        outfit=outfit,
+        launch_environment=launch_environment,
         mark="mark",
         home=str(folder),
         logs=folder,
@@ -44,7 +45,7 @@ def spec(tag: str) -> NodeSpec:
 async def test_what_cannot_be_started_is_told_and_noted(tmp_path: Path) -> None:
     faults: list[str] = []
     async with asyncio.TaskGroup() as tasks:
-        found = NodeSet(workshop(tmp_path, faults), tasks)
+        found = NodeSet(context(tmp_path, faults), tasks)
         found.apply([spec("a")])
         while found.statuses[0].state is not NodeState.FAILED:
             await asyncio.sleep(0)
@@ -61,7 +62,7 @@ async def test_logs_of_nodes_that_are_gone_do_not_pile_up(
 ) -> None:
     monkeypatch.setattr(node_set, "MAX_DEPARTED", 3)
     async with asyncio.TaskGroup() as tasks:
-        found = NodeSet(workshop(tmp_path, []), tasks)
+        found = NodeSet(context(tmp_path, []), tasks)
         for tag in ("a", "stays", "b", "a", "c", "d"):
             found.apply([spec("stays"), spec(tag)] if tag != "stays" else [spec("stays")])
             while any(status.state is NodeState.STARTING for status in found.statuses):
@@ -75,7 +76,7 @@ async def test_a_log_that_cannot_be_opened_is_a_fault_of_its_node(tmp_path: Path
     faults: list[str] = []
     (tmp_path / "a.000000000000.log").mkdir()
     async with asyncio.TaskGroup() as tasks:
-        found = NodeSet(workshop(tmp_path, faults), tasks)
+        found = NodeSet(context(tmp_path, faults), tasks)
         found.apply([spec("a")])
         while found.statuses[0].state is not NodeState.FAILED:
             await asyncio.sleep(0)

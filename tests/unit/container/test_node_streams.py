@@ -66,9 +66,9 @@ def test_records_are_chosen_by_how_serious_they_are(tmp_path: Path, log: NodeLog
     log.record(record(3, "between"))
     log.record(record(0, "below"))
     log.stdout(b"printed\n")
-    for level in LogLevel:
-        found = read(tmp_path, ROS, level=level)
-        wanted = [one for one in Level if one >= Level[level.name]]
+    for least in LogLevel:
+        found = read(tmp_path, ROS, level=least)
+        wanted = [one for one in Level if one >= Level[least.name]]
         assert [one for one in Level if f": {one.name.lower()}\n" in found] == wanted
     assert "between" in read(tmp_path, ROS, level=LogLevel.INFO)
     assert "between" not in read(tmp_path, ROS, level=LogLevel.WARN)
@@ -202,9 +202,10 @@ def rosout(tmp_path: Path, log: NodeLog) -> Rosout:
     return Rosout(tmp_path, log)
 
 
-def test_records_go_to_their_nodes_and_to_one_log_like_ros_has_it(
+def test_records_go_to_node_logs_and_rosout_log(
     tmp_path: Path, rosout: Rosout, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """Records go to their nodes and to one log like ros has it."""
     rosout.log.take(payload("/known", "hello"))
     rosout.log.take(payload("/another", "hi"))
     rosout.log.take(b"nonsense")

@@ -10,7 +10,7 @@ import struct
 
 import pytest
 
-from rce_container.nursery.kernel import Namespaces
+from rce_container.forkserver.kernel import Namespaces
 from rce_container.seccomp.calls import ALLOWED, CONDITIONAL, PRETENDED, REFUSED
 from rce_container.seccomp.library import LIBRARY, FilterUnavailableError, make_filter
 
@@ -33,7 +33,7 @@ def program() -> bytes:
 
 
 def number(call: str) -> int:
-    return ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(call.encode())
+    return int(ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(call.encode()))
 
 
 def run(program: bytes, data: bytes) -> int:
@@ -84,7 +84,8 @@ def test_what_is_not_named_does_not_exist(program: bytes) -> None:
     assert run(program, unheard_of) == INVISIBLE
 
 
-def test_threads_and_processes_are_allowed_and_namespaces_are_not(program: bytes) -> None:
+def test_threads_are_allowed_namespaces_are_not(program: bytes) -> None:
+    """Threads and processes are allowed and namespaces are not."""
     assert verdict(program, "clone", THREAD) == ALLOW
     assert verdict(program, "unshare", 0x400) == ALLOW
     for kind in (*Namespaces, 0x80):

@@ -43,7 +43,9 @@ def test_records_and_removal(tmp_path: Path) -> None:
     with StateFolder(tmp_path / "state", tmp_path / "run") as state:
         folder = state.create("user/box")
         assert folder.read_record() is None
-        record = Record(id="user/box", mark=folder.mark, runtime="process", pid=1, start=2)
+        record = Record(
+            id="user/box", incarnation_id=folder.incarnation_id, runtime="process", pid=1, start=2
+        )
         folder.write_record(record)
         (found,) = state.existing()
         assert found.read_record() == record

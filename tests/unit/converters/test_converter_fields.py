@@ -75,7 +75,7 @@ OBJECTS = json_objects(EVERYTHING)  # made once: there are many strategies in it
 
 
 @given(OBJECTS)
-def test_every_field_type_comes_back_as_it_went(value: Any) -> None:
+def test_every_field_type_comes_back_as_it_went(value: object) -> None:
     codec = CONVERTERS.of(EVERYTHING)
     payload, unknown = codec.decode(value)
     assert unknown == ()
@@ -85,14 +85,15 @@ def test_every_field_type_comes_back_as_it_went(value: Any) -> None:
 
 
 @given(OBJECTS)
-def test_values_survive_json_text_with_base64_in_place_of_binary_values(value: Any) -> None:
+def test_values_survive_json_with_base64_binaries(value: object) -> None:
+    """Values survive json text with base64 in place of binary values."""
     codec = CONVERTERS.of(EVERYTHING)
     payload, _ = codec.decode(value)
     assert codec.decode(msgspec.json.decode(msgspec.json.encode(value)))[0] == payload
 
 
 @given(st.data())
-def test_any_part_of_the_fields_may_be_missing(data: Any) -> None:
+def test_any_part_of_the_fields_may_be_missing(data: st.DataObject) -> None:
     full = data.draw(OBJECTS)
     kept = {key: full[key] for key in data.draw(st.sets(st.sampled_from(sorted(full))))}
     payload, unknown = CONVERTERS.of(EVERYTHING).decode(kept)
@@ -110,7 +111,8 @@ JSON_VALUES = st.recursive(
 
 
 @given(st.data(), JSON_VALUES)
-def test_a_strange_value_in_any_field_is_taken_or_refused_by_name(data: Any, strange: Any) -> None:
+def test_strange_value_is_taken_or_refused_by_name(data: st.DataObject, strange: object) -> None:
+    """A strange value in any field is taken or refused by name."""
     field = data.draw(st.sampled_from(EVERYTHING.fields))
     codec = CONVERTERS.of(EVERYTHING)
     try:
@@ -123,7 +125,7 @@ def test_a_strange_value_in_any_field_is_taken_or_refused_by_name(data: Any, str
 
 
 @given(st.binary(max_size=200))
-def test_garbage_bytes_are_read_or_refused(data: Any) -> None:
+def test_garbage_bytes_are_read_or_refused(data: bytes) -> None:
     for name in ("nav_msgs/Path", "std_msgs/Int32MultiArray", "sensor_msgs/Image"):
         try:
             converter(name).encode(data)
@@ -194,12 +196,13 @@ def test_garbage_bytes_are_read_or_refused(data: Any) -> None:
         ),
     ],
 )
-def test_what_does_not_fit_is_refused_by_the_name_of_its_field(name: str, value: Any, text: str) -> None:
+def test_what_does_not_fit_is_refused_by_the_name_of_its_field(name: str, value: object, text: str) -> None:
     with pytest.raises(ConversionError, match=text):
         converter(name).decode(value)
 
 
-def test_fixed_octets_are_taken_in_three_forms_of_the_right_length() -> None:
+def test_fixed_octets_are_taken_in_three_forms() -> None:
+    """Fixed octets are taken in three forms of the right length."""
     codec = CONVERTERS.of(TYPES.from_definition("mine/Id", "uint8[4] id\nchar[] more\n"))
     for form in (b"abcd", memoryview(b"abcd"), "YWJjZA==", [97, 98, 99, 100]):
         assert codec.decode({"id": form, "more": form})[0] == b"abcd\x04\0\0\0abcd"
@@ -266,7 +269,7 @@ def test_nan_and_infinity_become_null_in_json_text() -> None:
         ({}, 0, 0),
     ],
 )
-def test_times_are_taken_as_text_and_as_parts(value: Any, secs: int, nsecs: int) -> None:
+def test_times_are_taken_as_text_and_as_parts(value: object, secs: int, nsecs: int) -> None:
     assert converter("std_msgs/Time").decode({"data": value})[0] == struct.pack("<II", secs, nsecs)
 
 
@@ -293,7 +296,7 @@ def test_times_leave_as_text_with_microseconds(secs: int, nsecs: int, text: str)
         ({"secs": -1, "nsecs": 5}, -1, 5),
     ],
 )
-def test_durations_are_seconds(value: Any, secs: int, nsecs: int) -> None:
+def test_durations_are_seconds(value: object, secs: int, nsecs: int) -> None:
     payload = converter("std_msgs/Duration").decode({"data": value})[0]
     assert payload == struct.pack("<ii", secs, nsecs)
     assert math.isclose(converter("std_msgs/Duration").encode(payload)["data"], secs + nsecs / 1e9)
@@ -324,7 +327,7 @@ class _Reversed:
     def encode(self, fields: Any) -> Any:
         return fields["data"][::-1].encode()
 
-    def decode(self, value: Any) -> Any:
+    def decode(self, value: object) -> Any:
         if not isinstance(value, bytes):
             raise ValueError("must be a binary value")  # noqa: TRY004
         return {"data": bytes(value).decode()[::-1]}
@@ -368,7 +371,7 @@ def test_base64_is_what_the_wire_has() -> None:
         ("geometry_msgs/PoseStamped", {"header": {"seq": 9.0}}, {"header": {"seq": 9}}),
     ],
 )
-def test_numbers_without_fraction_are_integers(name: str, value: Any, same: Any) -> None:
+def test_numbers_without_fraction_are_integers(name: str, value: object, same: object) -> None:
     assert converter(name).decode(value) == converter(name).decode(same)
 
 
@@ -385,6 +388,6 @@ def test_numbers_without_fraction_are_integers(name: str, value: Any, same: Any)
         ("std_msgs/Time", {"data": {"secs": 1.5}}, "data: secs of a time is 1.5"),
     ],
 )
-def test_numbers_with_fraction_are_refused_as_integers(name: str, value: Any, text: str) -> None:
+def test_numbers_with_fraction_are_refused_as_integers(name: str, value: object, text: str) -> None:
     with pytest.raises(ConversionError, match=text):
         converter(name).decode(value)

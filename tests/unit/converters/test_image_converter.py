@@ -19,7 +19,7 @@ CHANNELS = {"mono8": 1, "8UC1": 1, "bayer_rggb8": 1, "mono16": 2, "16UC1": 2, "r
 CHANNELS |= {"rgba8": 4, "bgra8": 4, "8UC4": 4}
 
 
-def message(encoding: str, width: int = 5, height: int = 3, padding: int = 0, **more: Any) -> Message:
+def message(encoding: str, width: int = 5, height: int = 3, padding: int = 0, **more: object) -> Message:
     step = width * CHANNELS.get(encoding, 4) + padding
     data = bytes((7 * index) % 256 for index in range(step * height))
     fields = {"width": width, "height": height, "encoding": encoding, "step": step, "data": data}
@@ -112,7 +112,7 @@ def _bomb(width: int, height: int, colour: int = 0) -> bytes:
         (5, "PNG or JPEG as binary value, or an object"),
     ],
 )
-def test_what_is_no_picture_is_refused(data: Any, part: str) -> None:
+def test_what_is_no_picture_is_refused(data: object, part: str) -> None:
     with pytest.raises(ConversionError, match=part):
         IMAGES.decode(data)
 

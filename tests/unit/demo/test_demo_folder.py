@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce_fleet.demo.folder import LOCK, PREFIX, remove_abandoned, run_folder
+from rce_fleet.demo.resources import LOCK, PREFIX, remove_abandoned, run_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 OWNER = """
 import os, sys
 from pathlib import Path
-from rce_fleet.demo.folder import run_folder
+from rce_fleet.demo.resources import run_folder
 with run_folder() as folder:
     (folder / "data").write_text("x")
     print(folder, flush=True)
@@ -46,7 +46,7 @@ def test_a_folder_to_be_kept_is_kept(tmp: Path) -> None:
     assert folder.parent == tmp / "kept"
 
 
-def test_what_a_killed_demo_left_is_removed_by_the_next_one(tmp: Path) -> None:
+def test_folder_of_a_killed_demo_is_removed_by_the_next(tmp: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", OWNER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as owner:
@@ -71,7 +71,7 @@ def test_a_folder_that_a_program_still_uses_stays(tmp: Path) -> None:
     assert remove_abandoned(tmp) == [folder]
 
 
-def test_what_is_none_of_ours_stays(tmp: Path) -> None:
+def test_folders_of_other_programs_are_kept(tmp: Path) -> None:
     (tmp / f"{PREFIX}without-lock").mkdir()
     (tmp / f"{PREFIX}file").touch()
     (tmp / "other").mkdir()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from math import hypot
 from random import Random
@@ -15,19 +15,24 @@ from rce_fleet.coordination.events import (
     BlockedChanged,
     Event,
     GoalSet,
+    Instruction,
+    MakePlan,
     ObstacleSeen,
+    PlanMade,
     PoseSeen,
     Reply,
     ReportSeen,
+    RobotRemoved,
     SendCancel,
     SendCells,
     Tick,
 )
 from rce_fleet.coordination.move_client import ClientReport, GoalState, MoveClient, SendGoal, SendStop
-from rce_fleet.coordination.snapshot import RobotState
+from rce_fleet.coordination.replanning import compute_plan
+from rce_fleet.coordination.snapshot import FleetSnapshot, RobotSnapshot, RobotState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from rce_fleet.coordination.planner import FleetPlanner
     from rce_fleet.planning.grid import GridMap
@@ -94,26 +99,46 @@ class MakeBelieveRobot:
         return ended
 
 
-class MakeBelieveFleet:
+class SimulatedClients:
     """Runs planner, clients and robots in steps of 0.1 s. Messages are late, out of order and get lost.
 
-    After every step it checks that each robot is within its claims, that no two touch, and that none
-    touches a box.
+    After every step it checks that each robot is within its claims, that no two touch, that none touches a
+    box, and that the changes which the planner told of add up to its state.
+
+    Args:
+        planner: What is tested.
+        starts: A robot stands in each of these cells.
+        seed: Draws what goes wrong.
+        loss: Share of messages that get lost.
+        plan_delays: How long plans take, in seconds of the fleet's time; one of them is drawn for each plan.
     """
 
-    def __init__(self, planner: FleetPlanner, starts: list[int], seed: int, *, loss: float = 0.1) -> None:
+    def __init__(
+        self,
+        planner: FleetPlanner,
+        starts: list[int],
+        seed: int,
+        *,
+        loss: float = 0.1,
+        plan_delays: tuple[float, ...] = (0.0,),
+    ) -> None:
         self.rng = Random(seed)
         self.loss = loss
+        self.plan_delays = plan_delays
+        self.told: dict[str, RobotSnapshot] = {}
+        self.told_cells: dict[int, str] = {}
+        self.sequence = 0
         self.now = 1000.0
         self.planner = planner
-        self.grid = planner.books.grid
+        self.grid = planner.state.grid
         self.hidden: set[int] = set()
         self.blocked: set[int] = set()
         self.silent: set[str] = set()
         self.robots: dict[str, MakeBelieveRobot] = {}
         self.clients: dict[str, MoveClient] = {}
         self.replies: list[Reply] = []
-        self._mail: dict[Any, list[tuple[float, Callable[[], None]]]] = defaultdict(list)
+        self._plans: list[tuple[float, PlanMade]] = []
+        self._mail: dict[Any, list[tuple[float, Callable[[], object]]]] = defaultdict(list)
         for number, cell in enumerate(starts, start=1):
             self.add_robot(f"Robot{number}", cell)
 
@@ -125,9 +150,34 @@ class MakeBelieveFleet:
     def restart_client(self, robot: str) -> None:
         self.clients[robot] = MoveClient(self.grid, robot, self.now)
 
+    def restart_planner(self, planner: FleetPlanner) -> None:
+        """Let another planner take over; it knows nothing."""
+        self.planner = planner
+        self.sequence = 0
+        self._plans.clear()
+        self.told.clear()
+        self.told_cells.clear()
+
+    def remove(self, robot: str) -> None:
+        """Take a robot off the floor."""
+        del self.robots[robot], self.clients[robot]
+        for key, queue in self._mail.items():
+            if key[1] == robot:
+                queue.clear()
+        assert self.ask(RobotRemoved(robot)).ok
+
     def ask(self, event: Event) -> Reply:
-        self._plan(event)
+        self.tell(event)
         return self.replies[-1]
+
+    def tell(self, event: Event) -> list[Instruction]:
+        """Give an event to the planner and carry out what it says; returns that."""
+        instructions = self.planner.handle(event, self.now)
+        for instruction in instructions:
+            self._carry_out(instruction)
+        while self._plans and self._plans[0][0] <= self.now:
+            instructions += self.tell(self._plans.pop(0)[1])
+        return instructions
 
     def send(self, goals: list[int]) -> None:
         """Wait for all robots to have joined, and send robot N to ``goals[N - 1]``."""
@@ -135,6 +185,29 @@ class MakeBelieveFleet:
         for number, goal in enumerate(goals, start=1):
             reply = self.ask(GoalSet(f"Robot{number}", goal))
             assert reply.ok, reply.message
+
+    def newcomers_cells(self) -> set[int]:
+        """The cells of robots that the planner has given no place yet; boxes must not be put there."""
+        return {
+            cell
+            for robot in self.robots.values()
+            if not self.planner.state.ledger.length(robot.id)
+            for cell in self.grid.cells_touched(robot.x, robot.y, RADIUS)
+        }
+
+    def settled(self) -> bool:
+        """Tell whether all robots are there and take part in plans."""
+        away = (RobotState.JOINING, RobotState.STOPPING, RobotState.SILENT)
+        states = self.states()
+        return len(states) == len(self.robots) and not any(state in away for state in states)
+
+    def send_all(self, goals: list[int]) -> bool:
+        """Send the robots that are there somewhere else; tell whether the planner takes it."""
+        cleared = [self.ask(GoalSet(robot, None)).ok for robot in sorted(self.robots)]
+        taken = [
+            self.ask(GoalSet(robot, goal)).ok for robot, goal in zip(sorted(self.robots), goals, strict=True)
+        ]
+        return all(cleared + taken)
 
     def states(self) -> list[RobotState]:
         return [robot.state for robot in self.planner.snapshot().robots]
@@ -157,18 +230,19 @@ class MakeBelieveFleet:
                 self._post("result", robot.id, self._result, robot.id, goal_id, state)
             if robot.id in self.silent:
                 continue
-            self._post("pose", robot.id, self._plan, PoseSeen(robot.id, robot.x, robot.y, 0.0))
+            self._post("pose", robot.id, self.tell, PoseSeen(robot.id, robot.x, robot.y, 0.0))
             self._post("states", robot.id, self._goal_states, robot.id, dict(robot.goals))
             if robot.found:
-                self._post("obstacle", robot.id, self._plan, ObstacleSeen(robot.id, tuple(robot.found)))
+                self._post("obstacle", robot.id, self.tell, ObstacleSeen(robot.id, tuple(robot.found)))
             client = self.clients[robot.id]
             self._instruct(robot.id, [*client.tick(self.now), client.report])
-        self._plan(Tick())
+        self.tell(Tick())
         self.check()
 
     def check(self) -> None:
         self.planner.validate()
-        ledger = self.planner.books.ledger
+        self._check_changes()
+        ledger = self.planner.state.ledger
         for robot in self.robots.values():
             touched = self.grid.cells_touched(robot.x, robot.y, RADIUS)
             if ledger.route(robot.id):
@@ -177,9 +251,30 @@ class MakeBelieveFleet:
         for a, b in combinations(self.robots.values(), 2):
             assert hypot(a.x - b.x, a.y - b.y) > 2 * RADIUS, f"{a.id} touches {b.id}"
 
-    # -- mail -----------------------------------------------------------------------------------
+    def _check_changes(self) -> None:
+        """Add up what the planner says has changed, and compare."""
+        changes = self.planner.take_changes()
+        if changes is not None:
+            self.sequence += 1
+            assert changes.sequence == self.sequence == self.planner.sequence
+            for robot in changes.robots:
+                assert self.told.get(robot.id) != robot
+                self.told[robot.id] = robot
+            for name in changes.removed:
+                del self.told[name]
+            for state in ("blocked", "pending", "freed"):
+                self.told_cells.update(dict.fromkeys(getattr(changes, state), state))
+        now = self.planner.snapshot()
+        told = FleetSnapshot(
+            robots=tuple(self.told[robot] for robot in sorted(self.told)),
+            blocked=tuple(sorted(cell for cell, state in self.told_cells.items() if state == "blocked")),
+            pending=tuple(sorted(cell for cell, state in self.told_cells.items() if state == "pending")),
+        )
+        assert without_poses(told) == without_poses(now)
 
-    def _post(self, topic: str, robot: str, action: Callable[..., None], *values: Any) -> None:
+    # Mail
+
+    def _post(self, topic: str, robot: str, action: Callable[..., object], *values: object) -> None:
         """Topics are in order each, as over TCP, but not with one another."""
         if self.rng.random() < self.loss:
             return
@@ -194,17 +289,19 @@ class MakeBelieveFleet:
             while queue and queue[0][0] <= self.now:
                 queue.pop(0)[1]()
 
-    def _plan(self, event: Event) -> None:
-        for instruction in self.planner.handle(event, self.now):
-            match instruction:
-                case SendCells(robot, revision, cells):
-                    self._post("cells", robot, self._cells, robot, revision, list(cells))
-                case SendCancel(robot):
-                    self._post("cancel", robot, self._cancel, robot)
-                case Reply():
-                    self.replies.append(instruction)
-                case BlockedChanged(cells):
-                    self.blocked = set(cells)
+    def _carry_out(self, instruction: Instruction) -> None:
+        match instruction:
+            case SendCells(robot, revision, cells):
+                self._post("cells", robot, self._cells, robot, revision, list(cells))
+            case SendCancel(robot):
+                self._post("cancel", robot, self._cancel, robot)
+            case Reply():
+                self.replies.append(instruction)
+            case BlockedChanged(cells):
+                self.blocked = set(cells)
+            case MakePlan(request):
+                due = self.now + self.rng.choice(self.plan_delays)
+                self._plans.append((due, PlanMade(compute_plan(request))))
 
     def _cells(self, robot: str, revision: int, cells: list[int]) -> None:
         self._instruct(robot, self.clients[robot].take_cells(revision, cells, self.now))
@@ -218,7 +315,7 @@ class MakeBelieveFleet:
     def _goal_states(self, robot: str, states: dict[str, GoalState]) -> None:
         self._instruct(robot, self.clients[robot].take_goal_states(states, self.now))
 
-    def _instruct(self, robot: str, instructions: list[Any]) -> None:
+    def _instruct(self, robot: str, instructions: Iterable[SendGoal | SendStop | ClientReport]) -> None:
         for instruction in instructions:
             match instruction:
                 case SendGoal():
@@ -226,10 +323,15 @@ class MakeBelieveFleet:
                 case SendStop():
                     self._post("stop", robot, self.robots[robot].take_stop, instruction)
                 case ClientReport():
-                    self._post("report", robot, self._plan, ReportSeen(robot, instruction))
+                    self._post("report", robot, self.tell, ReportSeen(robot, instruction))
+
+
+def without_poses(snapshot: FleetSnapshot) -> FleetSnapshot:
+    robots = tuple(replace(robot, x=0.0, y=0.0, yaw=0.0) for robot in snapshot.robots)
+    return replace(snapshot, robots=robots)
 
 
 @pytest.fixture
-def make_fleet() -> type[MakeBelieveFleet]:
+def make_fleet() -> type[SimulatedClients]:
     """Makes fleets of make-believe robots."""
-    return MakeBelieveFleet
+    return SimulatedClients

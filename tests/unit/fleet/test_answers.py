@@ -21,7 +21,7 @@ ARRAY = TypeRegistry().message("std_msgs/Int32MultiArray")
 
 
 @given(report=REPORTS, blocked=CELLS)
-def test_what_is_written_is_read(report: ClientReport, blocked: tuple[int, ...]) -> None:
+def test_encoded_answer_is_decoded(report: ClientReport, blocked: tuple[int, ...]) -> None:
     message = ARRAY.deserialize(ARRAY.serialize(answer_array(Answer(report, blocked))))
     labels = [dimension.label for dimension in message.layout.dim]
     assert is_answer(labels)
@@ -30,7 +30,7 @@ def test_what_is_written_is_read(report: ClientReport, blocked: tuple[int, ...])
     assert read == Answer(report, blocked)
 
 
-def test_lists_are_no_answers() -> None:
+def test_cell_lists_are_not_answers() -> None:
     assert not is_answer([dimension["label"] for dimension in numbered_array([1], 3)["layout"]["dim"]])
     assert not is_answer([])
 
@@ -46,7 +46,7 @@ def test_lists_are_no_answers() -> None:
         (["answer=3 flying", "", ""], [1, 2, 0], [5, 1, 1]),
     ],
 )
-def test_what_has_another_form_is_refused(labels: list[str], sizes: list[int], data: list[int]) -> None:
+def test_answer_of_another_form_is_refused(labels: list[str], sizes: list[int], data: list[int]) -> None:
     with pytest.raises(ValueError, match=r"answer|invalid literal|ClientState"):
         read_answer(labels, sizes, data)
 

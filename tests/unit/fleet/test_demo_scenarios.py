@@ -14,7 +14,7 @@ from rce_fleet.planning.scenario import given_scenario, make_scenario, midway_ce
 
 @settings(max_examples=80, deadline=None)
 @given(seed=st.integers(0, 2**32), robots=st.integers(1, 12))
-def test_everybody_can_get_to_the_goal(seed: int, robots: int) -> None:
+def test_all_robots_can_reach_their_goals(seed: int, robots: int) -> None:
     scenario = make_scenario(GridMap(), robots, seed=seed)
     assert len(scenario.known_boxes) == 2
     assert len(scenario.hidden_boxes) == 1
@@ -25,7 +25,7 @@ def test_everybody_can_get_to_the_goal(seed: int, robots: int) -> None:
     assert scenario == make_scenario(GridMap(), robots, seed=seed)
 
 
-def test_a_hidden_box_stands_in_somebodys_way() -> None:
+def test_hidden_box_stands_on_a_robots_path() -> None:
     found = 0
     for seed in range(20):
         scenario = make_scenario(GridMap(), 3, seed=seed)
@@ -64,7 +64,7 @@ def test_too_many_robots_are_refused(robots: int) -> None:
 def test_given_pairs_are_checked() -> None:
     grid = GridMap(1, 3, blocked=frozenset({1}))
     assert given_scenario(GridMap(), [(0, 63), (63, 0)]).goals == (63, 0)
-    with pytest.raises(ScenarioError, match="no way"):
+    with pytest.raises(ScenarioError, match="no path"):
         given_scenario(grid, [(0, 2)])
     with pytest.raises(ScenarioError, match="same"):
         given_scenario(GridMap(), [(0, 5), (0, 6)])
@@ -72,7 +72,7 @@ def test_given_pairs_are_checked() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**32))
-def test_a_cell_blocked_midway_cuts_nobody_off(seed: int) -> None:
+def test_midway_cell_cuts_off_no_goal(seed: int) -> None:
     scenario = make_scenario(GridMap(), 3, seed=seed)
     grid = GridMap().with_blocked(scenario.boxes)
     goals = dict(zip(scenario.robots, scenario.goals, strict=True))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Protocol
 
 import pytest
 
@@ -10,6 +10,7 @@ from rce_fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
     CellFreed,
+    Event,
     GoalSet,
     ObstacleSeen,
     PoseSeen,
@@ -21,22 +22,32 @@ from rce_fleet.coordination.events import (
 )
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.planner import FleetPlanner
-from rce_fleet.coordination.robot import TRANSITIONS, Cause, Phase, RobotRecord
+from rce_fleet.coordination.robot import ROBOT_LIFE, Cause, Phase, RobotRecord
 from rce_fleet.coordination.snapshot import RobotSnapshot, RobotState
 from rce_fleet.exceptions import TransitionError
 from rce_fleet.planning.grid import GridMap
 
+if TYPE_CHECKING:
+    from unit.fleet.conftest import SimulatedClients
 
-def robot(fleet: Any, number: int = 1) -> RobotSnapshot:
-    found: RobotSnapshot = fleet.planner.snapshot().robots[number - 1]
-    return found
+
+def robot(fleet: SimulatedClients, number: int = 1) -> RobotSnapshot:
+    return fleet.planner.snapshot().robots[number - 1]
+
+
+class Make(Protocol):
+    """Makes a fleet; see :func:`make`."""
+
+    def __call__(
+        self, grid: GridMap, starts: list[int], goals: list[int] | None = None
+    ) -> SimulatedClients: ...
 
 
 @pytest.fixture
-def make(make_fleet: Any) -> Any:
+def make(make_fleet: type[SimulatedClients]) -> Make:
     """Makes a fleet whose robots have joined, on a network that loses nothing."""
 
-    def of(grid: GridMap, starts: list[int], goals: list[int] | None = None) -> Any:
+    def of(grid: GridMap, starts: list[int], goals: list[int] | None = None) -> SimulatedClients:
         fleet = make_fleet(FleetPlanner(grid), starts, 1, loss=0.0)
         fleet.send(goals or [])
         return fleet
@@ -44,12 +55,12 @@ def make(make_fleet: Any) -> Any:
     return of
 
 
-def test_a_robot_joins_where_it_stands_and_is_not_moved(make: Any) -> None:
+def test_a_robot_joins_where_it_stands_and_is_not_moved(make: Make) -> None:
     fleet = make(GridMap(), [27])
     assert (robot(fleet).cell, robot(fleet).plan, robot(fleet).state) == (27, (27,), RobotState.IDLE)
 
 
-def test_a_robot_drives_to_its_goal_in_granted_cells(make: Any) -> None:
+def test_a_robot_drives_to_its_goal_in_granted_cells(make: Make) -> None:
     fleet = make(GridMap(), [0], [63])
     assert len(robot(fleet).plan) == 15
     assert len(robot(fleet).granted) == 5
@@ -57,7 +68,7 @@ def test_a_robot_drives_to_its_goal_in_granted_cells(make: Any) -> None:
     assert robot(fleet).replans == 0
 
 
-def test_a_robot_without_goal_steps_aside_and_comes_back(make: Any) -> None:
+def test_a_robot_without_goal_steps_aside_and_comes_back(make: Make) -> None:
     # A corridor of one row with a bay beside cell 2, where the idle robot stands.
     grid = GridMap(2, 5, blocked=frozenset({5, 6, 8, 9}))
     fleet = make(grid, [2, 0])
@@ -67,17 +78,17 @@ def test_a_robot_without_goal_steps_aside_and_comes_back(make: Any) -> None:
     assert robot(fleet).state is RobotState.IDLE
 
 
-def test_a_robot_whose_cell_is_anothers_goal_makes_room_for_good(make: Any) -> None:
+def test_robot_on_anothers_goal_moves_away_and_stays_away(make: Make) -> None:
     fleet = make(GridMap(), [27, 0])
     assert fleet.ask(GoalSet("Robot2", 27)).ok
     fleet.run(lambda: robot(fleet, 2).state is RobotState.ARRIVED)
     assert robot(fleet).cell in GridMap().neighbours[27]
 
 
-def test_blocking_a_cell_of_a_path_cancels_it_and_brings_another(make: Any) -> None:
+def test_blocking_a_cell_of_a_path_cancels_it_and_brings_another(make: Make) -> None:
     fleet = make(GridMap(), [24], [31])
     cell = robot(fleet).plan[5]
-    out = fleet.planner.handle(CellBlocked(cell), fleet.now)
+    out = fleet.tell(CellBlocked(cell))
     assert SendCancel("Robot1") in out
     assert BlockedChanged((cell,)) in out
     fleet.blocked = {cell}
@@ -88,15 +99,15 @@ def test_blocking_a_cell_of_a_path_cancels_it_and_brings_another(make: Any) -> N
     fleet.run(fleet.all_arrived)
 
 
-def test_a_cell_that_robots_do_not_use_is_blocked_without_disturbing_them(make: Any) -> None:
+def test_blocking_an_unused_cell_changes_no_plan(make: Make) -> None:
     fleet = make(GridMap(), [0], [7])
-    out = fleet.planner.handle(CellBlocked(60), fleet.now)
+    out = fleet.tell(CellBlocked(60))
     assert not [done for done in out if isinstance(done, SendCancel)]
     fleet.run(fleet.all_arrived)
     assert robot(fleet).replans == 0
 
 
-def test_an_occupied_cell_is_blocked_when_its_robot_has_left(make: Any) -> None:
+def test_an_occupied_cell_is_blocked_when_its_robot_has_left(make: Make) -> None:
     fleet = make(GridMap(), [27])
     reply = fleet.ask(CellBlocked(27))
     assert reply.ok
@@ -107,7 +118,7 @@ def test_an_occupied_cell_is_blocked_when_its_robot_has_left(make: Any) -> None:
     assert robot(fleet).cell != 27
 
 
-def test_a_granted_cell_is_blocked_when_its_robot_has_stopped(make: Any) -> None:
+def test_a_granted_cell_is_blocked_when_its_robot_has_stopped(make: Make) -> None:
     fleet = make(GridMap(), [24], [31])
     ahead = robot(fleet).granted[4]
     assert fleet.ask(CellBlocked(ahead)).ok
@@ -116,14 +127,14 @@ def test_a_granted_cell_is_blocked_when_its_robot_has_stopped(make: Any) -> None
     fleet.run(fleet.all_arrived)
 
 
-def test_a_pending_cell_can_be_freed(make: Any) -> None:
+def test_a_pending_cell_can_be_freed(make: Make) -> None:
     fleet = make(GridMap(1, 1), [0])
     fleet.ask(CellBlocked(0))
     assert fleet.ask(CellFreed(0)).ok
     assert fleet.planner.snapshot().pending == ()
 
 
-def test_a_goal_that_is_cut_off_is_reported_and_reached_once_the_way_is_free(make: Any) -> None:
+def test_cut_off_goal_is_reported_and_reached_once_free(make: Make) -> None:
     fleet = make(GridMap(1, 5), [0, 4])
     assert fleet.ask(CellBlocked(2)).ok
     assert fleet.ask(GoalSet("Robot1", 3)).ok
@@ -134,7 +145,7 @@ def test_a_goal_that_is_cut_off_is_reported_and_reached_once_the_way_is_free(mak
     fleet.run(lambda: robot(fleet).state is RobotState.ARRIVED)
 
 
-def test_one_that_is_cut_off_does_not_keep_the_others(make: Any) -> None:
+def test_robot_cut_off_from_its_goal_does_not_block_others(make: Make) -> None:
     grid = GridMap(3, 3, blocked=frozenset({1}))
     fleet = make(grid, [0, 8])
     fleet.ask(CellBlocked(3))
@@ -144,7 +155,7 @@ def test_one_that_is_cut_off_does_not_keep_the_others(make: Any) -> None:
     assert robot(fleet).state is RobotState.UNREACHABLE
 
 
-def test_what_a_sensor_finds_is_blocked(make: Any) -> None:
+def test_cell_found_blocked_by_a_sensor_is_blocked(make: Make) -> None:
     fleet = make(GridMap(), [24])
     fleet.hidden = {28}
     fleet.ask(GoalSet("Robot1", 31))
@@ -153,18 +164,18 @@ def test_what_a_sensor_finds_is_blocked(make: Any) -> None:
     assert robot(fleet).replans == 1
 
 
-def test_what_a_sensor_finds_in_another_robots_cell_was_a_robot(make: Any) -> None:
+def test_sensor_hit_in_another_robots_cell_is_ignored(make: Make) -> None:
     fleet = make(GridMap(), [0, 1])
-    fleet.planner.handle(ObstacleSeen("Robot1", (1, 0, 999)), fleet.now)
+    fleet.tell(ObstacleSeen("Robot1", (1, 0, 999)))
     assert fleet.planner.snapshot().blocked == ()
     assert fleet.planner.snapshot().pending == ()
 
 
-def test_a_silent_robot_keeps_its_cells_and_the_others_drive_around(make: Any) -> None:
+def test_silent_robot_keeps_its_cells_others_drive_around(make: Make) -> None:
     fleet = make(GridMap(3, 5), [7, 5])
     fleet.silent = {"Robot1"}
     fleet.run(lambda: robot(fleet).state is RobotState.SILENT)
-    assert "not heard" in robot(fleet).reason
+    assert "sends no poses" in robot(fleet).reason
     fleet.ask(GoalSet("Robot2", 9))
     fleet.run(lambda: robot(fleet, 2).state is RobotState.ARRIVED)
     assert robot(fleet).granted == (7,)
@@ -172,7 +183,7 @@ def test_a_silent_robot_keeps_its_cells_and_the_others_drive_around(make: Any) -
     fleet.run(lambda: robot(fleet).state is RobotState.IDLE)
 
 
-def test_a_robot_that_falls_silent_under_way_goes_on_when_it_is_back(make: Any) -> None:
+def test_silent_robot_continues_after_its_return(make: Make) -> None:
     fleet = make(GridMap(), [0], [63])
     fleet.silent = {"Robot1"}
     fleet.run(lambda: robot(fleet).state is RobotState.SILENT)
@@ -180,14 +191,14 @@ def test_a_robot_that_falls_silent_under_way_goes_on_when_it_is_back(make: Any) 
     fleet.run(fleet.all_arrived)
 
 
-def test_a_new_robot_on_the_way_is_driven_around(make: Any) -> None:
+def test_a_new_robot_on_the_way_is_driven_around(make: Make) -> None:
     fleet = make(GridMap(3, 8), [8], [15])
     fleet.add_robot("Robot2", 14)
     fleet.run(lambda: fleet.states() == [RobotState.ARRIVED, RobotState.IDLE])
     assert robot(fleet, 2).cell == 14
 
 
-def test_a_robot_in_a_blocked_cell_says_why_it_cannot_join(make_fleet: Any) -> None:
+def test_robot_in_a_blocked_cell_reports_why_it_cannot_join(make_fleet: type[SimulatedClients]) -> None:
     fleet = make_fleet(FleetPlanner(GridMap()), [], 1, loss=0.0)
     fleet.ask(CellBlocked(9))
     fleet.blocked = set()
@@ -197,17 +208,17 @@ def test_a_robot_in_a_blocked_cell_says_why_it_cannot_join(make_fleet: Any) -> N
     fleet.run(lambda: robot(fleet).state is RobotState.IDLE)
 
 
-def test_a_restarted_planner_takes_over_where_robots_are(make: Any) -> None:
+def test_a_restarted_planner_takes_over_where_robots_are(make: Make) -> None:
     fleet = make(GridMap(), [0], [63])
     for _ in range(30):
         fleet.step()
-    fleet.planner = FleetPlanner(GridMap())
+    fleet.restart_planner(FleetPlanner(GridMap()))
     fleet.run(lambda: fleet.states() == [RobotState.IDLE])
     fleet.ask(GoalSet("Robot1", 7))
     fleet.run(fleet.all_arrived)
 
 
-def test_a_restarted_move_client_is_given_cells_anew(make: Any) -> None:
+def test_restarted_move_client_gets_its_cells_again(make: Make) -> None:
     fleet = make(GridMap(), [0], [63])
     for _ in range(30):
         fleet.step()
@@ -215,17 +226,17 @@ def test_a_restarted_move_client_is_given_cells_anew(make: Any) -> None:
     fleet.run(fleet.all_arrived)
 
 
-def test_a_new_goal_replaces_the_old_one(make: Any) -> None:
+def test_a_new_goal_replaces_the_old_one(make: Make) -> None:
     fleet = make(GridMap(), [0], [63])
     for _ in range(20):
         fleet.step()
     assert fleet.ask(GoalSet("Robot1", 56)).ok
     fleet.run(fleet.all_arrived)
     assert robot(fleet).cell == 56
-    assert robot(fleet).replans == 0, "a new goal is no blocked path"
+    assert robot(fleet).replans == 0, "a new goal is not a blocked path"
 
 
-def test_a_robot_without_its_goal_stays(make: Any) -> None:
+def test_a_robot_without_its_goal_stays(make: Make) -> None:
     fleet = make(GridMap(), [0], [63])
     for _ in range(40):
         fleet.step()
@@ -234,19 +245,19 @@ def test_a_robot_without_its_goal_stays(make: Any) -> None:
     assert robot(fleet).cell not in (0, 63)
 
 
-def test_a_robot_that_left_its_path_is_stopped_and_placed_anew(make: Any) -> None:
+def test_robot_off_its_path_is_stopped_and_placed_again(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     fleet = make(GridMap(), [0])
     fleet.run(lambda: fleet.clients["Robot1"].report.reached == 0)
-    fleet.check = lambda: None  # The robot is where it must not be: that is the point.
+    monkeypatch.setattr(fleet, "check", lambda: None)  # The robot is where it must not be: that is the point.
     fleet.robots["Robot1"].x, fleet.robots["Robot1"].y = 5.5, 5.5
-    fleet.planner.handle(PoseSeen("Robot1", 5.5, 5.5, 0.0), fleet.now)
+    fleet.tell(PoseSeen("Robot1", 5.5, 5.5, 0.0))
     assert robot(fleet).state is RobotState.STOPPING
     assert robot(fleet).reason == "it left its path"
     fleet.run(lambda: robot(fleet).state is RobotState.IDLE)
     assert robot(fleet).cell == 45
 
 
-def test_a_removed_robot_leaves_its_cells(make: Any) -> None:
+def test_a_removed_robot_leaves_its_cells(make: Make) -> None:
     fleet = make(GridMap(1, 3), [0, 1])
     fleet.ask(GoalSet("Robot1", 2))
     fleet.robots.pop("Robot2")
@@ -257,7 +268,7 @@ def test_a_removed_robot_leaves_its_cells(make: Any) -> None:
 @pytest.mark.parametrize(
     ("event", "words"),
     [
-        (GoalSet("Nobody", 3), "no robot Nobody"),
+        (GoalSet("Nobody", 3), "robot Nobody is unknown"),
         (GoalSet("Robot1", 64), "not on the map"),
         (GoalSet("Robot1", 10), "is blocked"),
         (GoalSet("Robot1", 12), "is blocked"),
@@ -266,10 +277,10 @@ def test_a_removed_robot_leaves_its_cells(make: Any) -> None:
         (CellBlocked(10), "is a wall"),
         (CellFreed(10), "is a wall"),
         (CellFreed(99), "not on the map"),
-        (RobotRemoved("Nobody"), "no robot Nobody"),
+        (RobotRemoved("Nobody"), "robot Nobody is unknown"),
     ],
 )
-def test_what_makes_no_sense_is_refused_with_words(make: Any, event: Any, words: str) -> None:
+def test_invalid_request_is_refused_with_a_reason(make: Make, event: Event, words: str) -> None:
     fleet = make(GridMap(blocked=frozenset({10})), [0, 1])
     fleet.ask(CellBlocked(12))
     fleet.ask(GoalSet("Robot2", 63))
@@ -280,17 +291,17 @@ def test_what_makes_no_sense_is_refused_with_words(make: Any, event: Any, words:
     assert fleet.planner.snapshot() == before
 
 
-def test_freeing_a_free_cell_is_no_fault(make: Any) -> None:
+def test_freeing_a_free_cell_succeeds(make: Make) -> None:
     assert make(GridMap(), [0]).ask(CellFreed(5)).ok
 
 
-def test_poses_that_are_no_numbers_are_ignored() -> None:
+def test_pose_that_is_not_a_number_is_ignored() -> None:
     planner = FleetPlanner(GridMap())
     assert planner.handle(PoseSeen("Robot1", float("nan"), 0.0, 0.0), 0.0) == []
     assert planner.snapshot().robots == ()
 
 
-def test_lists_are_said_again_until_the_client_has_them() -> None:
+def test_cell_list_is_sent_again_until_acknowledged() -> None:
     planner = FleetPlanner(GridMap(), first_revision=40)
     assert SendCells("R", 41, ()) in planner.handle(PoseSeen("R", 0.5, 0.5, 0.0), 0.0)
     assert SendCells("R", 41, ()) not in planner.handle(Tick(), 0.5)
@@ -300,13 +311,13 @@ def test_lists_are_said_again_until_the_client_has_them() -> None:
     assert not [done for done in planner.handle(Tick(), 2.5) if isinstance(done, SendCells)]
 
 
-def test_the_life_cycle_refuses_what_is_not_in_its_table() -> None:
+def test_transition_outside_the_table_is_refused() -> None:
     for phase in Phase:
         for cause in Cause:
             record = RobotRecord("R", 0, phase=phase)
-            if (phase, cause) in TRANSITIONS:
+            if ROBOT_LIFE.allows(phase, cause):
                 record.change(cause)
-                assert record.phase is TRANSITIONS[phase, cause]
+                assert record.phase is ROBOT_LIFE.table[phase][cause]
             else:
                 with pytest.raises(TransitionError):
                     record.change(cause)

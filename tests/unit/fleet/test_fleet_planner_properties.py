@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from random import Random
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rce_fleet.coordination.events import CellBlocked
+from rce_fleet.coordination.events import CellBlocked, CellFreed, GoalSet
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map, read_scenario
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from unit.fleet.conftest import SimulatedClients
 
 
 def connected_map(rng: Random, boxes: int) -> GridMap:
@@ -27,13 +29,16 @@ def connected_map(rng: Random, boxes: int) -> GridMap:
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 8))
-def test_every_robot_arrives_within_its_own_cells(make_fleet: Any, seed: int, count: int) -> None:
+def test_every_robot_arrives_within_its_own_cells(
+    make_fleet: type[SimulatedClients], seed: int, count: int
+) -> None:
     rng = Random(seed)
     grid = connected_map(rng, 3)
-    hidden = grid.blocked and rng.choice(sorted(grid.blocked))
+    hidden = rng.choice(sorted(grid.blocked))
     known = grid.with_blocked(grid.blocked - {hidden})
     starts, goals = rng.sample(grid.free, count), rng.sample(grid.free, count)
-    fleet = make_fleet(FleetPlanner(known), starts, seed, loss=rng.choice((0.0, 0.2)))
+    delays = rng.choice(((0.0,), (0.1, 0.5), (0.0, 3.0)))
+    fleet = make_fleet(FleetPlanner(known), starts, seed, loss=rng.choice((0.0, 0.2)), plan_delays=delays)
     fleet.hidden = {hidden}
     fleet.send(goals)
     for _ in range(rng.randrange(60)):
@@ -50,9 +55,59 @@ def test_every_robot_arrives_within_its_own_cells(make_fleet: Any, seed: int, co
     }
 
 
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32), count=st.integers(1, 8))
+def test_indexes_equal_a_recomputation_whatever_happens(
+    make_fleet: type[SimulatedClients], seed: int, count: int
+) -> None:
+    """After each step ``validate`` makes the indexes from scratch, and looks for what was left undone."""
+    rng = Random(seed)
+    grid = connected_map(rng, 3)
+    starts = rng.sample(grid.free, count)
+    delays = rng.choice(((0.0,), (0.1, 0.5), (0.0, 3.0)))
+    fleet = make_fleet(FleetPlanner(grid), starts, seed, loss=0.1, plan_delays=delays)
+    for _ in range(150):
+        disturb(fleet, rng)
+        fleet.step()
+    fleet.silent.clear()
+    for cell in sorted(fleet.blocked | fleet.planner.state.pending):
+        assert fleet.ask(CellFreed(cell)).ok
+    if fleet.robots:
+        fleet.run(fleet.settled)
+        assert fleet.send_all(rng.sample(grid.free, len(fleet.robots)))
+        fleet.run(fleet.all_arrived)
+
+
+def disturb(fleet: SimulatedClients, rng: Random) -> None:
+    """Let something happen, mostly nothing."""
+    robots = sorted(fleet.robots)
+    what = rng.randrange(100)
+    if what < 8 and robots:
+        robot = rng.choice(robots)
+        cell = rng.choice([None, *fleet.grid.free])
+        if robot in fleet.planner.state.robots:
+            fleet.ask(GoalSet(robot, cell))
+    elif what < 11:
+        cell = rng.choice(fleet.grid.free)
+        if cell not in fleet.newcomers_cells():
+            fleet.ask(CellBlocked(cell))
+    elif what < 14 and fleet.blocked:
+        fleet.ask(CellFreed(rng.choice(sorted(fleet.blocked))))
+    elif what == 14 and robots:
+        fleet.silent ^= {rng.choice(robots)}
+    elif what == 15 and robots:
+        fleet.restart_client(rng.choice(robots))
+    elif what == 16 and len(robots) > 1:
+        robot = rng.choice(robots)
+        if robot in fleet.planner.state.robots:
+            fleet.remove(robot)
+
+
 @pytest.mark.needs("data")
 @pytest.mark.parametrize("count", [4, 20])
-def test_robots_drive_on_a_benchmark_map(make_fleet: Any, rce_data: Path, count: int) -> None:
+def test_robots_drive_on_a_benchmark_map(
+    make_fleet: type[SimulatedClients], rce_data: Path, count: int
+) -> None:
     grid = read_map(rce_data / "maps" / "random-32-32-20.map")
     rows = read_scenario(rce_data / "maps" / "random-32-32-20-random-1.scen", grid, limit=count)
     fleet = make_fleet(FleetPlanner(grid), [row.start for row in rows], seed=count)

@@ -72,8 +72,8 @@ def test_a_disc_touches_what_it_overlaps() -> None:
     "arguments", [{"rows": 0}, {"cell_size": 0.0}, {"cell_size": float("nan")}, {"blocked": frozenset({64})}]
 )
 def test_impossible_maps_are_refused(arguments: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=r"rows|cell_size|blocked"):
-        GridMap(**arguments)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"row|cell_size|blocked"):
+        GridMap(**arguments)  # type: ignore[arg-type]  # impossible ones too
 
 
 def test_a_wall_parts_the_map() -> None:
@@ -84,7 +84,7 @@ def test_a_wall_parts_the_map() -> None:
     assert grid.reachable(0) == {0, 3, 6}
 
 
-# -- paths ------------------------------------------------------------------------------------------
+# Paths
 
 
 @given(grids, st.integers(0, 80), st.integers(0, 80))
@@ -114,11 +114,11 @@ def test_a_path_turns_as_seldom_as_it_can_at_each_step() -> None:
     assert shortest_path(GridMap(), 0, 18) in ([0, 1, 2, 10, 18], [0, 8, 16, 17, 18])
 
 
-def test_a_blocked_goal_is_reached_from_nowhere() -> None:
+def test_blocked_goal_is_unreachable() -> None:
     assert distances(GridMap(2, 2, blocked=frozenset({3})), 3) == [inf] * 4
 
 
-# -- files ------------------------------------------------------------------------------------------
+# Files
 
 MAP = "type octile\nheight 2\nwidth 3\nmap\n..@\nT.G\n"
 
@@ -161,7 +161,7 @@ def test_a_broken_scenario_row_is_named(row: str) -> None:
         parse_scenario(f"version 1\n0 m 3 2 0 0 1 1 2.0\n{row}\n", parse_map(MAP))
 
 
-def test_files_that_are_no_text_are_refused(tmp_path: Path) -> None:
+def test_binary_map_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.map").write_bytes(b"\xff\xfe")
     with pytest.raises(MapError, match=r"x\.map"):
         read_map(tmp_path / "x.map")
@@ -176,7 +176,7 @@ def test_public_maps_are_read(rce_data: Path) -> None:
     assert all(grid.connected((row.start, row.goal)) for row in rows)
 
 
-# -- occupancy --------------------------------------------------------------------------------------
+# Occupancy
 
 
 @given(grids, st.integers(1, 4))

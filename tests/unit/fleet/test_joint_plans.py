@@ -42,7 +42,7 @@ def test_plans_reach_their_goals_and_can_be_carried_out(seed: int, count: int) -
     assert joint.steps[-1] == tuple(goals)
 
 
-def test_two_robots_pass_one_another_where_one_can_step_aside() -> None:
+def test_two_robots_pass_where_one_can_step_aside() -> None:
     # A corridor with one bay: . . . . .
     #                           @ @ . @ @
     grid = GridMap(2, 5, blocked=frozenset({5, 6, 8, 9}))
@@ -51,20 +51,20 @@ def test_two_robots_pass_one_another_where_one_can_step_aside() -> None:
     assert joint.complete
 
 
-def test_robots_that_would_all_have_to_turn_in_a_circle_are_left_where_they_are() -> None:
+def test_plan_without_circular_moves_leaves_robots_in_place() -> None:
     joint = plan(GridMap(2, 2), [0, 1, 3, 2], [1, 3, 2, 0], effort=2000)
     assert not joint.complete
     assert joint.steps == ((0, 1, 3, 2),)
 
 
-def test_the_best_is_given_where_a_corridor_has_no_bay() -> None:
+def test_corridor_without_a_bay_gives_the_best_partial_plan() -> None:
     grid = GridMap(1, 6)
     joint = plan(grid, [0, 5], [5, 0], effort=5000)
     check(grid, joint, [0, 5])
     assert not joint.complete
 
 
-def test_a_robot_leaves_a_blocked_cell_and_nobody_enters_one() -> None:
+def test_blocked_cell_may_be_left_but_not_entered() -> None:
     grid = GridMap(3, 3, blocked=frozenset({4}))
     joint = plan(grid, [4, 0], [0, 8])
     check(grid, joint, [4, 0])
@@ -72,7 +72,7 @@ def test_a_robot_leaves_a_blocked_cell_and_nobody_enters_one() -> None:
     assert all(4 not in cells for cells in joint.steps[1:])
 
 
-def test_who_is_at_its_goal_with_nobody_coming_stays() -> None:
+def test_robot_at_its_goal_stays_if_its_cell_is_not_needed() -> None:
     joint = plan(GridMap(), [0, 63, 27], [7, 56, 27])
     assert {cells[2] for cells in joint.steps} == {27}
 
@@ -88,7 +88,7 @@ def test_the_same_seed_makes_the_same_plan() -> None:
     assert plan(GridMap(), starts, goals, seed=5) == plan(GridMap(), starts, goals, seed=5)
 
 
-def test_nobody_needs_no_plan() -> None:
+def test_plan_without_robots_is_empty() -> None:
     assert plan(GridMap(), [], []).complete
 
 

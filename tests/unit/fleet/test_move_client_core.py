@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from math import pi
-from typing import Any
 
 import pytest
 
@@ -13,6 +12,7 @@ from rce_fleet.coordination.move_client import (
     ClientReport,
     ClientState,
     GoalState,
+    Instruction,
     MoveClient,
     SendGoal,
     SendStop,
@@ -32,26 +32,31 @@ def client() -> MoveClient:
     return made
 
 
-def goal_of(instructions: list[Any]) -> SendGoal:
+def goal_of(instructions: list[Instruction]) -> SendGoal:
     (found,) = [done for done in instructions if isinstance(done, SendGoal)]
     return found
 
 
-def cells_sent(instructions: list[Any]) -> list[int]:
+def state_of(client: MoveClient) -> ClientState:
+    return client.report.state
+
+
+def cells_sent(instructions: list[Instruction]) -> list[int]:
     return [done.cell for done in instructions if isinstance(done, SendGoal)]
 
 
-def reach(client: MoveClient, goal: SendGoal, now: float = 11.0) -> list[Any]:
+def reach(client: MoveClient, goal: SendGoal, now: float = 11.0) -> list[Instruction]:
     return client.take_result(goal.id, GoalState.SUCCEEDED, now)
 
 
-def test_the_first_cell_is_driven_to_by_itself_then_straight_on(client: MoveClient) -> None:
+def test_first_cell_is_its_own_goal_then_straight_runs(client: MoveClient) -> None:
     goal = goal_of(client.take_cells(1, [0, 1, 2, 10, 18], 10.0))
     assert goal.cell == 0
     goal = goal_of(reach(client, goal))
     assert (goal.cell, goal.heading) == (2, 0.0)
     goal = goal_of(reach(client, goal))
-    assert (goal.cell, goal.heading) == (18, pytest.approx(pi / 2))
+    assert goal.cell == 18
+    assert goal.heading == pytest.approx(pi / 2)
     done = reach(client, goal)
     assert cells_sent(done) == []
     assert client.report == ClientReport(1, ClientState.IDLE, (0, 1, 2, 10, 18), 18, None)
@@ -66,7 +71,8 @@ def test_a_longer_list_moves_the_goal_ahead_while_driving(client: MoveClient) ->
     assert goal_of(reach(client, farther)).cell == 12
 
 
-def test_a_list_that_begins_with_the_target_does_not_slow_the_robot_down(client: MoveClient) -> None:
+def test_list_from_target_on_does_not_slow_robot(client: MoveClient) -> None:
+    """A list that begins with the target does not slow the robot down."""
     reach(client, goal_of(client.take_cells(1, [0, 1, 2], 10.0)))
     assert cells_sent(client.take_cells(2, [2, 3, 4], 12.0)) == [4]
 
@@ -114,7 +120,7 @@ def test_a_cancellation_stops_the_robot_and_drops_the_list(client: MoveClient) -
     assert client.report == ClientReport(1, ClientState.CANCELLING, (), None, None)
     assert client.take_goal_states({goal.id: GoalState.PREEMPTING}, 10.6) == []
     client.take_result(goal.id, GoalState.PREEMPTED, 10.7)
-    assert client.report.state is ClientState.IDLE
+    assert state_of(client) is ClientState.IDLE
 
 
 def test_an_empty_list_is_a_cancellation(client: MoveClient) -> None:
@@ -123,7 +129,8 @@ def test_an_empty_list_is_a_cancellation(client: MoveClient) -> None:
     assert client.report.revision == 2
 
 
-def test_a_list_that_comes_while_stopping_waits_until_the_robot_stands(client: MoveClient) -> None:
+def test_list_while_stopping_waits_for_standstill(client: MoveClient) -> None:
+    """A list that comes while stopping waits until the robot stands."""
     goal = goal_of(client.take_cells(1, [0, 1], 10.0))
     client.cancel(10.5)
     assert cells_sent(client.take_cells(2, [8, 9], 10.6)) == []
@@ -158,23 +165,23 @@ def test_a_lost_cancellation_is_sent_again(client: MoveClient) -> None:
     assert client.tick(10.5 + REPEAT_AFTER) == [SendStop(10.5 + REPEAT_AFTER)]
 
 
-def test_a_goal_that_the_robot_never_got_is_over_after_a_while(client: MoveClient) -> None:
+def test_goal_that_the_robot_never_received_times_out(client: MoveClient) -> None:
     client.take_cells(1, [0, 1], 10.0)
     client.cancel(10.5)
     client.take_goal_states({}, 10.6)
-    assert client.report.state is ClientState.CANCELLING
+    assert state_of(client) is ClientState.CANCELLING
     client.take_goal_states({}, 10.6 + QUIET_TIME)
-    assert client.report.state is ClientState.IDLE
+    assert state_of(client) is ClientState.IDLE
 
 
-def test_a_goal_of_an_earlier_life_is_waited_for() -> None:
+def test_goal_from_before_a_restart_is_waited_for() -> None:
     client = MoveClient(GridMap(), "Robot1", 0.0)
     assert client.take_goal_states({}, 5.0) == [SendStop(5.0)]
     client.take_goal_states({"old": GoalState.ACTIVE}, 5.5)
     client.take_goal_states({"old": GoalState.PREEMPTED}, 6.0)
-    assert client.report.state is ClientState.CANCELLING
+    assert state_of(client) is ClientState.CANCELLING
     client.take_goal_states({"old": GoalState.PREEMPTED}, 6.0 + QUIET_TIME)
-    assert client.report.state is ClientState.IDLE
+    assert state_of(client) is ClientState.IDLE
 
 
 def test_a_robot_that_gives_up_is_reported_and_can_be_sent_again(client: MoveClient) -> None:
@@ -185,9 +192,9 @@ def test_a_robot_that_gives_up_is_reported_and_can_be_sent_again(client: MoveCli
 
 
 @pytest.mark.parametrize("cells", [[0, 2], [0, 64], [-1], [7, 8]])
-def test_lists_that_are_no_path_are_refused(client: MoveClient, cells: list[int]) -> None:
+def test_cell_list_that_is_not_a_path_is_refused(client: MoveClient, cells: list[int]) -> None:
     before = client.report
-    with pytest.raises(ValueError, match="no path"):
+    with pytest.raises(ValueError, match="not a path"):
         client.take_cells(1, cells, 10.0)
     assert client.report == before
 

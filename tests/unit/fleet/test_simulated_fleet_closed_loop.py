@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import inf
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -13,15 +13,19 @@ from rce_fleet.coordination.events import (
     CellBlocked,
     Event,
     GoalSet,
+    MakePlan,
     ObstacleSeen,
+    PlanMade,
     PoseSeen,
+    Reply,
     ReportSeen,
     SendCancel,
     SendCells,
     Tick,
 )
-from rce_fleet.coordination.move_client import MoveClient, SendGoal, SendStop
+from rce_fleet.coordination.move_client import ClientReport, MoveClient, SendGoal, SendStop
 from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.replanning import compute_plan
 from rce_fleet.coordination.snapshot import RobotState
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map, read_scenario
@@ -31,6 +35,7 @@ from rce_fleet.simulation.obstacles import hit_points
 from rce_fleet.simulation.world import World
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
 
@@ -62,15 +67,21 @@ class SimulatedFleet:
                 case BlockedChanged(cells):
                     for cell in cells:
                         self.world.add_box(cell)
+                case MakePlan(request):
+                    self.plan(PlanMade(compute_plan(request)))
+                case Reply():
+                    pass
 
-    def tell(self, robot: str, instructions: list[Any]) -> None:
+    def tell(self, robot: str, instructions: Iterable[SendGoal | SendStop | ClientReport]) -> None:
         for instruction in instructions:
             match instruction:
                 case SendGoal(goal_id, stamp, cell):
-                    x, y = self.planner.books.grid.centre(cell)
+                    x, y = self.planner.state.grid.centre(cell)
                     self.bases[robot].accept(goal_id, stamp, x, y)
                 case SendStop(stamp):
                     self.bases[robot].cancel("", stamp)
+                case ClientReport():
+                    pass  # it is asked for each time
 
     def step(self, number: int) -> None:
         """0.05 s of the world."""
@@ -127,7 +138,7 @@ class SimulatedFleet:
 
 
 @pytest.mark.parametrize(("robots", "seed"), [(1, 0), (3, 1), (8, 2), (8, 3)])
-def test_nobody_touches_anything_on_the_way_to_the_goals(robots: int, seed: int) -> None:
+def test_robots_reach_goals_without_collisions(robots: int, seed: int) -> None:
     check_run(SimulatedFleet(make_scenario(GridMap(), robots, seed=seed), seed))
 
 

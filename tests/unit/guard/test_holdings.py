@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from rce.guard.budget import Ledger
 from rce.guard.holdings import Holdings
 
@@ -23,7 +25,7 @@ def test_the_oldest_that_can_be_given_up_goes_first() -> None:
     holdings = Holdings()
     holdings.hold(10)
     for name in "abc":
-        holdings.hold(10, lambda name=name: gone.append(name))
+        holdings.hold(10, partial(gone.append, name))
     holdings.shed(15)
     assert gone == ["a", "b"]
     assert holdings.bytes == 20

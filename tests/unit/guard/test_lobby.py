@@ -21,7 +21,7 @@ class Visitors:
 
     def come(self, address: str) -> int | None:
         number = self.count = self.count + 1
-        guest = self.lobby.enter(address, lambda: self.open.pop(number) and None)
+        guest = self.lobby.enter(address, lambda: self.open.pop(number))
         if guest is None:
             return None
         self.open[number] = guest

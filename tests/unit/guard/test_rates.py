@@ -19,7 +19,8 @@ def test_one_key_costs_another_nothing() -> None:
     assert [rates.take(name, 0.0) for name in ("anna", "bert", "anna")] == [0, 0, 1]
 
 
-def test_what_costs_more_than_a_full_bucket_is_paid_for_afterwards() -> None:
+def test_cost_above_bucket_size_is_paid_afterwards() -> None:
+    """What costs more than a full bucket is paid for afterwards."""
     rates = Rates(per_second=10, burst=5)
     assert rates.take("anna", 0.0) == 0
     assert rates.take("anna", 0.0, cost=100) == pytest.approx(0.1)

@@ -1,15 +1,16 @@
-"""The frame codec: what is written is read, however it is cut; what is no frame is refused."""
+"""The frame codec: what is written is read, however it is cut; what is not a frame is refused."""
 
 from __future__ import annotations
 
 from contextlib import suppress
 from itertools import zip_longest
+from random import Random
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.link.exceptions import LinkRefused, ProtocolError
+from rce.link.exceptions import LinkRefusedError, ProtocolError
 from rce.link.frames import (
     HANDSHAKE_SIZE,
     HEADER,
@@ -84,12 +85,12 @@ def test_frames_survive_any_cut(frames: list[Frame], cuts: list[int]) -> None:
     st.randoms(use_true_random=False),
 )
 def test_interleaved_fragments_are_put_together(
-    large: list[Frame], small: list[Frame], part: int, cut: int, random: object
+    large: list[Frame], small: list[Frame], part: int, cut: int, random: Random
 ) -> None:
     lines = [fragments(frame, max(part, 5_000)) for frame in large] + [[encode(frame)] for frame in small]
     written: list[bytes] = []
     while lines := [line for line in lines if line]:
-        line = random.choice(lines)  # type: ignore[attr-defined]
+        line = random.choice(lines)
         written.append(line.pop(0))
     got = fill(FrameReader(LIMITS), b"".join(written), [max(cut, 2_000)])
     assert sorted(got) == sorted(large + small)
@@ -244,7 +245,7 @@ def test_bad_hello_is_refused(frame: Frame) -> None:
 
 def test_answers_to_hello() -> None:
     check_answer(Frame(FrameType.WELCOME))
-    with pytest.raises(LinkRefused, match="not you"):
+    with pytest.raises(LinkRefusedError, match="not you"):
         check_answer(Frame(FrameType.REFUSE, payload=b"not you"))
     with pytest.raises(ProtocolError):
         check_answer(Frame(FrameType.DATA))

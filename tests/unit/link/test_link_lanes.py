@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.link.exceptions import Overloaded, ProtocolError
+from rce.aio.queues import OverflowPolicy
+from rce.link.exceptions import OverloadedError, ProtocolError
 from rce.link.frames import (
     FRAGMENT_SIZE,
     LATCHED,
@@ -20,7 +21,7 @@ from rce.link.frames import (
     parse_sources,
 )
 from rce.link.lanes import MAX_CONTROL_FRAMES, URGENT_BURST, Lanes
-from rce.link.queues import SMALL_MESSAGE, Backlog, Counters, OutgoingQueue, OverflowPolicy
+from rce.link.queues import SMALL_MESSAGE, Backlog, Counters, OutgoingQueue
 from rce.link.settings import LinkLimits
 
 LIMITS = LinkLimits()
@@ -55,9 +56,9 @@ def drain(lanes: Lanes) -> list[tuple[FrameType, int, int]]:
 # Queues
 
 
-def test_a_full_queue_keeps_the_last_latched_message_of_each_source() -> None:
+def test_full_queue_keeps_last_latched_of_each_source() -> None:
     """The newest of every source, and the newest list of sources, leave in order; the rest makes room."""
-    queue = topic(max_messages=4)
+    queue = topic(max_messages=3)
     for source, text in ((1, b"old"), (2, b"of 2"), (0, b"a"), (1, b"of 1"), (0, b"b"), (3, b"of 3")):
         queue.push(Frame(FrameType.DATA, 1, source, LATCHED if source else 0, text))
     for ids in ((1, 2), (2, 3)):
@@ -102,7 +103,7 @@ def test_backlog_is_the_sum_of_what_waits(steps: list[tuple[int, int]]) -> None:
     for what, size in steps:
         queue = queues[size % 2]
         if what < 3:
-            with contextlib.suppress(Overloaded):
+            with contextlib.suppress(OverloadedError):
                 queue.push(data(1, size))
                 assert grown.pop() == backlog.bytes
         elif what == 3 and len(queue):
@@ -134,6 +135,7 @@ def test_oldest_are_dropped_and_counted() -> None:
     for n in range(10):
         queue.push(data(1, 4, n))
     assert len(queue) == 3
+    assert queue.head is not None
     assert queue.head.payload == bytes([7] * 4)
     assert queue.counters.dropped == 7
 
@@ -168,11 +170,12 @@ def test_calls_are_refused_not_dropped() -> None:
     queue = service(max_messages=2)
     for n in (1, 2):
         queue.push(Frame(FrameType.CALL, 1, n))
-    with pytest.raises(Overloaded):
+    with pytest.raises(OverloadedError):
         queue.push(Frame(FrameType.CALL, 1, 3))
     assert queue.withdraw(1)
     assert not queue.withdraw(1)
     queue.push(Frame(FrameType.CALL, 1, 3))
+    assert queue.head is not None
     assert queue.head.id == 2
     assert queue.counters.dropped == 0
 

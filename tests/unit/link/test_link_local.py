@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from rce.link.carrier import LocalCarrier
+from rce.link.carrier import Carrier, LocalCarrier
 from rce.link.frames import Frame, FrameType
 
 
@@ -20,7 +20,7 @@ class Handler:
     def grew(self) -> None:
         pass
 
-    def carrier_lost(self, carrier: LocalCarrier, reason: Exception) -> None:
+    def carrier_lost(self, carrier: Carrier, reason: Exception) -> None:
         raise reason
 
 

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.link.exceptions import ProtocolError
+from rce.link.flow_control import FlowControl
 from rce.link.frames import Frame, FrameType
 from rce.link.pacing import MIN_RATE, Bucket, Pacer
-from rce.link.valve import Valve
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -114,7 +114,8 @@ def test_small_messages_go_ahead_of_bulk_at_once() -> None:
         pacer.spend(4_096, urgent=True)
 
 
-def test_flood_of_small_messages_is_limited_and_leaves_half_to_bulk() -> None:
+def test_flood_of_small_messages_leaves_half_to_bulk() -> None:
+    """Flood of small messages is limited and leaves half to bulk."""
     clock = Clock()
     pacer = clock.pacer(RATE)
     bulk, flood = Sender(pacer, pacer.part), Sender(pacer, 500, urgent=True)
@@ -181,50 +182,50 @@ class Wire:
 
 def test_peer_is_granted_what_the_rate_allows() -> None:
     clock, wire = Clock(), Wire()
-    valve = Valve(wire)
+    flow = FlowControl(wire)
     wire.received = 777
-    valve.pace(clock.pacer(RATE))
+    flow.pace(clock.pacer(RATE))
     start = clock.now
     for _ in range(20_000):
         clock.run(0.001)
         size = min(10_000, wire.grants[-1] - wire.received)
         if size:
             wire.received += size
-            valve.count_received()
+            flow.count_received()
     assert wire.reading
     assert wire.received - 777 == pytest.approx((clock.now - start) * RATE, rel=0.1)
 
 
 def test_peer_that_ignores_the_grant_is_not_read_from() -> None:
     clock, wire = Clock(), Wire()
-    valve = Valve(wire)
-    valve.pace(clock.pacer(RATE))
+    flow = FlowControl(wire)
+    flow.pace(clock.pacer(RATE))
     for _ in range(20_000):
         clock.run(0.001)
         if wire.reading:
-            wire.received += valve.read_size
-            valve.count_received()
+            wire.received += flow.read_size
+            flow.count_received()
     assert wire.received == pytest.approx(20 * RATE, rel=0.1)
-    valve.pace(None)
+    flow.pace(None)
     assert wire.reading
     assert wire.grants[-1] == 2**64 - 1
-    assert valve.open
+    assert flow.open
 
 
 def test_granted_end_sends_so_far_and_small_messages_further() -> None:
     wire = Wire()
-    valve = Valve(wire)
-    valve.allow((10_000).to_bytes(8))
-    assert not valve.open
-    assert valve.room(urgent=False) == 10_000
+    flow = FlowControl(wire)
+    flow.allow((10_000).to_bytes(8))
+    assert not flow.open
+    assert flow.room(urgent=False) == 10_000
     wire.sent = 9_999
-    assert valve.room(urgent=False) == 4_096
+    assert flow.room(urgent=False) == 4_096
     wire.sent = 20_000
-    assert valve.room(urgent=False) == 0
-    assert valve.room(urgent=True) > 0
+    assert flow.room(urgent=False) == 0
+    assert flow.room(urgent=True) > 0
     goes = wire.goes
-    valve.allow((30_000).to_bytes(8))
+    flow.allow((30_000).to_bytes(8))
     assert wire.goes > goes
-    assert valve.room(urgent=False) == 10_000
+    assert flow.room(urgent=False) == 10_000
     with pytest.raises(ProtocolError):
-        valve.allow(b"short")
+        flow.allow(b"short")

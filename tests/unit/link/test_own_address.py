@@ -9,9 +9,10 @@ from rce.link import address
 from rce.link.address import in_url, is_any, own_address
 
 
-async def test_a_master_on_the_same_machine_does_not_make_others_look_on_theirs(
+async def test_local_master_does_not_mislead_other_machines(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """A master on the same machine does not make others look on theirs."""
     ways = {"127.0.0.1": "127.0.0.1", "10.0.0.9": "10.0.0.2", "192.0.2.1": "10.0.0.7"}
 
     async def towards(host: str, _: int) -> str | None:

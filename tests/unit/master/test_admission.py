@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypedDict, Unpack
 
 import pytest
 from support.master_world import World
 
-from rce.control.model import EndpointState, EndpointStatus, Network, NodeSpec
-from rce_master.exceptions import Conflict, Forbidden, Invalid, LimitReached, NoRoom
+from rce.control.model import EndpointState, EndpointStatus
+from rce.model.specs import Network, NodeSpec, ResourceChanges
+from rce_master.exceptions import (
+    ConflictError,
+    ForbiddenError,
+    InvalidRequestError,
+    LimitReachedError,
+    NoRoomError,
+)
 from rce_master.state import commands, placing
-from rce_master.state.records import UserRole
+from rce_master.state.changes import Changes, Transaction
+from rce_master.state.placement import Room
+from rce_master.state.records import Container, UserRole
 from rce_master.state.settings import StateSettings
 
 MB = 1 << 20
@@ -20,8 +29,15 @@ def at(world: World, tag: str, user: str = "anna") -> str:
     return world.state.tables.endpoints[f"{user}/{tag}"].task_set
 
 
-def resize(world: World, tag: str = "c", user: str = "anna", **wish: object) -> object:
-    return world.do(commands.ResizeContainer(user=user, tag=tag, **wish))  # type: ignore[arg-type]
+class Resize(TypedDict, total=False):
+    size: int
+    cpu: float
+    memory: int
+    bandwidth: int
+
+
+def resize(world: World, tag: str = "c", user: str = "anna", **requested: Unpack[Resize]) -> Changes:
+    return world.do(commands.ResizeContainer(user=user, tag=tag, changes=ResourceChanges(**requested)))
 
 
 def gone(world: World, tag: str, process: str = "c1") -> None:
@@ -33,7 +49,7 @@ def test_out_of_capacity_names_what_is_missing_where(world: World) -> None:
     world.container_set("c1", name="m1", cores=2)
     world.container_set("c2", name="m2", cores=8, labels=("lidar",))
     world.container("a", cpu=0.5, special_features=())
-    with pytest.raises(NoRoom) as caught:
+    with pytest.raises(NoRoomError) as caught:
         world.container("big", cpu=4.0, special_features=("gpu",))
     assert str(caught.value) == (
         "no machine takes container 'big' now: m1 lacks the label gpu; m2 lacks the label gpu; "
@@ -41,7 +57,7 @@ def test_out_of_capacity_names_what_is_missing_where(world: World) -> None:
     )
     assert caught.value.status == 409
     with pytest.raises(
-        NoRoom, match=r"m1 has 2 of 2 cores free, 9 needed; m2 has 7\.5 of 8 cores free, 9 needed"
+        NoRoomError, match=r"m1 has 2 of 2 cores free, 9 needed; m2 has 7\.5 of 8 cores free, 9 needed"
     ):
         world.container("big", cpu=9.0)
     assert "anna/big" not in world.state.tables.endpoints
@@ -63,9 +79,10 @@ def test_who_waits_is_told_at_once_and_again_when_there_is_room(world: World) ->
     assert [notice.text for notice in changes.notices] == ["container 'b' has a machine now: m"]
 
 
-def test_those_that_wait_are_served_in_order_and_a_small_one_passes_only_one_that_fits_nowhere(
+def test_waiting_are_served_in_order_unless_unplaceable(
     world: World,
 ) -> None:
+    """Those that wait are served in order and a small one passes only one that fits nowhere."""
     world.container_set("c1", slots=4)
     world.container("full", size=4)
     world.container("big", size=3, wait=True)
@@ -98,7 +115,7 @@ def test_a_machine_that_may_come_back_is_waited_for(world: World) -> None:
     assert at(world, "c") == "c1"
     world.leave("c1")
     world.tick(30)
-    with pytest.raises(NoRoom):
+    with pytest.raises(NoRoomError):
         world.container("d", special_features=("gpu",))
 
 
@@ -106,11 +123,12 @@ def test_the_same_again_is_not_counted_twice(world: World) -> None:
     world.container_set("c1", slots=1)
     world.container()
     world.container()
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictError):
         world.container(size=2)
 
 
-def test_a_container_made_again_at_a_full_machine_waits_for_its_former_self_only(world: World) -> None:
+def test_remade_container_waits_only_for_its_predecessor(world: World) -> None:
+    """A container made again at a full machine waits for its former self only."""
     world.container_set("c1", slots=1)
     world.container()
     world.do(commands.DestroyContainer(user="anna", tag="c"))
@@ -120,7 +138,8 @@ def test_a_container_made_again_at_a_full_machine_waits_for_its_former_self_only
     assert world.phase() == "placed"
 
 
-def test_a_container_that_a_machine_cannot_hold_is_not_taken_back(world: World) -> None:
+def test_oversized_container_is_not_taken_back(world: World) -> None:
+    """A container that a machine cannot hold is not taken back."""
     world.container_set("c1", slots=2)
     world.container()
     world.run()
@@ -135,19 +154,20 @@ def test_a_container_that_a_machine_cannot_hold_is_not_taken_back(world: World) 
 # What one user may ask for
 
 
-def test_a_users_containers_have_limits_and_an_administrators_have_none() -> None:
+def test_users_have_limits_administrators_have_none() -> None:
+    """A users containers have limits and an administrators have none."""
     world = World(StateSettings(max_slots=3, max_cpu=1.5, max_memory=100 * MB))
     world.user("root", UserRole.ADMIN)
     world.container("a", size=2, cpu=1.0, memory=64 * MB)
     with pytest.raises(
-        LimitReached, match="would have 4 slots in all, and you may have 3; make others smaller"
+        LimitReachedError, match="would have 4 slots in all, and you may have 3; make others smaller"
     ):
         world.container("b", size=2)
-    with pytest.raises(LimitReached, match=r"would have 2 cores in all, and you may have 1\.5"):
+    with pytest.raises(LimitReachedError, match=r"would have 2 cores in all, and you may have 1\.5"):
         world.container("b", cpu=1.0)
-    with pytest.raises(LimitReached, match="would have 128 MB of memory in all, and you may have 100"):
+    with pytest.raises(LimitReachedError, match="would have 128 MB of memory in all, and you may have 100"):
         world.container("b", memory=64 * MB)
-    with pytest.raises(LimitReached, match="slots"):
+    with pytest.raises(LimitReachedError, match="slots"):
         resize(world, "a", size=4)
     resize(world, "a", size=1)
     world.container("b", size=2)
@@ -155,16 +175,18 @@ def test_a_users_containers_have_limits_and_an_administrators_have_none() -> Non
 
 
 def test_too_little_memory_is_refused_before_it_kills(world: World) -> None:
-    with pytest.raises(Invalid, match=r"memory: 1 MB are too little; a container itself needs 32 MB"):
+    with pytest.raises(
+        InvalidRequestError, match=r"memory: 1 MB are too little; a container itself needs 32 MB"
+    ):
         world.container(memory=MB)
 
 
 def test_the_machines_network_and_folders_are_for_administrators(world: World) -> None:
     world.user("root", UserRole.ADMIN)
     world.container_set("c1", networks=("none", "host"), runtimes=("podman",))
-    with pytest.raises(Forbidden, match="network: host is for containers of administrators"):
+    with pytest.raises(ForbiddenError, match="network: host is for containers of administrators"):
         world.container(network=Network.HOST)
-    with pytest.raises(Forbidden, match="image: folders of the machine are for administrators"):
+    with pytest.raises(ForbiddenError, match="image: folders of the machine are for administrators"):
         world.container(image="/")
     world.container(image="debian:12")
     world.container("c", "root", network=Network.HOST, image="/srv/rootfs")
@@ -175,20 +197,20 @@ def test_a_group_is_on_one_machine_with_addresses_of_one_network(world: World) -
     for process in ("c1", "c2"):
         world.container_set(process, networks=("none", "group"), slots=3)
 
-    def member(tag: str, address: str = "", user: str = "anna", **more: object) -> None:
-        world.container(tag, user, network=Network.GROUP, group="g", group_ip=address, **more)
+    def member(tag: str, address: str = "", user: str = "anna") -> None:
+        world.container(tag, user, network=Network.GROUP, group="g", group_ip=address)
 
     member("a", "10.0.0.2/24")
     with pytest.raises(
-        Conflict, match=r"groupIp: 10\.0\.0\.2 is the address of container 'a' of the group 'g'"
+        ConflictError, match=r"groupIp: 10\.0\.0\.2 is the address of container 'a' of the group 'g'"
     ):
         member("b", "10.0.0.2")
-    with pytest.raises(Conflict, match=r"groupIp: 10\.0\.1\.3/24 is not in 10\.0\.0\.0/24"):
+    with pytest.raises(ConflictError, match=r"groupIp: 10\.0\.1\.3/24 is not in 10\.0\.0\.0/24"):
         member("b", "10.0.1.3")
     member("b", "10.0.0.3")
     member("c")
     assert at(world, "a") == at(world, "b") == at(world, "c")
-    with pytest.raises(NoRoom, match="0 of 3 slots free"):
+    with pytest.raises(NoRoomError, match="0 of 3 slots free"):
         member("d")
     member("a", "10.0.0.2", "bob")
     assert at(world, "a", "bob") != at(world, "a")
@@ -216,14 +238,14 @@ def test_a_container_is_resized_while_it_runs(world: World) -> None:
     world.container(cpu=1.0, memory=100 * MB, bandwidth=5)
     world.run()
     changes = resize(world, cpu=0.5, memory=256 * MB)
-    assert list(changes.touched) == ["anna/c"]  # type: ignore[attr-defined]
-    assert [(h.kind, h.text) for h in changes.happenings] == [  # type: ignore[attr-defined]
+    assert list(changes.touched) == ["anna/c"]
+    assert [(h.kind, h.text) for h in changes.events] == [
         ("container_resized", "size 1, cpu 0.5, memory 256 MB, bandwidth 5B/s")
     ]
-    wish = world.spec("c").resources
-    assert (wish.cpu, wish.memory, wish.bandwidth) == (0.5, 256 * MB, 5)
+    requested = world.spec("c").resources
+    assert (requested.cpu, requested.memory, requested.bandwidth) == (0.5, 256 * MB, 5)
     assert world.phase() == "running"
-    assert list(resize(world, cpu=0.5).touched) == []  # type: ignore[attr-defined]
+    assert list(resize(world, cpu=0.5).touched) == []
     resize(world, cpu=0.0)
     assert world.spec("c").resources.cpu == 0.0
 
@@ -233,7 +255,7 @@ def test_what_has_no_room_to_grow_is_told_and_stays_as_it_is(world: World) -> No
     world.container(cpu=1.0)
     world.container("other", cpu=0.5)
     before = world.spec("c")
-    with pytest.raises(NoRoom) as caught:
+    with pytest.raises(NoRoomError) as caught:
         resize(world, cpu=4.0)
     assert str(caught.value) == (
         "container 'c' cannot grow so far: m1 has 1.5 of 2 cores free, 4 needed; nothing was changed"
@@ -250,13 +272,14 @@ def test_shrinking_makes_room_for_those_that_wait(world: World) -> None:
     assert world.phase("next") == "placed"
 
 
-def test_a_client_that_comes_back_may_ask_for_the_size_before_or_after(world: World) -> None:
+def test_returning_client_may_ask_for_either_size(world: World) -> None:
+    """A client that comes back may ask for the size before or after."""
     world.container(cpu=1.0)
     resize(world, cpu=0.5)
     world.container(cpu=1.0)
     world.container(cpu=0.5)
     assert world.spec("c").resources.cpu == 0.5
-    with pytest.raises(Conflict):
+    with pytest.raises(ConflictError):
         world.container(cpu=2.0)
 
 
@@ -272,7 +295,7 @@ def test_nodes_may_not_wait_for_one_another_in_a_circle(world: World) -> None:
 
     add("a", "b", "c")
     add("b", "c")
-    with pytest.raises(Invalid, match="node 'c': after goes round in a circle: c after"):
+    with pytest.raises(InvalidRequestError, match="node 'c': after goes round in a circle: c after"):
         add("c", "a")
     add("c")
 
@@ -283,7 +306,7 @@ def test_many_that_wait_cost_little(monkeypatch: pytest.MonkeyPatch) -> None:
     world.container("first")
     looked: list[str] = []
 
-    def choose(tx: Any, container: Any, rooms: Any) -> Any:
+    def choose(tx: Transaction, container: Container, rooms: dict[str, Room]) -> Room | None:
         looked.append(container.tag)
         return best(tx, container, rooms)
 

@@ -94,7 +94,7 @@ def test_folder_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
 
 
 def test_requests_are_named_without_values() -> None:
-    wanted = [
+    wanted: list[commands.Command] = [
         commands.CreateContainer(user="anna", tag="c1"),
         commands.SetParameter(user="anna", container="c1", name="key", value="a secret value"),
         *(commands.DestroyContainer(user="anna", tag=f"d{n}") for n in range(10)),

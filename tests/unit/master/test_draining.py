@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Unpack
 
 import pytest
 from support.master_world import World
+from support.parts import StatusParts
 
-from rce.control.model import EndpointState, EndpointStatus, LinkAddress, Network, NodeState, NodeStatus
-from rce_master.exceptions import NoRoom, NotFound
+from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
+from rce.model.specs import Network, ResourceChanges
+from rce_master.exceptions import NoRoomError, NotFoundError
 from rce_master.state import commands
 from rce_master.state.changes import Changes
 from rce_master.state.core import State
@@ -19,7 +21,11 @@ def drain(world: World, machine: str = "m1", *, undo: bool = False) -> Changes:
 
 
 def report(
-    world: World, tag: str, process: str, state: EndpointState = EndpointState.RUNNING, **fields: Any
+    world: World,
+    tag: str,
+    process: str,
+    state: EndpointState = EndpointState.RUNNING,
+    **fields: Unpack[StatusParts],
 ) -> Changes:
     fields.setdefault("address", LinkAddress(machine=process, unix=f"/{process}/{tag}"))
     return world.report(process, EndpointStatus(id=f"anna/{tag}", revision=1, state=state, **fields))
@@ -34,7 +40,7 @@ def moves(world: World) -> dict[str, str]:
 
 
 def kinds(changes: Changes) -> list[str]:
-    return [happening.kind for happening in changes.happenings]
+    return [state_event.kind for state_event in changes.events]
 
 
 @pytest.fixture
@@ -106,20 +112,21 @@ def test_a_draining_machine_takes_nothing_new(two: World) -> None:
     two.container("new")
     assert at(two, "new") == "c2"
     drain(two, "c2")
-    with pytest.raises(NoRoom, match="m1 is draining; m2 is draining"):
+    with pytest.raises(NoRoomError, match="m1 is draining; m2 is draining"):
         two.container("newer")
     drain(two, "m1", undo=True)
     two.container("newer")
     assert at(two, "newer") == "c1"
-    with pytest.raises(NotFound, match="there is no container machine 'm3'"):
+    with pytest.raises(NotFoundError, match="there is no container machine 'm3'"):
         drain(two, "m3")
 
 
-def test_what_has_room_nowhere_stays_and_the_operator_is_told_once(two: World) -> None:
+def test_unplaceable_container_stays_operator_told_once(two: World) -> None:
+    """What has room nowhere stays and the operator is told once."""
     two.container("large", size=4)
     assert at(two, "large") == "c2"
     changes = drain(two)
-    (first, second) = [h for h in changes.happenings if h.kind == "container_stays"]
+    (first, second) = [h for h in changes.events if h.kind == "container_stays"]
     assert (first.subject, first.user) == ("anna/c", "")
     assert "m2 has 0 of 4 slots free, 1 needed" in first.text
     assert second.subject == "anna/d"
@@ -134,7 +141,7 @@ def test_a_copy_that_fails_is_dropped_and_tried_again_later(two: World) -> None:
     drain(two)
     changes = report(two, "c", "c2", EndpointState.FAILED, detail="no such package")
     assert [(w.process, w.id) for w in changes.withdrawals] == [("c2", "anna/c")]
-    stays = [h.text for h in changes.happenings if h.kind == "container_stays"]
+    stays = [h.text for h in changes.events if h.kind == "container_stays"]
     assert "failed there: no such package" in stays[0]
     assert at(two, "c") == "c1"
     two.do(commands.EndpointGone(process="c2", id="anna/c"))
@@ -144,7 +151,7 @@ def test_a_copy_that_fails_is_dropped_and_tried_again_later(two: World) -> None:
     two.tick(30)
     assert moves(two) == {"c": "c2"}
     changes = two.tick(60)
-    assert "did not come up there within 60 s" in changes.happenings[0].text
+    assert "did not come up there within 60 s" in changes.events[0].text
 
 
 def test_a_copy_waits_until_its_former_one_is_gone_there(two: World) -> None:
@@ -171,7 +178,8 @@ def test_a_container_that_is_destroyed_takes_its_copy_along(two: World) -> None:
     assert {(w.process, w.id) for w in changes.withdrawals} == {("c1", "anna/c"), ("c2", "anna/c")}
 
 
-def test_a_machine_that_is_shut_down_meanwhile_leaves_what_moves_to_its_copy(two: World) -> None:
+def test_machine_shut_down_midway_leaves_the_copy(two: World) -> None:
+    """A machine that is shut down meanwhile leaves what moves to its copy."""
     drain(two)
     two.do(commands.EndpointGone(process="c1", id="anna/c"))
     assert (at(two, "c"), two.phase("c")) == ("c2", "placed")
@@ -204,23 +212,23 @@ def test_copies_count_where_they_are_made(two: World) -> None:
     two.container("large", size=3)
     drain(two)
     assert moves(two) == {"c": "c2"}
-    with pytest.raises(NoRoom, match="m2 has 0 of 4 slots free"):
+    with pytest.raises(NoRoomError, match="m2 has 0 of 4 slots free"):
         two.container("more")
-    with pytest.raises(NoRoom, match="m2 has 1 of 4 slots free, 2 needed"):
-        two.do(commands.ResizeContainer(user="anna", tag="c", size=2))
+    with pytest.raises(NoRoomError, match="m2 has 1 of 4 slots free, 2 needed"):
+        two.do(commands.ResizeContainer(user="anna", tag="c", changes=ResourceChanges(size=2)))
 
 
 def test_a_group_moves_as_a_whole(world: World) -> None:
-    machine = {"networks": ("none", "group")}
-    world.container_set("c1", name="m1", slots=4, **machine)
+    networks = ("none", "group")
+    world.container_set("c1", name="m1", slots=4, networks=networks)
     for tag in "ab":
         world.container(tag, network=Network.GROUP, group="g")
         report(world, tag, "c1")
-    world.container_set("c2", name="m2", slots=1, **machine)
+    world.container_set("c2", name="m2", slots=1, networks=networks)
     changes = drain(world)
-    texts = [h.text for h in changes.happenings if h.kind == "container_stays"]
+    texts = [h.text for h in changes.events if h.kind == "container_stays"]
     assert "it moves with 1 others of its group; no machine has room for all of them" in texts[0]
-    world.container_set("c3", name="m3", slots=2, **machine)
+    world.container_set("c3", name="m3", slots=2, networks=networks)
     world.tick(1)
     assert moves(world) == {"a": "c3", "b": "c3"}
     report(world, "a", "c3")

@@ -12,7 +12,7 @@ from argon2 import PasswordHasher
 from support.master_world import World
 
 from rce_master.auth import HASH_WORKERS, MAX_WAITING, Authenticator, client_digest
-from rce_master.exceptions import TooManyFailures, TooManyLogins, WrongCredentials
+from rce_master.exceptions import TooManyFailuresError, TooManyLoginsError, WrongCredentialsError
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
 from rce_master.throttle import MAX_ADDRESS_DELAY_S
@@ -56,7 +56,7 @@ class Door:
     async def log_in(self, name: str, digest: str, address: str) -> None:
         try:
             await self.auth.verify(name, digest, address)
-        except (WrongCredentials, TooManyFailures, TooManyLogins) as error:
+        except (WrongCredentialsError, TooManyFailuresError, TooManyLoginsError) as error:
             self.outcomes.append(type(error))
 
     async def flood(self, group: asyncio.TaskGroup, count: int, address: str) -> None:
@@ -75,7 +75,7 @@ async def door() -> AsyncIterator[Door]:
     made.auth.close()
 
 
-async def test_a_flood_from_one_address_holds_up_another_by_its_own_checks_only(door: Door) -> None:
+async def test_flood_delays_other_address_by_own_checks_only(door: Door) -> None:
     """Whoever is known comes in without a turn; who is not has the next one, though the queue is full."""
     await door.auth.verify("zoe", RIGHT, "home")
     door.hasher.go.clear()
@@ -83,7 +83,7 @@ async def test_a_flood_from_one_address_holds_up_another_by_its_own_checks_only(
         await door.flood(group, HASH_WORKERS + MAX_WAITING, "bad")
         assert (await door.auth.verify("zoe", RIGHT, "home")).name == "zoe"
         await door.flood(group, 5, "bad")
-        assert door.outcomes == [TooManyLogins] * 5
+        assert door.outcomes == [TooManyLoginsError] * 5
         stranger = group.create_task(door.auth.verify("yan", RIGHT, "elsewhere"))
         await settle()
         assert not stranger.done()
@@ -106,21 +106,20 @@ async def test_many_addresses_share_what_there_is(door: Door) -> None:
     assert door.hasher.verified.index(RIGHT) <= begun + CROWDS + HASH_WORKERS
 
 
-async def test_wrong_passwords_that_wait_together_are_counted_all_the_same(door: Door) -> None:
+async def test_wrong_passwords_checked_together_are_counted(door: Door) -> None:
+    """Wrong passwords that wait together are counted all the same."""
     door.hasher.go.clear()
     async with asyncio.TaskGroup() as group:
         for number in range(20):
             group.create_task(door.log_in("zoe", client_digest(str(number)), "bad"))
         await settle()
-        assert door.outcomes == [TooManyFailures] * 9
+        assert door.outcomes == [TooManyFailuresError] * 9
         door.hasher.go.set()
-    assert door.outcomes.count(WrongCredentials) == 11
+    assert door.outcomes.count(WrongCredentialsError) == 11
 
 
 @pytest.mark.parametrize("names", ["unknown", "zoe"])
-async def test_a_flood_from_the_same_address_holds_up_a_first_login_by_few_checks(
-    door: Door, names: str
-) -> None:
+async def test_flood_delays_first_login_by_few_checks(door: Door, names: str) -> None:
     """A fleet and its attacker behind one router: the queue is full of guesses, and of nothing else."""
     door.hasher.go.clear()
     async with asyncio.TaskGroup() as group:

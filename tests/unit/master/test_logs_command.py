@@ -1,4 +1,4 @@
-"""``rce logs``: what it asks for, and what it does when a container's life ends."""
+"""``rce logs``: what it asks for, and what it does when a container ends."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from typing import Any, Self
 import pytest
 
 from rce.control.logs import LogLevel
-from rce_master.cli import follow
+from rce_master.cli import credentials, follow
+from rce_master.cli.client import ApiClient
 from rce_master.cli.exceptions import ApiError
 
 
 class Server:
-    """Has the logs of a container's lives, one after the other; a life goes on while it is the last."""
+    """Has the logs of a container's lives, one after the other; a life continues while it is the last."""
 
     def __init__(self, **lives: str) -> None:
         self.lives = lives
@@ -48,8 +49,8 @@ class Server:
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Server:
     server = Server(one="first life", two="second life")
-    monkeypatch.setattr(follow.credentials, "load", lambda: None)
-    monkeypatch.setattr(follow.ApiClient, "of", lambda _: server)
+    monkeypatch.setattr(credentials, "load", lambda: None)
+    monkeypatch.setattr(ApiClient, "of", lambda _: server)
     monkeypatch.setattr(follow, "POLL_S", 0.0)
     return server
 
@@ -67,7 +68,7 @@ async def test_an_earlier_life_says_how_it_ended(server: Server, capsys: pytest.
     captured = capsys.readouterr()
     assert captured.out == "first life"
     assert captured.err.count("out of memory") == 1
-    assert "life one ended" in captured.err
+    assert "incarnation one ended" in captured.err
 
 
 async def test_following_goes_on_with_the_next_life(
@@ -79,7 +80,7 @@ async def test_following_goes_on_with_the_next_life(
         await follow._logs("c/n", follow=True, offset=0, query={"stream": "stdout"})
     captured = capsys.readouterr()
     assert captured.out == "second lifethird life"
-    assert captured.err.count("-- the container's life two ended") == 1
+    assert captured.err.count("-- the container's incarnation two ended") == 1
 
 
 def test_options_become_a_query(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import pytest
 
 from rce.control.exceptions import PeerTimeoutError
-from rce.control.logs import LogWish
+from rce.control.logs import LogQuery
 from rce.control.messages import LogChunk, MachineInfo, TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus
-from rce_master.exceptions import NotFound, TaskSetAway
+from rce_master.exceptions import NotFoundError, TaskSetAwayError
 from rce_master.logs import LogRequest, read_log
 from rce_master.state.lifecycle import ContainerPhase
 from rce_master.state.records import Container, ContainerLive, TaskSet, User, UserRole
 from rce_master.state.tables import Tables
 
 BOX = "anna/box"
-PREVIOUS = LogWish(previous=True)
+PREVIOUS = LogQuery(previous=True)
 
 
 class Machine:
@@ -25,7 +25,7 @@ class Machine:
         self.text = text
         self.ended = ended
         self.silent = silent
-        self.wishes: list[LogWish] = []
+        self.queries: list[LogQuery] = []
 
     async def read_log(
         self,
@@ -33,9 +33,9 @@ class Machine:
         node: str,
         offset: int = 0,
         limit: int = 65536,
-        wish: LogWish = LogWish(),  # noqa: B008
+        query: LogQuery = LogQuery(),  # noqa: B008
     ) -> LogChunk:
-        self.wishes.append(wish)
+        self.queries.append(query)
         if self.silent:
             raise PeerTimeoutError("machine", 1.0)
         error = "" if self.text else "no logs of an earlier life of container box are kept here"
@@ -59,26 +59,26 @@ class Cloud:
             self.tables.live.assign(BOX, live)
         self.robots = Machine("robots have no logs")
 
-    async def read(self, node: str = "", wish: LogWish = LogWish()) -> str:  # noqa: B008
+    async def read(self, node: str = "", query: LogQuery = LogQuery()) -> str:  # noqa: B008
         peers = {**self.machines, "robots": self.robots}
-        return (await read_log(self.tables, peers, LogRequest(BOX, node, wish=wish))).text
+        return (await read_log(self.tables, peers, LogRequest(BOX, node, query=query))).text
 
 
 async def test_a_container_is_read_where_it_is() -> None:
     cloud = Cloud(at="a", a=Machine("here"), b=Machine("there"))
     assert await cloud.read() == "here"
-    assert not cloud.machines["b"].wishes
-    await cloud.read(wish=LogWish(life="now"))
-    await cloud.read(wish=LogWish(life="former"))
-    assert cloud.machines["a"].wishes == [
-        LogWish(),
-        LogWish(life="now"),
-        LogWish(life="former", since=17.0),
+    assert not cloud.machines["b"].queries
+    await cloud.read(query=LogQuery(incarnation="now"))
+    await cloud.read(query=LogQuery(incarnation="former"))
+    assert cloud.machines["a"].queries == [
+        LogQuery(),
+        LogQuery(incarnation="now"),
+        LogQuery(incarnation="former", since=17.0),
     ], "not what was there before its user"
-    with pytest.raises(NotFound, match="has no node 'x'"):
+    with pytest.raises(NotFoundError, match="has no node 'x'"):
         await cloud.read("x")
     cloud.machines["a"].silent = True
-    with pytest.raises(TaskSetAway):
+    with pytest.raises(TaskSetAwayError):
         await cloud.read()
 
 
@@ -86,19 +86,20 @@ async def test_of_a_container_that_is_gone_the_last_life_counts() -> None:
     older, newer = Machine("older", ended=5.0), Machine("newer", ended=6.0)
     cloud = Cloud(a=older, b=newer, c=Machine(), d=Machine("?", silent=True))
     assert await cloud.read("any") == "newer"
-    assert older.wishes == [LogWish(since=17.0)], "not what was there before its user"
-    assert not cloud.robots.wishes
-    with pytest.raises(NotFound, match="there is no container 'box'"):
+    assert older.queries == [LogQuery(since=17.0)], "not what was there before its user"
+    assert not cloud.robots.queries
+    with pytest.raises(NotFoundError, match="there is no container 'box'"):
         await Cloud(a=Machine()).read()
 
 
-async def test_an_earlier_life_is_looked_for_where_the_container_is_and_then_elsewhere() -> None:
+async def test_earlier_log_is_searched_here_then_elsewhere() -> None:
+    """An earlier life is looked for where the container is and then elsewhere."""
     cloud = Cloud(at="a", a=Machine("here", ended=5.0), b=Machine("there", ended=9.0))
     assert await cloud.read("removed", PREVIOUS) == "here"
     cloud.machines["a"].text = ""
     assert await cloud.read("removed", PREVIOUS) == "there"
     cloud.machines["b"].text = ""
-    with pytest.raises(NotFound, match="no logs of an earlier life"):
+    with pytest.raises(NotFoundError, match="no logs of an earlier life"):
         await cloud.read("removed", PREVIOUS)
-    with pytest.raises(NotFound, match="no machine is connected"):
+    with pytest.raises(NotFoundError, match="no machine is connected"):
         await Cloud(at="away").read("", PREVIOUS)

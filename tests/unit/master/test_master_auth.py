@@ -9,7 +9,7 @@ from argon2 import PasswordHasher
 from support.master_world import World
 
 from rce_master.auth import Authenticator, client_digest
-from rce_master.exceptions import TooManyFailures, WrongCredentials
+from rce_master.exceptions import TooManyFailuresError, WrongCredentialsError
 from rce_master.state import commands
 from rce_master.state.records import KnownLogin, User, UserRole
 from rce_master.state.tables import Tables
@@ -52,7 +52,7 @@ def gate() -> Iterator[Gate]:
 async def test_right_and_wrong_passwords(gate: Gate) -> None:
     assert (await gate.auth.verify("zoe", RIGHT)).name == "zoe"
     for name, password in (("zoe", WRONG), ("nobody", RIGHT), ("anna", RIGHT)):
-        with pytest.raises(WrongCredentials, match="unknown user or wrong password"):
+        with pytest.raises(WrongCredentialsError, match="unknown user or wrong password"):
             await gate.auth.verify(name, password)
 
 
@@ -70,14 +70,14 @@ async def test_a_login_that_is_given_up_takes_no_other_with_it(gate: Gate) -> No
 
 
 async def test_an_unknown_user_takes_a_hash_too(gate: Gate) -> None:
-    with pytest.raises(WrongCredentials):
+    with pytest.raises(WrongCredentialsError):
         await gate.auth.verify("nobody", RIGHT)
     assert gate.hasher.verified == 1
 
 
 async def guess(gate: Gate, count: int, address: str = "192.0.2.66") -> None:
     for number in range(count):
-        with pytest.raises(WrongCredentials):
+        with pytest.raises(WrongCredentialsError):
             await gate.auth.verify("zoe", client_digest(f"guess {number}"), address)
 
 
@@ -86,7 +86,7 @@ async def test_guesses_from_one_address_hold_up_nobody_else(gate: Gate) -> None:
     await guess(gate, FREE)
     delayed = asyncio.create_task(gate.auth.verify("zoe", client_digest("eleventh"), "192.0.2.66"))
     await asyncio.sleep(0)
-    with pytest.raises(TooManyFailures, match="from your address; try again in 6 s"):
+    with pytest.raises(TooManyFailuresError, match="from your address; try again in 6 s"):
         await gate.auth.verify("zoe", client_digest("twelfth"), "192.0.2.66")
     assert gate.hasher.verified == FREE
     assert (await gate.auth.verify("zoe", RIGHT, "192.0.2.1")).name == "zoe"
@@ -132,7 +132,7 @@ async def test_a_right_password_is_known_over_a_restart(gate: Gate) -> None:
         new = await restarted.auth.hash(client_digest("new"))
         gate.world.do(commands.SetPassword(name="zoe", password=new))
         assert len(tables.known_logins) == 0
-        with pytest.raises(WrongCredentials):
+        with pytest.raises(WrongCredentialsError):
             await restarted.auth.verify("zoe", RIGHT, "192.0.2.1")
     finally:
         restarted.auth.close()
@@ -142,7 +142,7 @@ async def test_marks_made_with_another_key_are_worth_nothing(gate: Gate) -> None
     forged = KnownLogin(user="zoe", mark=gate.auth._mark("zoe", gate.password, WRONG))
     gate.auth._key = b"another key"
     gate.world.do(commands.RememberLogin(login=forged))
-    with pytest.raises(WrongCredentials):
+    with pytest.raises(WrongCredentialsError):
         await gate.auth.verify("zoe", WRONG)
 
 
@@ -150,6 +150,6 @@ async def test_a_changed_password_makes_the_old_one_worthless(gate: Gate) -> Non
     await gate.auth.verify("zoe", RIGHT)
     new = await gate.auth.hash(client_digest("new"))
     gate.world.do(commands.SetPassword(name="zoe", password=new))
-    with pytest.raises(WrongCredentials):
+    with pytest.raises(WrongCredentialsError):
         await gate.auth.verify("zoe", RIGHT)
     await gate.auth.verify("zoe", client_digest("new"))

@@ -3,24 +3,24 @@ from __future__ import annotations
 import asyncio
 
 from rce_master.events import EventLog
-from rce_master.state.changes import Happening
+from rce_master.state.changes import StateEvent
 
 
-def happening(text: str) -> Happening:
-    return Happening("kind", "anna", "anna/c", text)
+def state_event(text: str) -> StateEvent:
+    return StateEvent("kind", "anna", "anna/c", text)
 
 
 def test_ids_grow_over_a_restart() -> None:
     old = EventLog(1000.0)
     for _ in range(5):
-        old.add(happening("x"), 1000.0)
+        old.add(state_event("x"), 1000.0)
     assert EventLog(1000.5).last_id > old.last_id
 
 
 def test_the_ring_keeps_the_newest() -> None:
     log = EventLog(0.0, capacity=3)
     for number in range(5):
-        log.add(happening(str(number)), 0.0)
+        log.add(state_event(str(number)), 0.0)
     assert [e.text for e in log.since(-1)] == ["2", "3", "4"]
     assert [e.text for e in log.since(3)] == ["4"]
     assert [e.text for e in log.since(-1, limit=1)] == ["2"]
@@ -32,7 +32,7 @@ async def test_followers_wait_for_news() -> None:
     log = EventLog(0.0)
     waiting = [asyncio.ensure_future(log.wait(log.last_id, 30)) for _ in range(3)]
     await asyncio.sleep(0)
-    log.add(happening("news"), 1.0)
+    log.add(state_event("news"), 1.0)
     for found in await asyncio.gather(*waiting):
         assert [e.text for e in found] == ["news"]
     assert await log.wait(log.last_id, 0.01) == []
@@ -41,9 +41,9 @@ async def test_followers_wait_for_news() -> None:
 def test_one_users_flood_costs_nobody_else_their_events() -> None:
     log = EventLog(0.0, capacity=10)
     for text in ("first", "second"):
-        log.add(Happening("kind", "bert", "bert/c", text), 0.0)
+        log.add(StateEvent("kind", "bert", "bert/c", text), 0.0)
     for number in range(100):
-        log.add(happening(str(number)), 0.0)
+        log.add(state_event(str(number)), 0.0)
     assert [e.text for e in log.since(-1, user="bert")] == ["first", "second"]
     assert [e.text for e in log.since(-1, user="anna")] == [str(number) for number in range(92, 100)]
     assert [e.text for e in log.since(-1, limit=3)] == ["first", "second", "92"]

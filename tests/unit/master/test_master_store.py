@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce_master.exceptions import StoreBusy, StoreError
+from rce_master.exceptions import StaleTermError, StoreBusyError, StoreError
 from rce_master.store import MemoryStore, Row, SqliteStore
 
 if TYPE_CHECKING:
@@ -19,6 +19,28 @@ async def check_round_trip(store: Store) -> None:
     await store.save([Row("users", "a", b"1"), Row("users", "b", b"2"), Row("links", "a", b"3")])
     await store.save([Row("users", "a", None), Row("users", "b", b"4"), Row("users", "none", None)])
     assert await store.load() == {"users": {"b": b"4"}, "links": {"a": b"3"}}
+
+
+async def check_terms(store: Store) -> None:
+    await store.save([Row("users", "a", b"1")])
+    first = await store.begin_term()
+    await store.save([Row("users", "a", b"2")], first)
+    second = await store.begin_term()
+    assert second > first
+    with pytest.raises(StaleTermError, match="another master has taken over"):
+        await store.save([Row("users", "a", b"3")], first)
+    await store.save([Row("users", "b", b"4")], second)
+    assert await store.load() == {"users": {"a": b"2", "b": b"4"}}
+
+
+async def test_who_has_an_older_term_writes_nothing(tmp_path: Path) -> None:
+    await check_terms(MemoryStore())
+    store = await SqliteStore.open(tmp_path / "state")
+    await check_terms(store)
+    await store.close()
+    store = await SqliteStore.open(tmp_path / "state")
+    assert await store.begin_term() == 3
+    await store.close()
 
 
 async def test_memory_store_keeps_rows() -> None:
@@ -52,7 +74,7 @@ async def test_only_the_owner_can_read_it(tmp_path: Path) -> None:
 
 async def test_two_masters_do_not_share_a_folder(tmp_path: Path) -> None:
     store = await SqliteStore.open(tmp_path)
-    with pytest.raises(StoreBusy, match="a master is running"):
+    with pytest.raises(StoreBusyError, match="a master is running"):
         await SqliteStore.open(tmp_path)
     await store.close()
     await (await SqliteStore.open(tmp_path)).close()
@@ -75,7 +97,7 @@ async def test_a_file_that_is_no_store_is_refused(tmp_path: Path) -> None:
 
 async def test_a_failed_save_writes_nothing(tmp_path: Path) -> None:
     store = await SqliteStore.open(tmp_path)
-    bad = Row("users", "b", object())  # type: ignore[arg-type]
+    bad = Row("users", "b", object())  # type: ignore[arg-type]  # no store can keep it
     with pytest.raises(StoreError):
         await store.save([Row("users", "a", b"1"), bad])
     await store.save([Row("users", "c", b"3")])

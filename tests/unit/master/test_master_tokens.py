@@ -3,7 +3,13 @@ from __future__ import annotations
 import pytest
 from support.master_world import World
 
-from rce_master.exceptions import Conflict, Forbidden, LimitReached, NotFound, WrongCredentials
+from rce_master.exceptions import (
+    ConflictError,
+    ForbiddenError,
+    LimitReachedError,
+    NotFoundError,
+    WrongCredentialsError,
+)
 from rce_master.state import commands
 from rce_master.state.settings import StateSettings
 from rce_master.tokens import TOKEN_LIFETIME_S, Tokens, new_token
@@ -26,7 +32,7 @@ class Issuer:
     def is_good(self, token: str) -> bool:
         try:
             return self.tokens.find(token)[0].name == "anna"
-        except WrongCredentials:
+        except WrongCredentialsError:
             return False
 
     def digest(self, token: str) -> str:
@@ -94,17 +100,17 @@ def test_login_with_password_changed_meanwhile_is_refused() -> None:
     issuer = Issuer()
     _, record = new_token("anna", "", 0.0)
     issuer.world.do(commands.SetPassword(name="anna", password="y"))
-    with pytest.raises(Conflict, match="password was changed"):
+    with pytest.raises(ConflictError, match="password was changed"):
         issuer.world.do(commands.AddToken(token=record, password="x"))
     issuer.world.robot_set()
-    with pytest.raises(Forbidden, match="password was changed"):
+    with pytest.raises(ForbiddenError, match="password was changed"):
         issuer.world.do(commands.RobotLogin(process="r1", id="anna/rob", password="x"))
 
 
 def test_second_token_of_robot_needs_replace() -> None:
     issuer = Issuer()
     first = issuer.add("robot:R1")
-    with pytest.raises(Conflict, match="rce robot revoke R1"):
+    with pytest.raises(ConflictError, match="rce robot revoke R1"):
         issuer.add("robot:R1")
     second = issuer.add("robot:R1", replaces=True)
     assert (issuer.is_good(first), issuer.is_good(second)) == (False, True)
@@ -113,7 +119,7 @@ def test_second_token_of_robot_needs_replace() -> None:
 def test_robot_tokens_are_limited_and_stay() -> None:
     issuer = Issuer(StateSettings(max_robots=2))
     kept = [issuer.add(f"robot:R{number}") for number in range(2)]
-    with pytest.raises(LimitReached, match="2 tokens"):
+    with pytest.raises(LimitReachedError, match="2 tokens"):
         issuer.add("robot:R3")
     assert all(map(issuer.is_good, kept))
 
@@ -128,9 +134,9 @@ def test_revoked_robot_token_sends_away_its_session_only() -> None:
     changes = world.do(commands.RevokeRobotToken(user="anna", robot="R1"))
     assert [(w.id, w.reason) for w in changes.withdrawals] == [("anna/R1", "the robot's token was revoked")]
     assert (world.session("R1"), world.session("other")) == ("absent", "connected")
-    with pytest.raises(Forbidden, match="revoked"):
+    with pytest.raises(ForbiddenError, match="revoked"):
         world.do(commands.RobotLogin(process="r1", id="anna/R1", credential=digest))
-    with pytest.raises(NotFound, match="rce robot list"):
+    with pytest.raises(NotFoundError, match="rce robot list"):
         world.do(commands.RevokeRobotToken(user="anna", robot="R1"))
 
 
@@ -150,7 +156,7 @@ def test_revoke_by_id_is_of_the_user_only() -> None:
     issuer.world.user("bob")
     token = issuer.add()
     id_ = issuer.tokens.find(token)[1].id
-    with pytest.raises(NotFound, match="rce token list"):
+    with pytest.raises(NotFoundError, match="rce token list"):
         issuer.world.do(commands.RevokeToken(user="bob", id=id_))
     issuer.world.do(commands.RevokeToken(user="anna", id=id_))
     assert not issuer.is_good(token)

@@ -2,36 +2,43 @@
 
 from __future__ import annotations
 
-from typing import Any
+from random import Random
+from typing import Any, Unpack
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.parts import MachineParts
 
 from rce.control.messages import MachineInfo
-from rce.control.model import Network, Resources
+from rce.model.specs import Network, Resources
 from rce_master.state.placement import DETOUR, Room, choose, refusals
 
 MB = 1 << 20
 SHORT_OF_MEMORY = "m1 has 40 of 100 MB memory free, 50 MB needed"
 
 
-def room(process: str = "m1", **fields: Any) -> Room:
-    promised = {
-        key: fields.pop(key) for key in ("slots_used", "cpu_used", "memory_used", "draining") if key in fields
-    }
+def room(
+    process: str = "m1",
+    *,
+    slots_used: int = 0,
+    cpu_used: float = 0.0,
+    memory_used: int = 0,
+    draining: bool = False,
+    **machine: Unpack[MachineParts],
+) -> Room:
     return Room(
         process=process,
-        machine=MachineInfo(name=process, **fields),
-        slots=promised.get("slots_used", 0),
-        cpu=promised.get("cpu_used", 0.0),
-        memory=promised.get("memory_used", 0),
-        draining=promised.get("draining", False),
+        machine=MachineInfo(name=process, **machine),
+        slots=slots_used,
+        cpu=cpu_used,
+        memory=memory_used,
+        draining=draining,
     )
 
 
 @pytest.mark.parametrize(
-    ("where", "wish", "reason"),
+    ("where", "requested", "reason"),
     [
         (room(cores=2, cpu_used=0.5), {"cpu": 4.0}, "m1 has 1.5 of 2 cores free, 4 needed"),
         (room(slots=4, slots_used=3), {"size": 2}, "m1 has 1 of 4 slots free, 2 needed"),
@@ -48,9 +55,9 @@ def room(process: str = "m1", **fields: Any) -> Room:
         ),
     ],
 )
-def test_what_is_missing_is_named(where: Room, wish: dict[str, Any], reason: str) -> None:
-    assert where.why_not(Resources(**wish)) == reason
-    assert not where.fits(Resources(**wish))
+def test_what_is_missing_is_named(where: Room, requested: dict[str, Any], reason: str) -> None:
+    assert where.why_not(Resources(**requested)) == reason
+    assert not where.fits(Resources(**requested))
 
 
 def test_what_a_machine_does_not_count_it_has_enough_of() -> None:
@@ -99,7 +106,7 @@ def test_a_long_list_of_refusals_is_cut() -> None:
     assert text.endswith("and 12 more machines")
 
 
-WISHES = st.builds(
+REQUESTS = st.builds(
     Resources,
     size=st.integers(1, 4),
     cpu=st.sampled_from([0.0, 0.1, 0.5, 2.0]),
@@ -121,35 +128,37 @@ ROOMS = st.lists(
 )
 
 
-@given(ROOMS, st.lists(WISHES, max_size=12))
-def test_no_machine_is_ever_promised_more_than_it_has(rooms: list[Room], wishes: list[Resources]) -> None:
+@given(ROOMS, st.lists(REQUESTS, max_size=12))
+def test_no_machine_is_ever_promised_more_than_it_has(rooms: list[Room], requests: list[Resources]) -> None:
     found = {made.process: made for made in rooms}
-    for wish in wishes:
-        chosen = choose(found.values(), wish)
+    for requested in requests:
+        chosen = choose(found.values(), requested)
         if chosen is None:
-            assert not any(each.fits(wish) for each in found.values())
-            assert len(refusals(found.values(), wish, most=99).split("; ")) == max(1, len(found))
+            assert not any(each.fits(requested) for each in found.values())
+            assert len(refusals(found.values(), requested, most=99).split("; ")) == max(1, len(found))
             continue
         assert not chosen.draining
-        assert set(wish.special_features) <= set(chosen.machine.labels)
-        found[chosen.process] = chosen.with_(wish)
+        assert set(requested.special_features) <= set(chosen.machine.labels)
+        found[chosen.process] = chosen.with_(requested)
         assert all(share <= 1 + 1e-6 for share in found[chosen.process].shares.values())
-        assert found[chosen.process].without(wish).load == pytest.approx(chosen.load)
+        assert found[chosen.process].without(requested).load == pytest.approx(chosen.load)
 
 
-@given(ROOMS, st.lists(WISHES, max_size=9))
+@given(ROOMS, st.lists(REQUESTS, max_size=9))
 def test_filling_a_machine_at_once_is_filling_it_one_by_one(
-    rooms: list[Room], wishes: list[Resources]
+    rooms: list[Room], requests: list[Resources]
 ) -> None:
     for each in rooms:
         filled = each
-        for wish in wishes:
-            filled = filled.with_(wish)
-        assert each.filled(wishes) == filled
+        for requested in requests:
+            filled = filled.with_(requested)
+        assert each.filled(requests) == filled
 
 
-@given(ROOMS, WISHES, st.randoms())
-def test_the_choice_does_not_depend_on_the_order(rooms: list[Room], wish: Resources, random: Any) -> None:
+@given(ROOMS, REQUESTS, st.randoms())
+def test_the_choice_does_not_depend_on_the_order(
+    rooms: list[Room], requested: Resources, random: Random
+) -> None:
     shuffled = list(rooms)
     random.shuffle(shuffled)
-    assert choose(rooms, wish) == choose(shuffled, wish)
+    assert choose(rooms, requested) == choose(shuffled, requested)

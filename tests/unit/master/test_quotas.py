@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from rce_master.exceptions import TooMuch
+from rce_master.exceptions import TooMuchError
 from rce_master.quotas import ITEMS_PER_REQUEST, Quotas, QuotaSettings
 from rce_master.state.records import User, UserRole
 
@@ -25,7 +25,7 @@ def test_requests_are_counted_for_each_user() -> None:
     quotas = Quotas(SMALL, clock)
     for _ in range(10):
         quotas.request(ANNA)
-    with pytest.raises(TooMuch, match="you may make 2 a second; try again in 1 s") as refused:
+    with pytest.raises(TooMuchError, match="you may make 2 a second; try again in 1 s") as refused:
         quotas.request(ANNA)
     assert refused.value.retry_after == 0.5
     quotas.request(BERT)
@@ -40,7 +40,7 @@ def test_a_large_request_of_a_robot_costs_more() -> None:
     clock = Clock()
     quotas = Quotas(SMALL, clock)
     quotas.robot_request(ANNA, 100 * ITEMS_PER_REQUEST)
-    with pytest.raises(TooMuch, match="try again in 46 s"):
+    with pytest.raises(TooMuchError, match="try again in 46 s"):
         quotas.robot_request(ANNA, 0)
     clock.now = 46.0
     quotas.robot_request(ANNA, 0)
@@ -49,7 +49,7 @@ def test_a_large_request_of_a_robot_costs_more() -> None:
 def test_streams_are_counted_for_each_user() -> None:
     quotas = Quotas(SMALL)
     with quotas.stream(ANNA), quotas.stream(ANNA):
-        with pytest.raises(TooMuch, match="you follow 2 streams"), quotas.stream(ANNA):
+        with pytest.raises(TooMuchError, match="you follow 2 streams"), quotas.stream(ANNA):
             pass
         with quotas.stream(BERT):
             pass

@@ -6,19 +6,15 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from msgspec.structs import replace
 
+from rce.control.desired import DesiredState, Fit
 from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
-from rce.control.model import (
-    EndpointState,
-    EndpointStatus,
-    InterfaceSpec,
-    LinkAddress,
-    Network,
-    NodeSpec,
-    Resources,
-)
-from rce_master.exceptions import Refused
+from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
+from rce.model.specs import InterfaceSpec, Network, NodeSpec, ResourceChanges, Resources
+from rce_master.exceptions import RefusedError
 from rce_master.state import capacity, commands
+from rce_master.state.changes import Changes
 from rce_master.state.core import State
 from rce_master.state.records import User, UserRole
 from rce_master.state.settings import StateSettings
@@ -45,14 +41,23 @@ STATUSES = st.builds(
 )
 SLOTS = 3
 LIMITS = StateSettings(
-    move_patience=3,
+    move_timeout=3,
     move_rest=2,
     robot_grace=3,
     container_grace=2,
-    placement_patience=1,
+    placement_timeout=1,
     max_containers=3,
     max_connections=6,
 )
+
+
+def in_order(spec: EndpointSpec) -> EndpointSpec:
+    return replace(
+        spec,
+        interfaces=tuple(sorted(spec.interfaces, key=lambda one: one.tag)),
+        links=tuple(sorted(spec.links, key=lambda one: one.id)),
+        connections=tuple(sorted(spec.connections, key=lambda one: one.id)),
+    )
 
 
 class Histories(RuleBasedStateMachine):
@@ -65,6 +70,7 @@ class Histories(RuleBasedStateMachine):
         self.stored: dict[str, dict[str, bytes]] = {}
         self.numbers: set[int] = set()
         self.revisions: dict[str, int] = {}
+        self.replicas: dict[str, DesiredState] = {}
         for name in ("ann", "bob"):
             self.do(commands.AddUser(user=User(name=name, role=UserRole.ADMIN, password="", created=0.0)))
 
@@ -73,7 +79,7 @@ class Histories(RuleBasedStateMachine):
         known = self.connection_ids()
         try:
             changes = self.state.apply(command, self.now)
-        except Refused:
+        except RefusedError:
             assert self.image(persistent_only=False) == before
             return
         for row in changes.rows():
@@ -85,6 +91,7 @@ class Histories(RuleBasedStateMachine):
         new = self.connection_ids() - known
         assert not new & self.numbers, "a connection id was used again"
         self.numbers |= new
+        self.follow(changes)
         for id_ in changes.touched:
             revision = self.state.spec(id_).revision
             assert revision > self.revisions.get(id_, 0)
@@ -92,8 +99,26 @@ class Histories(RuleBasedStateMachine):
         for drop in changes.withdrawals:
             assert drop.revision > self.revisions.get(drop.id, 0) or drop.id in changes.touched
 
+    def follow(self, changes: Changes) -> None:
+        """Keep what a task set knows that is told of every change in patches."""
+        for id_, touched in changes.touched.items():
+            patch = self.state.patch(id_, touched)
+            there = self.replicas.get(id_)
+            if there is None or touched.since == 0:
+                self.replicas[id_] = DesiredState(self.state.spec(id_))
+            else:
+                assert there.fit(patch) is Fit.NEXT
+                there.patch(patch)
+        for id_ in [id_ for id_ in self.replicas if id_ not in self.state.tables.endpoints]:
+            del self.replicas[id_]
+
+    @invariant()
+    def patches_add_up_to_the_whole(self) -> None:
+        for id_, replica in self.replicas.items():
+            assert in_order(replica.whole) == in_order(self.state.spec(id_))
+
     def connection_ids(self) -> set[int]:
-        return {id_ for link in self.state.tables.links for id_ in link.connections}
+        return {connection.id for connection in self.state.tables.connections}
 
     def image(self, *, persistent_only: bool) -> dict[str, dict[str, bytes]]:
         return {
@@ -173,13 +198,14 @@ class Histories(RuleBasedStateMachine):
 
     @rule(user=USERS, tag=TAGS, size=st.sampled_from([1, 2]), wait=st.booleans(), grouped=st.booleans())
     def create(self, user: str, tag: str, size: int, wait: bool = False, grouped: bool = False) -> None:
-        group = {"network": Network.GROUP, "group": "g"} if grouped else {}
-        wish = Resources(size=size, **group)  # type: ignore[arg-type]
-        self.do(commands.CreateContainer(user=user, tag=tag, resources=wish, wait=wait))
+        requested = (
+            Resources(size=size, network=Network.GROUP, group="g") if grouped else Resources(size=size)
+        )
+        self.do(commands.CreateContainer(user=user, tag=tag, resources=requested, wait=wait))
 
     @rule(user=USERS, tag=TAGS, size=st.sampled_from([1, 2, 3, 4]))
     def resize(self, user: str, tag: str, size: int) -> None:
-        self.do(commands.ResizeContainer(user=user, tag=tag, size=size))
+        self.do(commands.ResizeContainer(user=user, tag=tag, changes=ResourceChanges(size=size)))
 
     @rule(process=CONTAINER_SETS, draining=st.booleans())
     def drain(self, process: str, draining: bool) -> None:
@@ -215,7 +241,7 @@ class Histories(RuleBasedStateMachine):
 
     @rule(user=USERS, tag=TAGS, interface=INTERFACES, type_=TYPES)
     def add_interface(self, user: str, tag: str, interface: str, type_: str) -> None:
-        spec = InterfaceSpec(tag=interface, type=type_, cls="p/T", addr="/x")
+        spec = InterfaceSpec(tag=interface, type=type_, message_type="p/T", addr="/x")
         self.do(commands.AddInterface(user=user, endpoint=tag, interface=spec))
 
     @rule(user=USERS, tag=TAGS, interface=INTERFACES)

@@ -5,8 +5,14 @@ from __future__ import annotations
 import pytest
 from support.master_world import World
 
-from rce.control.model import ParameterSpec, ParameterValue
-from rce_master.exceptions import Conflict, Invalid, LimitReached, NotFound, Refused
+from rce.model.specs import ParameterSpec, ParameterValue
+from rce_master.exceptions import (
+    ConflictError,
+    InvalidRequestError,
+    LimitReachedError,
+    NotFoundError,
+    RefusedError,
+)
 from rce_master.state import commands
 from rce_master.state.records import UserRole
 from rce_master.state.settings import StateSettings
@@ -33,34 +39,34 @@ def test_something_else_under_the_same_tag_is_refused(world: World) -> None:
     world.wired()
     world.node("c", "n")
     with pytest.raises(
-        Conflict, match=r"container 'c' exists with other settings; resize or destroy it first"
+        ConflictError, match=r"container 'c' exists with other settings; resize or destroy it first"
     ):
         world.container(memory=5)
     with pytest.raises(
-        Conflict, match="node 'n' of container 'c' exists with other settings; remove it first"
+        ConflictError, match="node 'n' of container 'c' exists with other settings; remove it first"
     ):
         world.node("c", "n", exe="other.py")
-    with pytest.raises(Conflict, match="interface 'c/in' exists with other settings"):
+    with pytest.raises(ConflictError, match="interface 'c/in' exists with other settings"):
         world.interface("c/in", "PublisherInterface", addr="/elsewhere")
 
 
 def test_tags_are_unique_among_robots_and_containers(world: World) -> None:
     world.wired()
-    with pytest.raises(Conflict, match="'rob' is a robot already"):
+    with pytest.raises(ConflictError, match="'rob' is a robot already"):
         world.container("rob")
-    with pytest.raises(Conflict, match="'c' is a container"):
+    with pytest.raises(ConflictError, match="'c' is a container"):
         world.login("c")
 
 
 def test_forms_belong_to_their_end(world: World) -> None:
     world.wired()
-    with pytest.raises(Invalid, match="a robot takes PublisherConverter or PublisherForwarder"):
+    with pytest.raises(InvalidRequestError, match="a robot takes PublisherConverter or PublisherForwarder"):
         world.interface("rob/x", "PublisherInterface")
-    with pytest.raises(Invalid, match="a container takes SubscriberInterface"):
+    with pytest.raises(InvalidRequestError, match="a container takes SubscriberInterface"):
         world.interface("c/x", "SubscriberForwarder", addr="/x")
-    with pytest.raises(Invalid, match="addr is missing"):
+    with pytest.raises(InvalidRequestError, match="addr is missing"):
         world.interface("c/x", "SubscriberInterface", addr="")
-    with pytest.raises(Invalid, match="unknown interface type 'Nonsense'"):
+    with pytest.raises(InvalidRequestError, match="unknown interface type 'Nonsense'"):
         world.interface("c/x", "Nonsense")
 
 
@@ -74,20 +80,20 @@ def test_connections_need_complementing_roles_and_one_class(world: World) -> Non
     world.wired()
     world.interface("rob/sub", "SubscriberConverter")
     world.interface("c/sub", "SubscriberInterface")
-    world.interface("c/number", "PublisherInterface", cls="std_msgs/Int32")
-    with pytest.raises(Invalid, match="a Subscriber connects to a Publisher"):
+    world.interface("c/number", "PublisherInterface", message_type="std_msgs/Int32")
+    with pytest.raises(InvalidRequestError, match="a Subscriber connects to a Publisher"):
         world.connect("rob/sub", "c/sub")
-    with pytest.raises(Invalid, match="must be the same"):
+    with pytest.raises(InvalidRequestError, match="must be the same"):
         world.connect("rob/sub", "c/number")
-    with pytest.raises(NotFound, match="there is no interface 'c/nothing'; add it first"):
+    with pytest.raises(NotFoundError, match="there is no interface 'c/nothing'; add it first"):
         world.connect("rob/sub", "c/nothing")
-    with pytest.raises(NotFound, match="there is no robot or container 'nobody'"):
+    with pytest.raises(NotFoundError, match="there is no robot or container 'nobody'"):
         world.connect("rob/sub", "nobody/x")
-    with pytest.raises(Invalid, match="write ENDPOINT/INTERFACE"):
+    with pytest.raises(InvalidRequestError, match="write ENDPOINT/INTERFACE"):
         world.connect("rob", "c/sub")
-    with pytest.raises(Invalid, match="must be the same"):
+    with pytest.raises(InvalidRequestError, match="must be the same"):
         world.connect("c/sub", "c/number")
-    with pytest.raises(Invalid, match="do not complete each other"):
+    with pytest.raises(InvalidRequestError, match="do not complete each other"):
         world.connect("c/sub", "c/sub")
 
 
@@ -110,24 +116,25 @@ def test_two_interfaces_of_one_endpoint_are_connected(world: World) -> None:
     assert [link.peer for link in world.spec("c").links if link.peer == spec.id] == []
 
 
-def test_a_service_of_an_endpoint_for_itself_takes_one_connection(world: World) -> None:
+def test_own_service_takes_one_connection(world: World) -> None:
+    """A service of an endpoint for itself takes one connection."""
     world.wired()
     for name in ("a_ask", "z_ask"):
-        world.interface(f"c/{name}", "ServiceProviderInterface", cls="std_srvs/Empty")
-        world.interface("c/serve", "ServiceClientInterface", cls="std_srvs/Empty")
-        world.interface("c/other", "ServiceClientInterface", cls="std_srvs/Empty")
+        world.interface(f"c/{name}", "ServiceProviderInterface", message_type="std_srvs/Empty")
+        world.interface("c/serve", "ServiceClientInterface", message_type="std_srvs/Empty")
+        world.interface("c/other", "ServiceClientInterface", message_type="std_srvs/Empty")
         world.connect(f"c/{name}", "c/serve")
-        with pytest.raises(Conflict, match="takes one connection"):
+        with pytest.raises(ConflictError, match="takes one connection"):
             world.connect(f"c/{name}", "c/other")
 
 
 def test_a_service_provider_takes_one_connection(world: World) -> None:
     world.wired()
-    world.interface("rob/call", "ServiceProviderConverter", cls="std_srvs/Empty")
-    world.interface("c/one", "ServiceClientInterface", cls="std_srvs/Empty")
-    world.interface("c/two", "ServiceClientInterface", cls="std_srvs/Empty")
+    world.interface("rob/call", "ServiceProviderConverter", message_type="std_srvs/Empty")
+    world.interface("c/one", "ServiceClientInterface", message_type="std_srvs/Empty")
+    world.interface("c/two", "ServiceClientInterface", message_type="std_srvs/Empty")
     world.connect("rob/call", "c/one")
-    with pytest.raises(Conflict, match="takes one connection: disconnect it first"):
+    with pytest.raises(ConflictError, match="takes one connection: disconnect it first"):
         world.connect("c/two", "rob/call")
     world.do(commands.Disconnect(user="anna", tag_a="c/one", tag_b="rob/call"))
     world.connect("c/two", "rob/call")
@@ -136,17 +143,18 @@ def test_a_service_provider_takes_one_connection(world: World) -> None:
 def test_disconnecting_what_is_not_connected_is_told(world: World) -> None:
     world.wired()
     world.interface("c/other", "PublisherInterface")
-    with pytest.raises(NotFound, match="are not connected"):
+    with pytest.raises(NotFoundError, match="are not connected"):
         world.do(commands.Disconnect(user="anna", tag_a="rob/out", tag_b="c/other"))
 
 
-def test_removing_an_interface_removes_its_connections_at_both_ends(world: World) -> None:
+def test_removing_interface_removes_connections_both_ends(world: World) -> None:
+    """Removing an interface removes its connections at both ends."""
     world.wired()
     changes = world.do(commands.RemoveInterface(user="anna", endpoint="rob", tag="out"))
     assert set(changes.touched) == {"anna/rob", "anna/c"}
     assert world.spec("c").connections == ()
     assert world.spec("c").links == ()
-    with pytest.raises(NotFound, match="there is no interface 'rob/out'"):
+    with pytest.raises(NotFoundError, match="there is no interface 'rob/out'"):
         world.do(commands.RemoveInterface(user="anna", endpoint="rob", tag="out"))
 
 
@@ -157,11 +165,11 @@ def test_destroying_a_container_removes_all_that_is_in_it(world: World) -> None:
     assert set(changes.touched) == {"anna/rob"}
     assert world.spec("rob").links == ()
     assert [(w.process, w.id) for w in changes.withdrawals] == [("c1", "anna/c")]
-    with pytest.raises(NotFound, match="there is no container 'c'; create it first"):
+    with pytest.raises(NotFoundError, match="there is no container 'c'; create it first"):
         world.node("c", "n")
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         world.do(commands.DestroyContainer(user="anna", tag="c"))
-    with pytest.raises(Invalid, match="is a robot, not a container"):
+    with pytest.raises(InvalidRequestError, match="is a robot, not a container"):
         world.do(commands.DestroyContainer(user="anna", tag="rob"))
 
 
@@ -170,9 +178,9 @@ def test_users_do_not_see_each_other(world: World) -> None:
     world.user("bert")
     world.login("bot", user="bert")
     world.interface("bot/in", "PublisherConverter", user="bert")
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         world.connect("bot/in", "rob/out", user="bert")
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         world.do(commands.DestroyContainer(user="bert", tag="c"))
     world.container("c", user="bert")
     assert world.spec("c", "bert").links == ()
@@ -195,13 +203,13 @@ def test_parameters_are_set_and_replaced(world: World) -> None:
     before = revision(world, "c")
     set_([1, "a", False])
     assert revision(world, "c") == before
-    with pytest.raises(Invalid, match="does not fit into 32 bits"):
+    with pytest.raises(InvalidRequestError, match="does not fit into 32 bits"):
         set_(2**31)
-    with pytest.raises(Invalid, match="finite"):
+    with pytest.raises(InvalidRequestError, match="finite"):
         set_([1.0, float("nan")])
     world.do(commands.DeleteParameter(user="anna", container="c", name="p"))
     assert world.spec("c").parameters == ()
-    with pytest.raises(NotFound, match="has no parameter 'p'"):
+    with pytest.raises(NotFoundError, match="has no parameter 'p'"):
         world.do(commands.DeleteParameter(user="anna", container="c", name="p"))
 
 
@@ -210,13 +218,13 @@ def test_a_refused_command_changes_nothing_and_uses_no_number() -> None:
     world.wired()
     world.node("c", "n")
     before = {table.name: list(table) for table in world.state.tables.all}
-    with pytest.raises(LimitReached):
+    with pytest.raises(LimitReachedError):
         world.container("other")
-    with pytest.raises(LimitReached):
+    with pytest.raises(LimitReachedError):
         world.interface("c/more", "PublisherInterface")
-    with pytest.raises(LimitReached):
+    with pytest.raises(LimitReachedError):
         world.node("c", "more")
-    with pytest.raises(Refused):
+    with pytest.raises(RefusedError):
         world.login("rob")
     assert {table.name: list(table) for table in world.state.tables.all} == before
 
@@ -246,7 +254,8 @@ def test_one_link_for_all_connections_of_two_endpoints(world: World) -> None:
     assert (mine.links[0].peer, theirs.links[0].peer) == ("anna/c", "anna/rob")
 
 
-def test_the_robot_dials_the_container_and_the_smaller_id_its_equal(world: World) -> None:
+def test_robot_dials_container_smaller_id_dials_equal(world: World) -> None:
+    """The robot dials the container and the smaller id its equal."""
     world.wired()
     world.run()
     world.login("abel")
@@ -272,7 +281,7 @@ def test_the_robot_dials_the_container_and_the_smaller_id_its_equal(world: World
 
 def test_the_last_administrator_stays(world: World) -> None:
     world.user("root", UserRole.ADMIN)
-    with pytest.raises(Conflict, match="last administrator"):
+    with pytest.raises(ConflictError, match="last administrator"):
         world.do(commands.RemoveUser(name="root"))
     world.user("second", UserRole.ADMIN)
     world.do(commands.RemoveUser(name="root"))

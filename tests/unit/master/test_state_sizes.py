@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from support.master_world import World
 
-from rce.control.model import InterfaceSpec, NodeSpec, ParameterValue
-from rce_master.exceptions import LimitReached
+from rce.model.specs import InterfaceSpec, NodeSpec, ParameterValue
+from rce_master.exceptions import LimitReachedError
 from rce_master.state import commands
 from rce_master.state.records import Container
 from rce_master.state.settings import StateSettings
@@ -32,13 +32,14 @@ def size(world: World, container: str = "c") -> int:
     return found.size
 
 
-def test_an_endpoint_holds_so_much_and_room_that_is_freed_can_be_used_again(world: World) -> None:
+def test_freed_room_of_endpoint_can_be_used_again(world: World) -> None:
+    """An endpoint holds so much and room that is freed can be used again."""
     put(world, "a")
     put(world, "b")
-    with pytest.raises(LimitReached, match="'c' would hold more than 100000 bytes"):
+    with pytest.raises(LimitReachedError, match="'c' would hold more than 100000 bytes"):
         put(world, "third")
     node = NodeSpec(tag="n", pkg="p", exe="e", args=LARGE)
-    with pytest.raises(LimitReached):
+    with pytest.raises(LimitReachedError):
         world.do(commands.AddNode(user="anna", container="c", node=node))
     put(world, "b", 1)
     put(world, "b", LARGE)
@@ -50,7 +51,7 @@ def test_a_user_holds_so_much_in_all(world: World) -> None:
     put(world, "a")
     put(world, "b")
     put(world, "a", container="d")
-    with pytest.raises(LimitReached, match="your robots and containers would hold more than 150000"):
+    with pytest.raises(LimitReachedError, match="your robots and containers would hold more than 150000"):
         put(world, "b", container="d")
     world.do(commands.DestroyContainer(user="anna", tag="c"))
     put(world, "b", container="d")
@@ -59,7 +60,7 @@ def test_a_user_holds_so_much_in_all(world: World) -> None:
 def test_what_is_taken_out_counts_no_more(world: World) -> None:
     before = size(world)
     node = NodeSpec(tag="n", pkg="p", exe="e")
-    interface = InterfaceSpec(tag="i", type="PublisherInterface", cls="a/B", addr="/x")
+    interface = InterfaceSpec(tag="i", type="PublisherInterface", message_type="a/B", addr="/x")
     world.do(commands.AddNode(user="anna", container="c", node=node))
     world.do(commands.AddInterface(user="anna", endpoint="c", interface=interface))
     put(world, "a", 1)

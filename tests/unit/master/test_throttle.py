@@ -4,7 +4,7 @@ import contextlib
 
 import pytest
 
-from rce_master.exceptions import TooManyFailures
+from rce_master.exceptions import TooManyFailuresError
 from rce_master.throttle import (
     FREE,
     FREE_OF_ADDRESS,
@@ -21,11 +21,12 @@ def fail(throttle: FailureThrottle, count: int, address: str = "a", user: str = 
     return [throttle.admit(address, user, 0.0) for _ in range(count)]
 
 
-def test_failures_are_slowed_down_and_refused_only_when_that_takes_too_long() -> None:
+def test_failures_are_slowed_then_refused() -> None:
+    """Failures are slowed down and refused only when that takes too long."""
     throttle = FailureThrottle()
     assert fail(throttle, FREE + 1) == [0.0] * FREE + [PACE_S]
     for _ in range(3):
-        with pytest.raises(TooManyFailures, match="try again in 6 s"):
+        with pytest.raises(TooManyFailuresError, match="try again in 6 s"):
             throttle.admit("a", "zoe", 0.0)
     assert throttle.admit("a", "zoe", 2.0) <= MAX_DELAY_S
 
@@ -62,7 +63,7 @@ def test_only_so_many_are_put_off_at_once() -> None:
     with contextlib.ExitStack() as stack:
         for _ in range(MAX_DELAYED):
             stack.enter_context(throttle.delaying("a", "zoe"))
-        with pytest.raises(TooManyFailures):
+        with pytest.raises(TooManyFailuresError):
             throttle.admit("a", "zoe", 0.0)
         assert throttle.admit("a", "anna", 0.0) == PACE_S
         assert throttle.admit("b", "zoe", 0.0) == 0

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from rce_master.bundles.uploads import FIRST_S, MAX_UPLOADS, Upload, Uploads
-from rce_master.exceptions import Busy, TooMuch
+from rce_master.exceptions import BusyError, TooMuchError
+from rce_master.packages.uploads import FIRST_S, MAX_UPLOADS, Upload, Uploads
 
 
 class Clock:
@@ -33,7 +33,7 @@ class Site:
             async with self.uploads.one(user) as upload:
                 self.current[user] = upload
                 await asyncio.Event().wait()
-        except (Busy, TooMuch) as error:
+        except (BusyError, TooMuchError) as error:
             self.ended[user] = str(error)
 
 
@@ -66,7 +66,7 @@ async def test_a_user_sends_one_package_at_a_time() -> None:
     async with asyncio.TaskGroup() as group:
         site = Site(group)
         task = await site.begin("anna")
-        with pytest.raises(TooMuch, match="another package just now"):
+        with pytest.raises(TooMuchError, match="another package just now"):
             async with site.uploads.one("anna"):
                 pass
         other = await site.begin("bert")

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypedDict, Unpack
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.parts import ResourceParts
 
 from rce.control.messages import MachineInfo, Usage
-from rce.control.model import EndpointUsage, NodeUsage, Resources
+from rce.control.model import EndpointUsage, NodeUsage
+from rce.model.specs import Resources
 from rce_master.advice import Advice, for_container, for_machine
 from rce_master.state.placement import Room
 from rce_master.usage import STEP_S, WINDOW_S, History, UsageBook
@@ -18,21 +20,35 @@ MB = 1 << 20
 ID = "anna/c"
 
 
+class CpuCounters(TypedDict):
+    cpu_s: float
+    throttled_s: float
+
+
+class UsageParts(TypedDict, total=False):
+    memory: int
+    memory_limit: int
+    oom_kills: int
+    cpu_limit: float
+
+
 class Watched:
     """A container that reports every two seconds."""
 
     def __init__(self) -> None:
         self.now = 0.0
         self.book = UsageBook(lambda: self.now)
-        self.counters: dict[str, float] = {}
+        self.counters = CpuCounters(cpu_s=0.0, throttled_s=0.0)
 
-    def run(self, seconds: float, *, cores: float = 0.0, throttled: float = 0.0, **fields: Any) -> History:
+    def run(
+        self, seconds: float, *, cores: float = 0.0, throttled: float = 0.0, **fields: Unpack[UsageParts]
+    ) -> History:
         """Let it run; returns its history."""
         for _ in range(int(seconds / 2)):
             self.now += 2
-            for key, rate in (("cpu_s", cores), ("throttled_s", throttled)):
-                self.counters[key] = self.counters.get(key, 0.0) + 2 * rate
-            told = EndpointUsage(**self.counters, **fields)  # type: ignore[arg-type]
+            self.counters["cpu_s"] += 2 * cores
+            self.counters["throttled_s"] += 2 * throttled
+            told = EndpointUsage(**self.counters, **fields)
             self.book.note("c1", Usage(cpu_s=1.0, memory=1, endpoints={ID: told}), {ID})
         found = self.book.history("c1", ID)
         assert found is not None
@@ -48,8 +64,8 @@ def texts(found: list[Advice]) -> list[tuple[str, str]]:
     return [(one.about, one.command) for one in found]
 
 
-def advise(history: History, room: Room | None = None, **wish: Any) -> list[Advice]:
-    return for_container("c", Resources(**wish), history, room)
+def advise(history: History, room: Room | None = None, **requested: Unpack[ResourceParts]) -> list[Advice]:
+    return for_container("c", Resources(**requested), history, room)
 
 
 def test_rates_are_those_of_the_last_two_reports(watched: Watched) -> None:
@@ -71,7 +87,7 @@ def test_nodes_have_rates_of_their_own() -> None:
 
 def test_a_container_that_was_made_anew_begins_anew(watched: Watched) -> None:
     watched.run(600, cores=1.0)
-    watched.counters.clear()
+    watched.counters = CpuCounters(cpu_s=0.0, throttled_s=0.0)
     history = watched.run(4, cores=0.5)
     assert history.rates.cpu == 0.5
     assert len(history.samples) == 2
@@ -132,17 +148,17 @@ def test_advice_to_grow_says_when_the_machine_has_no_room(watched: Watched) -> N
 
 
 def test_what_is_hardly_used_is_too_large_but_not_at_once(watched: Watched) -> None:
-    wish: dict[str, Any] = {"cpu": 2.0, "memory": 1000 * MB}
-    assert advise(watched.run(200, cores=0.1, memory=50 * MB), **wish) == []
+    requested: ResourceParts = {"cpu": 2.0, "memory": 1000 * MB}
+    assert advise(watched.run(200, cores=0.1, memory=50 * MB), **requested) == []
     history = watched.run(200, cores=0.1, memory=50 * MB)
-    assert texts(advise(history, **wish)) == [
+    assert texts(advise(history, **requested)) == [
         ("too large", "rce resize c --cpu 0.2"),
         ("too large", "rce resize c --memory 112M"),
     ]
     history = watched.run(10, cores=1.5, memory=900 * MB)
-    assert advise(history, **wish) == [], "once is enough"
+    assert advise(history, **requested) == [], "once is enough"
     watched.run(4, memory=50 * MB)
-    assert advise(watched.run(400, memory=50 * MB), **wish) == []
+    assert advise(watched.run(400, memory=50 * MB), **requested) == []
 
 
 def test_a_container_of_many_slots_that_uses_few_gives_some_back(watched: Watched) -> None:
@@ -175,7 +191,7 @@ def test_a_machine_that_is_nearly_promised_away_is_too_full() -> None:
     st.builds(Resources, size=st.integers(1, 9), cpu=st.floats(0, 8), memory=st.integers(0, 1 << 33)),
 )
 def test_advice_is_about_one_direction_of_each_thing(
-    reports: list[tuple[float, float, int, int, int]], wish: Resources
+    reports: list[tuple[float, float, int, int, int]], requested: Resources
 ) -> None:
     watched = Watched()
     for cores, throttled, memory, limit, kills in reports:
@@ -186,9 +202,9 @@ def test_advice_is_about_one_direction_of_each_thing(
             memory=memory,
             memory_limit=limit,
             oom_kills=kills,
-            cpu_limit=wish.cpu,
+            cpu_limit=requested.cpu,
         )
-    found = for_container("c", wish, history, None)
+    found = for_container("c", requested, history, None)
     assert all(one.command.startswith("rce resize c --") and one.text for one in found)
     assert len({one.command.split()[3] for one in found if one.about == "too small"}) == sum(
         one.about == "too small" for one in found

@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 from support.master_world import World
 
-from rce.control.limits import MEGABYTE as MB
-from rce_master.exceptions import LimitReached, NotFound
+from rce.control.machine import MEGABYTE as MB
+from rce_master.exceptions import LimitReachedError, NotFoundError
 from rce_master.state import commands
 from rce_master.state.limits import limit_of, used_of
 from rce_master.state.records import UserRole
@@ -36,7 +36,7 @@ def test_a_share_of_what_the_machines_have() -> None:
         "make others smaller (rce resize) or destroy them, or have an administrator allow more: "
         "rce user limit anna --slots"
     )
-    with pytest.raises(LimitReached) as refused:
+    with pytest.raises(LimitReachedError) as refused:
         world.container("b")
     assert str(refused.value) == text
 
@@ -60,16 +60,16 @@ def test_limits_of_one_user_win_until_they_are_taken_back() -> None:
     assert limit(world, "slots") == (0, "user")
     world.container("a", "bert")
     with pytest.raises(
-        LimitReached, match=r"you have 1 containers already; .*rce user limit bert --containers"
+        LimitReachedError, match=r"you have 1 containers already; .*rce user limit bert --containers"
     ):
         world.container("b", "bert")
     allow(world, containers=None)
-    with pytest.raises(LimitReached):
+    with pytest.raises(LimitReachedError):
         world.container("c")
     assert limit(world, "slots") == (0, "user")
     world.do(commands.RemoveUser(name="anna"))
     assert len(world.state.tables.user_limits) == 0
-    with pytest.raises(NotFound):
+    with pytest.raises(NotFoundError):
         allow(world, "nobody", slots=1)
 
 

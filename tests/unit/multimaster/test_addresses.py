@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rce.ros.multimaster import addresses
-from rce.ros.multimaster.errors import NoSuchInterface
+from rce.ros.multimaster.errors import NoSuchInterfaceError
 from rce.ros.multimaster.settings import DiscoverySettings
 
 
@@ -17,7 +17,7 @@ def test_groups_with_interfaces() -> None:
 
 async def test_an_interface_can_be_named() -> None:
     assert await addresses.address_of("lo") == await addresses.address_of("127.0.0.1") == "127.0.0.1"
-    with pytest.raises(NoSuchInterface):
+    with pytest.raises(NoSuchInterfaceError):
         await addresses.address_of("192.0.2.77")
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.ros.multimaster.errors import MalformedState, MultimasterError
+from rce.ros.multimaster.errors import MalformedStateError, MultimasterError
 from rce.ros.multimaster.filters import SyncFilter, SyncLists
 from rce.ros.multimaster.heartbeat import Stamp
 from rce.ros.multimaster.patterns import Patterns
@@ -128,7 +128,7 @@ def remote(**more: object) -> MasterInfo:
         nodes={"/talker": here},
         service_uris={"/clear": Provider("rosrpc://10.0.0.2:5001", THEIRS, is_local=True)},
     )
-    return replace(info, **more)  # type: ignore[arg-type]
+    return replace(info, **more)  # type: ignore[arg-type]  # any of its fields
 
 
 def names(entries: set[Registration]) -> set[tuple[str, str, str]]:
@@ -212,7 +212,7 @@ def test_a_state_of_fkie_is_read() -> None:
 
 @pytest.mark.parametrize("values", [None, [], [1] * 10, ["x", "0", "", "", [], [], [], [], [], []]])
 def test_what_is_no_state_is_refused(values: object) -> None:
-    with pytest.raises(MalformedState):
+    with pytest.raises(MalformedStateError):
         MasterInfo.from_wire(values)
 
 

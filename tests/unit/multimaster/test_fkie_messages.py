@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.heartbeat import Stamp
-from rce.ros.multimaster.neighbourhood import Neighbour, PeerChange, PeerEvent
+from rce.ros.multimaster.peer_table import Neighbour, PeerChange, PeerEvent
 
 SHARE = Path(messages.__file__).with_name("share") / messages.PACKAGE
 MASTER = Neighbour(

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.ros.multimaster.errors import MalformedHeartbeat
+from rce.ros.multimaster.errors import MalformedHeartbeatError
 from rce.ros.multimaster.heartbeat import SIZE, ZERO, Heartbeat, Kind, Stamp, decode
 
 LAYOUT = "cBBiiHii"
@@ -57,7 +57,7 @@ def test_what_is_written_is_read(kind: Kind, port: int, rate: int, stamp: Stamp,
 def test_whatever_else_comes_is_refused_or_a_heartbeat(datagram: bytes) -> None:
     try:
         beat = decode(datagram)
-    except MalformedHeartbeat:
+    except MalformedHeartbeatError:
         return
     assert datagram[:1] == b"R"
     assert beat.kind in Kind
@@ -73,7 +73,7 @@ def test_whatever_else_comes_is_refused_or_a_heartbeat(datagram: bytes) -> None:
     ],
 )
 def test_no_heartbeats(datagram: bytes) -> None:
-    with pytest.raises(MalformedHeartbeat):
+    with pytest.raises(MalformedHeartbeatError):
         decode(datagram)
 
 

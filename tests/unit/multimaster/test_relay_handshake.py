@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rce.ros.multimaster.errors import LinkBroken, MultimasterError
+from rce.ros.multimaster.errors import LinkBrokenError, MultimasterError
 from rce.ros.multimaster.relay.frames import MAX_GREETING, Decoder, Frame, Hello, Ping, Proof, encode
 from rce.ros.multimaster.relay.handshake import DialerHandshake, ListenerHandshake
 from rce.ros.multimaster.relay.link import check_listening
@@ -44,7 +44,9 @@ def test_token_is_in_no_frame() -> None:
 
 def test_dialer_with_another_token_learns_nothing() -> None:
     """The side that listens has given away a random number when it refuses."""
-    with pytest.raises(LinkBroken, match="robot has another token; give both sides the same --relay-token"):
+    with pytest.raises(
+        LinkBrokenError, match="robot has another token; give both sides the same --relay-token"
+    ):
         greet(DialerHandshake("robot", "wrong"), ListenerHandshake("cloud", "secret"))
 
 
@@ -55,7 +57,7 @@ def test_listener_with_another_token_is_refused() -> None:
     dialing.prove(listening.challenge(begin))
     challenge = liar.challenge(begin)
     _, hello = liar.finish(DialerHandshake.prove(_with_nonce(begin.nonce, "wrong"), challenge))
-    with pytest.raises(LinkBroken, match="cloud has another token"):
+    with pytest.raises(LinkBrokenError, match="cloud has another token"):
         dialing.finish(hello)
 
 
@@ -71,34 +73,34 @@ def test_recorded_proof_is_of_no_use() -> None:
     recorded = dialing.prove(listening.challenge(begin))
     another = ListenerHandshake("cloud", "secret")
     another.challenge(begin)
-    with pytest.raises(LinkBroken, match="another token"):
+    with pytest.raises(LinkBrokenError, match="another token"):
         another.finish(recorded)
 
 
 def test_own_connection_is_refused() -> None:
     """Who is dialed could hand our own proof back to us."""
     dialing = DialerHandshake("robot", "secret")
-    with pytest.raises(LinkBroken, match="from this program itself"):
+    with pytest.raises(LinkBrokenError, match="from this program itself"):
         ListenerHandshake("robot", "secret", frozenset({dialing.nonce})).challenge(dialing.begin())
 
 
 def test_older_protocol_is_refused_by_both_sides() -> None:
     """It sent the token to whoever connected."""
     older = Hello("old", protocol=1)
-    with pytest.raises(LinkBroken, match="old speaks relay protocol 1, not 2; update the older rce"):
+    with pytest.raises(LinkBrokenError, match="old speaks relay protocol 1, not 2; update the older rce"):
         ListenerHandshake("cloud", "secret").challenge(older)
-    with pytest.raises(LinkBroken, match="protocol 1"):
+    with pytest.raises(LinkBrokenError, match="protocol 1"):
         DialerHandshake("robot", "secret").prove(older)
 
 
 @pytest.mark.parametrize("frame", [Ping(), Hello("x"), Hello("x", "short"), Proof("x")])
 def test_listener_wants_a_hello_with_a_nonce(frame: Frame) -> None:
-    with pytest.raises(LinkBroken):
+    with pytest.raises(LinkBrokenError):
         ListenerHandshake("cloud", "secret").challenge(frame)
 
 
 def test_long_greeting_is_refused_before_it_is_kept() -> None:
-    with pytest.raises(LinkBroken, match="a frame of"):
+    with pytest.raises(LinkBrokenError, match="a frame of"):
         list(Decoder(MAX_GREETING).feed(b"".join(encode(Hello("x" * MAX_GREETING)))))
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.ros.multimaster.errors import LinkBroken
+from rce.ros.multimaster.errors import LinkBrokenError
 from rce.ros.multimaster.relay.frames import (
     Answer,
     Call,
@@ -65,7 +65,7 @@ def test_a_message_is_not_copied_on_its_way_out() -> None:
 def test_any_bytes_are_frames_or_break_the_link(stream: bytes) -> None:
     try:
         list(Decoder().feed(stream))
-    except LinkBroken:
+    except LinkBrokenError:
         return
 
 
@@ -74,7 +74,7 @@ def test_any_bytes_are_frames_or_break_the_link(stream: bytes) -> None:
     [b"\0\0\0\0P", b"\xff\xff\xff\xffD", b"\x01\0\0\0Z", b"\x02\0\0\0D1", b"\x03\0\0\0O[]", b"\x03\0\0\0H{}"],
 )
 def test_broken_frames(stream: bytes) -> None:
-    with pytest.raises(LinkBroken):
+    with pytest.raises(LinkBrokenError):
         list(Decoder().feed(stream))
 
 

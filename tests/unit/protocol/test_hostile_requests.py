@@ -6,10 +6,12 @@ import json
 
 import pytest
 
+from rce.model.requests import ConfigureComponents
 from rce.protocol.exceptions import MessageError
 from rce.protocol.limits import Limits
-from rce.protocol.messages import ConfigureComponents, DataMessage
-from rce.protocol.reading import decode, read_request
+from rce.protocol.messages import DataMessage
+from rce.protocol.reading import decode
+from rce.protocol.requests import read_request
 from rce.protocol.stream import Fault, ProtocolStream
 
 
@@ -24,7 +26,7 @@ def test_half_a_character_is_refused_beside_a_nan_too(half: str) -> None:
     text = '{"type": "CN", "data": {"x": NaN, "deleteParam": [{"containerTag": "c", "name": "HALF"}]}}'
     text = text.replace("HALF", half)
     for frame in (text, text.encode()):
-        with pytest.raises(MessageError, match="no valid JSON"):
+        with pytest.raises(MessageError, match="not valid JSON"):
             decode(frame)
 
 
@@ -36,7 +38,8 @@ def test_a_whole_character_in_two_escapes_is_read_beside_a_nan() -> None:
     assert message.msg["b"] == "\U0001f600"
 
 
-def test_a_request_that_is_too_long_is_refused_and_a_data_message_is_not() -> None:
+def test_long_request_is_refused_long_data_is_not() -> None:
+    """A request that is too long is refused and a data message is not."""
     stream = ProtocolStream.for_engine(Limits(max_request=1000))
     item = {"containerTag": "c", "name": "p", "value": "x" * 1000}
     (fault,) = stream.feed(json.dumps({"type": "CN", "data": {"setParam": [item]}}), 0.0)

@@ -10,21 +10,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rce.model import requests
+from rce.model.faults import join_path
+from rce.model.requests import AddNode, ConfigureComponents, Connection
+from rce.model.specs import Network, NodeSpec, Resources
 from rce.protocol import messages as m
 from rce.protocol.codec import encode, encode_message
 from rce.protocol.exceptions import MessageError
-from rce.protocol.reading import decode, read_request
+from rce.protocol.reading import decode
+from rce.protocol.requests import read_request
 
 
-def text(kind: str, data: Any) -> str:
+def text(kind: str, data: object) -> str:
     return json.dumps({"type": kind, "data": data})
 
 
 @pytest.mark.parametrize(
     ("kind", "data", "expected"),
     [
-        ("CC", {"containerTag": "c"}, m.CreateContainer(container_tag="c")),
-        ("CC", {"containerTag": "c", "containerData": None}, m.CreateContainer(container_tag="c")),
+        ("CC", {"containerTag": "c"}, requests.CreateContainer(tag="c")),
+        ("CC", {"containerTag": "c", "containerData": None}, requests.CreateContainer(tag="c")),
         (
             "CC",
             {
@@ -39,24 +44,25 @@ def text(kind: str, data: Any) -> str:
                     "specialFeatures": "gpu lidar",
                 },
             },
-            m.CreateContainer(
-                container_tag="c",
-                container_data=m.ContainerData(
+            requests.CreateContainer(
+                tag="c",
+                resources=Resources(
                     group="g",
                     group_ip="10.0.0.1",
+                    network=Network.GROUP,
                     size=2,
                     cpu=1.0,
-                    memory=1000,
+                    memory=1000 << 20,
                     bandwidth=5,
-                    special_features="gpu lidar",
+                    special_features=("gpu", "lidar"),
                 ),
             ),
         ),
-        ("DC", {"containerTag": "c", "unknown": 1}, m.DestroyContainer(container_tag="c")),
+        ("DC", {"containerTag": "c", "unknown": 1}, requests.DestroyContainer(tag="c")),
         (
             "CX",
             {"connect": [{"tagA": "c/i", "tagB": "r/j"}]},
-            m.ConfigureConnections(connect=(m.Connection(tag_a="c/i", tag_b="r/j"),)),
+            requests.ConfigureConnections(connect=(Connection(tag_a="c/i", tag_b="r/j"),)),
         ),
         (
             "DM",
@@ -65,17 +71,20 @@ def text(kind: str, data: Any) -> str:
         ),
         ("DM", {"iTag": "i", "type": "a/B", "msg": {}}, m.DataMessage("i", "a/B", {}, "nil")),
         ("ST", {"topic": "iu", "iTag": "i", "status": True}, m.InterfaceStatus(i_tag="i", status=True)),
-        ("ER", "no", m.ErrorReport(text="no")),
+        ("ER", "no", m.ErrorReport(problem="no")),
     ],
 )
-def test_message_is_read(kind: str, data: Any, expected: m.ClientMessage) -> None:
+def test_message_is_read(kind: str, data: object, expected: m.ClientMessage) -> None:
     assert decode(text(kind, data)) == expected
     assert decode(text(kind, data).encode()) == expected
 
 
 def test_features_are_words_or_a_list() -> None:
-    assert m.ContainerData(special_features="gpu  lidar").features == ("gpu", "lidar")
-    assert m.ContainerData(special_features=["gpu"]).features == ("gpu",)
+    for labels in ("gpu  lidar", ["gpu", "lidar"]):
+        read = read_request("CC", {"containerTag": "c", "containerData": {"specialFeatures": labels}})
+        assert read == requests.CreateContainer(
+            tag="c", resources=Resources(special_features=("gpu", "lidar"))
+        )
 
 
 def test_components_are_read() -> None:
@@ -107,13 +116,13 @@ def test_components_are_read() -> None:
             },
         )
     )
-    assert isinstance(read, m.ConfigureComponents)
+    assert isinstance(read, requests.ConfigureComponents)
     assert read.faults == ()
     assert read.add_nodes == (
-        m.AddNode(container_tag="c", node_tag="n", pkg="Test", exe="stringEcho.py", namespace="/Robot1"),
+        AddNode(container="c", node=NodeSpec(tag="n", pkg="Test", exe="stringEcho.py", namespace="/Robot1")),
     )
-    assert read.add_interfaces[0].addr == "/topic"
-    assert read.set_param[0].value == [1, 2.5, "x", True]
+    assert read.add_interfaces[0].interface.addr == "/topic"
+    assert read.set_param[0].parameter.value == [1, 2.5, "x", True]
     assert (len(read.remove_nodes), len(read.remove_interfaces), len(read.delete_param)) == (1, 1, 1)
     assert decode(str(encode(read)[0])) == read
 
@@ -134,9 +143,9 @@ def test_bad_items_are_reported_and_good_ones_kept() -> None:
         "setParam": [{"containerTag": "c", "name": "p", "value": {"a": 1}}],
     }
     read = read_request("CN", data)
-    assert isinstance(read, m.ConfigureComponents)
-    assert [node.node_tag for node in read.add_nodes] == ["n"]
-    places = [fault.split(": ", 1)[0] for fault in read.faults]
+    assert isinstance(read, requests.ConfigureComponents)
+    assert [add.node.tag for add in read.add_nodes] == ["n"]
+    places = [join_path(fault.path) for fault in read.faults]
     assert places == [
         "data.addNodes[1]",
         "data.addNodes[2].pkg",
@@ -146,25 +155,27 @@ def test_bad_items_are_reported_and_good_ones_kept() -> None:
         "data.addInterfaces[0].addr",
         "data.setParam[0].value",
     ]
-    assert "a package's name (letters, digits and '_', a letter first)" in read.faults[1]
+    assert "a package's name (letters, digits and '_', a letter first)" in read.faults[1].problem
 
 
 def test_bad_connection_is_reported_and_the_good_one_kept() -> None:
     read = read_request("CX", {"connect": [{"tagA": "ri", "tagB": "c/j"}, {"tagA": "r/i", "tagB": "c/j"}]})
-    assert isinstance(read, m.ConfigureConnections)
-    assert read.connect == (m.Connection(tag_a="r/i", tag_b="c/j"),)
-    assert read.faults == ("data.connect[0].tagA: must have the form ENDPOINT/INTERFACE, not 'ri'",)
+    assert isinstance(read, requests.ConfigureConnections)
+    assert read.connect == (Connection(tag_a="r/i", tag_b="c/j"),)
+    assert [str(fault) for fault in read.faults] == [
+        "data.connect[0].tagA: must have the form ENDPOINT/INTERFACE, not 'ri'"
+    ]
 
 
 @pytest.mark.parametrize(
     ("frame", "problem"),
     [
-        ("", "no valid JSON"),
-        ("{", "no valid JSON"),
-        ('{"type": "DM"} x', "no valid JSON"),
-        ('"\ud800"', "no valid JSON"),
-        (b"\xff", "no valid JSON"),
-        ('{"type": "CC", "data": Infinity', "no valid JSON"),
+        ("", "not valid JSON"),
+        ("{", "not valid JSON"),
+        ('{"type": "DM"} x', "not valid JSON"),
+        ('"\ud800"', "not valid JSON"),
+        (b"\xff", "not valid JSON"),
+        ('{"type": "CC", "data": Infinity', "not valid JSON"),
         ("[]", "a message must be an object, not a list"),
         ("null", "a message must be an object, not null"),
         ("{}", "type: is missing"),
@@ -203,7 +214,8 @@ def test_wrong_message_is_refused_with_its_place(frame: str | bytes, problem: st
     assert str(caught.value).startswith(problem)
 
 
-def test_nesting_within_the_limit_is_fine_even_among_many_brackets() -> None:
+def test_nesting_within_limit_is_fine_among_brackets() -> None:
+    """Nesting within the limit is fine even among many brackets."""
     msg = {"deep": json.loads("[" * 61 + "]" * 61), "wide": [[] for _ in range(1000)]}
     assert decode(text("DM", {"iTag": "i", "type": "a/B", "msg": msg})) == m.DataMessage("i", "a/B", msg)
 
@@ -223,17 +235,21 @@ def test_nan_of_python_writers_is_understood() -> None:
 @pytest.mark.parametrize("exe", ["a.py", "sub/a.py", "a..b", "..a"])
 def test_executable_inside_the_package_is_allowed(exe: str) -> None:
     node = {"containerTag": "c", "nodeTag": "n", "pkg": "Test", "exe": exe}
-    assert read_request("CN", {"addNodes": [node]}).add_nodes[0].exe == exe  # type: ignore[union-attr]
+    request = read_request("CN", {"addNodes": [node]})
+    assert isinstance(request, ConfigureComponents)
+    assert request.add_nodes[0].node.exe == exe
 
 
 @pytest.mark.parametrize("exe", ["", "/bin/sh", "..", "../a", "a/..", "a/../../b", "a\0b", "a\n"])
 def test_executable_outside_the_package_is_refused(exe: str) -> None:
     node = {"containerTag": "c", "nodeTag": "n", "pkg": "Test", "exe": exe}
-    assert read_request("CN", {"addNodes": [node]}).faults  # type: ignore[union-attr]
+    request = read_request("CN", {"addNodes": [node]})
+    assert isinstance(request, ConfigureComponents)
+    assert request.faults
 
 
 def test_unknown_request_type_is_refused() -> None:
-    with pytest.raises(MessageError, match="'DM' is no request; use one of CC, DC, CN, CX"):
+    with pytest.raises(MessageError, match="'DM' is not a request; use one of CC, DC, CN, CX"):
         read_request("DM", {})
 
 
@@ -253,14 +269,14 @@ JSON = st.recursive(
 
 
 @given(NAMES, NAMES, JSON, st.text(st.characters(codec="utf-8"), max_size=255))
-def test_data_message_survives_the_round_trip(tag: str, cls: str, msg: Any, msg_id: str) -> None:
+def test_data_message_survives_the_round_trip(tag: str, cls: str, msg: object, msg_id: str) -> None:
     message = m.DataMessage(tag, f"pkg/{cls}", msg, msg_id)
     (frame,) = encode(message)
     assert decode(str(frame)) == message
 
 
 @given(st.sampled_from(["CC", "DC", "CN", "CX", "DM", "ST", "ER", "XX"]), JSON)
-def test_any_data_is_a_message_or_an_error_with_words(kind: str, data: Any) -> None:
+def test_any_data_is_a_message_or_an_error_with_words(kind: str, data: object) -> None:
     (frame,) = encode_message(kind, data)
     with contextlib.suppress(MessageError):
         assert m.type_of(decode(str(frame))) == kind
@@ -274,7 +290,7 @@ def test_any_data_is_a_message_or_an_error_with_words(kind: str, data: Any) -> N
 def test_any_items_are_read_or_reported(data: Any) -> None:
     for kind in ("CN", "CX"):
         read = read_request(kind, data)
-        assert isinstance(read, m.ConfigureComponents | m.ConfigureConnections)
+        assert isinstance(read, requests.ConfigureComponents | requests.ConfigureConnections)
         given_items = sum(
             len(items)
             for key, items in data.items()
@@ -282,7 +298,7 @@ def test_any_items_are_read_or_reported(data: Any) -> None:
         )
         kept = (
             len(read.connect)
-            if isinstance(read, m.ConfigureConnections)
+            if isinstance(read, requests.ConfigureConnections)
             else len(read.add_nodes) + len(read.add_interfaces) + len(read.set_param)
         )
         assert kept + len(read.faults) >= given_items or len(read.faults) > 31

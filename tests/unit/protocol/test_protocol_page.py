@@ -10,10 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from rce.model.names import MAX_NAME_LENGTH, Form, Role
+from rce.model.requests import ConfigureComponents, ConfigureConnections
 from rce.protocol.http import CURRENT_VERSION, MIN_VERSION, read_credentials, read_master_request
 from rce.protocol.limits import DEFAULT_LIMITS, MAX_MESSAGE_ID_LENGTH
-from rce.protocol.messages import TYPES, ConfigureComponents, ConfigureConnections, DataMessage
-from rce.protocol.names import MAX_NAME_LENGTH, Form, Role
+from rce.protocol.messages import TYPES, DataMessage
 from rce.protocol.stream import Fault, ProtocolStream
 
 PAGE = (Path(__file__).parents[3] / "docs" / "protocol.md").read_text()

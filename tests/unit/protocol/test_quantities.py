@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.protocol.quantities import (
+from rce.model.quantities import (
     MAX_BANDWIDTH,
     MAX_CORES,
     MAX_MEMORY,
@@ -53,7 +52,7 @@ READERS: list[Callable[[object], float]] = [read_cores, read_memory, read_bandwi
     ],
 )
 def test_what_is_written_is_what_is_meant(
-    read: Callable[[object], float], written: Any, meant: float
+    read: Callable[[object], float], written: object, meant: float
 ) -> None:
     assert read(written) == meant
 
@@ -63,7 +62,9 @@ def test_what_is_written_is_what_is_meant(
     "written",
     ["", "much", "-1", "1,5", "5 apples", "٣", "1e3", "0x10", "5Mb", True, None, [1], {"a": 1}, b"1"],
 )
-def test_what_is_no_amount_is_refused_with_an_example(read: Callable[[object], float], written: Any) -> None:
+def test_what_is_no_amount_is_refused_with_an_example(
+    read: Callable[[object], float], written: object
+) -> None:
     if (read, written) == (read_memory, "5Mb"):
         assert read(written) == 5 << 20
         return

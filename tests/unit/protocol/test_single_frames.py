@@ -6,17 +6,16 @@ import json
 import re
 import struct
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rce.model.names import MAX_NAME_LENGTH
 from rce.protocol.codec import encode_data
 from rce.protocol.http import FEATURES, read_features
 from rce.protocol.limits import DEFAULT_LIMITS, MAX_MESSAGE_ID_LENGTH, Limits
 from rce.protocol.messages import NO_ID, DataMessage
-from rce.protocol.names import MAX_NAME_LENGTH
 from rce.protocol.single import MARK, MAX_HEADER, MAX_PAYLOAD
 from rce.protocol.stream import Event, Fault, ProtocolStream
 
@@ -33,7 +32,7 @@ def feed(frame: bytes, limits: Limits = DEFAULT_LIMITS) -> Event:
     return event
 
 
-def frame_of(header: Any, payload: bytes = b"payload") -> bytes:
+def frame_of(header: object, payload: bytes = b"payload") -> bytes:
     text = header if isinstance(header, bytes) else json.dumps(header).encode()
     return struct.pack("!BH", 1, len(text)) + text + payload
 
@@ -57,7 +56,7 @@ def test_message_makes_the_round_trip(
             assert isinstance(message.msg, memoryview)
             assert message.msg.obj is frame
             assert bytes(message.msg) == payload
-            told = (message.i_tag, message.type, message.msg_id, message.latch)
+            told = (message.i_tag, message.message_type, message.msg_id, message.latch)
             assert told == (tag, f"{package}/Type", msg_id, latch)
 
 
@@ -68,7 +67,7 @@ def test_any_bytes_are_a_message_or_one_fault(data: bytes) -> None:
 
 
 @given(st.recursive(st.none() | st.integers() | st.text(), lambda inner: st.dictionaries(st.text(), inner)))
-def test_any_json_as_header_is_one_fault(header: Any) -> None:
+def test_any_json_as_header_is_one_fault(header: object) -> None:
     assert isinstance(feed(frame_of(header)), Fault)
 
 
@@ -100,8 +99,8 @@ def test_msg_id_may_be_left_out_or_an_integer() -> None:
             b"\x01\xff\xff" + b" " * 70_000,
             f"a header of 65535 bytes is longer than the limit of {MAX_HEADER}",
         ),
-        (frame_of(b""), "no valid JSON"),
-        (frame_of(b"\xff{}"), "no valid JSON"),
+        (frame_of(b""), "not valid JSON"),
+        (frame_of(b"\xff{}"), "not valid JSON"),
         (frame_of(b'{"a":' * 800), ""),
         (frame_of([]), "data: must be an object"),
         (frame_of({"iTag": "i"}), "data.type: is missing"),
@@ -169,7 +168,7 @@ def test_example_of_the_page_is_such_a_frame() -> None:
     rows = [re.sub(r"\s*\|.*", "", row) for row in block.splitlines()]
     message = feed(bytes.fromhex("".join(rows)))
     assert isinstance(message, DataMessage)
-    assert (message.i_tag, message.type, bytes(message.msg)) == (
+    assert (message.i_tag, message.message_type, bytes(message.msg)) == (
         "say",
         "std_msgs/String",
         b"\x05\0\0\0hello",

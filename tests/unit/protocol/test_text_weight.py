@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -18,7 +17,7 @@ from rce.protocol.weight import Address, check_elements, find_address, is_light,
 STRING = "std_msgs/String"
 
 
-def data_message(msg: Any, *, msg_first: bool = False, **more: Any) -> bytes:
+def data_message(msg: object, *, msg_first: bool = False, **more: object) -> bytes:
     rest = {"iTag": "tag", "type": STRING, "msgID": "7", **more}
     data = {"msg": msg, **rest} if msg_first else {**rest, "msg": msg}
     return json.dumps({"data": data, "type": "DM"} if msg_first else {"type": "DM", "data": data}).encode()
@@ -66,7 +65,8 @@ def test_elements_are_counted_before_anything_is_parsed() -> None:
     check_elements(data_message("[" * 300_000), max_elements=10, max_values=10)
 
 
-def test_a_large_message_comes_out_unparsed_and_again_with_its_binary_values() -> None:
+def test_large_message_returns_with_its_binary_values() -> None:
+    """A large message comes out unparsed and again with its binary values."""
     stream = ProtocolStream.for_engine()
     id_ = "ab" * 16
     text = data_message({"format": "x" * 20, "many": [[]] * 3000, "data*": id_})
@@ -83,7 +83,8 @@ def test_a_large_message_comes_out_unparsed_and_again_with_its_binary_values() -
     assert stream.pending_bytes == 0
 
 
-def test_a_large_message_whose_binary_value_does_not_come_ends_its_call() -> None:
+def test_missing_binary_value_ends_the_call() -> None:
+    """A large message whose binary value does not come ends its call."""
     stream = ProtocolStream.for_engine()
     (large,) = stream.feed_text(data_message([[]] * 3000), 0.0)
     assert isinstance(large, LargeData)

@@ -4,28 +4,37 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Collection, Coroutine, Sequence
 from typing import Any
 
 import pytest
 
-from rce.control.model import InterfaceSpec
+from rce.aio.queues import OverflowPolicy
 from rce.guard.holdings import Holding, Holdings
-from rce.link import CallTimeout, InterfaceError, NotConnected, Overloaded, PeerFault, PeerLost
-from rce.protocol.messages import DataMessage
-from rce.protocol.names import InterfaceType
+from rce.link import (
+    Buffer,
+    CallTimeoutError,
+    InterfaceError,
+    NotConnectedError,
+    OverloadedError,
+    PeerFaultError,
+    PeerLostError,
+)
+from rce.model.names import InterfaceType
+from rce.model.specs import InterfaceSpec
+from rce.protocol.messages import CallId, DataMessage, ErrorReport
 from rce.protocol.stream import LargeData
 from rce.protocol.weight import Address
 from rce.ros.types import TypeRegistry
 from rce_robot.conversion import Result
 from rce_robot.conversion.jobs import HEAD, Job, decode_job, pack
 from rce_robot.conversion.worker import Worker
+from rce_robot.doors.base import Queued
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
 from rce_robot.factory import FormFactory
 from rce_robot.interface import RobotInterface
 from rce_robot.interfaces import make_interface
-from rce_robot.outbox import Overflow, Queued
-from rce_robot.outgoing import Outgoing, Serialized
+from rce_robot.outgoing import Outgoing, Rendered, Serialized
 from rce_robot.services import AnsweredByRobot
 
 STRING = "std_msgs/String"
@@ -37,20 +46,20 @@ WORKER = Worker(FormFactory(TypeRegistry()), 1 << 30)
 
 class FakePort:
     def __init__(self, type_: str, cls: str) -> None:
-        self.spec = InterfaceSpec(tag="tag", type=type_, cls=cls)
+        self.spec = InterfaceSpec(tag="tag", type=type_, message_type=cls)
         self.sent: list[bytes] = []
         self.latched: dict[str, bytes] = {}
         self.answer: bytes | Exception | asyncio.Future[bytes] = b""
 
-    def send(self, payload: Any, *, latched: bool = False, source: str = "") -> None:
+    def send(self, payload: Buffer, *, latched: bool = False, source: str = "") -> None:
         self.sent.append(bytes(payload))
         if latched:
             self.latched[source] = bytes(payload)
 
-    def keep_latched(self, sources: Sequence[str]) -> None:
+    def keep_latched(self, sources: Collection[str]) -> None:
         self.latched = {source: self.latched[source] for source in sources if source in self.latched}
 
-    async def call(self, payload: Any, *, timeout: float | None = None) -> bytes:
+    async def call(self, payload: Buffer, *, timeout: float | None = None) -> bytes:
         self.sent.append(bytes(payload))
         if isinstance(self.answer, Exception):
             raise self.answer
@@ -61,8 +70,8 @@ class FakeRobot:
     def __init__(self) -> None:
         self.connected = True
         self.room = True
-        self.data: list[tuple[Outgoing, Overflow]] = []
-        self.urgent: list[Outgoing] = []
+        self.data: list[tuple[Rendered, OverflowPolicy]] = []
+        self.urgent: list[Rendered] = []
         self.reports: list[str] = []
         self.states: list[bool] = []
         self.dropped = 0
@@ -74,7 +83,7 @@ class FakeRobot:
         self.sources: list[tuple[str, ...]] = []
         self.awaited: list[tuple[LargeData, list[str]]] = []
 
-    def send_data(self, tag: str, message: Queued, overflow: Overflow) -> bool:
+    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
         rendered = message.render()
         if rendered is not None and self.room:
             self.data.append((rendered, overflow))
@@ -86,14 +95,14 @@ class FakeRobot:
             self.urgent.append(rendered)
         return self.room
 
-    def report(self, text: str) -> None:
-        self.reports.append(text)
+    def report(self, problem: str, call: CallId | None = None) -> None:
+        self.reports.append(ErrorReport(problem=problem, call=call).text)
 
     def show_active(self, tag: str, active: bool) -> None:
         self.states.append(active)
 
     def send_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
-        self.send_data(tag, message, Overflow.DROP_OLDEST)
+        self.send_data(tag, message, OverflowPolicy.DROP_OLDEST)
 
     def send_sources(self, tag: str, sources: Sequence[str]) -> None:
         self.sources.append(tuple(sources))
@@ -138,12 +147,15 @@ class Setup:
         forms = FormFactory(TypeRegistry()).pair(self.port.spec, kind)
         self.interface = make_interface(kind.role, self.port, self.robot, *forms, call_timeout=call_timeout)
 
-    def take(self, msg: Any, msg_id: str = "nil") -> None:
-        self.interface.take(DataMessage(i_tag="tag", type=self.port.spec.cls, msg=msg, msg_id=msg_id))
+    def take(self, msg: object, msg_id: str = "nil") -> None:
+        self.interface.take(
+            DataMessage(i_tag="tag", message_type=self.port.spec.message_type, msg=msg, msg_id=msg_id)
+        )
 
 
-def shown(outgoing: Outgoing) -> Any:
-    return json.loads(outgoing.text)["data"]
+def shown(message: Rendered) -> Any:
+    assert isinstance(message, Outgoing)
+    return json.loads(bytes(message.text))["data"]
 
 
 def ros_string(text: str) -> bytes:
@@ -189,7 +201,7 @@ def test_from_the_robot() -> None:
         ("SubscriberForwarder", {"data": "x"}),
     ],
 )
-def test_what_does_not_fit_is_refused_and_named(type_: str, msg: Any) -> None:
+def test_what_does_not_fit_is_refused_and_named(type_: str, msg: object) -> None:
     setup = Setup(type_)
     with pytest.raises(UnreadableError, match="tag, msgID 7: "):
         setup.take(msg, "7")
@@ -211,7 +223,7 @@ def test_to_the_robot() -> None:
     setup.interface.receive(ros_string("x"), latched=False)
     ((message, overflow),) = setup.robot.data
     assert shown(message) == {"iTag": "tag", "type": STRING, "msgID": "nil", "msg": {"data": "x"}}
-    assert overflow is Overflow.DROP_OLDEST
+    assert overflow is OverflowPolicy.DROP_OLDEST
     with pytest.raises(MisdirectedError):
         setup.take({"data": "x"})
 
@@ -239,7 +251,8 @@ def test_a_forwarded_payload_is_not_copied() -> None:
     assert len(id_) == 32
 
 
-def test_the_last_latched_message_waits_for_a_robot_that_comes_back() -> None:
+def test_last_latched_message_waits_for_returning_robot() -> None:
+    """The last latched message waits for a robot that comes back."""
     setup = Setup("PublisherConverter")
     setup.interface.on_active(True)
     setup.interface.receive(ros_string("map"), latched=True)
@@ -301,6 +314,7 @@ async def test_pictures_are_converted_elsewhere_and_in_order() -> None:
     await asyncio.gather(*setup.robot.work)
     assert len(setup.robot.data) == 3
     for message, _ in setup.robot.data:
+        assert isinstance(message, Outgoing)
         ((_, frame),) = message.binaries
         assert bytes(frame)[32:40] == b"\x89PNG\r\n\x1a\n"
 
@@ -337,7 +351,8 @@ async def test_a_large_message_is_converted_elsewhere_and_in_order() -> None:
     assert setup.port.sent[2:] == [ros_string("third")]
 
 
-async def test_a_large_message_that_is_wrong_is_told_and_harms_no_other() -> None:
+async def test_wrong_large_message_harms_no_other() -> None:
+    """A large message that is wrong is told and harms no other."""
     setup = Setup("SubscriberConverter")
     setup.interface.take_large(large('{"data":5}'))
     setup.interface.take_large(large("[" * 100 + "]" * 100))
@@ -351,7 +366,8 @@ async def test_a_large_message_that_is_wrong_is_told_and_harms_no_other() -> Non
     assert many.startswith("tag: a message of 200010 objects, lists and members is over the limit of 200000")
 
 
-async def test_a_large_message_that_refers_to_binary_values_waits_for_them() -> None:
+async def test_large_message_waits_for_its_binary_values() -> None:
+    """A large message that refers to binary values waits for them."""
     setup = Setup("SubscriberConverter", "sensor_msgs/CompressedImage")
     id_ = "ab" * 16
     message = large(f'{{"format":"jpeg","data*":"{id_}"}}', cls="sensor_msgs/CompressedImage")
@@ -412,7 +428,7 @@ async def test_the_robot_asks() -> None:
     assert shown(message)["msg"] == {"success": True, "message": "done"}
 
 
-@pytest.mark.parametrize("error", [NotConnected(), PeerFault("no"), CallTimeout("late")])
+@pytest.mark.parametrize("error", [NotConnectedError(), PeerFaultError("no"), CallTimeoutError("late")])
 async def test_a_call_that_fails_is_told(error: Exception) -> None:
     setup = Setup("ServiceProviderConverter", SERVICE)
     setup.port.answer = error
@@ -434,7 +450,7 @@ async def test_a_large_answer_takes_the_data_lane_and_is_not_dropped() -> None:
     setup.take(b"\x01", "id1")
     await asyncio.gather(*setup.robot.work)
     ((message, overflow),) = setup.robot.data
-    assert overflow is Overflow.REFUSE
+    assert overflow is OverflowPolicy.REFUSE
     assert message.size > 1 << 20
 
 
@@ -451,13 +467,13 @@ async def test_the_robot_answers() -> None:
 
 async def test_the_ways_in_which_the_robot_does_not_answer() -> None:
     setup = Setup("ServiceClientConverter", SERVICE, call_timeout=0.01)
-    with pytest.raises(CallTimeout):
+    with pytest.raises(CallTimeoutError):
         await setup.interface.serve(b"\x01")
     setup.robot.room = False
-    with pytest.raises(Overloaded):
+    with pytest.raises(OverloadedError):
         await setup.interface.serve(b"\x01")
     setup.robot.connected = False
-    with pytest.raises(PeerLost):
+    with pytest.raises(PeerLostError):
         await setup.interface.serve(b"\x01")
     with pytest.raises(MisdirectedError, match="no call"):
         setup.take({}, "unknown")
@@ -465,7 +481,7 @@ async def test_the_ways_in_which_the_robot_does_not_answer() -> None:
 
 async def test_a_bad_request_of_a_peer_is_the_peers_to_know() -> None:
     setup = Setup("ServiceClientConverter", SERVICE)
-    with pytest.raises(PeerFault):
+    with pytest.raises(PeerFaultError):
         await setup.interface.serve(b"far too long for a bool")
     assert not setup.robot.reports
 
@@ -476,6 +492,6 @@ async def test_a_closed_interface_fails_its_callers() -> None:
     call = asyncio.ensure_future(setup.interface.serve(b"\x01"))
     await asyncio.sleep(0)
     await setup.interface.close()
-    with pytest.raises(PeerLost):
+    with pytest.raises(PeerLostError):
         await call
     assert setup.robot.gone == [setup.interface]

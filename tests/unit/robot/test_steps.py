@@ -10,8 +10,9 @@ import pytest
 from websockets.exceptions import ProtocolError
 from websockets.frames import Frame, Opcode
 from websockets.streams import StreamReader
+from websockets.utils import apply_mask
 
-from rce_robot.steps import LARGE_FRAME, Steps
+from rce_robot.doors.client.steps import LARGE_FRAME, Steps
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -74,16 +75,13 @@ def test_frames_of_all_sizes_keep_content_and_order() -> None:
 
 
 def test_no_more_than_a_read_is_buffered_or_unmasked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    import rce_robot.steps as module
-
     sizes = []
-    unmask = module.apply_mask
 
     def counted(data: bytearray, mask: bytes) -> bytes:
         sizes.append(len(data))
-        return unmask(data, mask)
+        return apply_mask(data, mask)
 
-    monkeypatch.setattr(module, "apply_mask", counted)
+    monkeypatch.setattr("rce_robot.doors.client.steps.apply_mask", counted)
     read = 10_000
     stream = masked(bytes(50 * read))
     parser = Parser()

@@ -16,7 +16,8 @@ def test_what_messages_hold_is_not_given_back() -> None:
     assert not unused.is_due(OWN + 500 * 2**20, 500 * 2**20, 1)
 
 
-def test_while_messages_come_only_what_is_beyond_the_most_is_given_back() -> None:
+def test_memory_is_kept_while_messages_come() -> None:
+    """While messages come only what is beyond the most is given back."""
     unused = UnusedMemory(OWN)
     assert not unused.is_due(OWN + MOST_UNUSED, 0, 1)
     assert not unused.is_due(OWN + MOST_UNUSED, 0, 2)

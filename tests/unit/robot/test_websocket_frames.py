@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 
-from rce_robot.frames import FIN_BINARY, FIN_TEXT, add_frame, find_message
+from rce_robot.doors.client.frames import FIN_BINARY, FIN_TEXT, add_frame, find_message
 
 ANY_SIZE = 1 << 20
 SIZES = [0, 1, 125, 126, 127, 65535, 65536, 70_000]

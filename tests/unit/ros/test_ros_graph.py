@@ -13,7 +13,7 @@ from rce.ros.core import Change, Graph, GraphEvent
 from rce.ros.core.api import MasterApi
 from rce.ros.core.events import Call
 from rce.ros.core.registrations import Kind
-from rce.ros.xmlrpc.dispatch import BadArgument
+from rce.ros.xmlrpc.dispatch import BadArgumentError
 
 
 def uri(node: str) -> str:
@@ -111,7 +111,7 @@ def test_the_last_topic_takes_parameter_subscriptions_along() -> None:
     ],
 )
 def test_parameter_subscribers_are_told(
-    subscribed: str, changed: str, value: Any, told: tuple[str, Any] | None
+    subscribed: str, changed: str, value: object, told: tuple[str, Any] | None
 ) -> None:
     graph = Graph()
     graph.subscribe_parameter(subscribed, "/n", uri("/n"))
@@ -156,7 +156,7 @@ def test_parameters_are_a_tree() -> None:
     tree.set_parameter("/a", 5)
     assert tree.parameters.all_names() == ["/a"]
     assert not tree.parameters.has("/a/b")
-    with pytest.raises(BadArgument):
+    with pytest.raises(BadArgumentError):
         tree.set_parameter("/", 5)
 
 
@@ -190,7 +190,7 @@ def test_searching_goes_upwards_by_the_first_segment() -> None:
 def test_the_api_refuses_nonsense(method: str, arguments: tuple[Any, ...]) -> None:
     graph = Graph()
     api = MasterApi(graph, lambda: "http://core:1/", lambda outcome: None)
-    with pytest.raises(BadArgument):
+    with pytest.raises(BadArgumentError):
         api.methods()[method]("/n", *arguments)
     assert graph.nodes == {}
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.ros import names
-from rce.ros.errors import InvalidName
+from rce.ros.errors import InvalidNameError
 
 BASE = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,8}", fullmatch=True)
 
@@ -30,13 +30,13 @@ def test_a_node_without_namespace_lives_at_the_root(namespace: str) -> None:
 
 @pytest.mark.parametrize("name", ["", "a b", "1a", "a//b", "a-b", "é", "http://x"])
 def test_refuses_what_is_no_name(name: str) -> None:
-    with pytest.raises(InvalidName):
+    with pytest.raises(InvalidNameError):
         names.Resolver("node").resolve(name)
 
 
 @pytest.mark.parametrize("name", ["", "/node", "ns/node", "~node", "2node"])
 def test_refuses_what_cannot_name_a_node(name: str) -> None:
-    with pytest.raises(InvalidName):
+    with pytest.raises(InvalidNameError):
         names.Resolver(name)
 
 
@@ -74,5 +74,5 @@ def test_resolved_names_are_global_and_stay_as_they_are(
 def test_any_text_is_resolved_or_refused(text: str) -> None:
     try:
         assert names.is_global(names.Resolver("node", "ns").resolve(text))
-    except InvalidName:
+    except InvalidNameError:
         assert not names.is_graph_name(text)

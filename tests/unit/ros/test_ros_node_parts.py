@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
 from rce.ros.names import is_base_name
-from rce.ros.node.queue import DropOldest
 from rce.ros.node.settings import NodeSettings, anonymous_name, parse_value
 
 
@@ -26,7 +21,8 @@ async def test_defaults() -> None:
     assert (settings.host, settings.bind) == ("127.0.0.1", "127.0.0.1")
 
 
-def test_the_command_line_wins_over_the_program_and_the_environment() -> None:
+def test_command_line_wins_over_program_and_environment() -> None:
+    """The command line wins over the program and the environment."""
     environ = {"ROS_NAMESPACE": "env", "ROS_MASTER_URI": "http://10.0.0.9:1/", "ROS_IP": "10.0.0.2"}
     assert gather(environ=environ).resolver.node_name == "/env/node"
     assert gather(environ=environ, namespace="own").resolver.node_name == "/own/node"
@@ -46,7 +42,8 @@ def test_a_log_file_is_in_the_folder_of_logs() -> None:
     assert gather(("__log:=/elsewhere/a.log",), environ).log_file == Path("/elsewhere/a.log")
 
 
-def test_a_host_that_others_can_reach_is_served_on_all_interfaces() -> None:
+def test_reachable_host_is_served_on_all_interfaces() -> None:
+    """A host that others can reach is served on all interfaces."""
     settings = gather(environ={"ROS_HOSTNAME": "robot.local", "ROS_IP": "10.0.0.2"})
     assert settings.host == "robot.local"
     assert settings.bind == "0.0.0.0"
@@ -65,20 +62,3 @@ def test_private_parameters_are_yaml() -> None:
 
 def test_anonymous_names_are_names() -> None:
     assert is_base_name(anonymous_name("node"))
-
-
-@given(st.lists(st.integers(0, 50)), st.integers(1, 5), st.integers(1, 100))
-def test_the_newest_items_stay(sizes: list[int], items: int, size: int) -> None:
-    queue: DropOldest[int] = DropOldest(items, size)
-    for number, length in enumerate(sizes):
-        queue.put(number, length)
-    kept = [queue.take() for _ in range(len(queue))]
-    assert kept == list(range(len(sizes)))[len(sizes) - len(kept) :]
-    assert len(kept) <= items
-    assert queue.dropped + len(kept) == len(sizes)
-    assert sum(sizes[number] for number in kept) <= size or len(kept) == 1
-
-
-def test_a_queue_without_room_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least one"):
-        DropOldest(0)

@@ -34,10 +34,12 @@ class GraphMaster(MasterClient):
                 self.graph.set_parameter(name, value, by=self.caller)
             case "deleteParam", (name,):
                 self.graph.delete_parameter(name)
+            case _:
+                pass  # the graph need not know
         return 0
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """A tree without the empty namespaces that deleting may leave: they count as not set."""
     if not isinstance(value, dict):
         return value

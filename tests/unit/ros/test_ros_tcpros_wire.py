@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from rce.ros.errors import HandshakeRefused, MalformedFrame
+from rce.ros.errors import HandshakeRefusedError, MalformedFrameError
 from rce.ros.tcpros.framing import LARGE, FrameReader, answer_frame, frame
 from rce.ros.tcpros.header import check_type, decode_header, encode_header, require
 
@@ -32,23 +32,25 @@ def test_header_layout() -> None:
 def test_any_bytes_are_a_header_or_refused(body: bytes) -> None:
     try:
         decode_header(body)
-    except MalformedFrame:
+    except MalformedFrameError:
         return
     assert not body or len(body) > 4
 
 
 @pytest.mark.parametrize(("here", "there"), [("abc", "abc"), ("*", "abc"), ("abc", "*"), ("*", "*")])
 def test_types_agree(here: str, there: str) -> None:
-    check_type({"md5sum": there}, md5sum=here, kind="a/B", subject="topic /t")
+    check_type({"md5sum": there}, md5sum=here, type_name="a/B", subject="topic /t")
 
 
 def test_types_disagree() -> None:
-    with pytest.raises(HandshakeRefused, match=r"topic /t is of type a/B with md5 sum abc here, of type c/D"):
-        check_type({"md5sum": "xyz", "type": "c/D"}, md5sum="abc", kind="a/B", subject="topic /t")
+    with pytest.raises(
+        HandshakeRefusedError, match=r"topic /t is of type a/B with md5 sum abc here, of type c/D"
+    ):
+        check_type({"md5sum": "xyz", "type": "c/D"}, md5sum="abc", type_name="a/B", subject="topic /t")
 
 
 def test_missing_fields_are_named() -> None:
-    with pytest.raises(HandshakeRefused, match="md5sum"):
+    with pytest.raises(HandshakeRefusedError, match="md5sum"):
         require({"callerid": "/a"}, "callerid", "md5sum")
 
 
@@ -111,5 +113,5 @@ def test_frames_that_are_too_long_are_refused() -> None:
     reader = FrameReader(memoryview(bytearray(64)), limit=10)
     reader.buffer()[:4] = struct.pack("<I", 11)
     reader.received(4)
-    with pytest.raises(MalformedFrame, match="longer than 10"):
+    with pytest.raises(MalformedFrameError, match="longer than 10"):
         reader.next_frame()

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.ros.errors import MalformedDocument, RemoteFault
-from rce.ros.xmlrpc import BadArgument, Dispatcher
+from rce.ros.errors import MalformedDocumentError, RemoteFaultError
+from rce.ros.xmlrpc import BadArgumentError, Dispatcher
 from rce.ros.xmlrpc.codec import decode_call, decode_response, encode_call, encode_fault, encode_response
 
 TEXT = st.text(
@@ -30,7 +30,7 @@ VALUE = st.recursive(
 
 
 @given(VALUE)
-def test_values_survive(value: Any) -> None:
+def test_values_survive(value: object) -> None:
     assert decode_response(encode_response(value)) == value
     assert decode_call(encode_call("method", (value, 1))) == ("method", (value, 1))
 
@@ -43,31 +43,31 @@ def test_reads_what_the_standard_library_writes(value: Any) -> None:
 
 @given(st.binary(max_size=200))
 def test_garbage_is_refused_not_crashed_on(document: bytes) -> None:
-    with pytest.raises(MalformedDocument):
+    with pytest.raises(MalformedDocumentError):
         decode_response(document)
 
 
 @pytest.mark.parametrize("value", [None, 2**31, object(), "bell \x07", {1: 2}])
-def test_refuses_to_write_what_has_no_form(value: Any) -> None:
-    with pytest.raises(MalformedDocument):
+def test_refuses_to_write_what_has_no_form(value: object) -> None:
+    with pytest.raises(MalformedDocumentError):
         encode_response(value)
 
 
 def test_faults_arrive() -> None:
-    with pytest.raises(RemoteFault, match="fault 7: no \\?"):
+    with pytest.raises(RemoteFaultError, match="fault 7: no \\?"):
         decode_response(encode_fault(7, "no \x00"))
 
 
 def test_entities_are_not_expanded() -> None:
     bomb = b"""<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]>
     <methodCall><methodName>m</methodName><params><param><value>&b;</value></param></params></methodCall>"""
-    with pytest.raises(MalformedDocument, match="document types"):
+    with pytest.raises(MalformedDocumentError, match="document types"):
         decode_call(bomb)
 
 
 def test_deep_nesting_is_refused() -> None:
     deep = "<array><data><value>" * 1000
-    with pytest.raises(MalformedDocument, match="nested"):
+    with pytest.raises(MalformedDocumentError, match="nested"):
         decode_response(f"<methodResponse><params><param><value>{deep}".encode())
 
 
@@ -82,10 +82,10 @@ def test_binary_is_base64() -> None:
 
 class TestDispatcher:
     @staticmethod
-    def ask(method: str, *arguments: Any) -> Any:
+    def ask(method: str, *arguments: object) -> Any:
         def add(caller: str, a: Any, b: Any = 1) -> Any:
             if not isinstance(a, int):
-                raise BadArgument("a must be a number")
+                raise BadArgumentError("a must be a number")
             return 1, caller, a // b
 
         return decode_response(Dispatcher({"add": add}).respond(encode_call(method, arguments)))
@@ -104,7 +104,7 @@ class TestDispatcher:
         assert self.ask("add", "/me", 1, 0)[0] == 0
 
     def test_unknown_methods_are_faults(self) -> None:
-        with pytest.raises(RemoteFault):
+        with pytest.raises(RemoteFaultError):
             self.ask("subtract", "/me")
 
     def test_lists_methods(self) -> None:

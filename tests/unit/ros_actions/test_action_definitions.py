@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rce.ros.packages import PackageIndex
-from rce.ros.types import BadDefinition, TypeRegistry, UnknownType
+from rce.ros.types import BadDefinitionError, TypeRegistry, UnknownTypeError
 from rce.ros.types.action import action_names, parse_action
 
 COUNT = """# how far
@@ -71,11 +71,11 @@ def test_known_checksums_of_builtin_actions(name: str, md5sum: str) -> None:
 
 def test_mistakes_are_found_where_they_are(tmp_path: Path) -> None:
     types = package(tmp_path, Bad="int32 a\n---\nint32 b\n---\n# fine\nnonsense\n", Two="int32 a\n---\n")
-    with pytest.raises(BadDefinition, match=r"Bad\.action:6"):
+    with pytest.raises(BadDefinitionError, match=r"Bad\.action:6"):
         types.message("mine/BadFeedback")
-    with pytest.raises(BadDefinition, match="two '---' lines, this text has 1"):
+    with pytest.raises(BadDefinitionError, match="two '---' lines, this text has 1"):
         types.message("mine/TwoGoal")
-    with pytest.raises(UnknownType):
+    with pytest.raises(UnknownTypeError):
         types.message("mine/NoneGoal")
 
 

@@ -8,17 +8,15 @@ from itertools import pairwise
 
 import pytest
 
-from rce.ros.actions.states import CLIENT_TRANSITIONS, GOAL_TRANSITIONS, CommState, GoalState
+from rce.ros.actions.states import CLIENT_TRANSITIONS, GOAL_LIFE, CommState, GoalState
 
 
 def test_every_goal_comes_to_an_end() -> None:
-    following: dict[GoalState, set[GoalState]] = {}
-    for (state, _), after in GOAL_TRANSITIONS.items():
-        following.setdefault(state, set()).add(after)
+    following = {state: set(row.values()) for state, row in GOAL_LIFE.table.items()}
     for state in GoalState:
-        assert state.is_over == (state not in following)
+        assert state.is_over == (not following[state])
     reached = {GoalState.PENDING}
-    while more := {after for state in reached for after in following.get(state, ())} - reached:
+    while more := {after for state in reached for after in following[state]} - reached:
         reached |= more
     assert reached == set(GoalState) - {GoalState.LOST}
 
@@ -31,9 +29,10 @@ def test_clients_can_follow_every_way_of_a_server() -> None:
         GoalState.RECALLING: CommState.RECALLING,
         GoalState.PREEMPTING: CommState.PREEMPTING,
     }
-    for (state, _), reported in GOAL_TRANSITIONS.items():
-        passed = CLIENT_TRANSITIONS[after[state]][reported]
-        assert passed[-1] == after.get(reported, CommState.WAITING_FOR_RESULT)
+    for state, row in GOAL_LIFE.table.items():
+        for reported in row.values():
+            passed = CLIENT_TRANSITIONS[after[state]][reported]
+            assert passed[-1] == after.get(reported, CommState.WAITING_FOR_RESULT)
 
 
 def test_every_path_is_possible_step_by_step() -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.ros.actions import CommState, GoalState, IllegalTransition
+from rce.ros.actions import CommState, GoalState, IllegalTransitionError
 from rce.ros.actions.tracker import GoalTracker
 
 
@@ -63,7 +63,8 @@ def test_a_goal_cancelled_at_once_is_not_lost_by_an_older_list() -> None:
     assert goal.not_listed(0) == ()
 
 
-def test_a_goal_whose_result_is_on_the_way_may_be_missing_in_the_list() -> None:
+def test_goal_with_result_under_way_may_be_unlisted() -> None:
+    """A goal whose result is on the way may be missing in the list."""
     goal = tracker()
     goal.listed(GoalState.SUCCEEDED, "", 1)
     assert goal.not_listed(2) == ()
@@ -98,7 +99,7 @@ def test_what_the_server_does_not_show_to_know_is_repeated() -> None:
 def test_what_cannot_be_changes_nothing() -> None:
     goal = tracker()
     goal.listed(GoalState.ACTIVE, "", 1)
-    with pytest.raises(IllegalTransition, match="goal g is ACTIVE: PENDING is not possible"):
+    with pytest.raises(IllegalTransitionError, match=r"goal g is ACTIVE: expected .*, found PENDING"):
         goal.listed(GoalState.PENDING, "text", 2)
     assert (goal.comm, goal.state, goal.text) == (CommState.ACTIVE, GoalState.ACTIVE, "")
 
@@ -126,7 +127,7 @@ def test_nothing_happens_after_the_end(story: list[tuple[str, GoalState]]) -> No
                     passed = goal.cancelled(now)
                 case _:
                     passed = goal.check(now, now - 5, 3)
-        except IllegalTransition:
+        except IllegalTransitionError:
             assert (goal.comm, goal.state) == before
         if was_done:
             assert passed == ()

@@ -110,7 +110,8 @@ def test_a_type_learned_from_its_full_text_is_the_same() -> None:
         assert (learned.md5sum, learned.definition) == (original.md5sum, original.definition)
 
 
-def test_a_learned_type_is_remembered_but_does_not_replace_another() -> None:
+def test_learned_type_does_not_replace_another() -> None:
+    """A learned type is remembered but does not replace another."""
     types = TypeRegistry()
     learned = types.from_definition("mine/Thing", "int8 x\n")
     assert types.message("mine/Thing") is learned
@@ -173,7 +174,8 @@ def _same(mine: str, theirs: str) -> bool:
 
 
 @pytest.mark.needs("rospy")
-def test_checksum_and_full_text_are_those_of_all_installed_ros_messages() -> None:
+def test_checksum_equals_installed_ros_messages() -> None:
+    """Checksum and full text are those of all installed ros messages."""
     classes = _system_ros()["msg"]
     assert {"std_msgs/String", "sensor_msgs/Image", "roscpp/Logger", "rosgraph_msgs/Log"} <= classes.keys()
     types = TypeRegistry(PackageIndex(["/usr/share"]))
@@ -198,10 +200,11 @@ MD5_OF_HEADER = re.compile(r"struct MD5Sum<.*?return \"([0-9a-f]{32})\"", re.DOT
 
 
 @pytest.mark.needs("rospy")
-def test_every_installed_definition_has_the_checksum_that_ros_made_of_it() -> None:
+def test_installed_definitions_have_ros_checksums() -> None:
     """Each ``.msg`` and ``.srv`` in ``/usr/share`` is compared with genpy's class and gencpp's header."""
     types, classes = TypeRegistry(PackageIndex(["/usr/share"])), _system_ros()
-    compared, alone = set(), set()
+    compared: set[str] = set()
+    alone: set[str] = set()
     for kind, of in (("msg", types.message), ("srv", types.service)):
         for file in Path("/usr/share").glob(f"*/{kind}/*.{kind}"):
             name = f"{file.parts[-3]}/{file.stem}"

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from rce.ros.packages import PackageIndex
-from rce.ros.types import BadDefinition, TypeRegistry, UnknownType
+from rce.ros.types import BadDefinitionError, TypeRegistry, UnknownTypeError
 from rce.ros.types.definition import parse_message, parse_service, split_full_text
 
 
@@ -58,25 +58,26 @@ def test_constants_have_values_of_their_type() -> None:
     ],
 )
 def test_a_fault_is_told_with_file_and_line(line: str, part: str) -> None:
-    with pytest.raises(BadDefinition) as caught:
+    with pytest.raises(BadDefinitionError) as caught:
         parse_message("p/T", f"# a comment\nuint8 first\n{line}\n", "/some/T.msg")
     assert caught.value.line == 3
     assert str(caught.value).startswith("/some/T.msg:3: ")
     assert part in str(caught.value)
 
 
-def test_a_service_is_a_request_and_a_response_with_lines_of_the_file() -> None:
+def test_service_errors_name_lines_of_the_file() -> None:
+    """A service is a request and a response with lines of the file."""
     request, response = parse_service("p/S", "int64 a\n  ---  \nint64 sum\n")
     assert [field.name for field in request.fields] == ["a"]
     assert [(field.name, field.line) for field in response.fields] == [("sum", 3)]
-    with pytest.raises(BadDefinition) as caught:
+    with pytest.raises(BadDefinitionError) as caught:
         parse_service("p/S", "int64 a\n---\nbad\n", "S.srv")
     assert caught.value.line == 3
 
 
 @pytest.mark.parametrize("text", ["int64 a\n", "---\n---\n"])
 def test_a_service_has_exactly_one_separator(text: str) -> None:
-    with pytest.raises(BadDefinition, match="one '---' line"):
+    with pytest.raises(BadDefinitionError, match="one '---' line"):
         parse_service("p/S", text)
 
 
@@ -84,13 +85,13 @@ def test_a_full_text_is_split_and_a_wrong_part_refused() -> None:
     separator = "=" * 80
     parts = dict(split_full_text("a/A", f"b/B b\n\n{separator}\nMSG: b/B\nint8 x\n"))
     assert parts == {"a/A": "b/B b\n", "b/B": "int8 x\n"}
-    with pytest.raises(BadDefinition, match="not with 'MSG: '"):
+    with pytest.raises(BadDefinitionError, match="not with 'MSG: '"):
         list(split_full_text("a/A", f"int8 x\n{separator}\nb/B\n"))
 
 
 def test_a_type_that_holds_itself_is_refused() -> None:
     separator = "=" * 80
-    with pytest.raises(BadDefinition, match="a/A > a/B > a/A"):
+    with pytest.raises(BadDefinitionError, match="a/A > a/B > a/A"):
         TypeRegistry().from_definition("a/A", f"B b\n{separator}\nMSG: a/B\nA[] a\n")
 
 
@@ -99,14 +100,14 @@ def test_an_unknown_type_is_told_with_the_place_that_needs_it(tmp_path: Path) ->
     messages.mkdir(parents=True)
     (messages / "Outer.msg").write_text("int8 x\nmine/Inner inner\n")
     types = TypeRegistry(PackageIndex([tmp_path]))
-    with pytest.raises(UnknownType) as caught:
+    with pytest.raises(UnknownTypeError) as caught:
         types.message("mine/Outer")
     assert caught.value.name == "mine/Inner"
     assert f"no file {messages / 'Inner.msg'}" in str(caught.value)
     assert f"{messages / 'Outer.msg'}:2" in str(caught.value)
-    with pytest.raises(UnknownType, match=f"no package nowhere on the package path \\({tmp_path}\\)"):
+    with pytest.raises(UnknownTypeError, match=f"no package nowhere on the package path \\({tmp_path}\\)"):
         types.service("nowhere/Thing")
-    with pytest.raises(UnknownType, match="named package/Type"):
+    with pytest.raises(UnknownTypeError, match="named package/Type"):
         types.message("../../etc/passwd")
 
 
@@ -121,7 +122,7 @@ def test_a_package_wins_over_a_builtin_definition(tmp_path: Path) -> None:
 def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / "p" / "msg").mkdir(parents=True)
     (tmp_path / "p" / "msg" / "T.msg").write_bytes(b"string \xff\n")
-    with pytest.raises(BadDefinition, match="not UTF-8"):
+    with pytest.raises(BadDefinitionError, match="not UTF-8"):
         TypeRegistry(PackageIndex([tmp_path])).message("p/T")
 
 

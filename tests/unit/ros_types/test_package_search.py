@@ -7,13 +7,14 @@ import logging
 import os
 import random
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
 
 from rce.ros import package_tree
 from rce.ros.package_tree import PackageTree
-from rce.ros.packages import PackageIndex, PackageNotFound
+from rce.ros.packages import PackageIndex, PackageNotFoundError
 
 LIST = """
 import json, sys, rospkg
@@ -109,7 +110,8 @@ def test_loops_of_links_end_and_each_folder_is_searched_once(tmp_path: Path) -> 
     assert found["linked"].resolve() == real
 
 
-def test_what_changes_is_noticed_and_nothing_else_is_searched_again(tmp_path: Path) -> None:
+def test_only_changed_packages_are_searched_again(tmp_path: Path) -> None:
+    """What changes is noticed and nothing else is searched again."""
     a = package(tmp_path / "x" / "a")
     searched = tree(tmp_path)
     for _ in range(3):
@@ -128,7 +130,7 @@ def test_what_changes_is_noticed_and_nothing_else_is_searched_again(tmp_path: Pa
 
 def test_a_package_that_is_added_after_a_miss_is_found(tmp_path: Path) -> None:
     index = PackageIndex([tmp_path / "later"])
-    with pytest.raises(PackageNotFound):
+    with pytest.raises(PackageNotFoundError):
         index.find("p")
     added = package(tmp_path / "later" / "repository" / "p")
     assert index.find("p").path == added
@@ -144,7 +146,7 @@ def test_a_large_tree_is_looked_at_seldom(tmp_path: Path, monkeypatch: pytest.Mo
         clock[0] += 0.001
         return clock[0]
 
-    monkeypatch.setattr(package_tree.time, "monotonic", now)
+    monkeypatch.setattr(time, "monotonic", now)
     searched = tree(tmp_path)
     for _ in range(10_000):
         searched.packages()

@@ -5,14 +5,15 @@ import os
 import subprocess
 import sys
 import xml
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
+from typing import Protocol
 
 import pytest
 
 from rce.ros import packages
-from rce.ros.packages import BadPackage, ExecutableNotFound, PackageIndex, PackageNotFound
+from rce.ros.packages import BadPackageError, ExecutableNotFoundError, PackageIndex, PackageNotFoundError
 from rce.ros.substitution import SubstitutionError, split_arguments, substitute
 
 
@@ -27,7 +28,8 @@ def make(folder: Path, manifest: str = "package.yaml", text: str = "", **files: 
     return folder
 
 
-def test_a_package_is_found_by_folder_by_itself_and_by_declared_name(tmp_path: Path) -> None:
+def test_package_is_found_by_folder_and_declared_name(tmp_path: Path) -> None:
+    """A package is found by folder by itself and by declared name."""
     one = make(tmp_path / "one", text="description: first\n")
     two = make(tmp_path / "folder", text="name: two\n")
     three = make(tmp_path / "three", "package.xml", "<package><name>three</name></package>")
@@ -39,7 +41,7 @@ def test_a_package_is_found_by_folder_by_itself_and_by_declared_name(tmp_path: P
     assert PackageIndex([two]).find("two").path == two
     assert PackageIndex([one]).find("one").path == one
     for name in ("folder", "four", "../one", ""):
-        with pytest.raises(PackageNotFound, match=str(tmp_path)):
+        with pytest.raises(PackageNotFoundError, match=str(tmp_path)):
             index.find(name)
 
 
@@ -66,7 +68,7 @@ def test_the_path_comes_from_the_environment(tmp_path: Path) -> None:
 )
 def test_a_bad_manifest_is_told(tmp_path: Path, text: str, part: str) -> None:
     make(tmp_path / "pkg", text=text)
-    with pytest.raises(BadPackage, match=part):
+    with pytest.raises(BadPackageError, match=part):
         PackageIndex([tmp_path]).find("pkg")
 
 
@@ -108,11 +110,12 @@ def test_what_is_not_inside_the_package_is_refused(tmp_path: Path, exe: str) -> 
     make(tmp_path / "pkg", nodes__n=0o755)
     (tmp_path / "outside").write_text("#!/bin/sh\n")
     (tmp_path / "outside").chmod(0o755)
-    with pytest.raises(ExecutableNotFound):
+    with pytest.raises(ExecutableNotFoundError):
         PackageIndex([tmp_path]).find("pkg").executable(exe)
 
 
-def test_file_elsewhere_that_may_be_executed_goes_before_one_that_may_not(tmp_path: Path) -> None:
+def test_executable_elsewhere_wins_over_plain_file(tmp_path: Path) -> None:
+    """File elsewhere that may be executed goes before one that may not."""
     folder = make(tmp_path / "pkg", "package.xml", "<package><name>pkg</name></package>", nodes__n=0o644)
     file = folder / "test" / "tools" / "n"
     file.parent.mkdir(parents=True)
@@ -123,7 +126,7 @@ def test_file_elsewhere_that_may_be_executed_goes_before_one_that_may_not(tmp_pa
 
 def test_a_file_that_may_not_be_executed_is_refused(tmp_path: Path) -> None:
     make(tmp_path / "pkg", nodes__n=0o644)
-    with pytest.raises(ExecutableNotFound, match="chmod"):
+    with pytest.raises(ExecutableNotFoundError, match="chmod"):
         PackageIndex([tmp_path]).find("pkg").executable("n")
 
 
@@ -138,8 +141,14 @@ def test_installed_packages_have_programs_in_lib(tmp_path: Path) -> None:
     assert index.find("tools").executable("relay") == [str(programs / "relay")]
 
 
+class Distributed(Protocol):
+    """Sets entry points: group, name, value; see :func:`distributed`."""
+
+    def __call__(self, *points: tuple[str, str, str]) -> None: ...
+
+
 @pytest.fixture
-def distributed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+def distributed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Distributed]:
     """Lets installed distributions have the entry points that a test gives."""
 
     def forget() -> None:
@@ -155,9 +164,11 @@ def distributed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]
     forget()
 
 
-def test_distributions_add_nodes_that_are_functions(distributed: Callable[..., None]) -> None:
+def test_distributions_add_nodes_that_are_functions(distributed: Distributed) -> None:
     distributed(("rce.nodes", "Clock:now.py", "time:time_ns"))
-    with pytest.raises(BadPackage, match="no file of a module time"):  # `time` is built in and has no folder
+    with pytest.raises(
+        BadPackageError, match="no file of a module time"
+    ):  # `time` is built in and has no folder
         PackageIndex([]).find("Clock")
     distributed(("rce.nodes", "Json:tool", "json.tool:main"))
     argv = PackageIndex([]).find("Json").executable("tool")
@@ -165,7 +176,7 @@ def test_distributions_add_nodes_that_are_functions(distributed: Callable[..., N
     assert done.stdout == '{\n    "a": 1\n}\n'
 
 
-def test_distributions_add_packages_with_nodes_that_are_scripts(distributed: Callable[..., None]) -> None:
+def test_distributions_add_packages_with_nodes_that_are_scripts(distributed: Distributed) -> None:
     distributed(
         ("rce.packages", "shop", "xml"),
         ("rce.nodes", "shop:tool.py", "json.tool"),
@@ -175,12 +186,12 @@ def test_distributions_add_packages_with_nodes_that_are_scripts(distributed: Cal
     assert found.path == Path(xml.__file__).parent
     script = Path(json.__file__).parent / "tool.py"
     assert found.executable("tool.py") == [sys.executable, str(script)]
-    with pytest.raises(BadPackage, match=r"entry point no\.x"):
+    with pytest.raises(BadPackageError, match=r"entry point no\.x"):
         PackageIndex([]).find("bad")
 
 
 def test_packages_on_the_path_go_before_those_of_distributions(
-    distributed: Callable[..., None], tmp_path: Path
+    distributed: Distributed, tmp_path: Path
 ) -> None:
     distributed(("rce.packages", "shop", "json"))
     folder = make(tmp_path / "shop")
@@ -223,7 +234,8 @@ def test_a_bad_substitution_is_told(tmp_path: Path, text: str, part: str) -> Non
     assert part in str(caught.value)
 
 
-def test_arguments_are_split_as_a_shell_splits_and_values_stay_in_their_word(tmp_path: Path) -> None:
+def test_arguments_split_like_a_shell_values_stay_whole(tmp_path: Path) -> None:
+    """Arguments are split as a shell splits and values stay in their word."""
     folder = make(tmp_path / "pkg")
     words = split_arguments(
         """a "b c" 'd e' f\\ g $(env X) "$(find pkg)/m.yaml" x:=$(env X); ls""",
@@ -250,5 +262,5 @@ def test_a_folder_that_may_not_be_entered_spoils_no_other(
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != closed)
     index = PackageIndex([closed, tmp_path / "open"])
     assert index.find("one").path == one
-    with pytest.raises(PackageNotFound, match=f"{closed} may not be read here"):
+    with pytest.raises(PackageNotFoundError, match=f"{closed} may not be read here"):
         index.find("two")

@@ -69,7 +69,7 @@ def test_every_field_type_survives_the_wire(message: Any) -> None:
 
 
 @given(st.data())
-def test_the_bytes_are_those_that_rosbags_reads_and_writes(data: Any) -> None:
+def test_the_bytes_are_those_that_rosbags_reads_and_writes(data: st.DataObject) -> None:
     store = get_typestore(Stores.ROS1_NOETIC)
     names = [name for kind, name in builtin_definitions() if kind == "msg"]
     name = data.draw(
@@ -81,7 +81,7 @@ def test_the_bytes_are_those_that_rosbags_reads_and_writes(data: Any) -> None:
 
 
 @given(st.binary(max_size=400))
-def test_garbage_is_read_or_refused(data: Any) -> None:
+def test_garbage_is_read_or_refused(data: bytes) -> None:
     for name in ("nav_msgs/Path", "std_msgs/Int32MultiArray", "diagnostic_msgs/DiagnosticArray"):
         kind = TYPES.message(name)
         try:
@@ -93,7 +93,7 @@ def test_garbage_is_read_or_refused(data: Any) -> None:
 
 
 @given(message_values(TYPES.message("nav_msgs/Path")), st.data())
-def test_every_cut_or_lengthened_message_is_refused(message: Any, data: Any) -> None:
+def test_every_cut_or_lengthened_message_is_refused(message: Any, data: st.DataObject) -> None:
     kind = TYPES.message("nav_msgs/Path")
     payload = kind.serialize(message)
     cut = data.draw(st.integers(0, len(payload) - 1))
@@ -141,7 +141,8 @@ def test_arrays_take_numpy_lists_tuples_and_views() -> None:
     assert np.asarray(scan.deserialize(expected).ranges).dtype == np.float32
 
 
-def test_a_message_of_an_equal_type_of_another_registry_is_taken_and_others_refused() -> None:
+def test_equal_type_of_other_registry_is_taken() -> None:
+    """A message of an equal type of another registry is taken and others refused."""
     string = TypeRegistry().message("std_msgs/String")
     assert TYPES.message("std_msgs/String").serialize(string.new(data="x")) == b"\x01\0\0\0x"
     with pytest.raises(SerializationError, match="a std_msgs/String is not a std_msgs/Bool"):
@@ -178,9 +179,8 @@ def test_constants_and_keyword_fields_are_attributes() -> None:
         ("geometry_msgs/Pose", {"position": {"w": 1}}, "position.w: geometry_msgs/Point has no such field"),
     ],
 )
-def test_a_value_that_does_not_fit_is_refused_by_the_name_of_its_field(
-    name: str, values: Any, text: str
-) -> None:
+def test_unfit_value_is_refused_by_its_field(name: str, values: Any, text: str) -> None:
+    """A value that does not fit is refused by the name of its field."""
     with pytest.raises(SerializationError, match=text):
         TYPES.message(name).serialize(values)
 

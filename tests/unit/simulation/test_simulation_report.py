@@ -31,7 +31,7 @@ def test_a_report_says_what_is_and_was(tmp_path: Path) -> None:
         report.robot("c")
 
 
-def test_one_robot_is_apart_from_nobody() -> None:
+def test_separation_of_one_robot_is_none() -> None:
     world = World(GridMap())
     world.add_robot("a", 0)
     world.step(0.1)
@@ -50,11 +50,11 @@ def test_contacts_are_counted() -> None:
     assert report.robot("a").distance_m > 0.1
 
 
-def test_no_report_yet(tmp_path: Path) -> None:
+def test_missing_report_is_none(tmp_path: Path) -> None:
     assert read_report(tmp_path / "r.json") is None
 
 
-def test_what_is_no_report_is_refused(tmp_path: Path) -> None:
+def test_file_that_is_not_a_report_is_refused(tmp_path: Path) -> None:
     (tmp_path / "r.json").write_text("{}")
-    with pytest.raises(ValueError, match="no report"):
+    with pytest.raises(ValueError, match="not a report"):
         read_report(tmp_path / "r.json")

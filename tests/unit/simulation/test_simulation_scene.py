@@ -16,7 +16,7 @@ from rce_fleet.planning.scenario import make_scenario
 ROBOT = {"id": "Robot1", "cell": 3}
 
 
-def load(folder: Path, **scene: Any) -> Any:
+def load(folder: Path, **scene: object) -> Any:
     (folder / "scene.json").write_text(json.dumps(scene))
     return load_scene(folder / "scene.json")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rce.ros.packages import PackageIndex
 from rce.ros.types import Time, TypeRegistry
 from rce_fleet.station.graph_watch import graph_state
-from rce_fleet.station.ros_wire import plain
+from rce_fleet.station.ros_planner_client import plain
 from rce_fleet.station.view import FleetView
 
 STATE = TypeRegistry(PackageIndex([])).message("fleet/FleetState")

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from rce_fleet.station.live import MAX_EVENTS, Broadcast
-from rce_fleet.station.view import FleetView
+from rce_fleet.station.live import MAX_CHANGES, MAX_EVENTS, Broadcast
+from rce_fleet.station.view import FleetView, ViewChange
 
 
-def robot(name: str, **changes: Any) -> dict[str, Any]:
+def robot(name: str, **changes: object) -> dict[str, Any]:
     known = {
         "id": name,
         "state": "idle",
@@ -25,7 +25,7 @@ def robot(name: str, **changes: Any) -> dict[str, Any]:
     return known | changes
 
 
-def state(*robots: dict[str, Any], **changes: Any) -> dict[str, Any]:
+def state(*robots: dict[str, Any], **changes: object) -> dict[str, Any]:
     grid = {"rows": 8, "columns": 8, "cell_size": 1.0, "origin_x": 0.0, "origin_y": 0.0}
     return {**grid, "blocked": [], "walls": [], "pending": [], "robots": list(robots), **changes}
 
@@ -35,7 +35,7 @@ def pose(x: float, y: float, yaw: float) -> dict[str, Any]:
     return {"pose": {"pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": orientation}}}
 
 
-def test_knows_nothing_before_the_planner_has_spoken() -> None:
+def test_view_is_empty_before_the_first_state() -> None:
     view = FleetView()
     assert (view.map(), view.robots(), view.blocked(), view.pending()) == (None, [], [], [])
 
@@ -55,7 +55,46 @@ def test_reads_heading_of_a_quaternion(yaw: float) -> None:
     assert view.robots()[0]["pose"] == pytest.approx({"x": 1.0, "y": 2.0, "theta": yaw})
 
 
-def test_forgets_the_pose_of_a_robot_that_is_gone() -> None:
+def test_a_state_tells_what_it_changed() -> None:
+    view = FleetView()
+    change = view.on_state(state(robot("Robot1"), robot("Robot2"), blocked=[1, 2], pending=[3]))
+    assert change == ViewChange(
+        is_new_map=True, robots=("Robot1", "Robot2"), blocked=(1, 2), pending=(3,), freed=()
+    )
+    change = view.on_state(state(robot("Robot1", goal=9), blocked=[1, 3]))
+    assert change == ViewChange(robots=("Robot1",), removed=("Robot2",), blocked=(3,), freed=(2,))
+    assert not view.on_state(state(robot("Robot1", goal=9), blocked=[1, 3]))
+
+
+def changes(*robots: dict[str, Any], **parts: object) -> dict[str, Any]:
+    return {"robots": list(robots), "removed": [], "blocked": [], "pending": [], "freed": [], **parts}
+
+
+def test_changes_are_applied_to_robots_and_cells() -> None:
+    view = FleetView()
+    view.on_state(state(robot("Robot1"), robot("Robot2"), blocked=[1, 2], pending=[3]))
+    view.on_pose("Robot2", pose(0, 0, 0))
+    change = view.on_changes(
+        changes(robot("Robot1", goal=9), robot("Robot0"), removed=["Robot2"], blocked=[3], freed=[2])
+    )
+    assert change == ViewChange(
+        robots=("Robot0", "Robot1"), removed=("Robot2",), blocked=(3,), pending=(), freed=(2,)
+    )
+    assert [(known["id"], known["goal"]) for known in view.robots()] == [("Robot0", None), ("Robot1", 9)]
+    assert (view.blocked(), view.pending(), view.poses) == ([1, 3], [], {})
+
+
+def test_a_change_that_is_applied_again_does_no_harm() -> None:
+    view = FleetView()
+    view.on_state(state(robot("Robot1"), robot("Robot2"), blocked=[1, 2]))
+    change = changes(robot("Robot1", goal=9), removed=["Robot2"], pending=[5], freed=[2])
+    view.on_changes(change)
+    known = view.state
+    view.on_changes(change)
+    assert view.state == known
+
+
+def test_pose_of_an_absent_robot_is_dropped() -> None:
     view = FleetView()
     view.on_state(state(robot("Robot1"), robot("Robot2")))
     view.on_pose("Robot1", pose(0, 0, 0))
@@ -71,6 +110,50 @@ async def test_a_slow_page_gets_only_the_newest_of_each_topic() -> None:
         pages.send("poses", f"poses {number}")
         pages.send("state", f"state {number}")
     assert await page.take() == ["poses 999", "state 999"]
+
+
+async def test_a_page_gets_everything_first_and_then_changes() -> None:
+    pages = Broadcast(lambda: ["everything"])
+    page = pages.open()
+    pages.send_change("in everything already")
+    assert await page.take() == ["everything"]
+    pages.send_change("one")
+    pages.send_change("two")
+    assert await page.take() == ["one", "two"]
+
+
+async def test_a_page_that_is_too_slow_gets_everything_anew() -> None:
+    pages = Broadcast(lambda: ["everything"])
+    slow, fast = pages.open(), pages.open()
+    await slow.take()
+    await fast.take()
+    for number in range(MAX_CHANGES + 1):
+        pages.send_change(str(number))
+        assert await fast.take() == [str(number)]
+    assert await slow.take() == ["everything"]
+    pages.send_change("next")
+    assert await slow.take() == ["next"]
+
+
+async def test_a_page_that_takes_no_changes_gets_everything_each_time() -> None:
+    """A page of an earlier release."""
+    pages = Broadcast(lambda: ["everything"])
+    page = pages.open(takes_changes=False)
+    for _ in range(2):
+        pages.send_change("one")
+        pages.send_change("two")
+        assert await page.take() == ["everything"]
+
+
+async def test_a_page_that_opens_before_anything_is_known_waits() -> None:
+    known: list[str] = []
+    pages = Broadcast(lambda: known)
+    page = pages.open()
+    pages.send_event("first")
+    assert await page.take() == ["first"]
+    known.append("everything")
+    pages.send_change("one")
+    assert await page.take() == ["everything"]
 
 
 async def test_a_page_that_opens_late_gets_what_is_known() -> None:

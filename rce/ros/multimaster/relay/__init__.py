@@ -1,1 +1,1 @@
-"""Passing messages on, their bytes untouched: to another name, another master, or over one connection."""
+"""Relays pass messages on without decoding them: to another name, another master, or over one connection."""

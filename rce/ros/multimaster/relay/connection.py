@@ -1,4 +1,4 @@
-"""One connection of a relay: frames in, frames out, and little of both until the other side is known."""
+"""One connection of a relay; until the other side has authenticated, it carries few and small frames."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import asyncio
 from collections.abc import Callable
 from typing import cast
 
+from rce.aio.queues import BoundedQueue
 from rce.guard.lobby import Guest, Lobby, address_of
-from rce.ros.multimaster.errors import LinkBroken
+from rce.ros.multimaster.errors import LinkBrokenError
 from rce.ros.multimaster.relay.frames import (
     MAX_FRAME_SIZE,
     MAX_GREETING,
@@ -21,11 +22,11 @@ from rce.ros.multimaster.relay.frames import (
     Proof,
     encode,
 )
-from rce.ros.node.queue import DropOldest
+from rce.ros.node.settings import MAX_QUEUED_BYTES
 
 PING_PERIOD = 1.0
 SILENCE = 3.5
-"""Seconds without a frame after which the other side is taken for gone."""
+"""Seconds without a frame after which the other side counts as gone."""
 
 WRITE_HIGH = 2**20
 """Bytes waiting to be sent from which on messages wait, the newest :data:`QUEUE` of them."""
@@ -51,10 +52,10 @@ class RelayConnection(asyncio.Protocol):
         self._lobby = lobby
         self._guest: Guest | None = None
         self._greetings: asyncio.Queue[Greeting | None] = asyncio.Queue()
-        """What came of the handshake; None at the end."""
+        """The received frames of the handshake; None at the end."""
         self._is_known = False
         self._answered = False
-        """Whether the side that was dialed has said its last word of the handshake."""
+        """Whether the side that was dialed has sent its last frame of the handshake."""
         self.ended: asyncio.Future[None] = loop.create_future()
         self.gone = asyncio.Event()
         self._ends: tuple[Callable[[Frame], None], ...] = ()
@@ -64,11 +65,11 @@ class RelayConnection(asyncio.Protocol):
         self._early: list[Frame] = []
         self._backlog: list[Frame] = []
         self._decoder = Decoder(MAX_GREETING)
-        self._waiting: DropOldest[Data] = DropOldest(QUEUE)
+        self._waiting: BoundedQueue[Data] = BoundedQueue(QUEUE, MAX_QUEUED_BYTES)
         self._full = False
         self._heard = loop.time()
 
-    # ------------------------------------------------------------------ for the owner
+    # For the owner
 
     def send(self, frame: Frame) -> None:
         """Send a frame; a message waits, and may be dropped for newer ones, while the connection is full."""
@@ -84,13 +85,13 @@ class RelayConnection(asyncio.Protocol):
         """Wait for the next frame of the handshake.
 
         Raises:
-            LinkBroken: The connection ended, or something else came.
+            LinkBrokenError: The connection ended, or something else came.
         """
         found = await self._greetings.get()
         if found is None:
             self._greetings.put_nowait(None)
             await self.ended
-            raise LinkBroken("the connection is lost")
+            raise LinkBrokenError("the connection is lost")
         return found
 
     def become_known(self) -> None:
@@ -101,24 +102,24 @@ class RelayConnection(asyncio.Protocol):
             self._guest.leave()
 
     def start(self, *ends: Callable[[Frame], None]) -> None:
-        """Give the frames to ``ends`` from now on, those that came since the hello first."""
+        """Pass frames to ``ends`` from now on, beginning with those that came since the hello."""
         self._ends = ends
         backlog, self._backlog = self._backlog, []
         for frame in backlog:
             self._take(frame)
 
     def stop(self) -> None:
-        """Ignore what comes from now on."""
+        """Ignore further frames."""
         self._stopped = True
 
     async def ping(self) -> None:
-        """Say now and then that this side is there; end the link when the other does not."""
+        """Send a ping periodically; end the link when the other side is silent."""
         loop = asyncio.get_running_loop()
         while True:
             self.send(Ping())
             await asyncio.sleep(PING_PERIOD)
             if loop.time() - self._heard > SILENCE:
-                self._fail(LinkBroken("the other side fell silent"))
+                self._fail(LinkBrokenError("the other side fell silent"))
 
     def abort(self) -> None:
         """Close now."""
@@ -126,7 +127,7 @@ class RelayConnection(asyncio.Protocol):
             self._transport.abort()
         self.ended.cancel()
 
-    # ------------------------------------------------------------------ for the transport
+    # For the transport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Count it, and send what waits."""
@@ -147,7 +148,7 @@ class RelayConnection(asyncio.Protocol):
         try:
             for frame in self._decoder.feed(data):
                 self._take(frame)
-        except LinkBroken as error:
+        except LinkBrokenError as error:
             self._fail(error)
 
     def pause_writing(self) -> None:
@@ -166,7 +167,7 @@ class RelayConnection(asyncio.Protocol):
         if self._guest is not None:
             self._guest.leave()
         self.gone.set()
-        self._fail(LinkBroken(f"the connection is lost: {error or 'the other side closed it'}"))
+        self._fail(LinkBrokenError(f"the connection is lost: {error or 'the other side closed it'}"))
 
     def _take(self, frame: Frame) -> None:
         if self._stopped:
@@ -176,7 +177,7 @@ class RelayConnection(asyncio.Protocol):
             return
         if not self._ends:
             if len(self._backlog) > MAX_BACKLOG or not (self._is_known or self._answered):
-                raise LinkBroken("the other side does not begin with a hello")
+                raise LinkBrokenError("the other side does not begin with a hello")
             self._backlog.append(frame)
         for end in self._ends:
             end(frame)
@@ -185,17 +186,17 @@ class RelayConnection(asyncio.Protocol):
         if self._is_known:
             return
         if self._greetings.qsize() >= MAX_GREETINGS:
-            raise LinkBroken("the other side says too much before the handshake is done")
+            raise LinkBrokenError("the other side says too much before the handshake is done")
         if self._lobby is None and isinstance(frame, Hello):
-            # The listening side's last word of the handshake; what follows may come with it.
+            # The listening side's last frame of the handshake; the next frames may come with it.
             self._answered = True
             self._decoder.most = MAX_FRAME_SIZE
         self._greetings.put_nowait(frame)
 
-    def _fail(self, error: LinkBroken) -> None:
+    def _fail(self, error: LinkBrokenError) -> None:
         self._greetings.put_nowait(None)
         if not self.ended.done():
             self.ended.set_exception(error)
-            self.ended.exception()  # it is not an unseen one: who waits gets it
+            self.ended.exception()  # mark the exception as retrieved: waiting callers get it
         if self._transport is not None:
             self._transport.abort()

@@ -1,4 +1,4 @@
-"""One end of a relay: offers what a graph has, sends what the other end wants."""
+"""The exporting end of a relay: offers the topics and services of a graph, sends what the importer wants."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import logging
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from rce.aio.tasks import TaskScope
 from rce.ros.errors import MasterError, ServiceError
-from rce.ros.multimaster.errors import NothingToRelay
+from rce.ros.multimaster.errors import NothingToRelayError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.relay.frames import Answer, Call, Data, Frame, Offer, Want
 from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind, learn_service, learn_topic
 from rce.ros.multimaster.source import RpcSource, Snapshot
 from rce.ros.node import Node, ServiceClient, Subscriber
 from rce.ros.node.master import MasterClient
-from rce.ros.tasks import TaskScope
 
 _log = logging.getLogger(__name__)
 
 PERIOD = 1.0
-"""Seconds between looks at the graph."""
+"""Seconds between checks of the graph."""
 
 CALL_TIMEOUT = 60.0
 MAX_CALLS = 256
@@ -49,11 +49,12 @@ class Exporter:
         Args:
             node: Subscribes and calls.
             master: The node's master.
-            chosen: What is offered, by the names that it is offered under.
+            chosen: The filter, by the names that topics and services are offered under.
             send: Takes frames for the other end.
             tasks: Owns the calls.
             rename: Gives the names to offer.
-            foreign: Tells nodes that were registered by a synchronization: what they have is not offered.
+            foreign: Returns the nodes that a synchronization registered; their topics and services are not
+                offered.
         """
         self._node = node
         self._master = master
@@ -75,7 +76,7 @@ class Exporter:
         self._calls = 0
 
     async def run(self) -> None:
-        """Offer what there is, and what is wanted of it, until cancelled."""
+        """Offer topics and services, and send the wanted messages, until cancelled."""
         loop = asyncio.get_running_loop()
         next_look = loop.time()
         try:
@@ -106,9 +107,9 @@ class Exporter:
                 self._send(Answer(frame.call, ok=False, payload=b"too many calls at once"))
                 return
             self._calls += 1
-            self._tasks.start(self._call(frame), name="relayed call")
+            self._tasks.spawn(self._call(frame), name="relayed call")
 
-    # ------------------------------------------------------------------ what there is
+    # The offer
 
     async def _look(self) -> None:
         snapshot = await self._source.read()
@@ -141,7 +142,7 @@ class Exporter:
         for topic in found.keys() - self._topics.keys():
             try:
                 learned = await learn_topic(self._master.rpc, self._node.name, topic, found[topic])
-            except NothingToRelay as error:
+            except NothingToRelayError as error:
                 _log.debug("%s", error)
                 continue
             self._topics[topic] = (self._number(topic), learned)
@@ -158,7 +159,7 @@ class Exporter:
         for service in found.keys() - self._services.keys():
             try:
                 learned = await learn_service(self._node.name, service, found[service])
-            except NothingToRelay as error:
+            except NothingToRelayError as error:
                 _log.debug("%s", error)
                 continue
             self._services[service] = (self._number(service), learned)
@@ -177,7 +178,7 @@ class Exporter:
     def _offered_name(self, name: str) -> str:
         return self._rename(name) or name
 
-    # ------------------------------------------------------------------ what is wanted
+    # Wanted messages and calls
 
     async def _serve_wants(self) -> None:
         for number in self._subscribers.keys() - (self._wanted & self._names.keys()):
@@ -201,7 +202,7 @@ class Exporter:
         try:
             response = await self._client(call.service).call_serialized(call.payload, timeout=CALL_TIMEOUT)
             self._send(Answer(call.call, ok=True, payload=response))
-        except (ServiceError, MasterError, NothingToRelay) as error:
+        except (ServiceError, MasterError, NothingToRelayError) as error:
             text = error.text if isinstance(error, ServiceError) else str(error)
             self._send(Answer(call.call, ok=False, payload=text.encode()))
         finally:
@@ -215,7 +216,7 @@ class Exporter:
                     client = self._clients[number] = self._node.service_client(service, kind.as_type())
                     break
             else:
-                raise NothingToRelay("the service is not offered any longer")
+                raise NothingToRelayError("the service is not offered any longer")
         return client
 
     async def _close(self) -> None:

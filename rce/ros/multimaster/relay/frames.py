@@ -1,7 +1,7 @@
-"""What two ends of a relay tell each other, and its bytes. Sans-I/O.
+"""The frames between the two ends of a relay. Sans-I/O.
 
-A frame on the wire is its length (uint32, little-endian, of all that follows), one byte for its kind, and its
-body: JSON for what is rare, a fixed head and the untouched message for what is many::
+A frame on the wire is its length (uint32, little-endian, of everything after it), one byte for its kind, and
+its body: JSON for rare frames, a fixed header and the untouched message for frequent ones::
 
     H  hello     {"protocol": 2, "name": ..., "nonce": ..., "proof": ...}: see :mod:`.handshake`
     N  challenge {"nonce": ...}
@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from rce.ros.multimaster.errors import LinkBroken
+from rce.ros.multimaster.errors import LinkBrokenError
 from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind
 from rce.ros.tcpros.framing import MAX_FRAME
 
@@ -41,7 +41,7 @@ MAX_GREETING = 4096
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """Who is at this end."""
+    """Names this end and authenticates it."""
 
     CODE: ClassVar[bytes] = b"H"
     name: str
@@ -59,7 +59,7 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Challenge:
-    """What the side that dials must prove itself with."""
+    """The nonce that the dialing side must use in its proof."""
 
     CODE: ClassVar[bytes] = b"N"
     nonce: str
@@ -143,7 +143,7 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a service answered."""
+    """The answer of a service."""
 
     CODE: ClassVar[bytes] = b"A"
     call: int
@@ -157,7 +157,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Ping:
-    """A sign of life."""
+    """Shows that the sender is alive."""
 
     CODE: ClassVar[bytes] = b"P"
 
@@ -192,14 +192,14 @@ class Decoder:
         """Take bytes; return the frames that are complete.
 
         Raises:
-            LinkBroken: This is not the protocol.
+            LinkBrokenError: The bytes are not frames of this protocol.
         """
         self._buffer += data
         position = 0
         while len(self._buffer) - position >= _HEAD.size:
             length, code = _HEAD.unpack_from(self._buffer, position)
             if not 1 <= length <= self.most:
-                raise LinkBroken(f"a frame of {length} bytes")
+                raise LinkBrokenError(f"a frame of {length} bytes")
             end = position + _HEAD.size + length - 1
             if end > len(self._buffer):
                 break
@@ -226,7 +226,7 @@ def _decode(code: bytes, body: bytes) -> Frame:
             case _:
                 return _decode_json(code, json.loads(body))
     except (struct.error, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise LinkBroken(f"a frame {code!r} that cannot be read: {error}") from error
+        raise LinkBrokenError(f"a frame {code!r} that cannot be read: {error}") from error
 
 
 def _decode_json(code: bytes, values: Any) -> Frame:

@@ -1,6 +1,6 @@
-"""How the two sides of a relay prove to each other that they have the same token. Sans-I/O.
+"""The handshake in which both sides of a relay prove that they have the same token. Sans-I/O.
 
-The token itself never travels. Who dials proves first, so that a stranger who connects learns nothing but a
+The token itself is never sent. The dialing side proves first, so that a stranger who connects learns only a
 random number::
 
     dialing side                                  listening side
@@ -19,7 +19,7 @@ import hmac
 import json
 import secrets
 
-from rce.ros.multimaster.errors import LinkBroken
+from rce.ros.multimaster.errors import LinkBrokenError
 from rce.ros.multimaster.relay.frames import PROTOCOL, Challenge, Frame, Hello, Proof
 
 NONCE_BYTES = 32
@@ -48,12 +48,12 @@ class DialerHandshake:
         """Take the challenge; return the answer.
 
         Raises:
-            LinkBroken: The other side does not speak this protocol.
+            LinkBrokenError: The other side does not speak this protocol.
         """
         if isinstance(frame, Hello):
             _check_protocol(frame)
         if not isinstance(frame, Challenge) or not _is_nonce(frame.nonce):
-            raise LinkBroken("the other side does not begin with a challenge")
+            raise LinkBrokenError("the other side does not begin with a challenge")
         self._theirs = frame.nonce
         return Proof(_sign(self._token, _DIALING, self.nonce, frame.nonce, self._name))
 
@@ -61,10 +61,10 @@ class DialerHandshake:
         """Take the other side's hello; return its name.
 
         Raises:
-            LinkBroken: It has another token.
+            LinkBrokenError: It has another token.
         """
         if not isinstance(frame, Hello):
-            raise LinkBroken("the other side does not answer with a hello")
+            raise LinkBrokenError("the other side does not answer with a hello")
         _check_protocol(frame)
         wanted = _sign(self._token, _LISTENING, self.nonce, self._theirs, self._name, frame.name)
         _compare(wanted, frame.proof, frame.name)
@@ -91,15 +91,15 @@ class ListenerHandshake:
         """Take the first frame; return the challenge.
 
         Raises:
-            LinkBroken: The other side does not speak this protocol, or is this one.
+            LinkBrokenError: The other side does not speak this protocol, or is this one.
         """
         if not isinstance(frame, Hello):
-            raise LinkBroken("the other side does not begin with a hello")
+            raise LinkBrokenError("the other side does not begin with a hello")
         _check_protocol(frame)
         if not _is_nonce(frame.nonce):
-            raise LinkBroken(f"{frame.name} sends no nonce of {NONCE_BYTES} bytes")
+            raise LinkBrokenError(f"{frame.name} sends no nonce of {NONCE_BYTES} bytes")
         if frame.nonce in self._own:
-            raise LinkBroken("the connection comes from this program itself")
+            raise LinkBrokenError("the connection comes from this program itself")
         self._hello = frame
         return Challenge(self._nonce)
 
@@ -110,12 +110,12 @@ class ListenerHandshake:
             The other side's name, and the last frame to send.
 
         Raises:
-            LinkBroken: It has another token.
+            LinkBrokenError: It has another token.
         """
         assert self._hello is not None
         name, nonce = self._hello.name, self._hello.nonce
         if not isinstance(frame, Proof):
-            raise LinkBroken(f"{name} does not answer the challenge")
+            raise LinkBrokenError(f"{name} does not answer the challenge")
         _compare(_sign(self._token, _DIALING, nonce, self._nonce, name), frame.proof, name)
         proof = _sign(self._token, _LISTENING, nonce, self._nonce, name, self._name)
         return name, Hello(self._name, proof=proof)
@@ -123,14 +123,14 @@ class ListenerHandshake:
 
 def _check_protocol(hello: Hello) -> None:
     if hello.protocol != PROTOCOL:
-        raise LinkBroken(
+        raise LinkBrokenError(
             f"{hello.name} speaks relay protocol {hello.protocol}, not {PROTOCOL}; update the older rce"
         )
 
 
 def _compare(wanted: str, given: str, name: str) -> None:
     if not hmac.compare_digest(wanted.encode(), given.encode("utf-8", "surrogateescape")):
-        raise LinkBroken(f"{name} has another token; give both sides the same --relay-token")
+        raise LinkBrokenError(f"{name} has another token; give both sides the same --relay-token")
 
 
 def _sign(token: str, *said: str) -> str:

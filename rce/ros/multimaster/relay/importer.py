@@ -1,4 +1,4 @@
-"""The other end of a relay: has in its graph what was offered, asks for what is used of it."""
+"""The importing end of a relay: advertises the offer in its graph, and asks for the topics in use."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import itertools
 import logging
 from collections.abc import Callable
 
-from rce.ros.errors import MasterError, RosError, ServiceFault
+from rce.ros.errors import MasterError, RosError, ServiceFaultError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.relay.exporter import CALL_TIMEOUT, Rename
 from rce.ros.multimaster.relay.frames import Answer, Call, Data, Frame, Offer, Want
@@ -22,7 +22,7 @@ RETRY = 1.0
 
 
 class Importer:
-    """Publishes and provides in one graph what the other end offers. Messages come while somebody listens."""
+    """Advertises the other end's offer in one graph. A topic's messages come while it has subscribers."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class Importer:
         Args:
             node: Publishes and provides.
             master: The node's master.
-            chosen: What is taken of the offer, by the names that it is offered under.
+            chosen: The filter of the offer, by the names in it.
             send: Takes frames for the other end.
             rename: Gives the names of this graph.
         """
@@ -57,7 +57,7 @@ class Importer:
         self._complained: set[str] = set()
 
     async def run(self) -> None:
-        """Keep the graph as the offers have it, until cancelled."""
+        """Keep the graph in step with the offers, until cancelled."""
         try:
             while True:
                 self._changed.clear()
@@ -81,12 +81,12 @@ class Importer:
                 if frame.ok:
                     waiting.set_result(frame.payload)
                 else:
-                    waiting.set_exception(ServiceFault("", frame.payload.decode(errors="replace")))
+                    waiting.set_exception(ServiceFaultError("", frame.payload.decode(errors="replace")))
         elif isinstance(frame, Offer):
             self._offer = frame
             self._changed.set()
 
-    # ------------------------------------------------------------------ topics
+    # Topics
 
     def _publish(self, data: Data) -> None:
         known = self._topics.get(data.topic)
@@ -129,7 +129,7 @@ class Importer:
                 self._changed.set()
         return is_complete
 
-    # ------------------------------------------------------------------ services
+    # Services
 
     async def _keep_services(self) -> bool:
         offered = self._offer.services
@@ -170,18 +170,18 @@ class Importer:
             async with asyncio.timeout(CALL_TIMEOUT):
                 return await waiting
         except TimeoutError as error:
-            raise ServiceFault(name, "no answer came over the relay") from error
-        except ServiceFault as error:
-            raise ServiceFault(name, error.text) from error
+            raise ServiceFaultError(name, "no answer came over the relay") from error
+        except ServiceFaultError as error:
+            raise ServiceFaultError(name, error.text) from error
         finally:
             del self._calls[number]
 
-    # ------------------------------------------------------------------ the end
+    # The end
 
     async def _close(self) -> None:
         for waiting in self._calls.values():
             if not waiting.done():
-                waiting.set_exception(ServiceFault("", "the relay was closed"))
+                waiting.set_exception(ServiceFaultError("", "the relay was closed"))
         try:
             for _, _, publisher in self._topics.values():
                 await publisher.close()

@@ -1,4 +1,4 @@
-"""The types of what is passed on: names and checksums, as connection headers tell them."""
+"""The types of relayed topics and services: names and checksums, from connection headers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import TcprosError, XmlRpcError
-from rce.ros.multimaster.errors import NothingToRelay
+from rce.ros.multimaster.errors import NothingToRelayError
 from rce.ros.tcpros.header import ANY, MAX_HEADER, decode_header, encode_header, raise_error_field
 from rce.ros.xmlrpc import RpcClient
 from rce.ros.xmlrpc.dispatch import SUCCESS
@@ -24,14 +24,14 @@ _LENGTH = 4
 
 @dataclass(frozen=True, slots=True)
 class TopicKind:
-    """What a publisher says of its topic's type."""
+    """A topic's type, as its publisher gives it."""
 
     name: str
     md5sum: str
     definition: str
 
     def as_type(self) -> MessageType:
-        """Return this as what nodes publish and subscribe to serialized messages with."""
+        """Return the type for publishing and subscribing to serialized messages."""
         return cast("MessageType", self)
 
 
@@ -42,7 +42,7 @@ class _Named:
 
 @dataclass(frozen=True, slots=True)
 class ServiceKind:
-    """What a provider says of its service's type."""
+    """A service's type, as its provider gives it."""
 
     name: str
     md5sum: str
@@ -60,7 +60,7 @@ class ServiceKind:
         return _Named(self.response_type)
 
     def as_type(self) -> ServiceType:
-        """Return this as what nodes provide and call serialized services with."""
+        """Return the type for providing and calling serialized services."""
         return cast("ServiceType", self)
 
 
@@ -74,9 +74,9 @@ async def learn_topic(rpc: RpcClient, caller: str, topic: str, publishers: Itera
         publishers: URIs of the publishers' APIs.
 
     Raises:
-        NothingToRelay: None of them answers.
+        NothingToRelayError: None of them answers.
     """
-    reason = "nobody publishes it"
+    reason = "it has no publisher"
     for uri in publishers:
         try:
             async with asyncio.timeout(PROBE_TIMEOUT):
@@ -87,7 +87,7 @@ async def learn_topic(rpc: RpcClient, caller: str, topic: str, publishers: Itera
             return TopicKind(fields["type"], fields["md5sum"], fields.get("message_definition", ""))
         except (TcprosError, XmlRpcError, OSError, EOFError, KeyError) as error:
             reason = f"{uri}: {str(error) or type(error).__name__}"
-    raise NothingToRelay(f"the type of {topic} cannot be learned: {reason}")
+    raise NothingToRelayError(f"the type of {topic} cannot be learned: {reason}")
 
 
 async def learn_service(caller: str, service: str, uri: str) -> ServiceKind:
@@ -99,7 +99,7 @@ async def learn_service(caller: str, service: str, uri: str) -> ServiceKind:
         uri: The provider's ``rosrpc`` URI.
 
     Raises:
-        NothingToRelay: It does not answer.
+        NothingToRelayError: It does not answer.
     """
     header = {"callerid": caller, "service": service, "md5sum": ANY, "probe": "1"}
     try:
@@ -115,7 +115,9 @@ async def learn_service(caller: str, service: str, uri: str) -> ServiceKind:
         )
     except (TcprosError, OSError, EOFError, KeyError, ValueError) as error:
         reason = str(error) or type(error).__name__
-        raise NothingToRelay(f"the type of service {service} cannot be learned: {uri}: {reason}") from error
+        raise NothingToRelayError(
+            f"the type of service {service} cannot be learned: {uri}: {reason}"
+        ) from error
 
 
 async def _topic_address(rpc: RpcClient, caller: str, topic: str, uri: str) -> tuple[str, int]:

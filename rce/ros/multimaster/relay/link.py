@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import random
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
+from rce.aio.backoff import Backoff
+from rce.aio.tasks import TaskScope
 from rce.dialing import open_socket
 from rce.guard.complaints import Complaints
 from rce.guard.lobby import Lobby
-from rce.ros.multimaster.errors import LinkBroken, MultimasterError
+from rce.ros.multimaster.errors import LinkBrokenError, MultimasterError
 from rce.ros.multimaster.relay.connection import RelayConnection
 from rce.ros.multimaster.relay.exporter import Exporter
 from rce.ros.multimaster.relay.frames import Frame
 from rce.ros.multimaster.relay.handshake import DialerHandshake, ListenerHandshake
 from rce.ros.multimaster.relay.importer import Importer
 from rce.ros.node.settings import is_loopback
-from rce.ros.tasks import TaskScope
 
 _log = logging.getLogger(__name__)
 
 DEFAULT_PORT = 11911
 HELLO_TIMEOUT = 5.0
 CONNECT_TIMEOUT = 10.0
-RETRY_FIRST, RETRY_MOST = 0.2, 5.0
+RETRY = Backoff(first=0.2, longest=5.0, jitter=0.5)
+WORKED_AFTER = 5.0
+"""After a link that lasted for so many seconds, the next pause is short again."""
 MAX_NEW = STRANGERS = 64
 """How many links may wait to be taken, or have not shown yet that they have the token."""
 
@@ -34,12 +36,12 @@ STRANGERS_PER_ADDRESS = 16
 
 
 MakeEnds = Callable[[Callable[[Frame], None], TaskScope, str], tuple[Exporter, Importer]]
-"""Makes both ends for a link, given what takes frames, what owns tasks, and the other side's name."""
+"""Makes both ends of a link, from the receiver of frames, the owner of tasks, and the other side's name."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkIdentity:
-    """What one side says of itself."""
+    """The identity of one side."""
 
     name: str
     token: str = ""
@@ -47,14 +49,14 @@ class LinkIdentity:
 
 
 def check_listening(host: str, token: str) -> None:
-    """Refuse to listen for everybody.
+    """Refuse to listen for other machines without a token.
 
     Args:
         host: Address to listen on; empty for all.
         token: What other sides must have.
 
     Raises:
-        MultimasterError: Other machines could connect, and there is no token that they must have.
+        MultimasterError: Other machines could connect, and no token is set that they must have.
     """
     if not token and not is_loopback(host):
         raise MultimasterError(
@@ -64,7 +66,7 @@ def check_listening(host: str, token: str) -> None:
 
 
 class RelayLinks:
-    """All links of one synchronization: those it makes and those it takes."""
+    """All links of one synchronization: dialed and accepted ones."""
 
     def __init__(self, identity: LinkIdentity, make_ends: MakeEnds) -> None:
         self.connected: set[str] = set()
@@ -76,12 +78,12 @@ class RelayLinks:
         self._lobby = Lobby("relay links", per_address=STRANGERS_PER_ADDRESS, in_all=STRANGERS)
         self._complaints = Complaints()
         self._dialing: set[str] = set()
-        """Nonces of the attempts to dial that go on."""
+        """Nonces of the attempts to dial that are not over."""
 
     async def dial(self, host: str, port: int) -> None:
         """Keep a link to another side, until cancelled."""
         loop = asyncio.get_running_loop()
-        wait = RETRY_FIRST
+        pauses = RETRY.start()
         while True:
             begin = loop.time()
             try:
@@ -89,19 +91,18 @@ class RelayLinks:
                     sock = await open_socket(host, port)
                     _, link = await loop.create_connection(RelayConnection, sock=sock)
                 await self._serve(link, self._greet_as_dialer)
-            except (OSError, LinkBroken) as error:
+            except (OSError, LinkBrokenError) as error:
                 _log.warning("relay to %s:%d: %s", host, port, str(error) or type(error).__name__)
-            if loop.time() - begin > RETRY_MOST:  # it did work for a while
-                wait = RETRY_FIRST
-            await asyncio.sleep(wait * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
-            wait = min(RETRY_MOST, 2 * wait)
+            if loop.time() - begin > WORKED_AFTER:
+                pauses.reset()
+            await asyncio.sleep(pauses.next())
 
     async def open_server(self, host: str | None, port: int) -> asyncio.Server:
         """Begin to listen for links; :meth:`serve` takes them.
 
         Raises:
-            MultimasterError: Other machines could connect, and there is no token that they must have.
-            OSError: The port cannot be had.
+            MultimasterError: Other machines could connect, and no token is set that they must have.
+            OSError: The port cannot be bound.
         """
         check_listening(host or "", self._identity.token)
         return await asyncio.get_running_loop().create_server(self._accept, host or "0.0.0.0", port)  # noqa: S104
@@ -112,7 +113,7 @@ class RelayLinks:
             async with TaskScope() as tasks:
                 while True:
                     link = await self._guests.get()
-                    tasks.start(self._serve_guest(link), name="relay link")
+                    tasks.spawn(self._serve_guest(link), name="relay link")
         finally:
             server.close()
 
@@ -127,7 +128,7 @@ class RelayLinks:
     async def _serve_guest(self, link: RelayConnection) -> None:
         try:
             await self._serve(link, self._greet_as_listener)
-        except LinkBroken as error:
+        except LinkBrokenError as error:
             if self._complaints.is_due(link.address, asyncio.get_running_loop().time()):
                 _log.warning("relay link from %s: %s", link.address, error)
 
@@ -135,14 +136,14 @@ class RelayLinks:
         """Run a link until it ends.
 
         Raises:
-            LinkBroken: The other side breaks the protocol, has another token or fell silent.
+            LinkBrokenError: The other side breaks the protocol, has another token or fell silent.
         """
         try:
             try:
                 async with asyncio.timeout(HELLO_TIMEOUT):
                     name = await greet(link)
             except TimeoutError as error:
-                raise LinkBroken("the other side does not say who it is") from error
+                raise LinkBrokenError("the other side does not say who it is") from error
             link.become_known()
             await self._run(link, name)
         finally:
@@ -158,8 +159,8 @@ class RelayLinks:
             link.send(handshake.prove(await link.greeting()))
             try:
                 last = await link.greeting()
-            except LinkBroken as error:
-                raise LinkBroken(f"{error}; it may have another token") from error
+            except LinkBrokenError as error:
+                raise LinkBrokenError(f"{error}; it may have another token") from error
             return handshake.finish(last)
         finally:
             self._dialing.discard(handshake.nonce)
@@ -181,9 +182,9 @@ class RelayLinks:
             async with TaskScope() as tasks:
                 exporter, importer = self._make_ends(link.send, tasks, name)
                 link.start(exporter.take, importer.take)
-                tasks.start(exporter.run(), name=f"offer to {name}")
-                tasks.start(importer.run(), name=f"take from {name}")
-                tasks.start(link.ping(), name=f"ping {name}")
+                tasks.spawn(exporter.run(), name=f"offer to {name}")
+                tasks.spawn(importer.run(), name=f"take from {name}")
+                tasks.spawn(link.ping(), name=f"ping {name}")
                 try:
                     await link.ended
                 finally:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import logging
 
+from rce.aio.tasks import TaskScope
 from rce.ros.errors import RosError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.filters import SyncFilter
-from rce.ros.multimaster.neighbourhood import Neighbour
+from rce.ros.multimaster.peer_table import Neighbour
 from rce.ros.multimaster.relay.exporter import Exporter
 from rce.ros.multimaster.relay.frames import Frame
 from rce.ros.multimaster.relay.importer import Importer
@@ -16,7 +17,6 @@ from rce.ros.multimaster.remote import Remote
 from rce.ros.names import SEPARATOR, canonical
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
-from rce.ros.tasks import TaskScope
 from rce.ros.xmlrpc import RpcClient
 
 _log = logging.getLogger(__name__)
@@ -34,9 +34,9 @@ def strip_namespace(name: str, namespace: str) -> str | None:
 
 
 class NamespaceRemote(Remote):
-    """Has a master's ``/x`` here as ``/NS/x``, and what is published here as ``/NS/y`` there as ``/y``.
+    """Relays a master's ``/x`` to ``/NS/x`` here, and what is published here as ``/NS/y`` to ``/y`` there.
 
-    A node of its own at the remote master takes and gives; here, the synchronization's node does.
+    It uses a node of its own at the remote master, and the synchronization's node here.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class NamespaceRemote(Remote):
         Args:
             master: The remote master.
             namespace: Where its names are here.
-            chosen: What the user wants of it, by the names there.
+            chosen: The user's filter, by the names there.
             node: The synchronization's node.
             local: Its master.
             rpc: Makes calls.
@@ -71,9 +71,9 @@ class NamespaceRemote(Remote):
         self._relay: asyncio.Task[None] | None = None
 
     async def synchronize(self) -> None:
-        """Begin to relay, unless that goes on already."""
+        """Begin to relay, unless it is being relayed already."""
         if self._relay is None or self._relay.done():
-            self._relay = self._tasks.start(self._run_relay(), name=f"relay of {self.master.name}")
+            self._relay = self._tasks.spawn(self._run_relay(), name=f"relay of {self.master.name}")
 
     async def release(self) -> None:
         """End the relay."""

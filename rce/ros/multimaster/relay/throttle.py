@@ -10,11 +10,11 @@ class Throttle(Protocol):
     """Decides on messages in the order in which they come."""
 
     def passes(self, now: float, size: int) -> bool:
-        """Tell whether a message of ``size`` bytes at ``now`` (seconds) goes on."""
+        """Return whether a message of ``size`` bytes at ``now`` (seconds) is passed on."""
 
 
 class Everything:
-    """Lets everything pass."""
+    """Passes every message."""
 
     def passes(self, now: float, size: int) -> bool:
         """Let it pass."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 
-from rce.ros.multimaster.errors import NothingToRelay
+from rce.ros.multimaster.errors import NothingToRelayError
 from rce.ros.multimaster.relay.kinds import TopicKind, learn_topic
 from rce.ros.multimaster.relay.throttle import Everything, Throttle
 from rce.ros.multimaster.source import multicall
@@ -16,7 +16,7 @@ from rce.ros.xmlrpc import RpcClient
 _log = logging.getLogger(__name__)
 
 LOOK_AGAIN = 0.5
-"""Seconds between looks for a first publisher."""
+"""Seconds between checks for a first publisher."""
 
 QUEUE = 100
 
@@ -25,7 +25,7 @@ class TopicRelay:
     """Publishes under one name what is published under another, of whatever type.
 
     Attributes:
-        passed: How many messages went on.
+        passed: How many messages were passed on.
         held_back: How many the throttle stopped.
     """
 
@@ -43,9 +43,9 @@ class TopicRelay:
         Args:
             source: The topic to take.
             target: The topic to publish.
-            throttle: Decides which messages go on; None: all.
-            latch: Keep the last message for later subscribers. Without it, what is latched stays so.
-            lazy: Take messages only while somebody wants them.
+            throttle: Decides which messages are passed on; None: all.
+            latch: Keep the last message for later subscribers. Without it, latched messages stay latched.
+            lazy: Take messages only while the target has subscribers.
         """
         self.passed = 0
         self.held_back = 0
@@ -98,7 +98,7 @@ class TopicRelay:
             while True:
                 try:
                     return await learn_topic(rpc, node.name, topic, await publisher_uris(master, topic))
-                except NothingToRelay as error:
+                except NothingToRelayError as error:
                     if str(error) != reason:
                         reason = str(error)
                         _log.info("%s", reason)

@@ -14,7 +14,7 @@ Attack = Callable[[], object]
 
 DONE = "done"
 HANGS = "hangs"
-_PATIENCE_S = 5.0
+_TIMEOUT_S = 5.0
 _MAX_SILENCES = 12
 _MAX_RESULT = 1 << 16
 
@@ -46,12 +46,12 @@ def attempt_all(attacks: Mapping[str, Attack]) -> dict[str, str]:
     return {name: attempt(attack) for name, attack in attacks.items()}
 
 
-def attempt(attack: Attack, patience: float = _PATIENCE_S) -> str:
+def attempt(attack: Attack, timeout: float = _TIMEOUT_S) -> str:
     """Try an attack in a child.
 
     Args:
         attack: What to try.
-        patience: Seconds of silence after which it hangs, if it did not even use the processor meanwhile: a
+        timeout: Seconds of silence after which it hangs, if it did not even use the processor meanwhile: a
             machine may be busy.
 
     Returns:
@@ -66,7 +66,7 @@ def attempt(attack: Attack, patience: float = _PATIENCE_S) -> str:
     os.close(theirs)
     said, worked, silences = b"", 0, 0
     while True:
-        if select.select((ours,), (), (), patience)[0]:
+        if select.select((ours,), (), (), timeout)[0]:
             piece = os.read(ours, _MAX_RESULT)
             if not piece:
                 break

@@ -102,7 +102,7 @@ def main() -> None:
     outside = sys.argv[2:] == ["outside"]
     targets = facts.get("targets") or {
         "environment": find_process("rce_container.environment"),
-        "cradle": find_process("rce_container.nursery.cradle"),
+        "node fork server": find_process("rce_container.forkserver.nodes"),
         "holder": 1,
     }
     attacks = {**processes(targets), **calls(outside), **limits(), **addresses(facts)}

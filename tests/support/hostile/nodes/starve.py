@@ -180,7 +180,7 @@ def descriptors() -> Iterator[int]:
 
 
 def passing() -> Iterator[int]:
-    """Descriptors that are on their way for ever, in sockets."""
+    """Descriptors that are on their way indefinitely, in sockets."""
     pieces = [os.open("/dev/null", os.O_RDONLY)] * 250
     for number in count(1):
         pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -266,8 +266,8 @@ async def _flap() -> int:
 
 
 def stop_environment() -> Iterator[int]:
-    """The environment does not run any more, nor does the cradle."""
-    os.kill(find_process("rce_container.nursery.cradle"), signal.SIGSTOP)
+    """The environment does not run any more, nor does the node fork server."""
+    os.kill(find_process("rce_container.forkserver.nodes"), signal.SIGSTOP)
     yield 1
     print(json.dumps({"ended": "stopped"}), flush=True)
     time.sleep(0.3)

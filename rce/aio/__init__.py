@@ -1,0 +1,1 @@
+"""Additions to asyncio: backoff, owners of tasks, bounded queues."""

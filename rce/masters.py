@@ -1,0 +1,51 @@
+"""The addresses of an engine's masters: one or several, of which one is in use at a time. Pure."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+
+def split_addresses(text: str) -> tuple[str, ...]:
+    """Return the addresses in a text that separates them by commas."""
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+class Masters:
+    """Addresses that are used in turn: after a failure the next one is used.
+
+    Args:
+        addresses: One or several; in a text they are separated by commas.
+
+    Raises:
+        ValueError: No address was given.
+
+    Example:
+        ```python
+        masters = Masters("http://one:9000/,http://two:9000/")
+        masters.current  # http://one:9000/
+        masters.failed("http://one:9000/")
+        masters.current  # http://two:9000/
+        ```
+    """
+
+    def __init__(self, addresses: str | Iterable[str]) -> None:
+        self.all = split_addresses(addresses) if isinstance(addresses, str) else tuple(addresses)
+        if not self.all:
+            raise ValueError("give the address of a master, or several, separated by commas")
+        self._index = 0
+
+    def __str__(self) -> str:
+        return ",".join(self.all)
+
+    @property
+    def current(self) -> str:
+        """The address to use now."""
+        return self.all[self._index]
+
+    def failed(self, address: str) -> None:
+        """Switch to the next address, if ``address`` is still in use."""
+        if address == self.current:
+            self._index = (self._index + 1) % len(self.all)

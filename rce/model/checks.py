@@ -1,0 +1,76 @@
+"""Checks of a request beyond the form of its fields. Pure."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+# A folder of the machine, or an image's name as in registries: no spaces, no option of a command line.
+_IMAGE = re.compile(r"(/[^\x00-\x1f]*|[A-Za-z0-9][A-Za-z0-9._:/@+-]*)")
+_MAX_IMAGE = 255
+
+DEFAULT_PREFIX = 24
+"""Prefix of a group's address without one."""
+_SHORTEST_PREFIX, _LONGEST_PREFIX = 8, 30
+
+
+def read_image(text: str) -> str:
+    """Check the name of a container's root file system; empty for none.
+
+    Raises:
+        ValueError: It is neither an image's name nor a path.
+    """
+    if text and (len(text) > _MAX_IMAGE or not _IMAGE.fullmatch(text)):
+        raise ValueError("must be an image's name such as debian:12, or the path of a folder")
+    return text
+
+
+def read_group_address(text: str) -> str:
+    """Check a container's address in the network of its group; empty for a free one.
+
+    Raises:
+        ValueError: It is not the IPv4 address of a host.
+    """
+    problem = _address_problem(text) if text else ""
+    if problem:
+        raise ValueError(f"{problem}, not {text!r:.60}")
+    return text
+
+
+def find_circle(start: str, after: Mapping[str, Sequence[str]]) -> list[str]:
+    """Find a cycle on which a node comes after itself.
+
+    Args:
+        start: The node's tag.
+        after: The tags of the nodes that each node comes after.
+
+    Returns:
+        The tags on the cycle, ``start`` first and last; empty without a cycle.
+    """
+    ways = [[start, tag] for tag in after.get(start, ())]
+    seen: set[str] = set()
+    while ways:
+        way = ways.pop()
+        if way[-1] == start:
+            return way
+        if way[-1] not in seen:
+            seen.add(way[-1])
+            ways += [[*way, tag] for tag in after.get(way[-1], ())]
+    return []
+
+
+def _address_problem(text: str) -> str:
+    try:
+        address = ipaddress.IPv4Interface(text if "/" in text else f"{text}/{DEFAULT_PREFIX}")
+    except ValueError:
+        return "must be an IPv4 address such as 10.0.0.2 or 10.0.0.2/24"
+    network = address.network
+    if not _SHORTEST_PREFIX <= network.prefixlen <= _LONGEST_PREFIX:
+        return f"must have a prefix from /{_SHORTEST_PREFIX} to /{_LONGEST_PREFIX}"
+    if address.ip in (network.network_address, network.broadcast_address):
+        return f"must be an address of a host in {network}"
+    return ""

@@ -1,0 +1,7 @@
+"""Packages of nodes that users bring to an engine, as signed archives with a version.
+
+- :mod:`rce.packages.folder` inspects a package's folder and packs it;
+- :mod:`rce.packages.archive` reads and writes archives; it trusts nothing that it reads;
+- :mod:`rce.packages.contents` inspects an archive; :mod:`rce.packages.unpacking` unpacks it to a disk;
+- :mod:`rce.packages.signing` makes keys and signatures; :mod:`rce.packages.versions` orders versions.
+"""

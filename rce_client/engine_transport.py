@@ -1,0 +1,317 @@
+"""Keeps a WebSocket to the engine: dials through the master, sends, receives, and dials again."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import logging
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Protocol
+from urllib.parse import urlencode, urlsplit, urlunsplit
+
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed
+
+from rce.aio.backoff import Backoff
+from rce.dialing import open_url_socket
+from rce.masters import Masters
+from rce.protocol.http import FEATURES, FEATURES_HEADER, FEATURES_KEY, SINGLE_FRAME
+from rce.protocol.limits import Limits
+from rce.protocol.stream import ProtocolStream
+from rce_client.discovery import VERSION, locate
+from rce_client.exceptions import ClientError, InUseError, LostError, RefusedError, UntrustedError
+from rce_client.failures import judge
+from rce_client.sendqueue import QueuedMessage, QueueLimits, SendQueue
+from rce_client.socket import EngineSocket
+
+if TYPE_CHECKING:
+    import ssl
+    from collections.abc import Callable, Sequence
+
+    from rce.protocol.codec import Frame
+    from rce.protocol.stream import Event
+
+_log = logging.getLogger(__name__)
+
+
+IN_USE_DELAY = 3.0
+"""Maximum seconds until the next attempt if another client has the robotID."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target:
+    """The client's account and the engine's address."""
+
+    url: str
+    """The master, ``http://HOST:9000/`` or ``https://``; several, separated by commas, are used in turn."""
+    user: str
+    robot: str
+    password: str = field(default="", repr=False)
+    token: str = field(default="", repr=False)
+    """The robot's own token, in place of its user's password."""
+    version: str = VERSION
+    tls: ssl.SSLContext | Callable[[], ssl.SSLContext] | None = None
+    """For ``https`` and ``wss``, or what gives it for each connection; the system's settings if None."""
+
+    def context(self) -> ssl.SSLContext | None:
+        """Return the TLS settings for the next connection.
+
+        Raises:
+            CertificateError: They cannot be made.
+        """
+        return self.tls() if callable(self.tls) else self.tls
+
+    def handshake(self, *, header: bool) -> tuple[str, dict[str, str]]:
+        """Return query and headers of the WebSocket handshake; the password itself never leaves this machine.
+
+        Args:
+            header: Whether the endpoint takes the credential in a header. It stays out of the URL then, which
+                proxies log.
+
+        Raises:
+            RefusedError: The client has only a token, and the endpoint does not accept tokens.
+        """
+        who = {"userID": self.user, "robotID": self.robot}
+        digest = hashlib.sha256(self.password.encode()).hexdigest()
+        if header:
+            return urlencode(who), {"Authorization": f"Bearer {self.token or digest}"}
+        if self.token:
+            reason = (
+                "this engine does not accept robots' tokens: update it, or use the user's password instead"
+                " of the token"
+            )
+            raise RefusedError(HTTPStatus.UNAUTHORIZED, reason)
+        return urlencode({**who, "password": digest}), {}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timing:
+    """Times in seconds, sizes in bytes."""
+
+    locate: float = 10.0
+    """Seconds for the master's answer."""
+    open: float = 25.0
+    """Seconds for the WebSocket handshake; the endpoint itself may wait some seconds for the master."""
+    ping_interval: float | None = 10.0
+    """Seconds between two pings; None for no pings."""
+    ping_timeout: float | None = 10.0
+    """Seconds to wait for the answer to a ping; then the connection counts as lost. None for no limit."""
+    close: float = 3.0
+    """Seconds for the closing handshake."""
+    flush: float = 5.0
+    """Seconds for sending queued messages when the program closes the connection."""
+    max_message: int = 64 << 20
+    """Bytes of the largest message that is accepted from the engine."""
+    write_buffer: tuple[int, int] = (128 << 10, 32 << 10)
+    """High and low limit of the bytes in the socket. Above the first, messages wait in their queue, where
+    others can overtake them; below the second, the next one is sent."""
+    backoff: Backoff = Backoff(first=0.2, longest=15.0, jitter=1.0)
+    """Pauses between attempts to connect."""
+
+
+class Listener(Protocol):
+    """Gets the events of an engine transport. Called in the event loop; must not block."""
+
+    def on_connecting(self) -> None:
+        """Learn that an attempt to connect begins."""
+
+    def on_failure(self, error: ClientError) -> None:
+        """Learn that an attempt failed.
+
+        Another one follows, or :meth:`EngineTransport.run` ends with this error.
+        """
+
+    def on_connected(self) -> None:
+        """Learn that the connection is established; messages posted from now on are sent."""
+
+    def on_lost(self, error: LostError) -> None:
+        """Learn that the connection ended."""
+
+    def on_event(self, event: Event) -> None:
+        """Handle an event from the engine."""
+
+
+class EngineTransport:
+    """A robot's transport to the engine; it reconnects when a connection is lost."""
+
+    def __init__(
+        self,
+        target: Target,
+        listener: Listener,
+        timing: Timing | None = None,
+        limits: QueueLimits | None = None,
+    ) -> None:
+        self._target = target
+        self._masters = Masters(target.url)
+        self._listener = listener
+        self._timing = timing or Timing()
+        self._queue = SendQueue(limits or QueueLimits())
+        self._idle = asyncio.Event()
+        self._idle.set()
+        self.connected = False
+        self._was_connected = False
+        self.features: frozenset[str] = frozenset()
+        """Optional protocol features of this connection's endpoint."""
+        self.dropped = self._queue.dropped
+        """Interface tag to the number of its messages that found no room to wait."""
+
+    async def run(self) -> None:
+        """Connect again and again, until cancelled.
+
+        An engine that was connected before and is not trusted any more (an expired certificate, say) is
+        tried again: the operator can repair it while robots' programs run.
+
+        Raises:
+            RefusedError: The engine refuses this client.
+        """
+        pauses = self._timing.backoff.start()
+        while True:
+            self._listener.on_connecting()
+            try:
+                socket = await self._dial()
+            except Exception as raised:
+                error = judge(raised)
+                self._listener.on_failure(error)
+                repairable = self._was_connected and isinstance(error, UntrustedError)
+                if isinstance(error, RefusedError) and not repairable:
+                    raise error from raised
+                delay = pauses.next()
+                await asyncio.sleep(min(delay, IN_USE_DELAY) if isinstance(error, InUseError) else delay)
+                continue
+            pauses.reset()
+            self._listener.on_lost(await self._use(socket))
+            await asyncio.sleep(pauses.next())
+
+    def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
+        """Send a topic's message when its turn comes; return False if there is no connection.
+
+        Args:
+            tag: The interface.
+            frames: The message's frames.
+            key: A queued message with a key is dropped only for a newer one of the same key.
+        """
+        if self.connected:
+            self._idle.clear()
+            self._queue.put_data(tag, QueuedMessage.of(frames, key))
+        return self.connected
+
+    def post_control(self, frames: Sequence[Frame]) -> bool:
+        """Send a message that must not be lost; return False without a connection or if the queue is full."""
+        if not self.connected or self._queue.full:
+            return False
+        self.post_request(frames)
+        return True
+
+    def post_request(self, frames: Sequence[Frame]) -> None:
+        """Send a message even if much waits already. For what the program waits for, or asks once."""
+        self._idle.clear()
+        self._queue.put_control(QueuedMessage.of(frames))
+
+    def deliver(self, frames: Sequence[Frame]) -> asyncio.Future[None]:
+        """Send a message when its turn comes.
+
+        Returns:
+            Done when the message was handed to the network; its exception is a :class:`LostError` if there is
+            no connection, or it ended before.
+        """
+        queued = QueuedMessage.of(frames)
+        queued.sent = asyncio.get_running_loop().create_future()
+        if self.connected:
+            self._idle.clear()
+            self._queue.put_control(queued)
+        else:
+            queued.sent.set_exception(LostError("not connected"))
+        return queued.sent
+
+    async def flush(self) -> None:
+        """Wait until nothing waits to be sent, at most :attr:`Timing.flush` seconds."""
+        try:
+            async with asyncio.timeout(self._timing.flush):
+                await self._idle.wait()
+        except TimeoutError:
+            _log.warning("the engine does not read; messages that wait to be sent are lost")
+
+    async def _dial(self) -> EngineSocket:
+        target, timing = self._target, self._timing
+        tls = target.context()
+        url = self._masters.current
+        try:
+            found = await locate(url, target.user, version=target.version, tls=tls, timeout=timing.locate)
+        except ClientError:
+            self._masters.failed(url)
+            raise
+        parts = urlsplit(found.url)
+        query, headers = target.handshake(header=found.takes_header)
+        async with asyncio.timeout(timing.open):
+            sock = await open_url_socket(found.url)
+        socket = await connect(
+            urlunsplit(parts._replace(query=f"{query}&{FEATURES_KEY}={','.join(sorted(FEATURES))}")),
+            sock=sock,
+            additional_headers=headers,
+            ssl=(tls or True) if parts.scheme == "wss" else None,
+            compression=None,  # costs more time than it saves for all but slow links
+            proxy=None,
+            max_size=timing.max_message,
+            open_timeout=timing.open,
+            ping_interval=timing.ping_interval,
+            ping_timeout=timing.ping_timeout,
+            close_timeout=timing.close,
+            write_limit=timing.write_buffer,
+            create_connection=EngineSocket,
+        )
+        assert isinstance(socket, EngineSocket)
+        return socket
+
+    async def _use(self, socket: EngineSocket) -> LostError:
+        """Send and receive until the connection ends; return why it did."""
+        self.connected = self._was_connected = True
+        told = socket.response.headers.get(FEATURES_HEADER, "") if socket.response is not None else ""
+        self.features = FEATURES & set(told.split(","))
+        error = LostError("the connection was closed")
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                writer = tasks.create_task(self._write(socket))
+                self._listener.on_connected()
+                error = await self._read(socket)
+                writer.cancel()
+        finally:
+            self.connected = False
+            self._queue.clear()
+            self._idle.set()
+            await socket.close()
+        return error
+
+    async def _read(self, socket: EngineSocket) -> LostError:
+        limit = self._timing.max_message
+        limits = Limits(max_text=limit, max_binary=limit)
+        stream = ProtocolStream.for_client(limits, single=SINGLE_FRAME in self.features)
+        now = asyncio.get_running_loop().time
+        try:
+            while True:
+                frame = await socket.recv()
+                for event in stream.feed(frame, now()):
+                    self._listener.on_event(event)
+                deadline = stream.next_deadline
+                if deadline is not None and deadline <= now():
+                    for event in stream.expire(now()):
+                        self._listener.on_event(event)
+        except ConnectionClosed as closed:
+            reason = closed.rcvd.reason if closed.rcvd is not None else ""
+            return LostError(reason or f"the connection ended: {closed}")
+
+    async def _write(self, socket: EngineSocket) -> None:
+        while True:
+            queued = self._queue.pop()
+            if queued is None:
+                self._idle.set()
+                queued = await self._queue.get()
+            try:
+                await socket.send_frames(queued.frames)
+                if queued.sent is not None and not queued.sent.done():
+                    queued.sent.set_result(None)
+            except ConnectionClosed:
+                return
+            finally:
+                if queued.sent is not None and not queued.sent.done():
+                    queued.sent.set_exception(LostError("the connection ended while the message was sent"))

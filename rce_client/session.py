@@ -1,0 +1,317 @@
+"""What stands behind a :class:`~rce_client.connection.Connection`: its state, its tasks, its memory."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from functools import partial
+from typing import TYPE_CHECKING, Any, Self, assert_never
+
+from rce.aio.tasks import TaskScope
+from rce.model.requests import (
+    ConfigureComponents,
+    ConfigureConnections,
+    CreateContainer,
+    DestroyContainer,
+    RemoveInterface,
+    ResizeContainer,
+)
+from rce.protocol.codec import encode
+from rce.protocol.http import LATCH, SINGLE_FRAME
+from rce.protocol.messages import DataMessage, ErrorReport, InterfaceStatus, LatchedSources
+from rce.protocol.stream import Fault, LargeData
+from rce_client.desired import Desired
+from rce_client.engine_transport import EngineTransport, Target, Timing
+from rce_client.exceptions import InUseError, LostError, NotConnectedError, RefusedError, UntrustedError
+from rce_client.interface_table import InterfaceTable
+from rce_client.life import CONNECTION_LIFE, ConnectionEvent, State
+from rce_client.reminder import Reminder
+from rce_client.sendqueue import QueueLimits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Sequence
+    from types import TracebackType
+
+    from rce.model.requests import Request
+    from rce.protocol.codec import Frame
+    from rce.protocol.stream import Event
+    from rce_client.exceptions import ClientError
+    from rce_client.interfaces import ClientInterface
+
+_log = logging.getLogger(__name__)
+
+CONNECTING = "looking for the engine"
+"""The words of the first report of an attempt; the reports of failures tell what went wrong."""
+
+
+class Session:
+    """Keeps the connection, what was asked of the engine, and the interfaces, until the program closes it.
+
+    Implements :class:`rce_client.interfaces.InterfaceOwner` and
+    :class:`rce_client.engine_transport.Listener`.
+
+    Args:
+        target: The engine, and who connects.
+        on_error: Called with the text of every ``ER`` that belongs to no service call.
+        on_state: Called with every new state and a few words.
+        timing: Times in seconds and sizes in bytes.
+        limits: How many messages and bytes may wait to be sent.
+    """
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        on_error: Callable[[str], None] | None = None,
+        on_state: Callable[[State, str], None] | None = None,
+        timing: Timing | None = None,
+        limits: QueueLimits | None = None,
+    ) -> None:
+        self.robot = target.robot
+        self._life = CONNECTION_LIFE.start(State.CLOSED, target.robot)
+        self.errors: deque[str] = deque(maxlen=100)
+        """The newest error texts."""
+        self.transport = EngineTransport(target, self, timing, limits)
+        self.desired = Desired()
+        self.interfaces = InterfaceTable()
+        self._on_error = on_error
+        self._on_state = on_state
+        self._tasks: TaskScope | None = None
+        self._waiters: set[asyncio.Future[None]] = set()
+        self._backlog: list[Request] = []
+        self._was_connected = False
+        self._refusal: RefusedError | None = None
+        self._reminder = Reminder()
+
+    @property
+    def state(self) -> State:
+        """Where the connection is in its life."""
+        return self._life.state
+
+    async def __aenter__(self) -> Self:
+        """Connect, and wait until it is done."""
+        self._tasks = await TaskScope().__aenter__()
+        self.spawn(self._run())
+        try:
+            await self.until(lambda: self._was_connected)
+        except BaseException as error:
+            await self.__aexit__(type(error), error, error.__traceback__)
+            raise
+        return self
+
+    async def __aexit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Send what waits, unless there was an exception, and close."""
+        assert self._tasks is not None
+        try:
+            if exc is None:
+                await self.transport.flush()
+        finally:
+            await self._close(self._tasks, exc_type, exc, traceback)
+
+    async def _close(
+        self,
+        tasks: TaskScope,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.interfaces.close()
+        try:
+            await tasks.__aexit__(exc_type, exc, traceback)
+        finally:
+            self._tasks = None
+            self._happen(ConnectionEvent.CLOSE, "closed")
+
+    async def request(self, request: Request) -> None:
+        """Send a request, and remember it for reconnects."""
+        self.check_open()
+        self.desired.apply(request)
+        sent = self.transport.deliver(encode(request))
+        sent.add_done_callback(partial(self._note_unsent, request))
+        await asyncio.wait((sent,))
+
+    def check_open(self) -> None:
+        """Raise unless the program may use the connection.
+
+        Raises:
+            RefusedError: The engine refused this client for good.
+            NotConnectedError: The program closed the connection, or has not opened it yet.
+        """
+        if self._refusal is not None:
+            raise self._refusal
+        if self._tasks is None:
+            raise NotConnectedError("the connection is not open")
+
+    async def until(self, done: Callable[[], bool]) -> None:
+        """Wait until ``done`` returns true; it is called after every change of state or interface.
+
+        Raises:
+            RefusedError: The engine refused this client for good.
+            NotConnectedError: The program closed the connection, or has not opened it yet.
+        """
+        while not done():
+            self.check_open()
+            waiter: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+            self._waiters.add(waiter)
+            try:
+                await waiter
+            finally:
+                self._waiters.discard(waiter)
+
+    # What the interfaces use: rce_client.interfaces.InterfaceOwner
+
+    def post_data(self, tag: str, frames: Sequence[Frame], key: str | None = None) -> bool:
+        """Send a topic's message; return False if there is no connection."""
+        return self.transport.post_data(tag, frames, key)
+
+    def is_active(self, tag: str) -> bool:
+        """Return whether an interface is joined with a peer."""
+        return self.interfaces.active.get(tag, False)
+
+    @property
+    def knows_sources(self) -> bool:
+        """Whether the engine takes the names of latched messages' sources."""
+        return LATCH in self.transport.features
+
+    @property
+    def takes_single_frames(self) -> bool:
+        """Whether the engine takes serialized messages in one frame."""
+        return SINGLE_FRAME in self.transport.features
+
+    def post_control(self, frames: Sequence[Frame]) -> bool:
+        """Send a service message; return False if that is not possible now."""
+        return self.transport.post_control(frames)
+
+    def spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Run a coroutine until the program closes the connection.
+
+        Raises:
+            NotConnectedError: The connection is not open.
+        """
+        if self._tasks is None:
+            work.close()
+            raise NotConnectedError("the connection is not open")
+        return self._tasks.spawn(work, name=f"connection of {self.robot}")
+
+    async def wait_active(self, tag: str, timeout: float | None = None) -> None:
+        """Wait until an interface is joined with a peer."""
+        try:
+            async with asyncio.timeout(timeout):
+                await self.until(lambda: self.is_active(tag))
+        except TimeoutError as error:
+            said = "; ".join(list(self.errors)[-3:])
+            hint = f" The engine said: {said}" if said else ""
+            raise TimeoutError(
+                f"interface {tag} did not become active within {timeout:g} s.{hint}"
+            ) from error
+
+    async def withdraw(self, interface: ClientInterface) -> None:
+        """Remove an interface."""
+        if self.interfaces.withdraw(interface):
+            removed = RemoveInterface(endpoint=self.robot, tag=interface.tag)
+            await self.request(ConfigureComponents(remove_interfaces=(removed,)))
+
+    # What the transport tells: rce_client.engine_transport.Listener
+
+    def on_connecting(self) -> None:
+        """Learn that an attempt to connect begins."""
+        self._happen(ConnectionEvent.DIAL, CONNECTING)
+
+    def on_failure(self, error: ClientError) -> None:
+        """Learn that it failed; without ``on_state``, log what only a person can repair."""
+        repairable = isinstance(error, (InUseError, UntrustedError))
+        if self._on_state is None and repairable and self._reminder.is_due(str(error)):
+            _log.warning("%s: %s", self.robot, error)
+        self._happen(ConnectionEvent.FAIL, str(error))
+
+    def on_connected(self) -> None:
+        """Ask again for everything that was made."""
+        for request in (*self._backlog, *self.desired.restore()):
+            self.transport.post_request(encode(request))
+        self._backlog.clear()
+        event = ConnectionEvent.RESTORE if self._was_connected else ConnectionEvent.CONNECT
+        self._was_connected = True
+        self._happen(event, "connected")
+
+    def on_lost(self, error: LostError) -> None:
+        """Learn that the connection broke."""
+        self.interfaces.lose()
+        self._happen(ConnectionEvent.LOSE, str(error))
+
+    def on_event(self, event: Event) -> None:
+        """Take what came from the engine."""
+        match event:
+            case DataMessage():
+                self.interfaces.deliver(event)
+            case InterfaceStatus():
+                self.interfaces.set_active(event.i_tag, event.status)
+                self._notify()
+            case LatchedSources():
+                self.interfaces.keep_latched(event.i_tag, event.sources)
+            case ErrorReport():
+                self._take_report(event)
+            case Fault():
+                self._take_fault(event)
+            case (
+                CreateContainer()
+                | ResizeContainer()
+                | DestroyContainer()
+                | ConfigureComponents()
+                | ConfigureConnections()
+                | LargeData()
+            ):
+                self._take_error(f"unexpected message {type(event).__name__}: only clients send it")
+            case _:
+                assert_never(event)
+
+    # Own
+
+    async def _run(self) -> None:
+        try:
+            await self.transport.run()
+        except RefusedError as error:
+            self._refusal = error
+            self.interfaces.close()
+            self._happen(ConnectionEvent.REFUSE, str(error))
+
+    def _note_unsent(self, request: Request, sent: asyncio.Future[None]) -> None:
+        """Send a request after the reconnect that the connection broke before."""
+        if not sent.cancelled() and isinstance(sent.exception(), LostError):
+            self._backlog.append(request)
+
+    def _take_fault(self, fault: Fault) -> None:
+        """Report what came and cannot be read; fail the service call that it was part of."""
+        text = f"unreadable: {fault.text}"
+        if fault.call is None or not self.interfaces.fail(fault.call.i_tag, fault.call.msg_id, text):
+            self._take_error(text)
+
+    def _take_report(self, report: ErrorReport) -> None:
+        call = self.interfaces.call_of(report)
+        if call is None:
+            self._take_error(report.text)
+        else:
+            self.interfaces.fail(call.i_tag, call.msg_id, report.text.removeprefix(f"{call}: "))
+
+    def _take_error(self, text: str) -> None:
+        self.errors.append(text)
+        if self._on_error is not None:
+            self._on_error(text)
+        else:
+            _log.warning("engine: %s", text)
+
+    def _happen(self, event: ConnectionEvent, words: str) -> None:
+        state = self._life.advance(event)
+        if self._on_state is not None:
+            self._on_state(state, words)
+        self._notify()
+
+    def _notify(self) -> None:
+        for waiter in self._waiters:
+            if not waiter.done():
+                waiter.set_result(None)

@@ -1,7 +1,0 @@
-"""Packages that users bring, on a machine of containers.
-
-- :mod:`~rce_container.bundles.cache` fetches, verifies and unpacks them, each once for all containers;
-- :mod:`~rce_container.bundles.shelf` puts them into a container's folder, while it runs;
-- :mod:`~rce_container.bundles.requirements` installs what their ``requirements.txt`` asks for;
-- :mod:`~rce_container.bundles.supply` does all of it for one container, and tells its owner what fails.
-"""

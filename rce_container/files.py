@@ -1,0 +1,55 @@
+"""Files of containers: atomic writes, and measuring and removing what nodes left. All functions block."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file atomically, through ``NAME.new`` beside it.
+
+    Args:
+        path: The file.
+        data: All of it.
+
+    Raises:
+        OSError: It cannot be written; the error names a file. A former version stays.
+    """
+    temporary = path.with_name(f"{path.name}.new")
+    try:
+        temporary.write_bytes(data)
+        temporary.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        error.filename = error.filename or str(path)
+        raise
+
+
+def size_of(folder: Path) -> int:
+    """Return how many bytes the files in a folder take; does not follow links."""
+    total = 0
+    waiting = [str(folder)]
+    while waiting:
+        with contextlib.suppress(OSError), os.scandir(waiting.pop()) as entries:
+            for entry in entries:
+                with contextlib.suppress(OSError):
+                    if entry.is_dir(follow_symlinks=False):
+                        waiting.append(entry.path)
+                    else:
+                        total += entry.stat(follow_symlinks=False).st_size
+    return total
+
+
+def remove(folder: Path) -> None:
+    """Remove a folder with its contents, as far as possible; may be repeated."""
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+    except RecursionError:  # rm handles any depth
+        rm = shutil.which("rm") or "/bin/rm"
+        with contextlib.suppress(OSError):
+            subprocess.run([rm, "-rf", "--", folder], check=False, capture_output=True)  # noqa: S603

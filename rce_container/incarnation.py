@@ -1,0 +1,440 @@
+"""One incarnation of a container: its processes, control connection and folder, owned by one task."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import assert_never
+
+import msgspec
+
+from rce.aio.tasks import BackgroundTasks
+from rce.control.desired import DesiredState
+from rce.control.execution import FEATURE as EXEC
+from rce.control.execution import Command
+from rce.control.model import (
+    PATCHES,
+    EndpointSpec,
+    EndpointStatus,
+    NodeStatus,
+    SpecPatch,
+    StatusPatch,
+)
+from rce.control.observed import ObservedStatus
+from rce.control.tags import Unknown
+from rce.link.handover import LinkAcceptor
+from rce.model.names import EndpointId
+from rce.model.specs import Resources
+from rce_container import events, intake
+from rce_container.archive import LogArchive
+from rce_container.environment import messages as m
+from rce_container.environment import proc
+from rce_container.environment.channel import Channel, connect
+from rce_container.environment.exceptions import ChannelError
+from rce_container.exceptions import (
+    ExecutionError,
+    KillError,
+    LimitError,
+    NetworkError,
+    StartError,
+    StateError,
+)
+from rce_container.folder import ContainerFolder
+from rce_container.limits.enforcer import LimitEnforcer
+from rce_container.links import ContainerLinks
+from rce_container.logs import last_line
+from rce_container.network import Networks
+from rce_container.packages.shelf import Shelf
+from rce_container.packages.supply import Library, Supply
+from rce_container.runtimes.base import Handle
+from rce_container.settings import ContainerSettings
+
+_log = logging.getLogger(__name__)
+
+_SHIM_TIMEOUT_S = 5.0
+"""Seconds that the shim has to remove the folders of a container that ended properly."""
+_LAST_WORDS_LENGTH = 300
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IncarnationContext:
+    """The context shared by all incarnations of all containers."""
+
+    settings: ContainerSettings
+    acceptor: LinkAcceptor
+    feed: Callable[[events.Event], None]
+    networks: Networks
+    archive: LogArchive
+    library: Library
+
+
+class Incarnation:
+    """One incarnation of one container, from the first process to the removal of the last file.
+
+    Args:
+        id: The container.
+        folder: Belongs to this incarnation.
+        handle: Its outermost process.
+        enforcer: Enforces the limits of its control group.
+        context: Shared by all incarnations.
+        isolated: Whether pids that the environment reports are those of a namespace of its own.
+    """
+
+    def __init__(
+        self,
+        id: str,  # noqa: A002 - the model's word
+        folder: ContainerFolder,
+        handle: Handle,
+        enforcer: LimitEnforcer,
+        context: IncarnationContext,
+        *,
+        isolated: bool,
+    ) -> None:
+        self.id = id
+        self.folder = folder
+        self.handle = handle
+        self.enforcer = enforcer
+        self.counters = m.Counters()
+        """The traffic of links and interfaces, as last reported by the environment."""
+        self._observed: ObservedStatus | None = None
+        """What the environment reported last."""
+        self.reported = asyncio.Event()
+        """Set by the first report, or by an end without a report."""
+        self._context = context
+        self._isolated = isolated
+        self._channel: Channel | None = None
+        self._links = ContainerLinks(context.acceptor, context.settings)
+        self._takes_errands = False
+        """Whether an environment runs for which links and limits are handled."""
+        self._desired: DesiredState | None = None
+        self._pids: dict[int, int] = {}
+        self._deadline: asyncio.Timeout | None = None
+        self._features: frozenset[str] = frozenset()
+        self._stopping = False
+        self._stop_reason = ""
+        self._hurry = False
+        self._errands = BackgroundTasks()
+        self._supply = Supply(
+            self.incarnation_id,
+            EndpointId.parse(id).user,
+            context.library,
+            Shelf(folder.user_packages, link=isolated),
+            tell=lambda text: context.feed(events.Faulted(id, folder.incarnation_id, text)),
+            on_arrival=self._tell_of_arrival,
+        )
+
+    @property
+    def incarnation_id(self) -> str:
+        """Names this incarnation."""
+        return self.folder.incarnation_id
+
+    @property
+    def node_pids(self) -> dict[str, int]:
+        """The pids of the nodes' first processes, as the machine sees them, by tag."""
+        return {node.tag: node.pid for node in self._observed.header.nodes} if self._observed else {}
+
+    @property
+    def status(self) -> EndpointStatus | None:
+        """What the environment reported last; None if it has not."""
+        return self._observed.whole if self._observed is not None else None
+
+    def apply(self, spec: EndpointSpec) -> None:
+        """Give the environment its desired state."""
+        self._desired = DesiredState(spec)
+        self._note_revision(spec.revision)
+        self._supply.want(spec.packages)
+        if self._channel is not None:
+            self._channel.send(m.encode(m.Apply(spec=spec)))
+        if self._takes_errands:
+            self._errands.spawn(self._links.assign(spec), name=f"links of {self.id}")
+            self._errands.spawn(self._resize(spec.resources), name=f"limits of {self.id}")
+
+    def apply_patch(self, patch: SpecPatch) -> None:
+        """Give the environment a patch of its desired state, based on the revision that it has."""
+        assert self._desired is not None, "a whole specification comes first"
+        self._desired.patch(patch)
+        if PATCHES not in self._features:
+            self.apply(self._desired.whole)
+            return
+        self._note_revision(patch.revision)
+        if patch.contents is not None:
+            self._supply.want(patch.contents.packages)
+            if self._takes_errands:
+                self._errands.spawn(self._resize(patch.contents.resources), name=f"limits of {self.id}")
+        if self._channel is not None:
+            self._channel.send(m.encode(m.ApplyPatch(patch=patch)))
+        if self._takes_errands and (patch.links or patch.removed_links):
+            self._errands.spawn(self._links.change(patch), name=f"links of {self.id}")
+
+    def _note_revision(self, revision: int) -> None:
+        try:
+            self.folder.note_revision(revision)
+        except StateError as error:
+            _log.warning("container %s: %s", self.id, error)
+
+    def _tell_of_arrival(self) -> None:
+        if self._channel is not None:
+            self._channel.send(m.encode(m.Shelved()))
+
+    def execute(self, command: Command, sock: socket.socket) -> None:
+        """Have the environment run a command (:mod:`rce.control.execution`).
+
+        Args:
+            command: The command.
+            sock: The environment's connection to the user; the caller closes its copy.
+
+        Raises:
+            ExecutionError: The environment cannot do it.
+        """
+        if self._channel is None or self._stopping or not self.reported.is_set():
+            raise ExecutionError("the container is not running")
+        if EXEC not in self._features:
+            raise ExecutionError(
+                "the container was started by an earlier release; destroy and create it anew"
+            )
+        self._channel.send(m.encode(m.Execute(command=command)), sock.fileno())
+
+    def poll(self) -> None:
+        """Ask for new :attr:`counters`, and report limits that were hit."""
+        if self._channel is None or self._stopping:
+            return
+        self._channel.send(m.encode(m.Poll()))
+        for text in self.enforcer.review():
+            self._context.feed(events.Faulted(self.id, self.incarnation_id, text))
+
+    def stop(self, reason: str = "") -> None:
+        """Tell the environment to end; kill it if it does not.
+
+        Args:
+            reason: For the record of this incarnation.
+        """
+        self._stopping = True
+        self._stop_reason = reason or self._stop_reason
+        if self._channel is not None:
+            self._channel.send(m.encode(m.Stop()))
+            self._limit(self._context.settings.stop_timeout)
+
+    def kill(self) -> None:
+        """End at once."""
+        self._stopping = self._hurry = True
+        self._limit(0.0)
+
+    async def run(self) -> None:
+        """Run until the container has ended.
+
+        A cancelled manager leaves the container running: it may be adopted.
+        """
+        try:
+            reason = await self._live()
+            if not self._stopping:
+                reason = self.enforcer.claim_all() or reason
+                reason += await asyncio.to_thread(self._last_words)
+                _log.warning("container %s: %s", self.id, reason)
+            self._context.feed(events.Lost(self.id, self.incarnation_id, reason))
+            await asyncio.to_thread(self._note_end, reason)
+            await self._clean(_SHIM_TIMEOUT_S if self._stopping and not self._hurry else 0.0)
+        except asyncio.CancelledError:
+            self.handle.abandon()
+            raise
+        finally:
+            self.reported.set()
+
+    async def _live(self) -> str:
+        """Exchange messages with the environment until it has ended; return the reason."""
+        try:
+            async with asyncio.timeout(self._context.settings.start_timeout) as self._deadline:
+                await self._launch()
+                self._channel = await connect(str(self.folder.control_socket))
+                self._open_handover(self._channel)
+                if self._stopping:
+                    self.stop()
+                if self._desired is not None:
+                    self.apply(self._desired.whole)
+                await self._converse(self._channel)
+        except TimeoutError:
+            self._hurry = True
+            return (
+                "its environment did not end in time" if self._stopping else "its environment does not answer"
+            )
+        except (StartError, StateError, NetworkError) as error:
+            return str(error)
+        except (OSError, ChannelError, msgspec.DecodeError) as error:
+            return f"its environment cannot be talked to: {error}"
+        finally:
+            await self._hang_up()
+        return "its environment died"
+
+    async def _launch(self) -> None:
+        """Start the environment, and record it for a later manager.
+
+        Raises:
+            StartError: It cannot be started.
+            StateError: The record cannot be written.
+        """
+        handle = self.handle
+        before = handle.environment
+        await handle.launch(self._prepare)
+        record = self.folder.read_record()
+        if handle.environment is before or handle.environment is None or record is None:
+            return
+        self.folder.write_record(
+            msgspec.structs.replace(
+                record,
+                namespaces_pid=handle.namespaces_pid,
+                environment=handle.environment.pid,
+                environment_start=handle.environment.start,
+            )
+        )
+
+    async def _prepare(self, pid: int) -> None:
+        await self._context.networks.attach(self.incarnation_id, pid)
+
+    async def _hang_up(self) -> None:
+        self._deadline = None
+        self._takes_errands = False
+        await self._errands.close()
+        await self._supply.close()
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None
+        self._links.close()
+
+    async def _converse(self, channel: Channel) -> None:
+        pace = intake.Pace()
+        while (line := await channel.receive()) is not None:
+            pace.pay(intake.PER_LINE + len(line))
+            self._hear(channel, intake.read(line), pace)
+            if pause := pace.pause:
+                await asyncio.sleep(pause)
+
+    def _hear(self, channel: Channel, said: m.ToManager | Unknown, pace: intake.Pace) -> None:
+        match said:
+            case m.Report(status=status, features=features):
+                self._features = frozenset(features) & {EXEC, PATCHES}
+                self._report(intake.sanitize_status(self.id, status, self._newest_revision), pace)
+            case m.ReportPatch(patch=patch):
+                self._report_patch(intake.sanitize_patch(self.id, patch, self._newest_revision), pace)
+            case m.SpecWanted():
+                self._apply_again(pace)
+            case m.Fault(text=text):
+                pace.pay(intake.PER_FAULT)
+                self._context.feed(events.Faulted(self.id, self.incarnation_id, intake.sanitize_text(text)))
+            case m.Counters() as counters:
+                self.counters = intake.sanitize_counters(counters)
+            case m.Killed(request=number):
+                channel.send(m.encode(m.Cause(request=number, text=self.enforcer.claim())))
+            case m.Dial() as request:
+                self._errands.spawn(self._dial(channel, request), name=f"dial for {self.id}")
+            case Unknown(name=name):
+                _log.debug("%s: its environment sent a %s", self.id, intake.sanitize_text(name))
+            case message:
+                assert_never(message)
+
+    @property
+    def _newest_revision(self) -> int:
+        """The newest revision that the environment was given, by this manager or an earlier one."""
+        if self._desired is not None:
+            return self._desired.revision
+        record = self.folder.read_record()
+        return record.revision if record is not None else 0
+
+    def _apply_again(self, pace: intake.Pace) -> None:
+        """Give the environment its whole desired state; the cost counts for the environment."""
+        pace.pay(intake.PER_FAULT)
+        if self._desired is not None:
+            pace.pay(intake.PER_PART * (len(self._desired.interfaces) + len(self._desired.connections)))
+            self.apply(self._desired.whole)
+
+    def _report(self, status: EndpointStatus, pace: intake.Pace) -> None:
+        if not self._stopping:
+            self._limit(None)
+        status = self._outside(status, pace)
+        self._observed = ObservedStatus(status, intake.MAX_CONNECTIONS)
+        self.reported.set()
+        self._context.feed(events.Reported(self.id, self.incarnation_id, status))
+
+    def _report_patch(self, patch: StatusPatch, pace: intake.Pace) -> None:
+        if self._observed is None:
+            return
+        patch = msgspec.structs.replace(patch, status=self._outside(patch.status, pace))
+        self._observed.patch(patch)
+        self._context.feed(events.Changed(self.id, self.incarnation_id, patch))
+
+    def _outside(self, status: EndpointStatus, pace: intake.Pace) -> EndpointStatus:
+        """Return a status as seen from outside the container."""
+        if not self._isolated:
+            return status
+        return msgspec.structs.replace(status, nodes=self._with_outer_pids(status, pace))
+
+    def _with_outer_pids(self, status: EndpointStatus, pace: intake.Pace) -> tuple[NodeStatus, ...]:
+        """Replace the nodes' pids inside the container by their pids outside."""
+        if any(node.pid and node.pid not in self._pids for node in status.nodes):
+            pace.pay(intake.PER_LOOK)
+            pids = self.enforcer.control_group.pids() or [
+                one.pid for one in self.handle.members(proc.table())
+            ]
+            self._pids = {proc.inner_pid(pid): pid for pid in pids}
+        return tuple(
+            msgspec.structs.replace(node, pid=self._pids.get(node.pid, 0)) if node.pid else node
+            for node in status.nodes
+        )
+
+    def _limit(self, seconds: float | None) -> None:
+        if self._deadline is not None:
+            loop = asyncio.get_running_loop()
+            self._deadline.reschedule(None if seconds is None else loop.time() + seconds)
+
+    async def _resize(self, resources: Resources) -> None:
+        if text := await self.enforcer.apply(resources):
+            self._context.feed(events.Faulted(self.id, self.incarnation_id, text))
+
+    # Links
+
+    def _open_handover(self, channel: Channel) -> None:
+        self._takes_errands = True
+        with self._links.open() as theirs:
+            channel.send(m.encode(m.Handover(features=(PATCHES,))), theirs.fileno())
+
+    async def _dial(self, channel: Channel, request: m.Dial) -> None:
+        links = self._desired.links.values() if self._desired is not None else ()
+        try:
+            sock = await self._links.dial(request.address, links)
+        except OSError as error:
+            text = str(error) or type(error).__name__
+            channel.send(m.encode(m.Dialed(request=request.request, error=text)))
+            return
+        with sock:
+            channel.send(m.encode(m.Dialed(request=request.request)), sock.fileno())
+
+    # The end
+
+    def _note_end(self, reason: str) -> None:
+        if self._stopping:
+            reason = "; ".join(filter(None, (self._stop_reason, reason if self._hurry else "")))
+        self._context.archive.end(self.id, self.incarnation_id, reason, time.time())
+
+    def _last_words(self) -> str:
+        words = last_line(self.folder.logs)[:_LAST_WORDS_LENGTH]
+        return f"; its last words: {words}" if words else ""
+
+    async def _clean(self, timeout: float) -> None:
+        """Wait ``timeout`` seconds for the shim, then kill the remaining processes and remove the folder."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                await self.handle.wait()
+        try:
+            await self.enforcer.end()
+            await self.handle.kill()
+        except KillError as error:
+            _log.error("container %s: %s", self.id, error)
+        await self._context.networks.detach(self.incarnation_id)
+        await asyncio.to_thread(self.folder.remove)
+        try:
+            await self.enforcer.remove()
+        except LimitError as error:
+            _log.error("container %s: %s", self.id, error)

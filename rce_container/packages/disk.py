@@ -1,0 +1,109 @@
+"""Folders that appear atomically. Functions that are not asynchronous block."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import AsyncIterator, Callable, Iterator
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+from rce_container.files import remove
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+_READ_ONLY_FOLDER = 0o755
+
+
+@contextlib.contextmanager
+def scratch(parent: Path) -> Iterator[Path]:
+    """Make a private folder, and remove it in the end."""
+    folder = _make_scratch(parent)
+    try:
+        yield folder
+    finally:
+        remove(folder)
+
+
+def _make_scratch(parent: Path) -> Path:
+    parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    return Path(tempfile.mkdtemp(dir=parent))
+
+
+async def in_thread(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+    """Run a blocking function; a cancelled caller still waits for its end.
+
+    So no caller removes a folder into which a thread still writes.
+    """
+    work = asyncio.ensure_future(asyncio.to_thread(function, *args, **kwargs))
+    try:
+        return await asyncio.shield(work)
+    except asyncio.CancelledError:
+        await asyncio.wait([work])
+        raise
+
+
+@contextlib.asynccontextmanager
+async def scratch_aside(parent: Path) -> AsyncIterator[Path]:
+    """Do the same as :func:`scratch`, in a thread."""
+    folder = await in_thread(_make_scratch, parent)
+    try:
+        yield folder
+    finally:
+        await in_thread(remove, folder)
+
+
+def forget_before_boot(folder: Path) -> None:
+    """Empty a folder that was filled before the machine was started.
+
+    Its files were not synced to the disk, so it may be incomplete after a power failure.
+    """
+    note = folder / "boot"
+    try:
+        now = BOOT_ID.read_text()
+    except OSError:
+        now = ""
+    with contextlib.suppress(OSError):
+        if now and note.read_text() == now:
+            return
+    for path in list(folder.iterdir()) if folder.is_dir() else []:
+        remove(path)
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    note.write_text(now)
+
+
+def replicate(source: Path, target: Path, *, link: bool) -> None:
+    """Copy a tree, with hard links where possible.
+
+    Args:
+        source: A tree of folders, files and links.
+        target: Is made.
+        link: Whether hard links may be used, because the receiver cannot write to the files.
+
+    Raises:
+        OSError: The tree cannot be made.
+    """
+    target.mkdir()
+    target.chmod(_READ_ONLY_FOLDER)
+    with os.scandir(source) as entries:
+        for entry in entries:
+            made = target / entry.name
+            if entry.is_symlink():
+                made.symlink_to(os.readlink(entry.path))  # noqa: PTH115 - as it is
+            elif entry.is_dir(follow_symlinks=False):
+                replicate(Path(entry.path), made, link=link)
+            elif not link or not _linked(entry.path, made):
+                shutil.copy2(entry.path, made)
+
+
+def _linked(source: str, target: Path) -> bool:
+    try:
+        target.hardlink_to(source)
+    except OSError:
+        return False  # another disk, or too many links: a copy does it
+    return True

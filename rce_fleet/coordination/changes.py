@@ -1,0 +1,115 @@
+"""Changes of the fleet's state, for publishing.
+
+Poses are not included: they are published for each robot as they arrive.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import nan
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rce_fleet.coordination.snapshot import RobotSnapshot
+
+
+@dataclass(frozen=True, slots=True)
+class FleetChanges:
+    """A change of the state. Applying it twice is harmless: it has the new state of its robots and cells.
+
+    Attributes:
+        sequence: Number of the change, counted from 1.
+        robots: Robots that are new or changed, by name.
+        removed: Removed robots, ascending.
+        blocked: Cells that became blocked, ascending; walls never change.
+        pending: Cells that will be blocked once the robots in them have left, ascending.
+        freed: Cells that are not blocked or pending any more, ascending.
+    """
+
+    sequence: int
+    robots: tuple[RobotSnapshot, ...] = ()
+    removed: tuple[str, ...] = ()
+    blocked: tuple[int, ...] = ()
+    pending: tuple[int, ...] = ()
+    freed: tuple[int, ...] = ()
+
+
+class ChangeLog:
+    """Collects possible changes, and returns the actual ones.
+
+    Attributes:
+        sequence: Number of the last change; 0 before the first.
+    """
+
+    def __init__(self) -> None:
+        self.sequence = 0
+        self._robots: set[str] = set()
+        self._cells: set[int] = set()
+        self._told: dict[str, RobotSnapshot] = {}
+        self._told_cells: dict[int, bool] = {}
+
+    def note_robot(self, robot: str) -> None:
+        """Note that a robot may have changed, come or gone."""
+        self._robots.add(robot)
+
+    def note_cell(self, cell: int) -> None:
+        """Note that a cell may have been blocked or freed."""
+        self._cells.add(cell)
+
+    def take(
+        self, describe: Callable[[str], RobotSnapshot | None], is_blocked: Callable[[int], bool | None]
+    ) -> FleetChanges | None:
+        """Return what changed since the last call; None if nothing did.
+
+        Args:
+            describe: Returns the state of a robot; None if it was removed.
+            is_blocked: Returns whether a cell is blocked (True), pending (False) or neither (None).
+        """
+        noted, self._robots = sorted(self._robots), set()
+        cells, self._cells = sorted(self._cells), set()
+        robots = [found for robot in noted if (found := self._tell(robot, describe(robot))) is not None]
+        removed = [robot for robot in noted if robot in self._told and describe(robot) is None]
+        for robot in removed:
+            del self._told[robot]
+        parts: dict[bool | None, list[int]] = {True: [], False: [], None: []}
+        for cell in cells:
+            now = is_blocked(cell)
+            if now != self._told_cells.get(cell):
+                parts[now].append(cell)
+                if now is None:
+                    del self._told_cells[cell]
+                else:
+                    self._told_cells[cell] = now
+        if not (robots or removed or any(parts.values())):
+            return None
+        self.sequence += 1
+        return FleetChanges(
+            self.sequence,
+            tuple(robots),
+            tuple(removed),
+            blocked=tuple(parts[True]),
+            pending=tuple(parts[False]),
+            freed=tuple(parts[None]),
+        )
+
+    def _tell(self, robot: str, now: RobotSnapshot | None) -> RobotSnapshot | None:
+        """Return a robot's state if it differs from the last published one."""
+        if now is None:
+            return None
+        known = replace(now, x=nan, y=nan, yaw=nan)
+        if _told(known) == _told(self._told.get(robot)):
+            return None
+        self._told[robot] = known
+        return now
+
+
+def _told(robot: RobotSnapshot | None) -> tuple[object, ...] | None:
+    """Return the published state of a robot, without its pose."""
+    if robot is None:
+        return None
+    return (
+        *(robot.state, robot.reason, robot.cell, robot.goal),
+        *(robot.plan, robot.granted, robot.replans),
+    )

@@ -1,0 +1,50 @@
+"""Reasons of the planner for refusing a request or not placing a robot, in words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Set as AbstractSet
+
+    from rce_fleet.coordination.fleet_state import FleetState
+    from rce_fleet.coordination.robot import RobotRecord
+
+
+def refuse_goal(state: FleetState, record: RobotRecord, cell: int) -> str:
+    """Return why a robot cannot be sent to a cell; empty if it can."""
+    if cell not in state.grid:
+        return f"cell {cell} is not on the map of {len(state.grid)} cells"
+    if state.is_shut(cell):
+        return f"cell {cell} is blocked; choose another goal"
+    holder = state.index.goals.get(cell, record.id)
+    return "" if holder == record.id else f"cell {cell} is the goal of {holder}; choose another goal"
+
+
+def refuse_block(state: FleetState, cell: int) -> str:
+    """Return why a cell can be neither blocked nor freed; empty if it can."""
+    if cell not in state.grid:
+        return f"cell {cell} is not on the map of {len(state.grid)} cells"
+    return f"cell {cell} is a wall" if cell in state.grid.blocked else ""
+
+
+def hindrance(
+    state: FleetState, record: RobotRecord, touched: AbstractSet[int], own: AbstractSet[int], cell: int | None
+) -> str:
+    """Return why a robot that stands still cannot be placed in a cell; empty if it can.
+
+    Args:
+        state: The fleet.
+        record: The robot.
+        touched: Cells that it overlaps.
+        own: Those of them that no other robot claims.
+        cell: The cell to place it in; None if there is none.
+    """
+    if not touched:
+        return "it is outside the map"
+    if cell is None or (own != touched and not state.ledger.length(record.id)):
+        other = min(touched - own)
+        return f"cell {other} is held by {state.ledger.owner(other)}"
+    if state.is_blocked(cell):
+        return "it stands in a blocked cell"
+    return ""

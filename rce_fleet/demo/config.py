@@ -1,0 +1,107 @@
+"""Configuration of the demo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from rce_fleet.demo.resources import LOOPBACK, Ports
+from rce_fleet.drivers.scene import scene_of
+from rce_fleet.planning.scenario import Scenario
+from rce_fleet.wiring import FleetAccount
+
+
+class Mode(StrEnum):
+    """What carries the fleet's messages."""
+
+    CLOUD = "cloud"
+    """The engine: planner and move clients in containers, each robot a ROS graph bridged to them."""
+    SINGLE = "single"
+    """One ROS core for all nodes, robots in namespaces."""
+    MULTI = "multi"
+    """A ROS core for each robot and one for the planner, which share a few topics."""
+
+
+class CoreProgram(StrEnum):
+    """The program that is the ROS core of the mode ``single``."""
+
+    RCE = "rce"
+    """``rce core``."""
+    ROSCORE = "roscore"
+    """``roscore`` of an installed ROS."""
+
+
+class MachineBackend(StrEnum):
+    """What stands for the machines of the mode ``multi``."""
+
+    AUTO = "auto"
+    """Namespaces if they can be created, else ports."""
+    NAMESPACES = "namespaces"
+    """A network namespace for each machine, with its own address. Needs root."""
+    PORTS = "ports"
+    """Ports of the loopback interface."""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoConfig:
+    """Configuration of the demo.
+
+    Attributes:
+        scenario: Robots, boxes and goals.
+        seed: Seed of the sensors' noise.
+        ports: Ports; those that the mode needs are chosen.
+        folder: Folder for configs, logs and state; must exist.
+        runtime: The containers' runtime; the engine's default if empty.
+        mode: What carries the fleet's messages.
+        core: The program that is the core of the mode ``single``.
+        core_uri: A running ROS master to use instead of that program; none if empty.
+        machines: What stands for the machines of the mode ``multi``.
+        blocked_cells: Cells that a headless run blocks while robots drive.
+    """
+
+    scenario: Scenario
+    seed: int
+    ports: Ports
+    folder: Path
+    runtime: str = ""
+    mode: Mode = Mode.CLOUD
+    core: CoreProgram = CoreProgram.RCE
+    core_uri: str = ""
+    machines: MachineBackend = MachineBackend.AUTO
+    blocked_cells: int = 1
+
+    @property
+    def account(self) -> FleetAccount:
+        """The engine's address and the development user."""
+        return FleetAccount(url=f"http://{LOOPBACK}:{self.ports.http}/")
+
+    @property
+    def scene(self) -> Path:
+        """File with the initial state of the simulated world."""
+        return self.folder / "scene.json"
+
+    @property
+    def report(self) -> Path:
+        """File that the simulated world writes its reports to."""
+        return self.folder / "world.json"
+
+    @property
+    def planner_parameters(self) -> dict[str, Any]:
+        """The planner's parameters: the map without hidden boxes."""
+        scenario, grid = self.scenario, self.scenario.grid
+        cells = {"walls": sorted(grid.blocked), "blocked": list(scenario.known_boxes)}
+        known = {name: value for name, value in cells.items() if value}
+        return {**self.map_parameters, "seed": self.seed, **known}
+
+    @property
+    def map_parameters(self) -> dict[str, Any]:
+        """Parameters for the size of the map and its cells."""
+        grid = self.scenario.grid
+        return {"rows": grid.rows, "columns": grid.columns, "cell_size": grid.cell_size}
+
+    def write_scene(self) -> None:
+        """Write the file that the simulated world reads."""
+        scene = scene_of(self.scenario, self.seed)
+        self.scene.write_text(scene.model_dump_json(indent=1), encoding="utf-8")

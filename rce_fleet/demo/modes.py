@@ -1,0 +1,156 @@
+"""The demo's modes: starts the programs of one of them, and stops them together."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Protocol
+
+from rce.config.documents import write_items
+from rce_fleet.demo.config import DemoConfig, Mode
+from rce_fleet.demo.programs import RCE, START_TIMEOUT, Program, ProgramGroup
+from rce_fleet.demo.ros_modes import MultiCorePrograms, SingleCorePrograms
+from rce_fleet.demo.traffic import MessageTotals, read_engine_totals
+from rce_fleet.drivers.report import WorldReport, read_report
+from rce_fleet.wiring import fleet_config, robot_config
+
+
+class ModePrograms(Protocol):
+    """The programs of one mode."""
+
+    async def start(self, group: ProgramGroup) -> str:
+        """Write the files and start all programs; return the URL of the page.
+
+        Raises:
+            DemoError: A program ended, or was not ready in time.
+            OSError: A program cannot be started, or a file cannot be written.
+        """
+
+    async def read_totals(self) -> MessageTotals:
+        """Return how many messages were received until now.
+
+        Raises:
+            DemoError: The counters cannot be read.
+        """
+
+
+class CloudPrograms:
+    """The engine: planner and move clients run in containers, ``rce-ros`` bridges the robots."""
+
+    def __init__(self, config: DemoConfig) -> None:
+        self._config = config
+
+    async def start(self, group: ProgramGroup) -> str:
+        """Start all programs; return the URL of the page."""
+        config = self._config
+        self._write_files()
+        engine = await group.start("engine", self._engine_argv(), stop_last=True)
+        world = await group.start("world", self._world_argv())
+        await group.wait_line(engine, "RCE ready:", START_TIMEOUT)
+        station = await group.start("station", self._station_argv(), restartable=True)
+        uris = await self._graphs(group, world)
+        page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)
+        bridges = [
+            await group.start(
+                f"robot{number}",
+                [sys.executable, "-m", "rce_client.ros_bridge", str(config.folder / f"robot{number}.config")],
+                env={"ROS_MASTER_URI": uris[robot]},
+                restartable=True,
+            )
+            for number, robot in enumerate(config.scenario.robots, start=1)
+        ]
+        for bridge in bridges:
+            await group.wait_line(bridge, "rce-ros ready:", START_TIMEOUT)
+        await group.wait_line(world, "simulation ready:", START_TIMEOUT)
+        return page
+
+    async def read_totals(self) -> MessageTotals:
+        """Read the message totals from the master."""
+        account = self._config.account
+        return await read_engine_totals(account.url, account.user, account.password)
+
+    def _write_files(self) -> None:
+        config, account, folder = self._config, self._config.account, self._config.folder
+        config.write_scene()
+        fleet = fleet_config(account, config.planner_parameters)
+        (folder / "fleet.config").write_text(write_items(fleet), encoding="utf-8")
+        for number in range(1, len(config.scenario.robots) + 1):
+            text = write_items(robot_config(number, account))
+            (folder / f"robot{number}.config").write_text(text, encoding="utf-8")
+
+    async def _graphs(self, group: ProgramGroup, world: Program) -> dict[str, str]:
+        """Return the URI of each robot's ROS master, as the world prints it."""
+        return {
+            robot: await group.wait_line(world, f"robot {robot} ROS_MASTER_URI=", START_TIMEOUT)
+            for robot in self._config.scenario.robots
+        }
+
+    def _engine_argv(self) -> list[str]:
+        config, ports = self._config, self._config.ports
+        options = {
+            "--state-dir": config.folder / "engine",
+            "--http-port": ports.http,
+            "--control-port": ports.control,
+            "--ws-port": ports.ws,
+            "--robot-link-port": ports.robot_link,
+            "--container-link-port": ports.container_link,
+            **({"--runtime": config.runtime} if config.runtime else {}),
+        }
+        return [*RCE, "up", "--dev", *(str(part) for item in options.items() for part in item)]
+
+    def _station_argv(self) -> list[str]:
+        config = str(self._config.folder / "fleet.config")
+        return [sys.executable, "-m", "rce_fleet.station", config, "--port", str(self._config.ports.page)]
+
+    def _world_argv(self) -> list[str]:
+        config, account = self._config, self._config.account
+        program = [sys.executable, "-m", "rce_fleet.drivers", str(config.scene)]
+        return [*program, "--report", str(config.report), "--master", account.url, "--user", account.user]
+
+
+_PROGRAMS: dict[Mode, Callable[[DemoConfig], ModePrograms]] = {
+    Mode.CLOUD: CloudPrograms,
+    Mode.SINGLE: SingleCorePrograms,
+    Mode.MULTI: MultiCorePrograms,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RunningDemo:
+    """A demo whose programs run.
+
+    Attributes:
+        page: URL of the operator's page.
+        config: What it runs.
+        group: All programs.
+        mode: The programs of the mode.
+    """
+
+    page: str
+    config: DemoConfig
+    group: ProgramGroup
+    mode: ModePrograms
+
+    def truth(self) -> WorldReport | None:
+        """Return the newest report of the simulated world; None before the first."""
+        return read_report(self.config.report)
+
+
+@asynccontextmanager
+async def start_demo(config: DemoConfig, show: Callable[[str], None]) -> AsyncIterator[RunningDemo]:
+    """Start all programs; stop them when the block is left.
+
+    Args:
+        config: What to run.
+        show: Called with every line that a program prints.
+
+    Raises:
+        DemoError: A program ended, or was not ready in time.
+        OSError: A program cannot be started, or a file cannot be written.
+    """
+    mode = _PROGRAMS[config.mode](config)
+    async with ProgramGroup(config.folder, show) as group:
+        page = await group.run_while_alive(mode.start(group))
+        yield RunningDemo(page, config, group, mode)

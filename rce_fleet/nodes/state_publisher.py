@@ -1,0 +1,135 @@
+"""Publishes the fleet's state: changes at once, the complete state on request and at a low rate.
+
+``/fleet/changes`` has numbered changes; ``/fleet/get_state`` answers with the complete state and the number
+of the last change in it. ``/fleet/state`` has the complete state, latched, for programs that read only one
+topic. Its rate falls with the size of the fleet: up to 20 robots after each change, 800 robots every 4 s.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rce.ros.types import Time
+
+if TYPE_CHECKING:
+    from rce.ros.node import Node, Publisher
+    from rce.ros.types import Message
+    from rce_fleet.coordination.changes import FleetChanges
+    from rce_fleet.coordination.planner import FleetPlanner
+    from rce_fleet.coordination.snapshot import RobotSnapshot
+    from rce_fleet.planning.grid import GridMap
+
+STATE = "fleet/FleetState"
+STATE_TOPIC = "/fleet/state"
+CHANGES = "fleet/FleetChanges"
+CHANGES_TOPIC = "/fleet/changes"
+GET_STATE = "fleet/GetState"
+GET_STATE_SERVICE = "/fleet/get_state"
+WHOLE_ROBOTS_PER_S = 200.0
+"""Maximum number of robots per second in complete states."""
+REPEAT_S = 1.0
+"""Seconds without a change after which the number of the last one is published again."""
+
+
+class StatePublisher:
+    """Publishes the fleet's state.
+
+    Args:
+        node: Running node.
+        planner: The planner, with the state.
+    """
+
+    def __init__(self, node: Node, planner: FleetPlanner) -> None:
+        self._node = node
+        self._planner = planner
+        self._started = Time.now()
+        self._whole_at = 0.0
+        self._is_whole_due = False
+        self._changes_at = 0.0
+        self._state: Publisher
+        self._changes: Publisher
+
+    async def start(self) -> None:
+        """Advertise topics and service, and publish the current state."""
+        node = self._node
+        self._state = await node.advertise(STATE_TOPIC, STATE, latch=True)
+        self._changes = await node.advertise(CHANGES_TOPIC, CHANGES)
+        await node.advertise_service(GET_STATE_SERVICE, GET_STATE, self._get_state)
+        self._publish_whole()
+
+    def update(self, now: float) -> None:
+        """Publish what is due at ``now``, in seconds; call it a few times per second."""
+        changes = self._planner.take_changes()
+        if changes is not None or now - self._changes_at >= REPEAT_S:
+            self._changes_at = now
+            self._changes.publish(changes_fields(self._started, changes, self._planner.sequence))
+        self._is_whole_due |= changes is not None
+        pause = len(self._planner.state.robots) / WHOLE_ROBOTS_PER_S
+        if self._is_whole_due and now - self._whole_at >= pause:
+            self._whole_at, self._is_whole_due = now, False
+            self._publish_whole()
+
+    def _publish_whole(self) -> None:
+        self._state.publish(state_fields(self._started, self._planner))
+
+    def _get_state(self, request: Message) -> dict[str, Any]:
+        del request
+        return {"sequence": self._planner.sequence, "state": state_fields(self._started, self._planner)}
+
+
+def state_fields(started: Time, planner: FleetPlanner) -> dict[str, Any]:
+    """Return the fields of a ``fleet/FleetState``."""
+    grid, snapshot = planner.state.grid, planner.snapshot()
+    walls = sorted(grid.blocked)
+    return {
+        "started": started,
+        **_map_fields(grid),
+        "blocked": sorted({*walls, *snapshot.blocked}),
+        "pending": list(snapshot.pending),
+        "walls": walls,
+        "robots": [robot_fields(robot) for robot in snapshot.robots],
+    }
+
+
+def changes_fields(started: Time, changes: FleetChanges | None, sequence: int) -> dict[str, Any]:
+    """Return the fields of a ``fleet/FleetChanges``; without changes, those of a repeated number."""
+    if changes is None:
+        return {"started": started, "sequence": sequence}
+    return {
+        "started": started,
+        "sequence": changes.sequence,
+        "robots": [robot_fields(robot) for robot in changes.robots],
+        "removed": list(changes.removed),
+        "blocked": list(changes.blocked),
+        "pending": list(changes.pending),
+        "freed": list(changes.freed),
+    }
+
+
+def robot_fields(robot: RobotSnapshot) -> dict[str, Any]:
+    """Return the fields of a ``fleet/RobotState``."""
+    return {
+        "id": robot.id,
+        "state": robot.state.value,
+        "reason": robot.reason,
+        "cell": _or_none(robot.cell),
+        "goal": _or_none(robot.goal),
+        "plan": list(robot.plan),
+        "granted": list(robot.granted),
+        "replans": robot.replans,
+    }
+
+
+def _map_fields(grid: GridMap) -> dict[str, Any]:
+    return {
+        "rows": grid.rows,
+        "columns": grid.columns,
+        "cell_size": grid.cell_size,
+        "origin_x": grid.origin[0],
+        "origin_y": grid.origin[1],
+    }
+
+
+def _or_none(cell: int | None) -> int:
+    """Return a cell as in messages: -1 for none."""
+    return -1 if cell is None else cell

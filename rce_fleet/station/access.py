@@ -1,0 +1,112 @@
+"""The station's access control: checks each request, and records each action in the audit log."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Mapping
+
+from aiohttp import hdrs, web
+
+from rce.web.openapi import PREFIX
+from rce.web.origin import ServerNames, is_foreign
+from rce_fleet.station.authentication import AuditedAction, AuthenticationError, Authenticator, StationUser
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+COOKIE = "rce_station"
+USER, TOKEN = web.RequestKey("user", StationUser), web.RequestKey("token", str)
+_PUBLIC = ("/login", f"{PREFIX}/login", f"{PREFIX}/openapi.json")
+"""Paths that need no token, beside the static files of the pages."""
+MAX_TOKEN = 256
+
+
+class AccessControl:
+    """Checks who sends a request and what this user may do.
+
+    Args:
+        authenticator: Finds the user of a token.
+        names: Host names under which the station may be requested.
+    """
+
+    def __init__(self, authenticator: Authenticator, names: ServerNames) -> None:
+        self._authenticator = authenticator
+        self._names = names
+
+    @web.middleware
+    async def check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Call the handler if the request's user may see the fleet; else return the error response."""
+        refusal = self._names.refusal(request.headers.get(hdrs.HOST, ""))
+        if refusal is not None:
+            return problem(421, refusal)
+        if is_foreign(request.headers.get(hdrs.ORIGIN), request.host):
+            return problem(403, "requests from pages of other sites are refused")
+        if request.path in _PUBLIC or request.path.startswith("/static/"):
+            return await handler(request)
+        token = token_of(request)
+        user = await self._authenticator.authenticate(token)
+        if user is None:
+            return self._unauthorized(request)
+        if not user.may_view:
+            return problem(403, f"user {user.name!r} has the role {user.role}, which may not see this fleet")
+        request[USER], request[TOKEN] = user, token
+        response = await handler(request)
+        if request.query.get("token") and not response.prepared:
+            set_cookie(response, token, secure=request.secure)
+        return response
+
+    async def is_still_allowed(self, request: web.Request) -> bool:
+        """Return whether an accepted request's user may still see the fleet; True while that is unknown."""
+        try:
+            user = await self._authenticator.authenticate(request[TOKEN])
+        except AuthenticationError:
+            return True
+        return user is not None and user.may_view
+
+    def control_refusal(self, request: web.Request, name: str, subject: str) -> web.Response | None:
+        """Return None if the request's user may control the fleet; else record the refusal and return it."""
+        user = request[USER]
+        if user.may_control:
+            return None
+        self.audit(request, name, subject, done=False)
+        return problem(403, f"user {user.name!r} has the role {user.role}, which may only see this fleet")
+
+    def audit(
+        self, request: web.Request, name: str, subject: str, detail: str = "", *, done: bool = True
+    ) -> None:
+        """Record an action in the audit log.
+
+        Args:
+            request: The request that asked for it.
+            name: The action, such as ``set_goal``.
+            subject: The robot or cell that it concerns.
+            detail: Its parameters, in words.
+            done: Whether it was carried out; False if it was refused.
+        """
+        action = AuditedAction(name, subject, detail, request.remote or "", done)
+        self._authenticator.audit(request[TOKEN], action)
+
+    def _unauthorized(self, request: web.Request) -> web.StreamResponse:
+        if request.path == "/" and self._authenticator.has_logins:
+            return web.Response(status=303, headers={hdrs.LOCATION: "/login"})
+        if self._authenticator.has_logins:
+            text = "log in at /login, or send a token (rce token) as 'Authorization: Bearer TOKEN'"
+        else:
+            text = "send the station's token: as 'Authorization: Bearer TOKEN', or once as ?token=TOKEN"
+        return problem(401, text, {hdrs.WWW_AUTHENTICATE: "Bearer"})
+
+
+def token_of(request: web.Request) -> str:
+    """Return the token of a request; empty if it has none, or one that cannot be valid."""
+    scheme, _, bearer = request.headers.get(hdrs.AUTHORIZATION, "").partition(" ")
+    given = bearer.strip() if scheme.lower() == "bearer" else ""
+    token = given or request.query.get("token", "") or request.cookies.get(COOKIE, "")
+    return token if token.isascii() and token.isprintable() and len(token) <= MAX_TOKEN else ""
+
+
+def set_cookie(response: web.StreamResponse, token: str, *, secure: bool) -> None:
+    """Store a token in a browser's cookie; scripts cannot read it and other sites cannot send it."""
+    response.set_cookie(COOKIE, token, httponly=True, samesite="Strict", secure=secure)
+
+
+def problem(status: int, text: str, headers: Mapping[str, str] | None = None) -> web.Response:
+    """Return an error response with a text."""
+    return web.json_response({"error": text}, status=status, headers=headers)

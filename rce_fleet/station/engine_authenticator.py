@@ -1,0 +1,251 @@
+"""Authenticates a station's users at the engine's master, and records their actions in its audit log."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import ssl
+import time
+from collections import OrderedDict
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any, Self, TypedDict
+
+import aiohttp
+from aiohttp import hdrs
+from yarl import URL
+
+from rce.masters import Masters
+from rce.tls.faults import explain_to_client
+from rce.web.client import session_connector
+from rce_fleet.station.authentication import AuditedAction, AuthenticationError, StationUser
+
+if TYPE_CHECKING:
+    from rce.tls.identity import Context
+
+_log = logging.getLogger(__name__)
+
+CACHE_S = 3.0
+"""How long an answer of the master is cached; a revoked token is refused after that."""
+OFFLINE_CACHE_S = 30.0
+"""How long it is used while the master cannot be reached."""
+LIFETIME_S = 12 * 3600.0
+"""Lifetime of a login at the page."""
+MAX_CACHED = 1000
+MAX_QUEUED_ACTIONS = 1000
+_PASSED_ON = {400: 400, 401: 401, 403: 403, 422: 400, 429: 429}
+"""Status of the master's answer to a login -> status of the station's; all others become 503."""
+_REQUEST_ERRORS = (aiohttp.ClientError, TimeoutError, ValueError, KeyError, AttributeError, TypeError)
+"""Raised by requests to the master, also if another program answers at its address."""
+_TIMEOUT = aiohttp.ClientTimeout(total=10)
+
+
+class RequestOptions(TypedDict):
+    """Options of each request to the master."""
+
+    ssl: ssl.SSLContext | bool
+    allow_redirects: bool
+
+
+@dataclass(frozen=True, slots=True)
+class StationAccount:
+    """The user account of the station itself."""
+
+    url: str
+    """URL of the master; several are separated by commas, and are used in turn."""
+    user: str
+    password: str
+    tls: Context | None = None
+    """Gives the TLS settings for each connection; the system's if None."""
+
+    @property
+    def options(self) -> RequestOptions:
+        """TLS settings by the authority file as it is now; redirects are not followed."""
+        return RequestOptions(ssl=True if self.tls is None else self.tls(), allow_redirects=False)
+
+    def __repr__(self) -> str:
+        return f"StationAccount(url={self.url!r}, user={self.user!r})"
+
+
+class EngineAuthenticator:
+    """Asks the master for the user of a token. An asynchronous context manager.
+
+    Args:
+        account: Account of the station; the fleet belongs to this user.
+        allow_anonymous: Treat requests without a token as the station's own user: for use on one machine.
+    """
+
+    def __init__(self, account: StationAccount, *, allow_anonymous: bool = False) -> None:
+        self._account = account
+        self._masters = Masters(account.url)
+        self._allow_anonymous = allow_anonymous
+        self._cache: OrderedDict[str, tuple[float, StationUser | None]] = OrderedDict()
+        self._actions: asyncio.Queue[tuple[str, AuditedAction]] = asyncio.Queue(MAX_QUEUED_ACTIONS)
+        self._own_token = ""
+        self._session: aiohttp.ClientSession
+        self._writer: asyncio.Task[None]
+
+    @property
+    def _api(self) -> URL:
+        return URL(self._masters.current) / "api/v1"
+
+    @property
+    def has_logins(self) -> bool:
+        """Whether users log in at the page by name and password."""
+        return not self._allow_anonymous
+
+    async def __aenter__(self) -> Self:
+        """Open the HTTP session; the master may start later."""
+        connector = session_connector(None)
+        self._session = aiohttp.ClientSession(timeout=_TIMEOUT, connector=connector)
+        self._writer = asyncio.create_task(self._send_actions())
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Revoke the station's own token and close the session."""
+        self._writer.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._writer
+        if self._own_token:
+            await self.log_out(self._own_token)
+        await self._session.close()
+
+    async def authenticate(self, token: str) -> StationUser | None:
+        """Return the user of a token, or None if the token is not valid.
+
+        Raises:
+            AuthenticationError: The master cannot be reached.
+        """
+        if not token:
+            return (
+                StationUser(self._account.user, "operator", is_owner=True) if self._allow_anonymous else None
+            )
+        now = time.monotonic()
+        asked_at, known = self._cache.get(token, (0.0, None))
+        if token in self._cache and now - asked_at < CACHE_S:
+            return known
+        master = self._masters.current
+        try:
+            user = await self._ask(token)
+        except _REQUEST_ERRORS as error:
+            self._masters.failed(master)
+            if token in self._cache and known is not None and now - asked_at < OFFLINE_CACHE_S:
+                return known
+            raise AuthenticationError(
+                503,
+                f"the engine cannot be reached to check the login; try again ({_reason_of(error)})",
+            ) from error
+        self._cache[token] = (now, user)
+        self._cache.move_to_end(token)
+        if len(self._cache) > MAX_CACHED:
+            self._cache.popitem(last=False)
+        return user
+
+    async def log_in(self, user: str, password: str, address: str) -> str:
+        """Return a token for a user.
+
+        Raises:
+            AuthenticationError: The password is wrong, the user may not see the fleet, or the master cannot
+                be reached.
+        """
+        body = {"userID": user, "password": password, "label": "station page", "lifetime": LIFETIME_S}
+        headers = {"X-Forwarded-For": address} if address else {}
+        master = self._masters.current
+        try:
+            token = await self._log_in(body, headers)
+            found = await self.authenticate(token)
+        except _REQUEST_ERRORS as error:
+            self._masters.failed(master)
+            raise AuthenticationError(
+                503, f"the engine cannot be reached; try again ({_reason_of(error)})"
+            ) from error
+        if found is None or not found.may_view:
+            await self.log_out(token)
+            raise AuthenticationError(
+                403,
+                f"user {user!r} may not see this fleet; ask an administrator for the role viewer or operator",
+            )
+        return token
+
+    async def log_out(self, token: str) -> None:
+        """Revoke a token."""
+        self._cache.pop(token, None)
+        try:
+            async with self._session.delete(
+                self._api / "login", headers=_bearer(token), **self._account.options
+            ):
+                pass  # a token that was revoked before is fine too
+        except (aiohttp.ClientError, TimeoutError) as error:
+            _log.warning("a token could not be revoked; it expires on its own: %s", error)
+
+    def audit(self, token: str, action: AuditedAction) -> None:
+        """Queue an action for the engine's audit log. Does not wait."""
+        try:
+            self._actions.put_nowait((token, action))
+        except asyncio.QueueFull:
+            _log.warning("not in the audit log, the queue is full: %s %s", action.name, action.subject)
+
+    async def _ask(self, token: str) -> StationUser | None:
+        async with self._session.get(
+            self._api / "user", headers=_bearer(token), **self._account.options
+        ) as reply:
+            if reply.status in (HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN):
+                return None
+            reply.raise_for_status()
+            found: dict[str, Any] = await reply.json()
+        return StationUser(found["name"], found["role"], is_owner=found["name"] == self._account.user)
+
+    async def _log_in(self, body: dict[str, Any], headers: dict[str, str]) -> str:
+        async with self._session.post(
+            self._api / "login", json=body, headers=headers, **self._account.options
+        ) as reply:
+            answer = await reply.json()
+            if reply.status == HTTPStatus.OK:
+                return str(answer["token"])
+            said = str(answer.get("error", reply.reason))
+            if reply.status in _PASSED_ON:
+                raise AuthenticationError(
+                    _PASSED_ON[reply.status], said, _seconds(reply.headers.get(hdrs.RETRY_AFTER, ""))
+                )
+            raise AuthenticationError(503, f"the engine refuses logins now: {said}")
+
+    async def _send_actions(self) -> None:
+        while True:
+            token, action = await self._actions.get()
+            try:
+                await self._send_action(token, action)
+            except (*_REQUEST_ERRORS, AuthenticationError) as error:
+                _log.warning("not in the audit log: %s %s: %s", action.name, action.subject, error)
+
+    async def _send_action(self, token: str, action: AuditedAction) -> None:
+        if not token and not self._own_token:
+            account = self._account
+            body = {"userID": account.user, "password": account.password, "label": "operator station"}
+            self._own_token = await self._log_in(body, {})
+        audit = {
+            "action": action.name,
+            "subject": action.subject[:300],
+            "detail": action.detail[:300],
+            "address": action.address,
+            "outcome": "done" if action.done else "refused",
+        }
+        headers = _bearer(token or self._own_token)
+        async with self._session.post(
+            self._api / "audit", json=audit, headers=headers, **self._account.options
+        ) as reply:
+            if reply.status == HTTPStatus.UNAUTHORIZED and not token:
+                self._own_token = ""
+            reply.raise_for_status()
+
+
+def _reason_of(error: Exception) -> str:
+    return explain_to_client(error) or str(error) or "no answer in time"
+
+
+def _seconds(text: str) -> int:
+    return int(text) if text.isascii() and text.isdecimal() and len(text) <= 5 else 0  # noqa: PLR2004 - a day
+
+
+def _bearer(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}"}

@@ -1,0 +1,144 @@
+"""The station's client of a planner that runs in the engine."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from rce.config.client import ClientConfig
+from rce.model.requests import Request
+from rce.tls.identity import Context
+from rce_client.connection import Connection, State
+from rce_client.exceptions import CallError, ClientError
+from rce_client.services import ServiceClient
+from rce_client.topics import Subscriber
+from rce_fleet.station.fleet_link import (
+    BLOCK_CELL,
+    CALL_TIMEOUT_S,
+    CHANGES,
+    CHANGES_TOPIC,
+    GET_STATE,
+    POSE,
+    SET_GOAL,
+    STATE,
+    STATE_TOPIC,
+    Call,
+    PlannerClient,
+    PlannerListener,
+    PlannerUnavailableError,
+    pose_topic,
+)
+from rce_fleet.station.node_restarts import node_requests
+
+_SERVICES = (("setGoal", SET_GOAL), ("blockCell", BLOCK_CELL))
+
+
+class EnginePlannerClient(PlannerClient):
+    """Connects to the planner's container, and restarts its nodes when they end.
+
+    Args:
+        config: The operator's config; its first container is the planner's.
+        tls: Gives the TLS settings for each connection; the system's if None.
+    """
+
+    def __init__(self, config: ClientConfig, tls: Context | None = None) -> None:
+        if not config.containers:
+            raise ValueError("containers: empty; the operator's config must have a container for the planner")
+        super().__init__("the planner's container is not ready yet")
+        self._config = config
+        self._tls = tls
+        self._container = config.containers[0].tag
+        self._node_requests: asyncio.Queue[Request] = asyncio.Queue()
+        self._listener: PlannerListener
+        self._states: Subscriber[dict[str, Any]]
+
+    async def run(self, listener: PlannerListener, ready: Callable[[], Awaitable[None]]) -> None:
+        """Create the planner's container, connect to it, and receive messages until cancelled."""
+        self._listener = listener
+        config = self._config
+        async with Connection(
+            config.url,
+            config.user,
+            config.password.get_secret_value(),
+            config.robot,
+            tls=self._tls,
+            on_error=lambda text: listener.take_event(text, "bad"),
+            on_state=self._on_state,
+        ) as connection:
+            try:
+                for request in config.setup():
+                    await connection.request(request)
+                await self._join_planner(connection)
+                await ready()
+                async with asyncio.TaskGroup() as group:
+                    group.create_task(self._follow_robots(connection))
+                    group.create_task(self._restart_nodes(connection))
+                    group.create_task(self._follow_changes(connection))
+            finally:
+                await connection.remove_all()
+
+    def on_engine(self, state: dict[str, Any]) -> None:
+        """Handle a state of the engine: restart nodes that ended."""
+        for request in node_requests(self._config, state):
+            self._node_requests.put_nowait(request)
+
+    async def _join_planner(self, connection: Connection) -> None:
+        self._states = await connection.subscriber("fleetState", STATE, self._listener.take_state)
+        await self._join(connection, "fleetState", "SubscriberInterface", STATE, STATE_TOPIC)
+        for tag, service in _SERVICES:
+            self._calls[service] = _caller(await connection.service_client(tag, service.type_name))
+            await self._join(connection, tag, "ServiceClientInterface", service.type_name, service.name)
+        for tag in ("fleetState", *(tag for tag, _ in _SERVICES)):
+            await connection.wait_active(tag)
+
+    async def _follow_changes(self, connection: Connection) -> None:
+        """Receive changes instead of whole states, once the planner is known to publish them."""
+        service = GET_STATE
+        self._calls[service] = _caller(await connection.service_client("getState", service.type_name))
+        await self._join(connection, "getState", "ServiceClientInterface", service.type_name, service.name)
+        await connection.subscriber("fleetChanges", CHANGES, self._listener.take_changes)
+        await self._join(connection, "fleetChanges", "SubscriberInterface", CHANGES, CHANGES_TOPIC)
+        self._listener.may_have_missed()
+        await self._changes_followed.wait()
+        await self._states.close()
+        await connection.remove_interface(self._container, "fleetState")
+
+    async def _follow_robots(self, connection: Connection) -> None:
+        while True:
+            await self._follow(connection, await self._new_robots.get())
+
+    async def _restart_nodes(self, connection: Connection) -> None:
+        while True:
+            await connection.request(await self._node_requests.get())
+
+    async def _follow(self, connection: Connection, robot: str) -> None:
+        """Subscribe to a robot's pose."""
+        tag, listener = f"pose{robot}", self._listener
+        await connection.subscriber(tag, POSE, lambda message: listener.take_pose(robot, message))
+        await self._join(connection, tag, "SubscriberInterface", POSE, pose_topic(robot))
+
+    async def _join(
+        self, connection: Connection, tag: str, interface_type: str, type_name: str, address: str
+    ) -> None:
+        await connection.add_interface(self._container, tag, interface_type, type_name, addr=address)
+        await connection.connect(f"{connection.robot_id}/{tag}", f"{self._container}/{tag}")
+
+    def _on_state(self, state: State, words: str) -> None:
+        if state is State.LOST:
+            self._listener.take_event(f"connection to the engine lost: {words}", "bad")
+        elif state is State.RESTORED:
+            self._listener.take_event("connection to the engine restored", "good")
+            self._listener.may_have_missed()
+
+
+def _caller(client: ServiceClient[dict[str, Any]]) -> Call:
+    async def call(request: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return await client(request, timeout=CALL_TIMEOUT_S)
+        except CallError as error:
+            raise PlannerUnavailableError(f"the planner did not answer: {error}") from error
+        except ClientError as error:
+            raise PlannerUnavailableError(f"the engine cannot be reached: {error}") from error
+
+    return call

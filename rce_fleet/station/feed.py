@@ -1,0 +1,133 @@
+"""Sends the view and its changes to the pages.
+
+A page first gets ``map``, ``state`` and ``poses``, which are complete; then ``changes``, numbered from the
+``state`` on, and ``poses`` of robots that moved. A page that misses a number reconnects.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from typing import Any
+
+from rce_fleet.station.live import Broadcast
+from rce_fleet.station.view import FleetView, ViewChange
+
+POSES_EVERY_S = 0.1
+"""Seconds between two messages with poses."""
+REPEAT_POSE_S = 1.0
+"""Seconds after which an unchanged pose is sent again, to show that the robot is connected."""
+
+_Pose = tuple[float, float, float]
+
+
+class Feed:
+    """Sends the fleet to the pages.
+
+    Attributes:
+        pages: The open pages.
+
+    Args:
+        view: The state of the fleet.
+    """
+
+    def __init__(self, view: FleetView) -> None:
+        self.pages = Broadcast(self._tell_all)
+        self._view = view
+        self._number = 0
+        self._heard: set[str] = set()
+        self._any_heard = asyncio.Event()
+        self._sent: dict[str, tuple[_Pose, float]] = {}
+        self._all: list[str] = []
+
+    async def run(self) -> None:
+        """Send poses in batches until cancelled."""
+        while True:
+            await self._any_heard.wait()
+            self._any_heard.clear()
+            self.send_poses(time.monotonic())
+            await asyncio.sleep(POSES_EVERY_S)
+
+    def on_change(self, change: ViewChange) -> None:
+        """Send a change of the view."""
+        if not change:
+            return
+        self._number += 1
+        self._all = []
+        for robot in change.removed:
+            self._sent.pop(robot, None)
+        for robot in change.robots:
+            if robot not in self._sent and robot in self._view.poses:
+                self.on_pose(robot)
+        if change.is_new_map:
+            self.pages.send_change(_text("map", self._view.map() or {}))
+        self.pages.send_change(
+            _text(
+                "changes",
+                {
+                    "sequence": self._number,
+                    "robots": self._robots(change.robots),
+                    "removed": change.removed,
+                    "blocked": change.blocked,
+                    "pending": change.pending,
+                    "freed": change.freed,
+                },
+            )
+        )
+
+    def on_pose(self, robot: str) -> None:
+        """Add a robot's pose to the next batch."""
+        self._heard.add(robot)
+        self._any_heard.set()
+
+    def send_poses(self, now: float) -> None:
+        """Send the poses of robots that moved, or were not sent for a while; ``now`` is in seconds."""
+        moved: dict[str, _Pose] = {}
+        for robot in sorted(self._heard):
+            if not self._view.knows(robot) or robot not in self._view.poses:
+                continue
+            pose = self._pose(robot)
+            before, sent_at = self._sent.get(robot, (None, 0.0))
+            if pose != before or now - sent_at >= REPEAT_POSE_S:
+                self._sent[robot] = pose, now
+                moved[robot] = pose
+        self._heard.clear()
+        if moved:
+            self._all = []
+            self.pages.send_change(_text("poses", {"poses": moved}))
+
+    def on_engine(self, state: dict[str, Any]) -> None:
+        """Send the engine's state."""
+        self.pages.send("engine", _text("engine", state))
+
+    def on_event(self, text: str, tone: str) -> None:
+        """Send an event."""
+        self.pages.send_event(_text("event", {"text": text, "tone": tone}))
+
+    def _tell_all(self) -> list[str]:
+        """Return the complete messages; made once for all pages that need them now."""
+        grid = self._view.map()
+        if grid is not None and not self._all:
+            names = self._view.robot_ids()
+            state = {
+                "sequence": self._number,
+                "robots": self._robots(names),
+                "blocked": self._view.blocked(),
+                "pending": self._view.pending(),
+            }
+            poses = {robot: self._pose(robot) for robot in names if robot in self._view.poses}
+            self._all = [_text("map", grid), _text("state", state), _text("poses", {"poses": poses})]
+        return self._all
+
+    def _robots(self, names: tuple[str, ...] | list[str]) -> list[dict[str, Any]]:
+        robots = self._view.robots(names)
+        return [{key: value for key, value in robot.items() if key != "pose"} for robot in robots]
+
+    def _pose(self, robot: str) -> _Pose:
+        pose = self._view.poses[robot]
+        return round(pose.x, 3), round(pose.y, 3), round(pose.theta, 3)
+
+
+def _text(kind: str, message: dict[str, Any]) -> str:
+    return json.dumps({"type": kind, **message}, separators=(",", ":"))

@@ -1,0 +1,107 @@
+"""The station's client of a planner in a ROS graph, without the engine."""
+
+from __future__ import annotations
+
+import asyncio
+from array import array
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from rce.ros.errors import RosError, ServiceError
+from rce.ros.node import Node, ServiceClient
+from rce.ros.types import Duration, Message, Time, TypeRegistry
+from rce_fleet.station.fleet_link import (
+    BLOCK_CELL,
+    CALL_TIMEOUT_S,
+    CHANGES,
+    CHANGES_TOPIC,
+    GET_STATE,
+    POSE,
+    SET_GOAL,
+    STATE,
+    STATE_TOPIC,
+    Call,
+    PlannerClient,
+    PlannerListener,
+    PlannerUnavailableError,
+    pose_topic,
+)
+
+NODE = "operator_station"
+
+
+class RosPlannerClient(PlannerClient):
+    """A node in the planner's graph.
+
+    Args:
+        master_uri: The ROS master of the planner's graph, which may start later.
+        types: Where message types come from.
+    """
+
+    def __init__(self, master_uri: str, types: TypeRegistry) -> None:
+        super().__init__("the ROS master cannot be reached yet")
+        self._node = Node(
+            NODE, argv=(), master_uri=master_uri, types=types, signals=False, master_timeout=None
+        )
+        self._heard = asyncio.Event()
+
+    async def run(self, listener: PlannerListener, ready: Callable[[], Awaitable[None]]) -> None:
+        """Join the graph and receive messages until cancelled."""
+
+        def take_state(message: Message) -> None:
+            listener.take_state(plain(message))
+            self._heard.set()
+
+        async with self._node as node:
+            for service in (SET_GOAL, BLOCK_CELL, GET_STATE):
+                self._calls[service] = _caller(node.service_client(service.name, service.type_name))
+            states = await node.subscribe(STATE_TOPIC, STATE, take_state)
+            await self._heard.wait()
+            await ready()
+            await node.subscribe(
+                CHANGES_TOPIC, CHANGES, lambda message: listener.take_changes(plain(message))
+            )
+            listener.may_have_missed()
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._follow_robots(listener))
+                await self._changes_followed.wait()
+                await states.close()
+
+    async def _follow_robots(self, listener: PlannerListener) -> None:
+        while True:
+            await self._follow(listener, await self._new_robots.get())
+
+    async def _follow(self, listener: PlannerListener, robot: str) -> None:
+        await self._node.subscribe(
+            pose_topic(robot), POSE, lambda message: listener.take_pose(robot, plain(message))
+        )
+
+
+def _caller(client: ServiceClient) -> Call:
+    async def call(request: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return plain(await client(request, timeout=CALL_TIMEOUT_S))
+        except ServiceError as error:
+            raise PlannerUnavailableError(f"the planner did not answer: {error}") from error
+        except RosError as error:
+            raise PlannerUnavailableError(f"the planner's ROS graph cannot be reached: {error}") from error
+
+    return call
+
+
+def plain(message: Message) -> dict[str, Any]:
+    """Return a message as dictionaries and lists; times become strings."""
+    names: tuple[str, ...] = message.__class__.__slots__
+    return {name: _plain(getattr(message, name)) for name in names}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Message):
+        return plain(value)
+    if isinstance(value, array):
+        return value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [_plain(element) for element in value]
+    if isinstance(value, (Time, Duration)):
+        return f"{value.secs}.{value.nsecs:09}"
+    return value

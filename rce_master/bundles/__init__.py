@@ -1,1 +1,0 @@
-"""Packages that users bring: how they come in and where their contents are kept."""

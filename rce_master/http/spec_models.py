@@ -1,0 +1,261 @@
+"""The REST API's models of containers, nodes, parameters, interfaces and connections.
+
+Most fields are those of :mod:`rce.model.specs` and :mod:`rce.model.requests`; this module has those of the
+API only.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
+
+from pydantic import Field as Option
+from pydantic import create_model
+
+from rce.model.requests import (
+    AddInterface,
+    AddNode,
+    Connection,
+    CreateContainer,
+    DestroyContainer,
+    ResizeContainer,
+    SetParameter,
+)
+from rce.model.specs import InterfaceSpec, NodeSpec, Resources
+from rce.model.spelling import Field, Spelling, fields_of
+from rce.model.written import Value
+from rce_master.http.model import Body, Model
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from msgspec import Struct
+
+M = TypeVar("M", bound=Model)
+Amount = int | float | str
+"""An amount as :mod:`rce.model.quantities` reads it."""
+
+SPELLING = Spelling(
+    str,
+    {
+        (ResizeContainer, "tag"): "container",
+        (DestroyContainer, "tag"): "container",
+        (InterfaceSpec, "message_type"): "cls",
+    },
+)
+"""The REST API's names of the fields."""
+
+
+def takes(request: type[Struct], *path: str) -> Callable[[type[M]], type[M]]:
+    """Give a body the fields of a request.
+
+    Args:
+        request: The request.
+        path: Those of its fields that are in the URL's path.
+    """
+
+    def extend(model: type[M]) -> type[M]:
+        fields = [field for field in fields_of(request) if SPELLING.key(field) not in path]
+        return _extended(model, {SPELLING.key(field): (_taken(field), _default(field)) for field in fields})
+
+    return extend
+
+
+def gives(spec: type[Struct]) -> Callable[[type[M]], type[M]]:
+    """Give an answer the fields of a spec, as :func:`shown` shows them."""
+
+    def extend(model: type[M]) -> type[M]:
+        return _extended(model, {SPELLING.key(field): (_given(field), ...) for field in fields_of(spec)})
+
+    return extend
+
+
+def shown(spec: Struct) -> dict[str, Any]:
+    """Show the fields of a spec: amounts as numbers, in bytes and cores."""
+    return {SPELLING.key(field): _plain(field.get(spec)) for field in fields_of(type(spec))}
+
+
+def _extended(model: type[M], fields: dict[str, Any]) -> type[M]:
+    return create_model(
+        model.__name__, __base__=model, __module__=model.__module__, __doc__=model.__doc__, **fields
+    )
+
+
+def _taken(field: Field) -> Any:
+    """Return the type of a sent field; the request's reader validates the value."""
+    kind = field.rule.type
+    if get_origin(kind) is Literal:
+        kind = str
+    elif get_origin(field.kept) is tuple:
+        kind = list[str]
+    elif field.rule.type != Value and len(get_args(kind)) > 1 and get_origin(kind) is not None:
+        kind = get_args(kind)[0] if hasattr(kind, "__metadata__") else Amount
+    return kind | None if field.default is None else kind
+
+
+def _default(field: Field) -> Any:
+    if field.required:
+        return ...
+    if field.default is None:
+        return None
+    return Option(default=field.rule.write(field.default) if field.rule.blank is None else field.rule.blank)
+
+
+def _given(field: Field) -> Any:
+    """Return the type of a shown field."""
+    if isinstance(field.kept, type) and issubclass(field.kept, Enum):
+        return str
+    return list[str] if get_origin(field.kept) is tuple else field.kept
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Enum):
+        return value.value
+    return list(value) if isinstance(value, tuple) else value
+
+
+# In
+
+
+@takes(CreateContainer)
+class ContainerIn(Body):
+    """A container to make. Zero or empty: not requested."""
+
+
+@takes(ResizeContainer, "container")
+class ResizeIn(Body):
+    """What a container may use from now on; null or left out: as before. Zero withdraws a request."""
+
+
+@takes(AddNode, "container")
+class NodeIn(Body):
+    """A node to start."""
+
+
+@takes(SetParameter, "container")
+class ParameterIn(Body):
+    """A parameter to set."""
+
+
+@takes(AddInterface, "endpoint")
+class InterfaceIn(Body):
+    """An interface to make."""
+
+
+@takes(Connection)
+class ConnectionIn(Body):
+    """Two interfaces to join, each ``ENDPOINT/INTERFACE``."""
+
+
+# Out
+
+
+@gives(Resources)
+class RequestedOut(Model):
+    """What a container asked for; zero or empty: nothing."""
+
+
+class ContainerOut(Model):
+    """A container."""
+
+    id: str
+    user: str
+    tag: str
+    state: str
+    """``requested``, ``placed``, ``starting``, ``running``, ``degraded``, ``failed``, ``stopping``,
+    ``stopped`` or ``lost``."""
+    detail: str
+    task_set: str
+    machine: str
+    revision: int
+    incarnation: str
+    nodes: int
+    interfaces: int
+    cpu_s: float
+    """CPU seconds since its start."""
+    memory: int
+    """Bytes in use."""
+    requested: RequestedOut = Option(alias="wish")
+    moving_to: str
+    """Task set where its copy is being made, while its machine is drained; else empty."""
+
+
+@gives(NodeSpec)
+class NodeOut(Model):
+    """A node."""
+
+    user: str
+    container: str
+    state: str
+    """``waiting``, ``starting``, ``running``, ``stuck``, ``stopping``, ``exited``, ``failed``; ``unknown``
+    until reported."""
+    pid: int
+    exit_code: int | None
+    detail: str
+    restarts: int
+    """How often it was started again by itself."""
+
+
+class ParameterOut(Model):
+    """A parameter."""
+
+    user: str
+    container: str
+    name: str
+    value: Value
+
+
+@gives(InterfaceSpec)
+class InterfaceOut(Model):
+    """An interface."""
+
+    user: str
+    endpoint: str
+    active: bool
+    """Whether it has an established connection."""
+    messages_in: int
+    messages_out: int
+    bytes_in: int
+    bytes_out: int
+    dropped: int
+
+
+class ConnectionOut(Model):
+    """A connection."""
+
+    id: int
+    user: str
+    tag_a: str
+    tag_b: str
+    established: bool
+    """Whether both ends report it as open."""
+
+
+class ContainersOut(Model):
+    """Containers."""
+
+    containers: list[ContainerOut]
+
+
+class NodesOut(Model):
+    """Nodes."""
+
+    nodes: list[NodeOut]
+
+
+class ParametersOut(Model):
+    """Parameters."""
+
+    parameters: list[ParameterOut]
+
+
+class InterfacesOut(Model):
+    """Interfaces."""
+
+    interfaces: list[InterfaceOut]
+
+
+class ConnectionsOut(Model):
+    """Connections."""
+
+    connections: list[ConnectionOut]

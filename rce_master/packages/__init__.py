@@ -1,0 +1,1 @@
+"""Packages that users bring: uploads, and storage of their contents."""

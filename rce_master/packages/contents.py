@@ -1,0 +1,162 @@
+"""Archives by their hash, in a folder: ``FOLDER/SHA256``, and ``FOLDER/incoming`` for running uploads."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import os
+import re
+import shutil
+import tempfile
+from typing import TYPE_CHECKING
+
+from rce.packages.contents import Contents, inspect
+from rce.packages.exceptions import BadArchiveError
+from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
+from rce_master.exceptions import InvalidRequestError, StoreError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Collection
+    from pathlib import Path
+
+_HASH = re.compile(r"[0-9a-f]{64}")
+_INCOMING = "incoming"
+_BUFFER = 1 << 20
+
+
+class Incoming:
+    """A completely received archive."""
+
+    def __init__(self, path: Path, limits: ArchiveLimits, sha256: str, size: int) -> None:
+        self.path = path
+        self.sha256 = sha256
+        self.size = size
+        """Bytes."""
+        self._limits = limits
+
+    async def inspect(self) -> Contents:
+        """Return its contents.
+
+        Raises:
+            InvalidRequestError: It is not a package's archive.
+        """
+        try:
+            return await asyncio.to_thread(self._inspect)
+        except BadArchiveError as error:
+            raise InvalidRequestError(f"the archive cannot be taken: {error}") from error
+
+    def _inspect(self) -> Contents:
+        with self.path.open("rb") as file:
+            return inspect(file, self._limits)
+
+
+class ContentStore:
+    """The archives of all users. Archives with equal contents are stored once.
+
+    Args:
+        folder: Made with the first archive.
+        limits: How large each may be.
+    """
+
+    def __init__(self, folder: Path, limits: ArchiveLimits = DEFAULT_LIMITS) -> None:
+        self._folder = folder
+        self._limits = limits
+
+    @contextlib.asynccontextmanager
+    async def receive(self, chunks: AsyncIterator[bytes]) -> AsyncIterator[Incoming]:
+        """Receive an archive; it is removed at the end unless it was kept.
+
+        Raises:
+            InvalidRequestError: The archive is too large.
+            StoreError: It cannot be written.
+        """
+        try:
+            path = await asyncio.to_thread(self._make_incoming)
+            try:
+                yield await self._write(path, chunks)
+            finally:
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            raise StoreError(f"the master cannot keep the package: {error.strerror or error}") from error
+
+    async def keep(self, incoming: Incoming) -> None:
+        """Keep an archive; when this returns, it survives a crash.
+
+        Raises:
+            StoreError: It cannot be kept.
+        """
+        try:
+            await asyncio.to_thread(self._keep, incoming)
+        except OSError as error:
+            raise StoreError(f"the master cannot keep the package: {error.strerror or error}") from error
+
+    async def read(self, sha256: str, offset: int, count: int) -> tuple[bytes, int] | None:
+        """Read a piece of an archive.
+
+        Returns:
+            The piece and the size of the archive; None if the archive does not exist.
+        """
+        if _HASH.fullmatch(sha256) is None:
+            return None
+        return await asyncio.to_thread(self._read, sha256, offset, count)
+
+    def sweep(self, known: Collection[str]) -> None:
+        """Remove all archives except those with known hashes. Blocks."""
+        with contextlib.suppress(FileNotFoundError):
+            for path in self._folder.iterdir():
+                if _HASH.fullmatch(path.name) and path.name not in known:
+                    path.unlink(missing_ok=True)
+
+    def forget_incoming(self) -> None:
+        """Remove unfinished uploads of an earlier master. Blocks."""
+        shutil.rmtree(self._folder / _INCOMING, ignore_errors=True)
+
+    def _make_incoming(self) -> Path:
+        incoming = self._folder / _INCOMING
+        incoming.mkdir(mode=0o700, parents=True, exist_ok=True)
+        descriptor, name = tempfile.mkstemp(dir=incoming)
+        os.close(descriptor)
+        return incoming / name
+
+    async def _write(self, path: Path, chunks: AsyncIterator[bytes]) -> Incoming:
+        digest = hashlib.sha256()
+        size = 0
+        with path.open("wb") as file:
+            held = bytearray()
+            async for chunk in chunks:
+                held += chunk
+                size += len(chunk)
+                if size > self._limits.archive:
+                    raise InvalidRequestError(f"the archive has more than {self._limits.archive} bytes")
+                if len(held) >= _BUFFER:
+                    await asyncio.to_thread(_append, file.fileno(), digest.update, bytes(held))
+                    held.clear()
+            await asyncio.to_thread(_append, file.fileno(), digest.update, bytes(held))
+            await asyncio.to_thread(os.fsync, file.fileno())
+        return Incoming(path, self._limits, digest.hexdigest(), size)
+
+    def _keep(self, incoming: Incoming) -> None:
+        incoming.path.replace(self._folder / incoming.sha256)
+        descriptor = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def _read(self, sha256: str, offset: int, count: int) -> tuple[bytes, int] | None:
+        try:
+            descriptor = os.open(self._folder / sha256, os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError:
+            return None
+        try:
+            return os.pread(descriptor, count, offset), os.fstat(descriptor).st_size
+        finally:
+            os.close(descriptor)
+
+
+def _append(descriptor: int, update: Callable[[bytes], None], data: bytes) -> None:
+    update(data)
+    left = memoryview(data)
+    while left:
+        left = left[os.write(descriptor, left) :]

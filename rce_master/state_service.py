@@ -1,0 +1,255 @@
+"""The owner of the state: applies commands one by one, stores their changes, and notifies listeners."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rce_master.exceptions import MasterError, RefusedError, StoreError
+from rce_master.state.changes import make_row
+from rce_master.state.core import State
+from rce_master.state.migration import conversion
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from rce.control.model import EndpointSpec, SpecPatch
+    from rce_master.state.changes import Changes, Touched
+    from rce_master.state.commands import Command
+    from rce_master.state.settings import StateSettings
+    from rce_master.state.tables import Tables
+    from rce_master.store import Snapshot, Store
+
+_log = logging.getLogger(__name__)
+
+MAX_WAITING = 10_000
+MAX_BATCH = 256
+MAX_COMMANDS = 512
+"""Approximate number of commands in one batch, which blocks the event loop."""
+
+Outcome = MasterError | None
+"""The result of a command: None on success, else the error."""
+
+
+@dataclass(slots=True)
+class _Job:
+    commands: Sequence[Command]
+    done: asyncio.Future[list[Outcome]]
+    outcomes: list[Outcome] = field(default_factory=list)
+
+
+class StateService:
+    """Owns the state. Every change goes core -> store -> listeners, in this order.
+
+    Commands that wait at the same time are stored in one transaction, so that a storm of logins costs one
+    sync of the disk and not hundreds.
+
+    Args:
+        state: The state.
+        store: Keeps what must survive.
+        clock: Seconds that never go back.
+        term: The term of the store in which this writes.
+
+    Attributes:
+        listeners: Called with the changes of each command after they were stored; must not block or raise.
+    """
+
+    def __init__(
+        self, state: State, store: Store, clock: Callable[[], float] = time.monotonic, term: int = 0
+    ) -> None:
+        self.state = state
+        self._term = term
+        self.listeners: list[Callable[[Changes], None]] = []
+        self._store = store
+        self._clock = clock
+        self._jobs: asyncio.Queue[_Job] = asyncio.Queue(MAX_WAITING)
+        self._store_fault = ""
+
+    @classmethod
+    async def open(
+        cls,
+        store: Store,
+        settings: StateSettings | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        revision: int | None = None,
+    ) -> StateService:
+        """Go on from what a store holds, in a new term of it.
+
+        Args:
+            store: The store.
+            settings: Limits and times.
+            clock: Seconds; never goes back.
+            revision: As :meth:`State.load` takes it; None is the time of day.
+
+        Raises:
+            StoreError: It cannot be read.
+        """
+        if revision is None:
+            revision = time.time_ns() // 1_000_000
+        term = await store.begin_term()
+        state = State.load(await load_converted(store, term), clock(), settings, revision=revision)
+        return cls(state, store, clock, term)
+
+    @property
+    def tables(self) -> Tables:
+        """The state's tables, to read from."""
+        return self.state.tables
+
+    def spec(self, endpoint: str) -> EndpointSpec:
+        """Tell what is desired of an endpoint.
+
+        Raises:
+            KeyError: There is no such endpoint.
+        """
+        return self.state.spec(endpoint)
+
+    def patch(self, endpoint: str, touched: Touched) -> SpecPatch:
+        """Return what is desired now of the parts of an endpoint that changed.
+
+        Raises:
+            KeyError: There is no such endpoint.
+        """
+        return self.state.patch(endpoint, touched)
+
+    def copy_spec(self, endpoint: str) -> tuple[str, EndpointSpec] | None:
+        """Tell where a container is being handed over to, and what is desired there; None if it is not."""
+        return self.state.copy_spec(endpoint)
+
+    async def check_store(self) -> None:
+        """Tell whether the store works: what was last written was kept, and it is still where it was.
+
+        Raises:
+            StoreError: It does not.
+        """
+        if self._store_fault:
+            raise StoreError(self._store_fault)
+        await self._store.check()
+
+    async def submit(self, command: Command) -> None:
+        """Do a command; return when it is stored and all listeners were notified.
+
+        Raises:
+            RefusedError: It cannot be done; nothing changed.
+            StoreError: It cannot be stored; nothing changed.
+        """
+        (outcome,) = await self.submit_all([command])
+        if outcome is not None:
+            raise outcome
+
+    async def submit_all(self, commands: Sequence[Command]) -> list[Outcome]:
+        """Do commands one after the other; one that is refused does not keep the others from being done.
+
+        Returns:
+            What became of each.
+        """
+        return await (await self.enqueue(commands))
+
+    async def enqueue(self, commands: Sequence[Command]) -> asyncio.Future[list[Outcome]]:
+        """Take commands, in the order of the calls; waits only while too many are waiting already.
+
+        Returns:
+            What becomes of each, once they are done.
+        """
+        job = _Job(commands, asyncio.get_running_loop().create_future())
+        await self._jobs.put(job)
+        return job.done
+
+    async def run(self) -> None:
+        """Work until cancelled."""
+        while True:
+            jobs = [await self._jobs.get()]
+            size = len(jobs[0].commands)
+            while len(jobs) < MAX_BATCH and size < MAX_COMMANDS and not self._jobs.empty():
+                jobs.append(self._jobs.get_nowait())
+                size += len(jobs[-1].commands)
+            await self._work(jobs)
+
+    async def _work(self, jobs: list[_Job]) -> None:
+        done: list[Changes] = []
+        for job in jobs:
+            job.outcomes = [self._apply(command, done) for command in job.commands]
+        try:
+            await self._save(done)
+        except StoreError as error:
+            await self._stand_alone(jobs, error)
+            return
+        _touch_once(done)
+        for changes in done:
+            for listener in self.listeners:
+                listener(changes)
+        self._answer(jobs, None)
+
+    async def _save(self, done: list[Changes]) -> None:
+        # Of a key that several commands wrote, only the newest record counts; nothing is encoded twice.
+        keys = {key: table for changes in done for key, table in changes.written().items()}
+        rows = [make_row(table, key) for (_, key), table in keys.items()]
+        try:
+            if rows:
+                await self._store.save(rows, self._term)
+                self._store_fault = ""
+        except BaseException as error:
+            self._store_fault = str(error) if isinstance(error, StoreError) else self._store_fault
+            for changes in reversed(done):
+                changes.revert()
+            raise
+
+    async def _stand_alone(self, jobs: list[_Job], error: StoreError) -> None:
+        """Do jobs one by one after their common transaction failed: reports need no store."""
+        if len(jobs) == 1:
+            _log.error("%s", error)
+            self._answer(jobs, error)
+            return
+        for job in jobs:
+            await self._work([job])
+
+    def _apply(self, command: Command, done: list[Changes]) -> Outcome:
+        try:
+            done.append(self.state.apply(command, self._clock()))
+        except RefusedError as error:
+            return error
+        except Exception as error:  # noqa: BLE001 - logged
+            # A bug in one command must not stop the whole cloud; the command was not applied.
+            _log.exception("could not apply %r", command)
+            return MasterError(f"internal error: {error!r}")
+        return None
+
+    @staticmethod
+    def _answer(jobs: list[_Job], error: StoreError | None) -> None:
+        for job in jobs:
+            if not job.done.done():
+                job.done.set_result([outcome or error for outcome in job.outcomes])
+
+
+async def load_converted(store: Store, term: int) -> Snapshot:
+    """Read a store; one of the release before is converted in it, in one transaction.
+
+    Args:
+        store: The store.
+        term: The term of it in which the caller writes.
+
+    Raises:
+        StoreError: It cannot be read or written.
+    """
+    snapshot = await store.load()
+    rows = conversion(snapshot)
+    if not rows:
+        return snapshot
+    _log.info("converting the store of an earlier release: %d records", len(rows))
+    await store.save(rows, term)
+    return await store.load()
+
+
+def _touch_once(done: Sequence[Changes]) -> None:
+    """Keep each endpoint only in the last of several changes: its spec contains all of them."""
+    later: dict[str, Touched] = {}
+    for changes in reversed(done):
+        once = {}
+        for id_, touched in changes.touched.items():
+            if id_ in later:
+                later[id_].include(touched)
+            else:
+                once[id_] = later[id_] = touched
+        changes.touched = once

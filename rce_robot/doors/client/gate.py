@@ -1,0 +1,115 @@
+"""Admission to the door, decided while the WebSocket handshake waits for its answer."""
+
+from __future__ import annotations
+
+import logging
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from websockets.protocol import State
+
+from rce.guard.loop_share import LoopShare
+from rce.guard.proxies import TrustedProxies
+from rce.model.names import EndpointId
+from rce.protocol.exceptions import HandshakeError
+from rce.protocol.http import FEATURES_HEADER, read_credentials, read_features
+from rce_robot.doors.client.session import Session
+from rce_robot.doors.client.websocket import RobotSocket
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+    from rce.protocol.http import Credentials
+    from rce_robot.doors.base import Admission
+    from rce_robot.namespace import Namespace
+    from rce_robot.settings import SessionSettings
+
+_log = logging.getLogger(__name__)
+
+_FORBIDDEN, _CONFLICT = 403, 409
+
+
+class Gate:
+    """Answers handshakes. Used as ``process_request`` of the WebSocket server."""
+
+    def __init__(
+        self,
+        admission: Admission,
+        settings: SessionSettings,
+        origins: Collection[str],
+        proxies: TrustedProxies | None = None,
+    ) -> None:
+        self._admission = admission
+        self._settings = settings
+        self._origins = origins
+        self._proxies = proxies or TrustedProxies()
+        self._share = LoopShare()
+
+    async def admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Admit a robot (None), or return the refusal."""
+        assert isinstance(connection, RobotSocket)
+        connection.speak()
+        if ",".join(request.headers.get_all("Upgrade")).lower() != "websocket":
+            return None  # not a WebSocket handshake: the library answers it
+        try:
+            self._check_origin(request.headers.get_all("Origin"))
+            authorization = request.headers.get_all("Authorization")
+            query = request.path.partition("?")[2].partition("#")[0]
+            credentials = read_credentials(query, authorization)
+            forwarded = request.headers.get_all("X-Forwarded-For")
+            address = self._proxies.origin(connection.remote_address, forwarded)
+            namespace = await self._claim(credentials, address)
+        except HandshakeError as error:
+            _log.info("refused %s: %s %s", connection.remote_address, error.status, error.reason)
+            return connection.respond(error.status, f"{error.reason}\n")
+        client = f"{address or 'an unknown address'} since {_clock()} UTC"
+        features = read_features(query)
+        session = Session(
+            connection, namespace, self._settings, namespace.dropped, client=client, features=features
+        )
+        namespace.session = session
+        connection.receiver = session
+        connection.share_loop(self._share, namespace.id.user)
+        connection.become_known()
+        if connection.protocol.state is not State.CONNECTING:
+            session.on_lost("the robot left during the handshake")
+        return None
+
+    async def answer(self, connection: ServerConnection, request: Request, response: Response) -> None:  # noqa: ARG002 - the library's call
+        """Tell an admitted client which of its requested features it gets."""
+        assert isinstance(connection, RobotSocket)
+        session = connection.receiver
+        if isinstance(session, Session) and session.features:
+            response.headers[FEATURES_HEADER] = ",".join(sorted(session.features))
+
+    def _check_origin(self, origins: list[str]) -> None:
+        """Refuse requests of other sites' pages, which a browser would send from its user's network."""
+        for origin in origins:
+            if origin not in self._origins and "*" not in self._origins:
+                raise HandshakeError(_FORBIDDEN, f"Origin {origin} may not connect here.")
+
+    async def _claim(self, credentials: Credentials, address: str) -> Namespace:
+        """Log in. A dead former connection of the robot makes room for the new one."""
+        try:
+            spec = await self._admission.log_in(credentials, address)
+        except HandshakeError as error:
+            namespace = self._admission.find(EndpointId(credentials.user, credentials.robot))
+            former = None if namespace is None else namespace.session
+            if error.status != _CONFLICT or former is None or await former.probe():
+                raise
+            spec = await self._admission.log_in(credentials, address)
+        namespace = await self._admission.settle(spec)
+        if namespace.session is not None:
+            raise HandshakeError(_CONFLICT, _already(namespace.id, namespace.session.client))
+        return namespace
+
+
+def _already(robot: EndpointId, client: str) -> str:
+    return f"robot {robot.tag!r} is connected already, from {client}; a robotID can be used once at a time"
+
+
+def _clock() -> str:
+    return datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S")

@@ -1,0 +1,420 @@
+"""One robot's connection, from handshake to end: handles its messages, and queues messages to it.
+
+Data messages are handled directly when they arrive. Longer work runs in the session's task group: requests to
+the master one after another, service calls concurrently.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING, Any, assert_never
+
+import msgspec
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
+
+from rce.aio.queues import OverflowPolicy
+from rce.model.requests import (
+    ConfigureComponents,
+    ConfigureConnections,
+    CreateContainer,
+    DestroyContainer,
+    ResizeContainer,
+)
+from rce.protocol.codec import encode
+from rce.protocol.http import LATCH, SINGLE_FRAME
+from rce.protocol.limits import Limits
+from rce.protocol.messages import DataMessage, ErrorReport, InterfaceStatus, LatchedSources, type_of
+from rce.protocol.stream import Fault, LargeData, ProtocolStream
+from rce.protocol.weight import is_light, utf8_in_steps
+from rce_robot.doors.client.outbox import Outbox
+from rce_robot.doors.client.websocket import LARGE_PART
+from rce_robot.exceptions import RobotError
+from rce_robot.outgoing import LatchedDelivery, Outgoing, Serialized
+
+if TYPE_CHECKING:
+    from collections import Counter
+    from collections.abc import Coroutine, Iterator, Sequence
+
+    from rce.model.requests import Request
+    from rce.protocol.messages import CallId
+    from rce.protocol.stream import Event
+    from rce_robot.doors.base import Owner, Queued
+    from rce_robot.doors.client.websocket import RobotSocket
+    from rce_robot.settings import SessionSettings
+
+_log = logging.getLogger(__name__)
+
+LARGE_TEXT = 1 << 20
+"""Size in bytes from which texts are handled in steps, between which other users have their turns."""
+
+MAX_REASON = 100
+"""Maximum length of a reason in a close frame."""
+
+
+class Session:
+    """A connected robot.
+
+    Implements :class:`rce_robot.doors.base.DoorSession`, and the ``Receiver`` of
+    :mod:`rce_robot.doors.client.websocket`.
+
+    Life: made in the handshake; :meth:`run` from its end on; :meth:`on_lost` when the connection ends, with
+    or without a completed handshake; then waiting requests are carried out, and :attr:`ended` is set.
+    """
+
+    def __init__(
+        self,
+        socket: RobotSocket,
+        owner: Owner,
+        settings: SessionSettings,
+        dropped: Counter[str],
+        *,
+        client: str = "",
+        features: frozenset[str] = frozenset(),
+    ) -> None:
+        self._socket = socket
+        self._owner = owner
+        self._settings = settings
+        self._drain_timeout = settings.drain_timeout
+        limits = Limits(max_text=settings.max_text, max_binary=settings.max_message)
+        self._single = SINGLE_FRAME in features
+        self._stream = ProtocolStream.for_engine(limits, single=self._single)
+        self._outbox = Outbox(settings.outbox, dropped)
+        self._requests: asyncio.Queue[tuple[Request, int] | None] = asyncio.Queue()
+        self._pending_bytes = 0
+        """Bytes of incomplete messages at the last check."""
+        self._waiting_bytes = 0
+        """Text bytes of waiting and running requests."""
+        self._tasks: asyncio.TaskGroup | None = None
+        self._calls: set[asyncio.Task[None]] = set()
+        self._loop = asyncio.get_running_loop()
+        self._now = self._loop.time
+        self._reason = ""
+        self._abort: asyncio.TimerHandle | None = None
+        """A timer: a dropped robot has a moment to receive the reason."""
+        self.features = features
+        """The client's features beyond the first protocol; see :mod:`rce.protocol.http`."""
+        self.client = client
+        """The robot's address and the time of its connection."""
+        self.lost = False
+        """Whether the connection ended."""
+        self.ended = asyncio.Event()
+        """Set when the session has ended completely."""
+
+    async def run(self) -> None:
+        """Serve the robot until its connection has ended and its last requests are carried out."""
+        try:
+            async with asyncio.TaskGroup() as self._tasks:
+                worker = self._tasks.create_task(self._carry_out_requests())
+                if not self.lost:
+                    self._owner.joined(self)
+                await self._socket.wait_closed()
+                for call in self._calls:
+                    call.cancel()
+                await asyncio.wait([worker], timeout=self._drain_timeout)
+                worker.cancel()
+        finally:
+            self._tasks = None
+            self._end()
+
+    async def close(self, reason: str, code: int = CloseCode.POLICY_VIOLATION) -> None:
+        """Close the connection, forget the robot's requests and wait until the session has ended."""
+        self._drain_timeout = 0.0
+        await self._socket.close(code, reason[:MAX_REASON])
+        await self.ended.wait()
+
+    async def probe(self) -> bool:
+        """Return whether the robot still answers; end the connection if it does not."""
+        if not self.lost:
+            with contextlib.suppress(TimeoutError, ConnectionClosed):
+                async with asyncio.timeout(self._settings.probe_timeout):
+                    await (await self._socket.ping())
+                    return True
+            self._socket.abort()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self._settings.probe_timeout):
+                await self.ended.wait()
+        return not self.ended.is_set()
+
+    def tick(self) -> None:
+        """Drop messages that have been incomplete for too long; called every few seconds."""
+        for event in self._stream.expire(self._now()):
+            self._handle(event)
+
+    # Memory
+
+    @property
+    def knows_sources(self) -> bool:
+        """Whether the robot supports sources of latched messages."""
+        return LATCH in self.features
+
+    @property
+    def held(self) -> int:
+        """Bytes of waiting messages: to be sent, completed or carried out."""
+        return self._socket.held + self._stream.pending_bytes + self._outbox.bytes + self._waiting_bytes
+
+    def shed(self, size: int) -> None:
+        """Drop incomplete messages, then waiting ones, oldest first: about ``size`` bytes."""
+        goal = self.held - size
+        for event in self._stream.drop_oldest(size):
+            self._handle(event)
+        self._outbox.shed(max(0, self.held - goal))
+
+    def fail(self, reason: str) -> None:
+        """Drop the connection and all waiting messages, because of the robot's usage."""
+        self._socket.fail(CloseCode.TRY_AGAIN_LATER, reason[:MAX_REASON])
+        self._outbox.clear()
+        self._stream.drop_oldest(self._stream.pending_bytes)
+        if self._abort is None:
+            self._abort = self._loop.call_later(self._settings.close_timeout, self._socket.abort)
+
+    # To the robot
+
+    def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
+        """Send in the data lane; False if the queue refuses or the connection ended."""
+        if self._socket.writable and not self._outbox:
+            self._write(message)
+            return True
+        taken = not self.lost and self._outbox.put_data(tag, message, overflow)
+        self._owner.grew()
+        return taken
+
+    def send_latched(self, tag: str, source: str, message: Queued, *, shared: bool) -> None:
+        """Send the latched message of a source in the data lane, where it is not dropped."""
+        if LATCH in self.features:
+            message = LatchedDelivery(message, source)
+        if self._socket.writable and not self._outbox:
+            self._write(message)
+        elif not self.lost:
+            self._outbox.put_latched(tag, source, message, shared=shared)
+            self._owner.grew()
+
+    def send_sources(self, tag: str, sources: Sequence[str]) -> None:
+        """Send an ``LT`` after earlier messages, to a client that supports it."""
+        if LATCH not in self.features:
+            return
+        message = _outgoing(LatchedSources(i_tag=tag, sources=tuple(sources)))
+        if self._socket.writable and not self._outbox:
+            self._write(message)
+        elif not self.lost:
+            self._outbox.put_latched(tag, "", message, shared=False)
+            self._owner.grew()
+
+    def drop_latched(self, tag: str, source: str) -> None:
+        """Drop the unsent latched message of a source."""
+        self._outbox.drop_latched(tag, source)
+
+    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
+        """Handle a large message again when its binary values have arrived."""
+        for event in self._stream.await_binaries(large, ids, self._now()):
+            self._handle(event)
+        self._look_at_pending()
+
+    def send_urgent(self, message: Queued) -> bool:
+        """Send in the control lane; False if that is full or the connection ended."""
+        if self._socket.writable and not self._outbox:
+            self._write(message)
+            return True
+        taken = not self.lost and self._outbox.put_control(message)
+        self._owner.grew()
+        return taken
+
+    def report(self, problem: str, call: CallId | None = None) -> None:
+        """Send an ``ER``; if the lane is full, drop and log it."""
+        self._send_report(ErrorReport(problem=problem, call=call))
+
+    def _send_report(self, report: ErrorReport) -> None:
+        if not self.send_urgent(_outgoing(report)):
+            _log.info("not sent: %s", report.text)
+
+    def show_active(self, tag: str, active: bool) -> None:
+        """Send an ``ST``."""
+        message = _outgoing(InterfaceStatus(i_tag=tag, status=active))
+        if self._socket.writable and not self._outbox:
+            self._write(message)
+        elif not self.lost:
+            self._outbox.put_state(tag, message)
+
+    def discard(self, tag: str) -> None:
+        """Drop the waiting messages of a removed interface."""
+        self._outbox.discard(tag)
+
+    def spawn(self, work: Coroutine[Any, Any, None]) -> bool:
+        """Run a coroutine until the connection ends; return False if too many run already."""
+        if self._tasks is None or self.lost or len(self._calls) >= self._settings.max_calls:
+            work.close()
+            return False
+        task = self._tasks.create_task(self._guard(work))
+        self._calls.add(task)
+        task.add_done_callback(self._calls.discard)
+        return True
+
+    # From the robot: rce_robot.doors.client.websocket.Receiver
+
+    def on_text(self, text: bytes) -> Iterator[None] | None:
+        """Handle a text frame, a large one in steps."""
+        if len(text) >= LARGE_TEXT:
+            return self._handle_in_steps(text)
+        events = self._stream.feed_text(text, self._now())
+        if _has_fault(events) and not all(utf8_in_steps(text)):
+            self._refuse_text()
+        else:
+            self._handle_events(events, len(text))
+        return None
+
+    def _handle_in_steps(self, text: bytes) -> Iterator[None]:
+        light = is_light(text)
+        yield
+        events = self._stream.feed_text(text, self._now(), light=light)
+        yield
+        if _has_fault(events):
+            for valid in utf8_in_steps(text):
+                if not valid:
+                    self._refuse_text()
+                    return
+                yield
+        self._handle_events(events, len(text))
+
+    def _handle_events(self, events: Sequence[Event], size: int) -> None:
+        for event in events:
+            self._handle(event, size)
+        self._look_at_pending()
+
+    def _refuse_text(self) -> None:
+        self._socket.fail(CloseCode.INVALID_DATA, "a text frame is not UTF-8")
+
+    def on_binary(self, data: bytes) -> None:
+        """Handle a binary frame."""
+        for event in self._stream.feed_binary(data, self._now()):
+            self._handle(event)
+        self._look_at_pending()
+
+    def on_part(self) -> None:
+        """Count a large message that is still being received."""
+        self._owner.grew()
+
+    def on_writable(self) -> None:
+        """Send waiting messages, as far as the connection takes them."""
+        while self._socket.writable:
+            message = self._outbox.pop()
+            if message is None:
+                return
+            self._write(message)
+
+    def on_lost(self, reason: str) -> None:
+        """Stop sending, and let :meth:`run` come to its end."""
+        self.lost = True
+        self._reason = reason
+        if self._abort is not None:
+            self._abort.cancel()
+        self._owner.leaving(self)
+        self._requests.put_nowait(None)
+        if self._tasks is None:
+            self._end()
+
+    # Private
+
+    def _end(self) -> None:
+        if not self.ended.is_set():
+            self.ended.set()
+            self._owner.left(self, self._reason)
+
+    def _look_at_pending(self) -> None:
+        pending = self._stream.pending_bytes
+        if pending > self._pending_bytes:
+            self._owner.grew()
+        self._pending_bytes = pending
+
+    def _write(self, message: Queued) -> None:
+        rendered = message.render()
+        if rendered is None:
+            return
+        if not isinstance(rendered, Serialized):
+            self._socket.write(rendered)
+        elif self._single and not rendered.is_long:
+            self._socket.write_binary(rendered.prefix, rendered.payload)
+        else:
+            self._socket.write(rendered.split())
+        if rendered.size > LARGE_PART:
+            self._owner.grew()
+
+    def _handle(self, event: Event, size: int = 0) -> None:
+        match event:
+            case DataMessage():
+                try:
+                    self._owner.take(event)
+                except RobotError as error:
+                    self.report(error.problem, error.call)
+                except Exception:  # noqa: BLE001 - logged; it must not end anything else
+                    _log.exception("data message at %s", event.i_tag)
+                    problem = "internal error; the engine's log tells more"
+                    fault = RobotError.at(event.i_tag, event.msg_id, problem)
+                    self.report(fault.problem, fault.call)
+            case LargeData():
+                self._handle_large(event)
+            case LatchedSources():
+                self._owner.keep_latched(event.i_tag, event.sources)
+            case Fault():
+                self._send_report(event.report)
+                if event.call is not None:
+                    self._owner.refused(event.call, event.text)
+            case ErrorReport() | InterfaceStatus():
+                self.report(f"type: {type_of(event)} is not for clients to send")
+            case (
+                CreateContainer()
+                | ResizeContainer()
+                | DestroyContainer()
+                | ConfigureComponents()
+                | ConfigureConnections()
+            ):
+                self._request(event, size)
+            case _:
+                assert_never(event)
+
+    def _handle_large(self, large: LargeData) -> None:
+        try:
+            self._owner.take_large(large)
+        except RobotError as error:
+            self.report(error.problem, error.call)
+
+    def _request(self, request: Request, size: int) -> None:
+        if isinstance(request, (ConfigureComponents, ConfigureConnections)):
+            for fault in request.faults:
+                self._send_report(ErrorReport(problem=str(fault), path=fault.path, code=fault.code))
+            request = msgspec.structs.replace(request, faults=())
+        waiting = self._waiting_bytes + size
+        if (
+            self._requests.qsize() >= self._settings.max_requests
+            or waiting > self._settings.max_request_bytes
+        ):
+            self.report(f"{type_of(request)}: too many requests wait; this one was dropped")
+        else:
+            self._waiting_bytes = waiting
+            self._requests.put_nowait((request, size))
+
+    async def _guard(self, work: Coroutine[Any, Any, None]) -> None:
+        """Prevent a bug in one call from ending the session."""
+        try:
+            await work
+        except Exception:  # noqa: BLE001 - logged; it must not end anything else
+            _log.exception("service call")
+            self.report("internal error in a service call; the engine's log tells more")
+
+    async def _carry_out_requests(self) -> None:
+        """Pass on requests to the master, one at a time and in order."""
+        while (item := await self._requests.get()) is not None:
+            request, size = item
+            for error in await self._owner.ask_master(request):
+                self.report(error)
+            self._waiting_bytes -= size
+
+
+def _outgoing(message: ErrorReport | InterfaceStatus | LatchedSources) -> Outgoing:
+    (text,) = encode(message)
+    return Outgoing(text.encode() if isinstance(text, str) else text)
+
+
+def _has_fault(events: Sequence[Event]) -> bool:
+    return any(type(event) is Fault for event in events)

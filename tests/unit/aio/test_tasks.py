@@ -1,0 +1,230 @@
+"""Owners of tasks."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from rce.aio.tasks import BackgroundTasks, TaskScope, cancel_and_wait, run_until_first
+
+Reported = list[BaseException]
+
+
+async def for_ever() -> None:
+    await asyncio.Event().wait()
+
+
+async def fail() -> None:
+    raise ValueError("broken")
+
+
+@pytest.fixture
+async def reported() -> Reported:
+    """What is reported to the event loop's exception handler."""
+    found: Reported = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: found.append(context["exception"]))
+    return found
+
+
+async def test_leaving_a_scope_cancels_what_runs() -> None:
+    async with TaskScope() as scope:
+        task = scope.spawn(for_ever(), name="sleeper")
+    assert task.cancelled()
+    assert task.get_name() == "sleeper"
+
+
+async def test_leaving_a_scope_waits_for_what_a_task_does_last() -> None:
+    done: list[str] = []
+
+    async def tidy() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await asyncio.sleep(0)
+            done.append("tidied")
+
+    async with TaskScope() as scope:
+        scope.spawn(tidy(), name="tidy")
+        await asyncio.sleep(0)
+    assert done == ["tidied"]
+
+
+async def test_what_is_spawned_while_leaving_does_nothing() -> None:
+    done: list[str] = []
+    spawned: list[asyncio.Task[None]] = []
+
+    async def late() -> None:
+        done.append("late")
+
+    async def last_words(scope: TaskScope) -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            spawned.append(scope.spawn(late(), name="late"))
+
+    async with TaskScope() as scope:
+        scope.spawn(last_words(scope), name="speaker")
+        await asyncio.sleep(0)
+    assert spawned[0].cancelled()
+    assert done == []
+
+
+async def test_a_failing_task_ends_the_block() -> None:
+    async def block() -> None:
+        async with TaskScope() as scope:
+            scope.spawn(fail(), name="failing")
+            await asyncio.Event().wait()
+
+    with pytest.raises(ExceptionGroup) as caught:
+        await block()
+    assert caught.group_contains(ValueError, match="broken")
+
+
+async def test_an_error_of_the_block_passes_unchanged() -> None:
+    tasks: list[asyncio.Task[None]] = []
+
+    async def block() -> None:
+        async with TaskScope() as scope:
+            tasks.append(scope.spawn(for_ever(), name="sleeper"))
+            raise KeyError("mine")
+
+    with pytest.raises(KeyError, match="mine"):
+        await block()
+    assert tasks[0].cancelled()
+
+
+async def test_cancelling_the_block_cancels_its_tasks() -> None:
+    inside: list[asyncio.Task[None]] = []
+    begun = asyncio.Event()
+
+    async def block() -> None:
+        async with TaskScope() as scope:
+            inside.append(scope.spawn(for_ever(), name="sleeper"))
+            begun.set()
+            await asyncio.Event().wait()
+
+    outer = asyncio.create_task(block())
+    await begun.wait()
+    outer.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await outer
+    assert inside[0].cancelled()
+
+
+async def test_a_scope_that_has_ended_takes_no_task() -> None:
+    async with TaskScope() as scope:
+        pass
+    work = for_ever()
+    with pytest.raises(RuntimeError):
+        scope.spawn(work, name="late")
+    work.close()
+
+
+async def test_background_failure_is_reported_and_others_go_on(reported: Reported) -> None:
+    tasks = BackgroundTasks()
+    failing = tasks.spawn(fail(), name="failing")
+    lasting = tasks.spawn(for_ever(), name="lasting")
+    await asyncio.wait([failing])
+    await asyncio.sleep(0)
+    assert [str(error) for error in reported] == ["broken"]
+    assert not lasting.done()
+    assert len(tasks) == 1
+    await tasks.close()
+    assert lasting.cancelled()
+    assert len(tasks) == 0
+
+
+async def test_a_closed_owner_takes_no_task(reported: Reported) -> None:
+    tasks = BackgroundTasks()
+    await tasks.close()
+    assert tasks.closed
+    with pytest.raises(RuntimeError, match="late comes too late: its owner is closed"):
+        tasks.spawn(for_ever(), name="late")
+    assert reported == []
+
+
+async def test_a_background_task_can_close_its_owner() -> None:
+    tasks = BackgroundTasks()
+    other = tasks.spawn(for_ever(), name="other")
+
+    async def closing() -> str:
+        await tasks.close()
+        return "closed"
+
+    assert await tasks.spawn(closing(), name="closing") == "closed"
+    assert other.cancelled()
+
+
+async def test_a_cancelled_close_has_cancelled_the_tasks() -> None:
+    tasks = BackgroundTasks()
+    release = asyncio.Event()
+
+    async def slow() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await release.wait()
+
+    task = tasks.spawn(slow(), name="slow")
+    await asyncio.sleep(0)
+    closing = asyncio.create_task(tasks.close())
+    await asyncio.sleep(0)
+    closing.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await closing
+    assert not task.done()
+    release.set()
+    await asyncio.wait([task])
+    assert task.cancelled()
+
+
+async def test_cancel_and_wait_waits_for_every_task(reported: Reported) -> None:
+    failing, lasting = asyncio.create_task(fail()), asyncio.create_task(for_ever())
+    await asyncio.sleep(0)
+    await cancel_and_wait(failing, lasting)
+    assert failing.done()
+    assert lasting.cancelled()
+    assert reported == []
+
+
+async def test_run_until_first_cancels_the_others() -> None:
+    ended: list[str] = []
+
+    async def last_words() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await asyncio.sleep(0)
+            ended.append("cancelled")
+
+    async def short() -> None:
+        await asyncio.sleep(0)
+        ended.append("first")
+
+    await run_until_first(last_words(), short())
+    assert ended == ["first", "cancelled"]
+
+
+async def test_run_until_first_raises_what_the_first_raised() -> None:
+    with pytest.raises(ValueError, match="broken"):
+        await run_until_first(for_ever(), fail())
+
+
+async def test_cancelling_run_until_first_cancels_all() -> None:
+    ended: list[int] = []
+    begun = asyncio.Barrier(3)
+
+    async def wait(number: int) -> None:
+        await begun.wait()
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ended.append(number)
+
+    running = asyncio.create_task(run_until_first(wait(1), wait(2)))
+    await begun.wait()
+    running.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await running
+    assert sorted(ended) == [1, 2]

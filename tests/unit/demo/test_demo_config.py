@@ -1,0 +1,66 @@
+"""What is run, and what the planner is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from rce.config.client import loads
+from rce.config.documents import write_items
+from rce_fleet.demo.config import DemoConfig
+from rce_fleet.demo.resources import Ports
+from rce_fleet.demo.ros_modes import PLANNER, node_names, planner_argv, sync_argv, world_argv
+from rce_fleet.demo.scenario import choose_scenario
+from rce_fleet.demo.traffic import received
+from rce_fleet.wiring import fleet_config
+
+CONFIG = DemoConfig(choose_scenario(3, 0), 0, Ports(), Path("/folder"))
+
+
+def test_the_planner_is_not_told_of_hidden_boxes() -> None:
+    parameters, scenario = CONFIG.planner_parameters, CONFIG.scenario
+    assert parameters["walls"] == sorted(scenario.grid.blocked)
+    assert parameters["blocked"] == list(scenario.known_boxes)
+    assert not {*parameters["walls"], *parameters["blocked"]}.intersection(scenario.hidden_boxes)
+    loads(write_items(fleet_config(None, parameters)))
+
+
+def test_the_planner_gets_its_parameters_on_its_command_line() -> None:
+    argv = planner_argv(CONFIG)
+    assert f"_walls:={sorted(CONFIG.scenario.grid.blocked)}" in argv
+    assert "_rows:=8" in argv
+    assert any(word.endswith("fleet_planner.py") for word in argv)
+
+
+def test_each_robot_of_the_world_joins_its_own_core() -> None:
+    argv = world_argv(CONFIG, "http://c:1/", {"Robot1": "http://a:1/", "Robot2": "http://b:1/"})
+    joins = [argv[place + 1] for place, word in enumerate(argv) if word == "--core"]
+    assert joins == ["Robot1=http://a:1/", "Robot2=http://b:1/"]
+    assert argv[argv.index("--planner-core") + 1] == "http://c:1/"
+
+
+def test_only_the_demos_own_nodes_are_counted() -> None:
+    one = replace(CONFIG, scenario=choose_scenario(1, 0))
+    assert node_names(one) == {
+        *("/Robot1/robot", "/Robot1/move_client"),
+        *("/fleet_planner", "/operator_station", "/world"),
+    }
+
+
+def test_received_counts_sum_topics_and_connections() -> None:
+    """Received messages are summed over topics and connections."""
+    pose = ["/Robot1/amcl_pose", [[1, 999, 7, -1, True], [2, 999, 5, -1, True]]]
+    answer = [1, "bus stats", [[["/map", 10, [[9, 10, 1, True]]]], [pose, ["/map", []]], []]]
+    assert received(answer) == 12
+
+
+def test_robots_machine_syncs_only_its_own_topics() -> None:
+    argv = sync_argv("Robot1", ["Robot1", "Robot2"])
+    assert argv[argv.index("--hosts") + 1] == PLANNER
+    assert argv[argv.index("--topics") + 1] == "/Robot1/goalNodesList,/Robot1/cancelGoal"
+
+
+def test_planners_machine_syncs_two_topics_per_robot() -> None:
+    argv = sync_argv(PLANNER, ["Robot1", "Robot2"])
+    topics = argv[argv.index("--topics") + 1].split(",")
+    assert topics == [f"/Robot{n}/{name}" for n in (1, 2) for name in ("amcl_pose", "goalNodesList")]

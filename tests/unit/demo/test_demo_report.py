@@ -1,0 +1,64 @@
+"""The report of a headless run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.fleet_states import truth
+
+from rce_fleet.demo.headless import RunReport
+from rce_fleet.demo.scenario import choose_scenario
+from rce_fleet.demo.scenario_run import ScenarioRun
+from rce_fleet.demo.traffic import MessageTotals
+
+SCENARIO = choose_scenario(2, 0)
+ROBOTS = dict(zip(SCENARIO.robots, SCENARIO.goals, strict=True))
+
+
+def make_report(reached: set[str], problem: str = "", collisions: int = 0) -> RunReport:
+    unused: Any = None
+    run = ScenarioRun(unused, SCENARIO, lambda: None, lambda _: None)
+    run.reached = reached
+    return RunReport(
+        SCENARIO, 0, run, truth(ROBOTS, apart=0.5, collisions=collisions), MessageTotals(10, 1), problem
+    )
+
+
+def test_report_of_a_good_run() -> None:
+    report = make_report(set(ROBOTS)).as_json()
+    assert report["ok"] is True
+    assert report["collisions"] == 0
+    assert report["min_separation_m"] == 0.5
+    assert report["engine"] == {"messages": 10, "dropped": 1}
+    assert report["robots"] == [
+        {
+            "id": robot,
+            "start_cell": start,
+            "goal_cell": goal,
+            "reached": True,
+            "replans": 0,
+            "distance_m": 1.0,
+        }
+        for robot, start, goal in zip(SCENARIO.robots, SCENARIO.starts, SCENARIO.goals, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (make_report({"Robot1"}), "not at their goals: Robot2"),
+        (make_report(set(ROBOTS), collisions=2), "robots collided 2 times"),
+        (make_report(set(ROBOTS), problem="the time is over"), "the time is over"),
+        (RunReport(SCENARIO, 0, None, None, None, "no engine"), "no engine"),
+    ],
+)
+def test_report_of_a_bad_run_names_the_faults(bad: RunReport, words: str, tmp_path: Path) -> None:
+    assert not bad.ok
+    bad.write(tmp_path / "r.json")
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["ok"] is False
+    assert any(words in fault for fault in report["faults"])
+    assert report.keys() >= {"duration_s", "collisions", "min_separation_m", "robots", "engine"}

@@ -1,0 +1,60 @@
+"""Where the masters of one engine are."""
+
+from __future__ import annotations
+
+import pytest
+
+from rce.config.client import ClientConfig
+from rce.config.exceptions import ConfigError
+from rce.config.loading import read_document
+from rce.masters import Masters, split_addresses
+
+
+def test_one_address_is_used_for_good() -> None:
+    masters = Masters("http://one:9000/")
+    masters.failed("http://one:9000/")
+    assert masters.current == "http://one:9000/"
+
+
+def test_several_are_used_in_turn() -> None:
+    masters = Masters("a, b,c")
+    assert masters.all == ("a", "b", "c")
+    seen = []
+    for _ in range(4):
+        seen.append(masters.current)
+        masters.failed(masters.current)
+    assert seen == ["a", "b", "c", "a"]
+    assert str(Masters(["a", "b"])) == "a,b"
+
+
+def test_who_fails_late_does_not_skip_an_address() -> None:
+    masters = Masters(["a", "b", "c"])
+    masters.failed("a")
+    masters.failed("a")
+    assert masters.current == "b"
+
+
+@pytest.mark.parametrize("nothing", ["", " , ", ()])
+def test_no_address_is_refused(nothing: str | tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match="give the address of a master"):
+        Masters(nothing)
+    assert split_addresses(" , ") == ()
+
+
+def config(url: object) -> ClientConfig:
+    return ClientConfig.model_validate({"url": url, "userID": "u", "robotID": "r"})
+
+
+def test_a_clients_file_names_one_or_several_masters() -> None:
+    one, two = "http://one:9000/", "https://two:9000/"
+    assert config(one).url == one
+    assert config([one, two]).url == config(f"{one},{two}").url == f"{one},{two}"
+    for wrong in ([], [one, 7], [one, "ftp://two/"], 7, ""):
+        with pytest.raises(ValueError, match="must be the master's address"):
+            config(wrong)
+
+
+def test_task_sets_settings_name_one_or_several_masters() -> None:
+    assert read_document({"master_host": "one,10.0.0.2"}, "file")["master_host"] == "one,10.0.0.2"
+    with pytest.raises(ConfigError, match="must be a host name"):
+        read_document({"master_host": "one,t!wo"}, "file")
