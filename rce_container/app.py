@@ -273,7 +273,7 @@ class Quitting:
     def _on_renewal(self) -> None:
         if self.told.is_set() or self.renewal:  # a shutdown that has begun continues
             return
-        _log.info("starting anew; containers stay")
+        _log.info("restarting; containers stay")
         self.renewal = True
         self._let_go()
 

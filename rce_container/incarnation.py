@@ -195,7 +195,7 @@ class Incarnation:
             raise ExecutionError("the container is not running")
         if EXEC not in self._features:
             raise ExecutionError(
-                "the container was started by an earlier release; destroy and create it anew"
+                "the container was started by an earlier release; destroy it and create it again"
             )
         self._channel.send(m.encode(m.Execute(command=command)), sock.fileno())
 

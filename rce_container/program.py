@@ -42,7 +42,7 @@ def run(engine: EngineSettings, *, end: bool = False, check: bool = False, verbo
         if not check:  # the file belongs to the program that runs
             log_as("rce-container", engine, verbose=verbose)
     except LogFileError as error:
-        print(f"rce-container: {error}", file=sys.stderr)  # noqa: T201 - for whoever started it
+        print(f"rce-container: {error}", file=sys.stderr)  # noqa: T201 - for the shell
         return 1
     raise_file_limit()
     own = engine.container
@@ -87,7 +87,7 @@ def run(engine: EngineSettings, *, end: bool = False, check: bool = False, verbo
         if uvloop.run(program.run(_announce)):
             renew()
     except (SecretError, RunDirError, ContainerError, CertificateError, OSError) as error:
-        print(f"rce-container: {error}", file=sys.stderr)  # noqa: T201 - for whoever started it
+        print(f"rce-container: {error}", file=sys.stderr)  # noqa: T201 - for the shell
         return 1
     return 0
 

@@ -34,7 +34,7 @@ def run(engine: EngineSettings, *, verbose: bool = False) -> int:
     try:
         log_as("rce-robot", engine, verbose=verbose)
     except LogFileError as error:
-        print(f"rce-robot: {error}", file=sys.stderr)  # noqa: T201 - for whoever started it
+        print(f"rce-robot: {error}", file=sys.stderr)  # noqa: T201 - for the shell
         return 1
     own = engine.robot
     settings = RobotSettings(
@@ -64,7 +64,7 @@ def run(engine: EngineSettings, *, verbose: bool = False) -> int:
         )
         uvloop.run(program.run(_announce))
     except (SecretError, RunDirError, CertificateError, OSError) as error:
-        print(f"rce-robot: {error}", file=sys.stderr)  # noqa: T201 - for whoever started it
+        print(f"rce-robot: {error}", file=sys.stderr)  # noqa: T201 - for the shell
         return 1
     return 0
 

@@ -68,7 +68,7 @@ class RoleIn(Body):
 
 
 class AuditIn(Body):
-    """What somebody did at a station."""
+    """An action of a user at a station."""
 
     action: Annotated[str, Field(pattern="^[a-z_]{1,64}$")]
     subject: Annotated[str, Field(max_length=300)] = ""
@@ -139,13 +139,13 @@ class TokenListed(Model):
 
 
 class AuditRecord(Model):
-    """Something that somebody did, or was refused."""
+    """An action, or a refused one."""
 
     id: int
     time: float
     """Seconds since 1970."""
     user: str
-    """Who; empty: nobody that is known."""
+    """The user; empty if unknown."""
     action: str
     subject: str
     outcome: str
