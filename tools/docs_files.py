@@ -20,41 +20,50 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDER = "files"
-_LINK = re.compile(r"\]\((\.\./[^)#\s]+)([^)]*)\)")
+_PAGES = "docs"
+_LINK = re.compile(r"\]\((?!\w+:)([^)#\s]+)([^)]*)\)")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
-    """Add the files that the pages link to outside of their folder."""
-    for page in list(files.documentation_pages()):
+    """Add the files that the pages link to outside of their folder, and those that these link to."""
+    pages = list(files.documentation_pages())
+    for page in pages:
         for found in _LINK.finditer(page.content_string):
-            place = outside(page.src_uri, found[1])
-            if place and files.get_file_from_path(f"{FOLDER}/{place}") is None:
-                files.append(File.generated(config, f"{FOLDER}/{place}", content=(ROOT / place).read_bytes()))
+            place = in_site(page.src_uri, found[1])
+            if place.startswith(f"{FOLDER}/") and files.get_file_from_path(place) is None:
+                content = (ROOT / place.removeprefix(f"{FOLDER}/")).read_bytes()
+                files.append(File.generated(config, place, content=content))
+                if place.endswith(".md"):
+                    pages.append(files.src_uris[place])
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:  # noqa: ARG001
-    """Point the links to the copies."""
+    """Point the links to where the files are in the site."""
     source = page.file.src_uri
 
-    def to_copy(found: re.Match[str]) -> str:
-        place = outside(source, found[1])
+    def to_site(found: re.Match[str]) -> str:
+        place = in_site(source, found[1])
         if not place:
             return found[0]
-        target = os.path.relpath(f"{FOLDER}/{place}", PurePosixPath(source).parent)
-        return f"]({target}{found[2]})"
+        return f"]({os.path.relpath(place, PurePosixPath(source).parent)}{found[2]})"
 
-    return _LINK.sub(to_copy, markdown)
+    return _LINK.sub(to_site, markdown)
 
 
-def outside(source: str, link: str) -> str:
-    """Return the path in the project of a file outside of the documentation that a page links to.
+def in_site(source: str, link: str) -> str:
+    """Return the path in the site of what a page links to.
 
     Args:
-        source: The page, as seen from the documentation's folder.
-        link: The target of its link.
+        source: The page's path in the site.
+        link: The target of its link, relative to the page's place in the project.
 
     Returns:
-        Empty if the link stays in the documentation, or the file is not in the project.
+        Empty if the link is between two pages of the documentation, or the file is not in the project.
     """
-    place = os.path.normpath(PurePosixPath("docs", source).parent / link)
-    return "" if place.startswith(("docs/", "..")) or not (ROOT / place).is_file() else place
+    is_copy = source.startswith(f"{FOLDER}/")
+    page = PurePosixPath(source.removeprefix(f"{FOLDER}/")) if is_copy else PurePosixPath(_PAGES, source)
+    place = os.path.normpath(page.parent / link)
+    is_page = place.startswith(f"{_PAGES}/")
+    if place.startswith("..") or not (ROOT / place).is_file() or (is_page and not is_copy):
+        return ""
+    return place.removeprefix(f"{_PAGES}/") if is_page else f"{FOLDER}/{place}"

@@ -228,7 +228,7 @@ async def test_established_connection_reaches_late_nodes(machine: Machine) -> No
         async with joined(address) as peer:
             await peer.active("req")
             peer.ends["req"].port.send(STRING.serialize(STRING.new(data="the first")))
-            assert "heard the first" in await holds(machine, "late", "heard")
+            await holds(machine, "late", "heard the first")
             assert machine.faults == []
 
 
@@ -270,7 +270,7 @@ async def test_records_of_a_rospy_node_go_to_its_log(machine: Machine) -> None:
         await machine.put(BOX, nodes=(NodeSpec(tag="node", pkg="sys", exe="tell.py"),))
         text = await holds(machine, "node", "from rospy", LogStream.ROSOUT, level=LogLevel.WARN)
         assert text.startswith("[WARN] [")
-        assert "WARN /real [" in await holds(machine, "", "from rospy", LogStream.ROSOUT)
+        await holds(machine, "", "WARN /real [", LogStream.ROSOUT)
 
 
 async def test_a_killed_node_says_by_what(machine: Machine) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tools.docs_files import outside
+from tools.docs_files import in_site
 
 ROOT = Path(__file__).parents[3]
 GOOD = "[page](other.md#a-part), [`name`][other]\n"
@@ -48,18 +48,24 @@ def test_a_broken_link_fails_the_build(tmp_path: Path, broken: str) -> None:
     assert "WARNING" in done.stderr
 
 
+FLEET, SHARE = "reference/fleet.md", "files/rce_fleet/share/README.md"
+
+
 @pytest.mark.parametrize(
-    ("link", "place"),
+    ("source", "link", "place"),
     [
-        ("../../README.md", "README.md"),
-        ("../../configs/engine.yaml", "configs/engine.yaml"),
-        ("../architecture.md", ""),
-        ("../../no/such.py", ""),
-        ("../../../elsewhere.md", ""),
+        (FLEET, "../../README.md", "files/README.md"),
+        (FLEET, "../../configs/engine.yaml", "files/configs/engine.yaml"),
+        (FLEET, "../architecture.md", ""),
+        (FLEET, "../../no/such.py", ""),
+        (FLEET, "../../../elsewhere.md", ""),
+        (SHARE, "../../docs/reference/fleet.md", FLEET),
+        (SHARE, "msg/FleetState.msg", "files/rce_fleet/share/msg/FleetState.msg"),
+        (SHARE, "../../docs/no-such-page.md", ""),
     ],
 )
-def test_files_outside_of_the_pages_are_found(link: str, place: str) -> None:
-    assert outside("reference/fleet.md", link) == place
+def test_linked_files_have_a_place_in_the_site(source: str, link: str, place: str) -> None:
+    assert in_site(source, link) == place
 
 
 def test_the_menu_has_every_page() -> None:
