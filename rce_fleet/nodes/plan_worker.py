@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 _LENGTH = 4
 """Bytes of the length in front of each message."""
+_ENDING_S = 5.0
+"""How long a process whose output ended may take to end."""
 
 
 class PlanWorker:
@@ -63,25 +65,32 @@ class PlanWorker:
         try:
             return await self._ask(request)
         except (asyncio.IncompleteReadError, ConnectionError):
-            self._log.warning("the plan worker ended (%s); restarting it", await self._end())
+            self._log.warning("the plan worker ended (%s); restarting it", await self._end(_ENDING_S))
         await self._start()
         try:
             return await self._ask(request)
         except (asyncio.IncompleteReadError, ConnectionError) as error:
-            status = await self._end()
+            status = await self._end(_ENDING_S)
             raise PlanWorkerError(request.number, len(request.robots), status) from error
 
     async def _start(self) -> None:
         self._process = await asyncio.create_subprocess_exec(*self._command, stdin=PIPE, stdout=PIPE)
 
-    async def _end(self) -> str:
-        """End the process; return how it ended, in words."""
+    async def _end(self, grace: float = 0.0) -> str:
+        """End the process, after ``grace`` seconds; return how it ended, in words.
+
+        A process that ends by itself needs the grace: to kill it would take its status from asyncio.
+        """
         process, self._process = self._process, None
         if process is None:
             return "it was ended"
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        status = await process.wait()
+        try:
+            async with asyncio.timeout(grace):
+                status = await process.wait()
+        except TimeoutError:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            status = await process.wait()
         return f"signal {-status}" if status < 0 else f"status {status}"
 
     async def _ask(self, request: PlanRequest) -> PlanResult:
