@@ -133,7 +133,7 @@ class LogArchive:
 
     def _settle(self, kept: Kept, now: float) -> None:
         words = last_line(kept.folder)
-        reason = "no manager saw it end" + (f"; its last words: {words}" if words else "")
+        reason = "no manager saw it end" + (f"; its last output: {words}" if words else "")
         self.end(kept.record.id, kept.record.incarnation_id, reason, now)
 
     def prune(self, now: float) -> None:

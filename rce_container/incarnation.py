@@ -420,7 +420,7 @@ class Incarnation:
 
     def _last_words(self) -> str:
         words = last_line(self.folder.logs)[:_LAST_WORDS_LENGTH]
-        return f"; its last words: {words}" if words else ""
+        return f"; its last output: {words}" if words else ""
 
     async def _clean(self, timeout: float) -> None:
         """Wait ``timeout`` seconds for the shim, then kill the remaining processes and remove the folder."""

@@ -101,7 +101,7 @@ class NodeLife:
                 child.signal_group(signal.SIGKILL)
                 await kill_marked(launch.env[NODE_MARK], variable=NODE_MARK)
         if code and not self._halted.done() and (words := self._log.last_words):
-            reason += f"; its last words: {words}"
+            reason += f"; its last output: {words}"
         return Ended(self._spec.tag, self.life, code, reason)
 
     def _start(self, launch: Launch, pumps: ExitStack) -> Child:

@@ -110,14 +110,14 @@ async def test_a_node_that_dies_is_told_and_not_restarted(machine: Machine) -> N
         await machine.put(BOX, nodes=(ECHO, own("fail.py"), own("end.py", tag="end")))
         node = await machine.node_is(BOX, "node", NodeState.FAILED)
         assert (node.exit_code, node.pid) == (3, 0)
-        assert node.detail == "exit code 3; its last words: it is broken"
+        assert node.detail == "exit code 3; its last output: it is broken"
         await machine.node_is(BOX, "end", NodeState.EXITED)
         running = await machine.node_is(BOX, "echo", NodeState.RUNNING)
         assert "stringEcho" in Path(f"/proc/{running.pid}/cmdline").read_text()
         os.kill(running.pid, signal.SIGKILL)
         assert (await machine.node_is(BOX, "echo", NodeState.FAILED)).exit_code == -signal.SIGKILL
         assert any(
-            text.endswith("node node failed: exit code 3; its last words: it is broken")
+            text.endswith("node node failed: exit code 3; its last output: it is broken")
             for text in machine.faults
         )
         assert any("node echo failed: killed by SIGKILL" in text for text in machine.faults)

@@ -120,13 +120,13 @@ async def test_a_node_that_crashes_is_restarted_up_to_its_limit(machine: Machine
         node = await machine.node_is(BOX, "node", NodeState.FAILED)
         assert (node.restarts, node.exit_code, node.pid) == (2, 3, 0)
         assert node.detail.startswith(
-            "exit code 3; its last words: it is broken; it was started again 2 times"
+            "exit code 3; its last output: it is broken; it was started again 2 times"
         )
         assert [one for one in states(machine) if one is NodeState.WAITING] == [NodeState.WAITING] * 2
         assert machine.reported(BOX).state is EndpointState.DEGRADED
         text = (await read(machine, "node")).text
         assert text.count("it is broken\n") == text.count("to stdout\n") == 3
-        ended = "-- ended: exit code 3; its last words: it is broken --\n"
+        ended = "-- ended: exit code 3; its last output: it is broken --\n"
         pauses = "".join(f"{ended}-- starts again after {pause} s --\n" for pause in ("0.5", "1"))
         assert (await read(machine, "node", LogStream.ENGINE)).text == pauses + ended
         assert len([text for text in machine.faults if "node node" in text]) == 2
@@ -319,7 +319,7 @@ async def test_logs_outlive_killed_manager_and_unseen_end(
     async with machine.engine():
         chunk = await read(machine, "node")
         assert "hello" in chunk.text
-        assert "no manager saw it end; its last words" in chunk.reason
+        assert "no manager saw it end; its last output" in chunk.reason
         assert "no manager for 0.5 s" in chunk.reason
 
 

@@ -143,7 +143,7 @@ def test_the_end_of_what_nobody_saw_end_is_noted_later(archive: LogArchive) -> N
     archive.settle({"there"}, 10.0)
     (kept,) = archive.ended(BOX)
     assert (kept.record.incarnation_id, kept.record.ended) == ("gone", 10.0)
-    assert kept.record.reason == "no manager saw it end; its last words: _environment of gone"
+    assert kept.record.reason == "no manager saw it end; its last output: _environment of gone"
     archive.settle_one("there", 11.0)
     archive.settle_one("unknown", 11.0)
     assert incarnation_ids(archive) == ["there", "gone"]
