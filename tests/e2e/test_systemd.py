@@ -139,8 +139,13 @@ async def check_reload(machine: Booted) -> None:
         what="rce-container is ready again",
     )
     assert main_pid(machine, "rce-container") == pid
+    await until(lambda: labels(machine) == [["reloaded"]], timeout=TIMEOUT_S, what="the master knows them")
+
+
+def labels(machine: Booted) -> list[list[str]]:
+    """Return the labels of the machines that have any, as the master knows them."""
     found = ask(machine, "GET", "/machines")["machines"]
-    assert [one["labels"] for one in found if one["labels"]] == [["reloaded"]]
+    return [one["labels"] for one in found if one["labels"]]
 
 
 def check_stop(machine: Booted) -> None:
