@@ -11,7 +11,7 @@ SERVER, FLEET, ALL = "server", "fleet", "all"
 
 _MODULES = {
     SERVER: ("aiohttp", "aiosqlite", "argon2", "cryptography", "numpy", "PIL", "prometheus_client", "rich"),
-    FLEET: ("aiohttp", "numpy", "pymunk"),
+    FLEET: ("aiohttp", "numpy", "PIL", "pymunk", "scipy"),
 }
 _ROLES = {
     "rce.cli.certificate": SERVER,
