@@ -4,6 +4,7 @@
 
     FleetError
     +-- MapError            a map or scenario file that cannot be read
+    +-- LogError            a log of laser scans, or a trajectory, that cannot be read
     +-- ScenarioError       no scenario of the requested size exists on the map
     +-- OccupiedError       a box cannot stand where a robot is
     +-- TransitionError     an event that the life cycle of a robot does not allow
@@ -101,3 +102,7 @@ class PlanWorkerError(FleetError):
             f"plan {self.number} for {self.robots} robots was not made: the process that makes plans ended"
             f" twice over it ({self.status}); read its output, and check that the container has enough memory"
         )
+
+
+class LogError(FleetError):
+    """A log of laser scans, or a trajectory, that cannot be read."""
