@@ -16,14 +16,15 @@ import numpy as np
 from rce.ros.tf import StampedTransform, Transform, frames
 from rce.ros.tf.broadcaster import KIND, TF
 from rce.ros.types import Time
-from rce_fleet.navigation.angles import quaternion_z
+from rce_fleet.geometry.angles import quaternion_z
 from rce_fleet.simulation.move_base import SimulatedMoveBase
 from rce_fleet.simulation.obstacles import hit_points
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher
     from rce.ros.types import Message
-    from rce_fleet.navigation.navigation import DriveLimits, Pose
+    from rce_fleet.geometry.poses import Pose
+    from rce_fleet.navigation.navigation import DriveLimits
     from rce_fleet.simulation.lidar import Floats
     from rce_fleet.simulation.move_base import Goal
     from rce_fleet.simulation.world import World

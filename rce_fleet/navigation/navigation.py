@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from math import atan2, cos, hypot, inf, sqrt
 from typing import TYPE_CHECKING
 
-from rce_fleet.navigation.angles import wrap
+from rce_fleet.geometry.angles import wrap
+from rce_fleet.geometry.poses import Pose, Twist
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,23 +38,6 @@ class DriveLimits:
     reach: float = 0.04
     facing: float = 0.35
     gap: float = 0.08
-
-
-@dataclass(frozen=True, slots=True)
-class Pose:
-    """A position and direction in the plane: metres, radians."""
-
-    x: float
-    y: float
-    yaw: float
-
-
-@dataclass(frozen=True, slots=True)
-class Twist:
-    """A forward speed, metres per second, and a turn rate, radians per second."""
-
-    speed: float = 0.0
-    turn_rate: float = 0.0
 
 
 class Navigator:

@@ -41,7 +41,7 @@ from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.revisions import numbered_array
 from rce_fleet.coordination.settings import FleetSettings
-from rce_fleet.navigation.angles import yaw_of
+from rce_fleet.geometry.angles import yaw_of
 from rce_fleet.navigation.occupancy import occupancy
 from rce_fleet.nodes.parameters import make_grid
 from rce_fleet.nodes.plan_worker import PlanWorker

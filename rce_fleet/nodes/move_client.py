@@ -21,7 +21,7 @@ from rce_fleet.coordination.move_client import (
     SendStop,
 )
 from rce_fleet.coordination.revisions import revision_of
-from rce_fleet.navigation.angles import quaternion_z
+from rce_fleet.geometry.angles import quaternion_z
 from rce_fleet.nodes.parameters import make_grid
 from rce_fleet.planning.grid import GridMap
 

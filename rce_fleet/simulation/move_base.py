@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rce_fleet.coordination.move_client import GoalState
-from rce_fleet.navigation.navigation import DriveLimits, Navigator, Pose, Twist
+from rce_fleet.geometry.poses import Pose, Twist
+from rce_fleet.navigation.navigation import DriveLimits, Navigator
 from rce_fleet.simulation.obstacles import blocked_cell, clear_ahead
 
 if TYPE_CHECKING:

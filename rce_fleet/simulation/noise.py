@@ -7,8 +7,8 @@ from math import cos, exp, sin, sqrt
 
 import numpy as np
 
-from rce_fleet.navigation.angles import wrap
-from rce_fleet.navigation.navigation import Pose
+from rce_fleet.geometry.angles import wrap
+from rce_fleet.geometry.poses import Pose
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from rce_fleet.navigation.navigation import Pose
+    from rce_fleet.geometry.poses import Pose
     from rce_fleet.planning.grid import GridMap
     from rce_fleet.simulation.lidar import Floats, LidarSpec
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pymunk
 
-from rce_fleet.navigation.angles import wrap
-from rce_fleet.navigation.navigation import Pose, Twist
+from rce_fleet.geometry.angles import wrap
+from rce_fleet.geometry.poses import Pose, Twist
 from rce_fleet.simulation.noise import NoiseSpec, Odometry, PoseEstimate
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import numpy as np
 import pymunk
 
 from rce_fleet.exceptions import OccupiedError
-from rce_fleet.navigation.navigation import Pose
+from rce_fleet.geometry.poses import Pose
 from rce_fleet.simulation.lidar import Floats, LidarSpec, cast
 from rce_fleet.simulation.noise import NoiseSpec
 from rce_fleet.simulation.robot import SimulatedRobot

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from rce_fleet.coordination.move_client import GoalState
 from rce_fleet.exceptions import OccupiedError
-from rce_fleet.navigation.angles import quaternion_z, wrap, yaw_of
-from rce_fleet.navigation.navigation import DriveLimits, Navigator, Pose, Twist
+from rce_fleet.geometry.angles import quaternion_z, wrap, yaw_of
+from rce_fleet.geometry.poses import Pose, Twist
+from rce_fleet.navigation.navigation import DriveLimits, Navigator
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.simulation.boxes import BoxKeeper
 from rce_fleet.simulation.lidar import LidarSpec, cast

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rce_fleet.drivers.report import look_at, read_report, write_report
-from rce_fleet.navigation.navigation import Twist
+from rce_fleet.geometry.poses import Twist
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.simulation.world import World
 

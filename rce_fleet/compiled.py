@@ -1,0 +1,174 @@
+"""Compiled inner loops: the only module that imports numba.
+
+A :class:`Kernel` is a function in two forms that give the same answer: a numpy one, which is used by default,
+and a loop that numba compiles. :func:`compile_kernels` compiles the loops of the modules that are imported so
+far; a node calls it while it starts, so that nothing compiles at a robot's first message::
+
+    def _sum_numpy(values): return float(values.sum())
+
+    @kernel("float64(float64[::1])", numpy=_sum_numpy)
+    def total(values):
+        result = 0.0
+        for value in values:
+            result += value
+        return result
+
+    compile_kernels()  # without this, total() is _sum_numpy()
+
+Compiled loops may call functions marked with :func:`helper`. They must not call themselves: numba's cache can
+end the process then.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterable
+from time import perf_counter
+from types import FunctionType
+from typing import Any, Generic, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_log = logging.getLogger(__name__)
+_SWITCH = "RCE_COMPILED"
+_OFF = ("0", "no", "false", "off")
+_kernels: list[Kernel[..., Any]] = []
+_helpers: dict[Callable[..., Any], Any] = {}
+
+
+class Kernel(Generic[P, R]):
+    """A function with a numpy form and a form to compile; see the module.
+
+    Attributes:
+        loop: The form to compile, as plain Python.
+        numpy: The numpy form.
+    """
+
+    def __init__(self, loop: Callable[P, R], signatures: tuple[str, ...], numpy: Callable[P, R]) -> None:
+        self.loop = loop
+        self.numpy = numpy
+        self.__name__ = loop.__name__
+        self.__doc__ = loop.__doc__
+        self._signatures = signatures
+        self._compiled: Callable[P, R] | None = None
+        self._used = numpy
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Run the form that is in use."""
+        return self._used(*args, **kwargs)
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether calls run the compiled loop."""
+        return self._used is self._compiled
+
+    def compile(self) -> Callable[P, R]:
+        """Compile the loop if that has not been done, and return it; calls still run what they ran before.
+
+        Raises:
+            ImportError: numba is not installed.
+        """
+        if self._compiled is None:
+            self._compiled = _jit(self.loop, list(self._signatures))
+        return self._compiled
+
+    def use_compiled(self) -> None:
+        """Compile the loop, and run it in calls from now on."""
+        self._used = self.compile()
+
+    def use_numpy(self) -> None:
+        """Run the numpy form in calls from now on."""
+        self._used = self.numpy
+
+
+def kernel(*signatures: str, numpy: Callable[P, R]) -> Callable[[Callable[P, R]], Kernel[P, R]]:
+    """Mark a loop that can be compiled.
+
+    Args:
+        signatures: numba's types of arguments and result, such as ``float64(float64[::1], int64)``.
+        numpy: The same function in numpy.
+    """
+
+    def mark(loop: Callable[P, R]) -> Kernel[P, R]:
+        made = Kernel(loop, signatures, numpy)
+        _kernels.append(made)
+        return made
+
+    return mark
+
+
+def helper(function: Callable[P, R]) -> Callable[P, R]:
+    """Mark a small function that compiled loops call; it stays plain Python for other callers."""
+    _helpers[function] = None
+    return function
+
+
+def is_available() -> bool:
+    """Return whether numba is installed and the variable ``RCE_COMPILED`` does not turn it off."""
+    if os.environ.get(_SWITCH, "").lower() in _OFF:
+        return False
+    try:
+        import numba  # noqa: F401  # only whether it is there
+    except ImportError:
+        return False
+    return True
+
+
+def compile_kernels(kernels: Iterable[Kernel[..., Any]] | None = None) -> bool:
+    """Compile these kernels now, by default all of the imported modules, and log one line.
+
+    Without numba, or with ``RCE_COMPILED=no``, they go on with numpy, and the line says so.
+
+    Returns:
+        Whether the kernels are compiled.
+    """
+    chosen = list(_kernels if kernels is None else kernels)
+    if not chosen:
+        return False
+    if not is_available():
+        _log.info(
+            "%d inner loops run in numpy; 'pip install rce[compiled]' makes them faster%s",
+            len(chosen),
+            f" ({_SWITCH} turns them off)" if _SWITCH in os.environ else "",
+        )
+        return False
+    begin = perf_counter()
+    for each in chosen:
+        each.use_compiled()
+    _log.info("%d inner loops compiled in %.1f s (numba)", len(chosen), perf_counter() - begin)
+    return True
+
+
+def _jit(function: Callable[..., Any], signatures: list[str] | None) -> Any:
+    """Compile a function with the helpers that it calls, from numba's cache on disk if it has one."""
+    import numba
+
+    assert isinstance(function, FunctionType)
+    names = {
+        name: _compiled_helper(value)
+        for name in function.__code__.co_names
+        if (value := function.__globals__.get(name)) is not None
+        and isinstance(value, FunctionType)
+        and value in _helpers
+    }
+    loop = function
+    if names:
+        loop = FunctionType(
+            function.__code__, {**function.__globals__, **names}, function.__name__, function.__defaults__
+        )
+        loop.__module__ = function.__module__
+        loop.__qualname__ = function.__qualname__
+    try:
+        return numba.njit(signatures, cache=True)(loop) if signatures else numba.njit(loop)
+    except RuntimeError as error:  # no folder can be written to for the cache
+        if "cannot cache" not in str(error):
+            raise
+        return numba.njit(signatures)(loop)
+
+
+def _compiled_helper(function: FunctionType) -> Any:
+    if _helpers[function] is None:
+        _helpers[function] = _jit(function, None)
+    return _helpers[function]

@@ -1,0 +1,1 @@
+"""Occupancy maps: the grid, ROS's files, distances, ranges. Pure."""
