@@ -43,7 +43,7 @@ from rce_fleet.coordination.revisions import numbered_array
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.geometry.angles import yaw_of
 from rce_fleet.navigation.occupancy import occupancy
-from rce_fleet.nodes.parameters import make_grid
+from rce_fleet.nodes.grid_parameters import make_grid
 from rce_fleet.nodes.plan_worker import PlanWorker
 from rce_fleet.nodes.state_publisher import StatePublisher
 
@@ -253,7 +253,7 @@ def _report(message: Message) -> ClientReport:
     )
 
 
-async def read_parameters(node: Node) -> dict[str, Any]:
+async def read_fleet_parameters(node: Node) -> dict[str, Any]:
     """Return the parameters of the namespace ``/fleet``, overridden by the node's private ones."""
     values: dict[str, Any] = {}
     for namespace in ("/fleet", "~"):
@@ -266,7 +266,7 @@ async def read_parameters(node: Node) -> dict[str, Any]:
 async def main() -> None:
     """Run the planner until the node is stopped."""
     async with Node("fleet_planner") as node:
-        values = await read_parameters(node)
+        values = await read_fleet_parameters(node)
         settings = FleetSettings(
             robot_radius=float(values.get("robot_radius", FleetSettings().robot_radius)),
             seed=int(values.get("seed", 0)),

@@ -22,7 +22,7 @@ from rce_fleet.coordination.move_client import (
 )
 from rce_fleet.coordination.revisions import revision_of
 from rce_fleet.geometry.angles import quaternion_z
-from rce_fleet.nodes.parameters import make_grid
+from rce_fleet.nodes.grid_parameters import make_grid
 from rce_fleet.planning.grid import GridMap
 
 if TYPE_CHECKING:

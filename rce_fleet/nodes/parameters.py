@@ -1,36 +1,52 @@
-"""The map that the fleet's nodes get by parameters."""
+"""Reads a node's private parameters into a dataclass, as all nodes of the fleet do.
+
+The node always starts: a value that cannot be used is reported as an error on ``/rosout``, and the default is
+used. An unknown parameter is a warning that names the nearest known one.
+"""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, TypeVar
 
-from rce_fleet.planning.grid import GridMap
-from rce_fleet.planning.movingai import read_map
+from rce_fleet.nodes.parameter_values import read_values, searched_names
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Sequence
+
+    from _typeshed import DataclassInstance
+
+    from rce.ros.node import Node
+
+T = TypeVar("T", bound="DataclassInstance")
 
 
-def make_grid(values: Mapping[str, Any]) -> GridMap:
-    """Return the map that parameters describe.
+async def read_parameters(node: Node, kind: type[T], *, unused: Sequence[str] = ()) -> T:
+    """Return a node's private parameters; report those that are unknown or cannot be used.
 
     Args:
-        values: ``map``, a file, or ``rows``, ``columns``, ``origin_x``, ``origin_y`` (metres) and ``walls``
-            (cells); and ``cell_size`` (metres).
+        node: A running node.
+        kind: A frozen dataclass that declares the parameters (:mod:`rce_fleet.nodes.parameter_values`).
+        unused: Names of parameters that ROS 1's node of this name has, and this one does not use.
 
     Raises:
-        ValueError: They do not describe a map.
-        MapError: The map file cannot be read.
-        OSError: The map file cannot be opened.
+        MasterUnreachableError: The master does not answer.
+
+    Example:
+        ```python
+        async with Node("amcl") as node:
+            parameters = await read_parameters(node, AmclParameters)
+        ```
     """
-    size = float(values.get("cell_size", 1.0))
-    if values.get("map"):
-        return read_map(Path(values["map"]), cell_size=size)
-    return GridMap(
-        rows=int(values.get("rows", 8)),
-        columns=int(values.get("columns", 8)),
-        cell_size=size,
-        origin=(float(values.get("origin_x", 0.0)), float(values.get("origin_y", 0.0))),
-        blocked=frozenset(int(cell) for cell in values.get("walls", [])),
-    )
+    found = await node.get_param("~", {})
+    outer = {}
+    for name in sorted(searched_names(kind)):
+        place = await node.search_param(name)
+        if place is not None:
+            outer[name] = await node.get_param(place, None)
+    prefix = node.resolve("~").rstrip("/") + "/"
+    values = found if isinstance(found, Mapping) else {}
+    parameters, problems = read_values(kind, values, outer=outer, prefix=prefix, unused=unused)
+    for problem in problems:
+        (node.log.warning if problem.is_unknown else node.log.error)("%s", problem.text)
+    return parameters

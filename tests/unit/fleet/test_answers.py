@@ -10,7 +10,7 @@ from rce.ros.types import TypeRegistry
 from rce_fleet.coordination.answers import Answer, answer_array, is_answer, read_answer
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.revisions import numbered_array, revision_of
-from rce_fleet.nodes.parameters import make_grid
+from rce_fleet.nodes.grid_parameters import make_grid
 
 CELLS = st.lists(st.integers(0, 2**31 - 1), max_size=5).map(tuple)
 PLACES = st.one_of(st.none(), st.integers(0, 2**31 - 1))
