@@ -14,7 +14,7 @@ from typing import Any
 import psutil
 
 from benchmarks.engine import BIN, RunningEngine, free_ports, pss
-from rce.config.resources import configs_dir
+from rce.config.folders import configs_dir
 from rce.ros.node import Node
 from rce.ros.types import Message
 from rce.supervision.process import Child

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from types import TracebackType
 
-    from rce.model.requests import Request
+    from rce.model import Request
 
 __all__ = ["Connection", "State"]
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, TypeVar, assert_never
 
 from msgspec.structs import replace
 
-from rce.model.requests import (
+from rce.model import (
     AddInterface,
     AddNode,
     ConfigureComponents,
@@ -24,7 +24,7 @@ from rce.model.requests import (
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rce.model.requests import Request
+    from rce.model import Request
 
 Item = TypeVar("Item")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from rce.model.names import Form, InterfaceType, Role
+from rce.model import Form, InterfaceType, Role
 from rce.protocol.codec import encode_data
 from rce.protocol.messages import NO_ID
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
 
-from rce.model.requests import AddInterface, ConfigureComponents
-from rce.model.specs import InterfaceSpec
+from rce.model import AddInterface, ConfigureComponents, InterfaceSpec
 from rce_client.services import ServiceClient, ServiceProvider
 from rce_client.topics import Publisher, Subscriber
 

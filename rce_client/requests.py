@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
-from rce.model.requests import (
+from rce.model import (
     AddInterface,
     AddNode,
     ConfigureComponents,
@@ -14,18 +14,19 @@ from rce.model.requests import (
     CreateContainer,
     DeleteParameter,
     DestroyContainer,
+    InterfaceSpec,
+    ParameterSpec,
     RemoveInterface,
     RemoveNode,
     ResizeContainer,
     SetParameter,
 )
-from rce.model.specs import InterfaceSpec, ParameterSpec
 from rce.model.spelling import PLAIN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rce.model.requests import Request
+    from rce.model import Request
     from rce.model.written import NetworkName, Quantity, RestartName, Value
 
 

@@ -8,7 +8,7 @@ import logging
 import uuid
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from rce.model.names import Role
+from rce.model import Role
 from rce.protocol.messages import CallId
 from rce_client.exceptions import CallError, CallTimeoutError, NotConnectedError
 from rce_client.interfaces import ClientInterface, InterfaceOwner

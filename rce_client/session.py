@@ -9,7 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Self, assert_never
 
 from rce.aio.tasks import TaskScope
-from rce.model.requests import (
+from rce.model import (
     ConfigureComponents,
     ConfigureConnections,
     CreateContainer,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
     from types import TracebackType
 
-    from rce.model.requests import Request
+    from rce.model import Request
     from rce.protocol.codec import Frame
     from rce.protocol.stream import Event
     from rce_client.exceptions import ClientError

@@ -8,7 +8,7 @@ import logging
 from collections import deque
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from rce.model.names import Role
+from rce.model import Role
 from rce.protocol.codec import encode
 from rce.protocol.messages import LatchedSources
 from rce_client.exceptions import InterfaceError

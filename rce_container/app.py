@@ -13,20 +13,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from rce.config.exceptions import ShippedFileError
-from rce.config.folders import default_state_dir, run_dir
-from rce.config.resources import examples_dir
+from rce.config.folders import default_state_dir, examples_dir, run_dir
 from rce.config.secret import Secret
 from rce.control.channel import TaskSetChannel
 from rce.control.contents import ContentClient
 from rce.control.dialing import RunDialer
-from rce.control.machine import MEMORY_PER_SLOT, machine_memory
 from rce.control.messages import MachineInfo
 from rce.link.address import in_url, is_any, own_address
 from rce.link.handover import LinkAcceptor
 from rce.link.listening import listen_on
 from rce.masters import Masters, split_addresses
+from rce.model import MEMORY_PER_SLOT
+from rce.own_process import end_signals, machine_memory
 from rce.ros.packages import PackageIndex, installed_shares
-from rce.supervision.signals import end_signals
 from rce.tls.choice import TlsChoice
 from rce.tls.identity import Context
 from rce_container.exceptions import RuntimeUnavailableError, StateError

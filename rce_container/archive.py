@@ -17,7 +17,7 @@ from typing import NamedTuple
 import msgspec
 from msgspec import Struct, field
 
-from rce.model.names import EndpointId
+from rce.model import EndpointId
 from rce_container.exceptions import StateError
 from rce_container.files import remove, size_of, write_whole
 from rce_container.logs import last_line

@@ -25,7 +25,7 @@ from rce.control.model import (
 )
 from rce.control.observed import ObservedStatus
 from rce.lifecycle import StateMachine
-from rce.model.specs import Resources
+from rce.model import Resources
 from rce_container.events import (
     Adopted,
     Apply,

@@ -28,8 +28,7 @@ from rce.control.model import (
 from rce.control.observed import ObservedStatus
 from rce.control.tags import Unknown
 from rce.link.handover import LinkAcceptor
-from rce.model.names import EndpointId
-from rce.model.specs import Resources
+from rce.model import EndpointId, Resources
 from rce_container import events, intake
 from rce_container.archive import LogArchive
 from rce_container.environment import messages as m

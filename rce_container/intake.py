@@ -24,7 +24,7 @@ from rce.control.model import (
     StatusPatch,
 )
 from rce.control.tags import Unknown
-from rce.model.names import is_name
+from rce.model import is_name
 from rce.protocol.printable import one_line
 from rce_container.environment import messages as m
 

@@ -8,8 +8,7 @@ import resource
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from rce.model.names import EndpointId
-from rce.model.specs import Network, Resources
+from rce.model import EndpointId, Network, Resources
 from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.exceptions import ContainerError, StartError, StateError

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, assert_never
 
 from rce.control.execution import FEATURE as EXEC
 from rce.control.execution import Command
-from rce.control.machine import cpu_seconds, resident_bytes
 from rce.control.messages import (
     CONTROL_VERSION,
     ClientReply,
@@ -40,7 +39,8 @@ from rce.control.messages import (
     Welcome,
 )
 from rce.control.model import PATCHES, EndpointStatus, LinkAddress
-from rce.model.names import EndpointId
+from rce.model import EndpointId
+from rce.own_process import cpu_seconds, resident_bytes
 from rce_container import core, events
 from rce_container.environment import messages as m
 from rce_container.environment import proc

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from rce.model.specs import Network
+from rce.model import Network
 from rce_container.exceptions import NetworkError, RuntimeUnavailableError
 from rce_container.network import Networks
 from rce_container.runtimes.base import Runtime

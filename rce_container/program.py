@@ -12,9 +12,9 @@ import uvloop
 from rce.config.exceptions import LogFileError, RunDirError, SecretError
 from rce.config.logs import log_as
 from rce.config.secret import load_secret
-from rce.guard.files import raise_file_limit
+from rce.own_process import raise_file_limit
 from rce.tls.choice import TlsChoice
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 from rce_container.app import App, package_path
 from rce_container.ending import end_containers
 from rce_container.exceptions import ContainerError

@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from rce.control.machine import MEGABYTE
+from rce.model import MEGABYTE
 from rce_container.archive import LOG_DAYS, LOG_SPACE
 from rce_container.packages.requirements import InstallerSettings
 from rce_container.uids import FIRST_UID, UIDS

@@ -9,9 +9,7 @@ import math
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
-from rce.control.machine import MEGABYTE, MIN_MEMORY
-from rce.model.quantities import write_cores, write_memory
-from rce.model.specs import Resources
+from rce.model import MEGABYTE, MIN_MEMORY, Resources, write_cores, write_memory
 from rce_master.usage import STEP_S, WINDOW_S, rates_between
 
 if TYPE_CHECKING:

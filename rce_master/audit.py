@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 from collections import OrderedDict, deque
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from msgspec import Struct
@@ -19,8 +20,10 @@ from rce.config.logs import redact
 from rce.protocol.printable import one_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
+
+    from rce_master.state.commands import Command
 
 _log = logging.getLogger(__name__)
 
@@ -35,6 +38,12 @@ REPEAT_S = 60.0
 """Refusals of the same user from the same address within this time are one record."""
 MAX_REPEATS = 1000
 MAX_TEXT = 300
+
+SHOWN = 5
+"""How many of a request's commands are named; the others are counted."""
+
+_UPPER = re.compile(r"(?<!^)(?=[A-Z])")
+_NAMES = ("container", "endpoint", "tag", "name", "tag_a", "tag_b")
 
 DONE, REFUSED = "done", "refused"
 
@@ -235,3 +244,21 @@ def _read(file: Path) -> Iterator[Record]:
             yield msgspec.json.decode(line, type=Record)
         except msgspec.MsgspecError:
             _log.warning("the audit log %s has an unreadable line", file)
+
+
+def describe(commands: Sequence[Command]) -> str:
+    """Return a short description of the commands of one request."""
+    words = [_describe(command) for command in commands[:SHOWN]]
+    more = len(commands) - len(words)
+    return ", ".join(words) + (f", and {more} more" if more else "")
+
+
+def _describe(command: Command) -> str:
+    action = _UPPER.sub(" ", type(command).__name__).lower()
+    names = [getattr(command, name, "") for name in _NAMES]
+    names += [_tag_of(getattr(command, part, None)) for part in ("node", "interface")]
+    return f"{action} {' '.join(name for name in names if name)}"
+
+
+def _tag_of(part: Any) -> str:
+    return str(getattr(part, "tag", ""))

@@ -23,7 +23,7 @@ from rce.control.messages import (
     Usage,
 )
 from rce_master import requests
-from rce_master.audit_words import describe
+from rce_master.audit import describe
 from rce_master.exceptions import (
     ForbiddenError,
     MasterError,

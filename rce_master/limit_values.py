@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.model.quantities import read_cores, read_memory
+from rce.model import read_cores, read_memory
 from rce_master.exceptions import InvalidRequestError
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import msgspec
 from rce.control.exceptions import ControlError
 from rce.control.logs import LogQuery
 from rce.control.messages import LogChunk, TaskSetKind
-from rce.model.names import EndpointId, is_name
+from rce.model import EndpointId, is_name
 from rce_master.exceptions import NotFoundError, TaskSetAwayError
 from rce_master.state.records import Container
 from rce_master.state.tables import Tables

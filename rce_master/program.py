@@ -12,10 +12,9 @@ import uvloop
 from rce.config.exceptions import LogFileError, RunDirError, SecretError
 from rce.config.logs import log_as
 from rce.config.secret import load_secret
-from rce.guard.files import raise_file_limit
-from rce.supervision.signals import end_signals
+from rce.own_process import end_signals, raise_file_limit
 from rce.tls.choice import TlsChoice
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 from rce_master.exceptions import MasterError
 from rce_master.master import Master, RunningMaster
 from rce_master.quotas import QuotaSettings

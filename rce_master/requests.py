@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rce.control.messages import ClientRequest
-    from rce.model.requests import Component, Request
+    from rce.model import Component, Request
 
 
 def count_items(request: ClientRequest) -> int:

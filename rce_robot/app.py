@@ -13,10 +13,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rce.config.exceptions import ShippedFileError
-from rce.config.folders import run_dir
-from rce.config.resources import examples_dir
+from rce.config.folders import examples_dir, run_dir
 from rce.control.channel import TaskSetChannel
-from rce.control.machine import machine_memory
 from rce.control.messages import MachineInfo
 from rce.control.model import LinkAddress
 from rce.guard.lobby import Lobby
@@ -26,9 +24,9 @@ from rce.link.listening import listen_on
 from rce.link.unix import remove_stale_sockets, socket_name
 from rce.lookups import LOOKUPS
 from rce.masters import Masters, split_addresses
+from rce.own_process import end_signals, machine_memory
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
-from rce.supervision.signals import end_signals
 from rce.tls.choice import TlsChoice, plain_warning
 from rce.tls.expiry import name_warning
 from rce_robot.conversion import ConversionPool

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, assert_never
 
-from rce.model.names import Role
+from rce.model import Role
 from rce_robot.services import AnsweredByRobot, AskedByRobot
 from rce_robot.topics import FromRobot, ToRobot
 

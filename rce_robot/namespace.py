@@ -17,7 +17,7 @@ from rce.aio.queues import OverflowPolicy
 from rce.control.model import EndpointUsage, InterfaceUsage
 from rce.guard.holdings import Holdings
 from rce.link import Endpoint, InterfaceError
-from rce.model.names import EndpointId, InterfaceType
+from rce.model import EndpointId, InterfaceType
 from rce_robot.exceptions import MisdirectedError
 from rce_robot.interfaces import make_interface
 from rce_robot.reporting import RobotReporter
@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from rce.guard.budget import Ledger
     from rce.guard.holdings import Holding
     from rce.link import Interface, LinkHub, Port
-    from rce.model.requests import Request
-    from rce.model.specs import InterfaceSpec
+    from rce.model import InterfaceSpec, Request
     from rce.protocol.messages import CallId, DataMessage
     from rce.protocol.stream import LargeData
     from rce_robot.conversion import ConversionPool, Result

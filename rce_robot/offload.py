@@ -13,7 +13,7 @@ from rce_robot.outgoing import Outgoing
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rce.model.specs import InterfaceSpec
+    from rce.model import InterfaceSpec
     from rce.protocol.stream import LargeData
     from rce_robot.conversion import Result
     from rce_robot.interface import RobotSide

@@ -10,10 +10,10 @@ import uvloop
 from rce.config.exceptions import LogFileError, RunDirError, SecretError
 from rce.config.logs import log_as
 from rce.config.secret import load_secret
-from rce.guard.files import raise_file_limit
+from rce.own_process import raise_file_limit
 from rce.ros.tcpros.allocator import keep_large_blocks
 from rce.tls.choice import TlsChoice
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 from rce_robot.app import App
 from rce_robot.settings import RobotSettings
 

@@ -12,7 +12,6 @@ import logging
 from typing import TYPE_CHECKING, Protocol, assert_never
 
 from rce.control.exceptions import ControlError
-from rce.control.machine import cpu_seconds, machine_memory, resident_bytes
 from rce.control.messages import (
     CONTROL_VERSION,
     TYPED_REQUESTS,
@@ -42,7 +41,8 @@ from rce.control.messages import (
 )
 from rce.control.model import PATCHES, StatusPatch
 from rce.guard.budget import Ledger
-from rce.model.names import EndpointId
+from rce.model import EndpointId
+from rce.own_process import cpu_seconds, machine_memory, resident_bytes
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.messages import type_of
 from rce.protocol.requests import write_request
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from rce.control.model import EndpointSpec, LinkAddress, SpecPatch
     from rce.guard.lobby import Lobby
     from rce.link import LinkHub
-    from rce.model.requests import Request
+    from rce.model import Request
     from rce.protocol.http import Credentials
     from rce_robot.conversion import ConversionPool
     from rce_robot.namespace import Forms

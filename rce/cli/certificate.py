@@ -11,7 +11,7 @@ import typer
 from rce.cli.options import Certificates
 from rce.tls.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS, RENEWAL_DAYS, Details
 from rce.tls.choice import default_folder
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 from rce.tls.folder import AUTHORITY, CertificateFolder
 
 T = TypeVar("T")

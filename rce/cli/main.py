@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import typer
 
 from rce import __version__
-from rce.cli.streams import open_missing_streams
-from rce.extras import missing_for
+from rce.cli.programs import missing_for
+from rce.own_process import open_missing_streams
 
 if TYPE_CHECKING:
     from collections.abc import Callable

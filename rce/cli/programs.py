@@ -1,12 +1,34 @@
-"""The programs of a server; they report missing packages of the extra ``server``."""
+"""The programs of a server, and the extras that each role needs beside the base.
+
+The base is what a robot needs. ``pyproject.toml`` names the packages of each extra. Programs and commands
+report what is missing.
+"""
 
 from __future__ import annotations
 
 import sys
 from importlib import import_module
+from importlib.util import find_spec
 
-from rce.cli.streams import open_missing_streams
-from rce.extras import missing_for
+from rce.own_process import open_missing_streams
+
+SERVER, FLEET, ALL = "server", "fleet", "all"
+
+_MODULES = {
+    SERVER: ("aiohttp", "aiosqlite", "argon2", "cryptography", "numpy", "PIL", "prometheus_client", "rich"),
+    FLEET: ("aiohttp", "numpy", "PIL", "pymunk", "scipy"),
+}
+_ROLES = {
+    "rce.cli.certificate": SERVER,
+    "rce.cli.up": SERVER,
+    "rce.cli.service": SERVER,
+    "rce_master": SERVER,
+    "rce_robot": SERVER,
+    "rce_container": SERVER,
+    "rce_fleet.station": FLEET,
+    "rce_fleet.drivers": FLEET,
+    "rce_fleet.demo": ALL,
+}
 
 
 def master() -> None:
@@ -29,3 +51,25 @@ def _run(program: str, package: str) -> None:
     if problem := missing_for(package):
         sys.exit(f"{program}: {problem}")
     import_module(f"{package}.__main__").main()
+
+
+def extra_of(module: str) -> str:
+    """Return the extra that a module of the project needs; empty for none.
+
+    Example::
+
+        extra_of("rce_master.cli.show")  # "server"
+    """
+    return next((extra for start, extra in _ROLES.items() if f"{module}.".startswith(f"{start}.")), "")
+
+
+def missing_for(module: str) -> str | None:
+    """Return how to install the missing packages of a module of the project; None if all are installed."""
+    extra = extra_of(module)
+    parts = (SERVER, FLEET) if extra == ALL else (extra,)
+    names = {name for part in parts for name in _MODULES.get(part, ())}
+    missing = sorted(name for name in names if find_spec(name) is None)
+    if not missing:
+        return None
+    be = "is" if len(missing) == 1 else "are"
+    return f"{', '.join(missing)} {be} not installed: pip install 'rce[{extra}]'"

@@ -22,9 +22,16 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from rce.config.exceptions import Fault
 from rce.config.items import MessageTypeName, RosName
 from rce.config.validation import Strict
-from rce.model.names import MAX_NAME_LENGTH, Form, InterfaceType, Role, is_name
-from rce.model.requests import AddInterface, Connection
-from rce.model.specs import InterfaceSpec
+from rce.model import (
+    MAX_NAME_LENGTH,
+    AddInterface,
+    Connection,
+    Form,
+    InterfaceSpec,
+    InterfaceType,
+    Role,
+    is_name,
+)
 from rce.model.written import ROS_NAME_PATTERN
 
 if TYPE_CHECKING:

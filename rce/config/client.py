@@ -18,7 +18,7 @@ from rce.config.exceptions import ConfigError, Fault
 from rce.config.items import Container, Interface, ItemOf, Link, Name, Node, Parameter
 from rce.config.validation import Strict, faults_of
 from rce.masters import split_addresses
-from rce.model.requests import (
+from rce.model import (
     AddInterface,
     AddNode,
     ConfigureComponents,
@@ -27,12 +27,12 @@ from rce.model.requests import (
     CreateContainer,
     DeleteParameter,
     DestroyContainer,
+    InterfaceSpec,
     RemoveInterface,
     RemoveNode,
     Request,
     SetParameter,
 )
-from rce.model.specs import InterfaceSpec
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

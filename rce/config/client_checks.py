@@ -13,11 +13,20 @@ from pydantic import ValidationError
 
 from rce.config.exceptions import Fault
 from rce.config.items import SPELLING
-from rce.model.checks import find_circle
-from rce.model.faults import join_path
-from rce.model.names import Form, Role, is_name
-from rce.model.requests import AddInterface, AddNode, Connection, CreateContainer, SetParameter, faults_of
-from rce.model.specs import Network
+from rce.model import (
+    AddInterface,
+    AddNode,
+    Connection,
+    CreateContainer,
+    Form,
+    Network,
+    Role,
+    SetParameter,
+    faults_of,
+    find_circle,
+    is_name,
+    join_path,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Iterator, Mapping

@@ -28,7 +28,7 @@ from msgspec.structs import fields as struct_fields
 from rce.config.documents import join
 from rce.config.exceptions import Fault
 from rce.masters import split_addresses
-from rce.model.quantities import read_cores, read_memory, write_memory
+from rce.model import read_cores, read_memory, write_memory
 
 _WORDS = {
     "int": "an integer",

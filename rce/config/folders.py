@@ -1,4 +1,4 @@
-"""The engine's folders for its state and its sockets."""
+"""The engine's folders: for its state and its sockets, and those that ship with the project."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ from typing import TYPE_CHECKING
 
 import platformdirs
 
-from rce.config.exceptions import RunDirError
+import rce
+from rce.config.exceptions import RunDirError, ShippedFileError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+
+_PACKAGE = Path(rce.__file__).resolve().parent
 
 
 def default_state_dir() -> Path:
@@ -62,3 +66,30 @@ def private_folder(path: Path) -> Path:
     except OSError as error:
         raise RunDirError(f"cannot use {path} for sockets: {error}") from error
     return path
+
+
+def examples_dir() -> Path:
+    """Return the folder of example packages.
+
+    Raises:
+        ShippedFileError: It was not shipped.
+    """
+    return _find("examples")
+
+
+def configs_dir() -> Path:
+    """Return the folder of example configs and default settings.
+
+    Raises:
+        ShippedFileError: It was not shipped.
+    """
+    return _find("configs")
+
+
+def _find(name: str) -> Path:
+    # A wheel holds the folders inside the package; a checkout has them beside it.
+    candidates = (_PACKAGE / "share" / name, _PACKAGE.parent / name)
+    for candidate in candidates:
+        if candidate.is_dir():
+            return candidate
+    raise ShippedFileError(f"folder {name!r} is neither {candidates[0]} nor {candidates[1]}")

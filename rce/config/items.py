@@ -17,16 +17,17 @@ from pydantic import Field as Option
 from pydantic_core import core_schema
 
 from rce.config.validation import Strict
-from rce.model import written
-from rce.model.requests import (
+from rce.model import (
     AddInterface,
     AddNode,
     Connection,
     CreateContainer,
+    InterfaceSpec,
     Item,
+    NodeSpec,
     SetParameter,
+    written,
 )
-from rce.model.specs import InterfaceSpec, NodeSpec
 from rce.model.spelling import Field, Spelling, camel, fields_of
 from rce.model.written import HUMAN_PATTERNS
 

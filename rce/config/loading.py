@@ -1,7 +1,11 @@
-"""Combines the engine's settings: defaults, the file, and the command line, which overrides it."""
+"""Combines the engine's settings: defaults, the file, and the command line, which overrides it.
+
+One program of the engine hands its settings to the next as a document (:func:`handed_over`).
+"""
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any
 
 from rce.config.documents import parse, read_file
@@ -10,7 +14,9 @@ from rce.config.fields import read_section, sections_of, write_section
 from rce.config.settings import LOOPBACK, PROGRAM_SECTIONS, EngineSettings
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
+
 
 _LOOPBACK_ONLY: dict[str, Any] = {
     "master_host": LOOPBACK,
@@ -82,3 +88,26 @@ def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
         inner = key in sections_of(EngineSettings)
         merged[key] = merged.get(key, {}) | value if inner else value
     return merged
+
+
+def handed_over(arguments: Sequence[str], *, master: bool = False) -> EngineSettings | None:
+    """Read a command line that consists of ``--settings JSON`` only.
+
+    Args:
+        arguments: The command line without the program.
+        master: Whether the settings must say where the master is.
+
+    Returns:
+        The settings. None if the command line has anything else, or if the document has a fault: then the
+        program's own reader of command lines reads it, and reports the fault.
+    """
+    match arguments:
+        case ["--settings", document]:
+            pass
+        case _:
+            return None
+    try:
+        settings = load_settings(None, read_document(json.loads(document), "--settings"))
+    except (json.JSONDecodeError, ConfigError):
+        return None
+    return None if master and not settings.master_host else settings

@@ -41,8 +41,7 @@ from rce.control.tags import Unknown
 from rce.control.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, MAX_TEXT, ControlTimeouts
 from rce.dialing import open_url_socket
 from rce.masters import Masters
-from rce.tls.exceptions import CertificateError
-from rce.tls.faults import explain_to_client
+from rce.tls.faults import CertificateError, explain_to_client
 from rce.tls.websocket import TlsClientConnection
 
 if TYPE_CHECKING:
@@ -52,7 +51,7 @@ if TYPE_CHECKING:
 
     from rce.config.secret import Secret
     from rce.control.messages import Hello, ToMaster, ToTaskSet
-    from rce.model.requests import Request
+    from rce.model import Request
     from rce.tls.identity import Context
 
 _log = logging.getLogger(__name__)

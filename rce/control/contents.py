@@ -21,8 +21,7 @@ from websockets.http11 import Response
 from rce.control.exceptions import ContentError
 from rce.control.timeouts import DEFAULT_TIMEOUTS, ControlTimeouts
 from rce.dialing import open_socket
-from rce.tls.exceptions import CertificateError
-from rce.tls.faults import explain_to_client
+from rce.tls.faults import CertificateError, explain_to_client
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

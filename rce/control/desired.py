@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping
 
     from rce.control.model import ConnectionSpec, LinkSpec, SpecPatch
-    from rce.model.specs import InterfaceSpec
+    from rce.model import InterfaceSpec
 
 K = TypeVar("K", bound="Hashable")
 V = TypeVar("V")

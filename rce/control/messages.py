@@ -31,7 +31,7 @@ from rce.control.model import (
     StatusPatch,
 )
 from rce.control.tags import TaggedReader
-from rce.model.requests import Request
+from rce.model import Request
 
 CONTROL_VERSION = 2
 ACCEPTED_VERSIONS = (1, CONTROL_VERSION)

@@ -12,7 +12,7 @@ from enum import Enum
 
 from msgspec import Struct, field
 
-from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec, Resources
+from rce.model import InterfaceSpec, NodeSpec, ParameterSpec, Resources
 
 PATCHES = "patches"
 """The feature of programs that take and send patches in place of whole specs and statuses."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from rce.guard.complaints import Complaints
 from rce.guard.lobby import address_of
+from rce.guard.rates import Complaints
 
 if TYPE_CHECKING:
     import asyncio

@@ -1,10 +1,19 @@
-"""Rate limits: a token bucket for each key (pure: the time is an argument)."""
+"""Rate limits: a token bucket for each key, and a log line for each address per interval.
+
+Pure: the time is an argument.
+"""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 
 MOST_KEYS = 16_384
+
+
+EVERY_S = 10.0
+"""Seconds between two complaints about an address."""
+_MOST = 1024
+"""Addresses that are remembered."""
 
 
 class Rates:
@@ -78,3 +87,24 @@ class Rates:
         self._buckets.move_to_end(key)
         if len(self._buckets) > self._most_keys:
             self._buckets.popitem(last=False)
+
+
+class Complaints:
+    """Decides which complaints are logged."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, float] = {}
+
+    def is_due(self, address: str, now: float) -> bool:
+        """Return whether to log a complaint about an address; if so, it counts as logged.
+
+        Args:
+            address: The peer's address.
+            now: Seconds that never go back.
+        """
+        if now - self._last.get(address, -EVERY_S) < EVERY_S:
+            return False
+        if len(self._last) >= _MOST:
+            self._last.clear()
+        self._last[address] = now
+        return True

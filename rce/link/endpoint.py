@@ -13,11 +13,8 @@ from rce.aio.tasks import BackgroundTasks
 from rce.control.desired import DesiredState, Difference
 from rce.control.model import EndpointKind, EndpointSpec
 from rce.guard.holdings import Holdings
-from rce.link.carrier import LocalCarrier
 from rce.link.channel import Channel
-from rce.link.dialer import keep_dialed
-from rce.link.link import Link, add_traffic
-from rce.link.pacing import Pacer
+from rce.link.links import EndpointLinks, is_same_link
 from rce.link.queues import Backlog
 from rce.link.slot import InterfaceSlot
 from rce.link.wiring import ChannelTable, Refusals, WiringNews
@@ -25,12 +22,11 @@ from rce.link.wiring import ChannelTable, Refusals, WiringNews
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from rce.control.model import ConnectionSpec, InterfaceUsage, LinkSpec, SpecPatch
-    from rce.link.carrier import Carrier
+    from rce.control.model import ConnectionSpec, InterfaceUsage, SpecPatch
     from rce.link.hub import LinkHub
     from rce.link.interface import InterfaceFactory
-    from rce.model.names import EndpointId
-    from rce.model.specs import InterfaceSpec
+    from rce.link.link import Link
+    from rce.model import EndpointId, InterfaceSpec
 
 _log = logging.getLogger(__name__)
 
@@ -64,9 +60,6 @@ class Endpoint:
         self._on_change = on_change
         self._on_fault = on_fault
         self._slots: dict[str, InterfaceSlot] = {}
-        self._links: dict[str, Link] = {}
-        self._far_ends: dict[str, Link] = {}
-        """The other ends of links of this endpoint with itself."""
         self._channels = ChannelTable()
         self._desired = DesiredState(EndpointSpec(id=str(id), kind=EndpointKind.ROBOT, revision=-1))
         self._due = Difference()
@@ -74,13 +67,10 @@ class Endpoint:
         self._news = WiringNews()
         self._backlog = Backlog(on_growth)
         self._holdings = Holdings(on_growth)
-        self._on_growth = on_growth
-        self._pacer: Pacer | None = None
-        self._former_traffic = (0, 0)
         self._refused = Refusals()
         self._starts: dict[InterfaceSlot, asyncio.Task[None]] = {}
-        self._dials: dict[Link, asyncio.Task[None]] = {}
         self._tasks = BackgroundTasks()
+        self._links = EndpointLinks(id, hub, self._tasks, on_growth)
         self._lock = asyncio.Lock()
         self._notice: asyncio.Handle | None = None
         self._closed = False
@@ -121,16 +111,12 @@ class Endpoint:
     @property
     def traffic(self) -> tuple[int, int]:
         """Bytes that came in and that went out on all sockets of its links, with headers."""
-        total = self._former_traffic
-        for link in self._links.values():
-            total = add_traffic(total, link.traffic)
-        return total
+        return self._links.traffic
 
     @property
     def waiting_bytes(self) -> int:
         """Payload bytes that are held: to be sent, to be answered, incomplete, or latched."""
-        unfinished = sum(link.unfinished_bytes for link in self._links.values())
-        return self._backlog.bytes + self._holdings.bytes + unfinished
+        return self._backlog.bytes + self._holdings.bytes + self._links.unfinished_bytes
 
     def shed(self, size: int) -> None:
         """Drop held payloads until ``size`` bytes are free, or nothing is left to drop.
@@ -150,7 +136,7 @@ class Endpoint:
         The oldest go first, of the links on which most is incomplete.
         """
         goal = self.waiting_bytes - size
-        for link in sorted(self._links.values(), key=lambda link: -link.unfinished_bytes):
+        for link in sorted(self._links, key=lambda link: -link.unfinished_bytes):
             if self.waiting_bytes > goal:
                 link.drop_unfinished(self.waiting_bytes - goal)
 
@@ -188,27 +174,14 @@ class Endpoint:
         async with self._lock:
             self._closed = True
             self._drop_channels(list(self._channels))
-            carriers = self._drop_links(list(self._links.values()))
+            carriers = self._links.drop(list(self._links))
             await self._close_slots(list(self._slots.values()))
             await self._tasks.close()
             for carrier in carriers:
                 await carrier.wait_closed()
-            self._limit(0)
+            self._links.limit(0)
             if self._notice is not None:
                 self._notice.cancel()
-
-    # The limit
-
-    def _limit(self, rate: int) -> None:
-        """Let ``rate`` bytes per second pass on all links together; 0 for any number."""
-        if rate and self._pacer is not None:
-            self._pacer.change(rate)
-        elif rate or self._pacer is not None:
-            former, self._pacer = self._pacer, Pacer(rate) if rate else None
-            for link in self._links.values():
-                link.pace(self._pacer)
-            if former is not None:
-                former.close()
 
     # What is due
 
@@ -216,7 +189,7 @@ class Endpoint:
         """Do what is due. If this is cancelled, it is due again the next time."""
         due, desired = self._due, self._desired
         if due.contents:
-            self._limit(desired.contents.resources.bandwidth)
+            self._links.limit(desired.contents.resources.bandwidth)
         self._refused.review(due.interfaces, due.connections, desired)
         slots = [
             slot
@@ -227,14 +200,14 @@ class Endpoint:
             link
             for link_id in due.links
             if (link := self._links.get(link_id)) is not None
-            and not _is_same_link(link.spec, desired.links.get(link_id))
+            and not is_same_link(link.spec, desired.links.get(link_id))
         ]
         for tag in due.interfaces:
             due.connections.update(dict.fromkeys(desired.connections_at(tag)))
         for link_id in due.links:
             due.connections.update(dict.fromkeys(desired.connections_on(link_id)))
         self._drop_channels(self._stale_channels(due, slots, gone))
-        self._drop_links(gone)
+        self._links.drop(gone)
         await self._close_slots(slots)
         self._add(due)
         self._due = Difference()
@@ -261,18 +234,6 @@ class Endpoint:
             channel.slot.remove(channel)
             self._channels.remove(channel)
             self._news.changed_connections[channel.number] = None
-
-    def _drop_links(self, links: list[Link]) -> list[Carrier]:
-        """Forget links; return the carriers that are still closing."""
-        for link in links:
-            self._hub.unregister(link)
-            self._stop_dialing(link)
-            del self._links[link.spec.id]
-        links += [far for link in links if (far := self._far_ends.pop(link.spec.id, None)) is not None]
-        carriers = [carrier for link in links if (carrier := link.detach()) is not None]
-        for link in links:
-            self._former_traffic = add_traffic(self._former_traffic, link.traffic)
-        return carriers
 
     async def _close_slots(self, slots: list[InterfaceSlot]) -> None:
         """Close interfaces, all at the same time; cancelling this does not stop the closing."""
@@ -304,7 +265,7 @@ class Endpoint:
         desired = self._desired
         for link_id in due.links:
             if (link := desired.links.get(link_id)) is not None:
-                self._put_link(link)
+                self._links.put(link)
         for tag in due.interfaces:
             interface = desired.interfaces.get(tag)
             if interface is not None and tag not in self._slots and not self._refused.has_interface(tag):
@@ -316,34 +277,6 @@ class Endpoint:
             for end in self._ends(connection):
                 if not self._channels.has(end) and not self._refused.has_connection(number):
                     self._add_channel(connection, end)
-
-    def _put_link(self, spec: LinkSpec) -> None:
-        link = self._links.get(spec.id)
-        if link is None:
-            link = self._links[spec.id] = Link(spec, self._hub.limits, self._on_growth)
-            link.pace(self._pacer)
-            if spec.peer == str(self.id):
-                self._far_ends[spec.id] = _bend_back(link)
-            elif spec.dial:
-                self._dial(link)
-            else:
-                self._hub.register(link)
-        elif link.spec != spec:
-            moved = spec.dial and link.spec.address != spec.address
-            link.spec = spec
-            if moved and (link.carrier is None or link.carrier.kind != "local"):
-                self._stop_dialing(link)
-                link.detach()
-                self._dial(link)
-
-    def _dial(self, link: Link) -> None:
-        task = self._tasks.spawn(keep_dialed(link, self._hub), name=f"{self.id} dials {link.spec.peer}")
-        self._dials[link] = task
-
-    def _stop_dialing(self, link: Link) -> None:
-        task = self._dials.pop(link, None)
-        if task is not None:
-            task.cancel()
 
     def _add_slot(self, spec: InterfaceSpec) -> None:
         try:
@@ -387,7 +320,7 @@ class Endpoint:
             self._on_fault(f"connection {end.id}: there is no {missing}")
             return
         if end is not connection:
-            link = self._far_ends[end.link]
+            link = self._links.far_end(end.link)
         channel = Channel(end, slot, link, self._backlog)
         self._channels.add(channel)
         slot.add(channel)
@@ -407,17 +340,3 @@ class Endpoint:
     def _tell(self) -> None:
         self._notice = None
         self._on_change()
-
-
-def _bend_back(link: Link) -> Link:
-    """Make the other end of the link of an endpoint with itself, and join the two for good."""
-    far = Link(link.spec, link.limits)
-    one, other = LocalCarrier.pair()
-    link.attach(one)
-    far.attach(other)
-    return far
-
-
-def _is_same_link(old: LinkSpec, new: LinkSpec | None) -> bool:
-    """Whether a link can continue under a new spec: another address or token does not end it."""
-    return new is not None and (old.peer, old.dial) == (new.peer, new.dial)

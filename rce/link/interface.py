@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 if TYPE_CHECKING:
-    from rce.model.specs import InterfaceSpec
+    from rce.model import InterfaceSpec
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
 """A payload to send. It is not copied where that can be avoided: do not change it afterwards."""

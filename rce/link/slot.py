@@ -11,7 +11,7 @@ from rce.link.channel import as_payload
 from rce.link.exceptions import MessageTooLargeError, NotConnectedError
 from rce.link.latch import HeardSources, LatchedMessages
 from rce.link.queues import Counters
-from rce.model.names import InterfaceType, Role
+from rce.model import InterfaceType, Role
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rce.link.channel import Channel
     from rce.link.interface import Buffer, Interface, InterfaceFactory
     from rce.link.settings import LinkLimits, LinkTimeouts
-    from rce.model.specs import InterfaceSpec
+    from rce.model import InterfaceSpec
 
 _log = logging.getLogger(__name__)
 

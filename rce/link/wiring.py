@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rce.control.desired import DesiredState
     from rce.control.model import ConnectionSpec
     from rce.link.channel import Channel
-    from rce.model.specs import InterfaceSpec
+    from rce.model import InterfaceSpec
 
 
 @dataclass(slots=True)

@@ -17,6 +17,12 @@ from __future__ import annotations
 import re
 from decimal import Decimal, InvalidOperation
 
+MEGABYTE = 1 << 20
+"""Bytes of 1 MB, wherever memory is given in MB."""
+MIN_MEMORY = 32 * MEGABYTE
+"""Least memory of a container (bytes): its environment alone needs most of this."""
+MEMORY_PER_SLOT = 64 * MEGABYTE
+"""A machine offers one slot for so many bytes of its memory, unless its operator says otherwise."""
 MAX_CORES = 2**16
 MAX_MEMORY = 2**44
 """Bytes."""

@@ -3,5 +3,5 @@
 - :mod:`rce.packages.folder` inspects a package's folder and packs it;
 - :mod:`rce.packages.archive` reads and writes archives; it trusts nothing that it reads;
 - :mod:`rce.packages.contents` inspects an archive; :mod:`rce.packages.unpacking` unpacks it to a disk;
-- :mod:`rce.packages.signing` makes keys and signatures; :mod:`rce.packages.versions` orders versions.
+- :mod:`rce.packages.signing` makes keys and signatures; :mod:`rce.model.names` orders versions.
 """

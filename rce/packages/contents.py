@@ -8,7 +8,7 @@ from typing import BinaryIO
 
 from msgspec import Struct
 
-from rce.model.names import is_name
+from rce.model import is_name
 from rce.packages import requirements
 from rce.packages.archive import read_archive
 from rce.packages.exceptions import BadArchiveError

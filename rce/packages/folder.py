@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from rce.model.names import is_version
+from rce.model import is_version
 from rce.packages import ignore
 from rce.packages.archive import ArchiveWriter, make_header
 from rce.packages.contents import Contents, describe

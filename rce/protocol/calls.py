@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rce.model.names import is_name
+from rce.model import is_name
 from rce.protocol.limits import MAX_MESSAGE_ID_LENGTH
 from rce.protocol.messages import NO_ID, CallId
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.model.faults import FaultCode, FieldFault
+from rce.model import FaultCode, FieldFault
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -14,7 +14,7 @@ from urllib.parse import parse_qs, parse_qsl
 
 import msgspec
 
-from rce.model.names import is_name
+from rce.model import is_name
 from rce.protocol.exceptions import HandshakeError
 
 if TYPE_CHECKING:

@@ -11,12 +11,13 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 
 from msgspec import Meta, Struct, field
 
-from rce.model.faults import FaultCode, Path
-from rce.model.requests import (
+from rce.model import (
     ConfigureComponents,
     ConfigureConnections,
     CreateContainer,
     DestroyContainer,
+    FaultCode,
+    Path,
     Request,
     ResizeContainer,
 )

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rce.model.faults import FaultCode
+from rce.model import FaultCode
 from rce.protocol.calls import call_at
 from rce.protocol.messages import ErrorReport
 
 if TYPE_CHECKING:
-    from rce.model.faults import Path
+    from rce.model import Path
 
 
 def write_report(report: ErrorReport) -> dict[str, Any]:

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rce.model.faults import FaultCode, FieldFault, SpecError
-from rce.model.requests import (
+from rce.model import (
     AddInterface,
     AddNode,
     ConfigureComponents,
@@ -17,14 +16,18 @@ from rce.model.requests import (
     CreateContainer,
     DeleteParameter,
     DestroyContainer,
+    FaultCode,
+    FieldFault,
+    InterfaceSpec,
     Item,
+    NodeSpec,
     RemoveInterface,
     RemoveNode,
     Request,
     ResizeContainer,
     SetParameter,
+    SpecError,
 )
-from rce.model.specs import InterfaceSpec, NodeSpec
 from rce.model.spelling import Spelling, camel, short
 from rce.protocol.exceptions import MessageError
 from rce.protocol.messages import REQUEST_TYPES

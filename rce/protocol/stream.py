@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from msgspec import Struct
 
-from rce.model.faults import FieldFault
+from rce.model import FieldFault
 from rce.protocol.assembler import Assembler, Binary
 from rce.protocol.calls import call_at, call_of
 from rce.protocol.exceptions import MessageError, ProtocolError

@@ -194,3 +194,7 @@ class ServiceFaultError(ServiceError):
 
 class NodeClosedError(RosError):
     """The node was used before it started or after it ended."""
+
+
+class ToolError(Exception):
+    """The command cannot be done; its text says why and what to do."""

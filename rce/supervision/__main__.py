@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import uvloop
 
+from rce.own_process import end_signals
 from rce.supervision.plan import Plan
 from rce.supervision.prefork import Prepared, prepare
-from rce.supervision.signals import end_signals
 from rce.supervision.supervisor import StartError, Supervisor
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

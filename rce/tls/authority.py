@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rce.config.folders import default_state_dir
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 from rce.tls.identity import TlsFiles, TlsIdentity
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING
 
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -5,6 +5,11 @@ from __future__ import annotations
 import ssl
 from datetime import UTC, datetime
 
+
+class CertificateError(Exception):
+    """A certificate or its key cannot be made, read or used; the text says which and what to do."""
+
+
 _PLAIN = (
     "the server does not speak TLS at this port; remove --tls, or use http:// (ws://), where the network is"
     " trusted, or start the engine with --tls"

@@ -29,7 +29,7 @@ from rce.tls.authority import (
     make_authority,
     read_details,
 )
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 from rce.tls.revocation import Record, Revocation, make_list, read_list
 
 if TYPE_CHECKING:

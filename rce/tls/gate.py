@@ -15,11 +15,10 @@ import socket
 from typing import TYPE_CHECKING, cast
 
 from rce.aio.tasks import BackgroundTasks
-from rce.guard.complaints import Complaints
 from rce.guard.lobby import address_of
+from rce.guard.rates import Complaints
 from rce.tls.alerts import alert_of
-from rce.tls.exceptions import CertificateError
-from rce.tls.faults import explain_to_server
+from rce.tls.faults import CertificateError, explain_to_server
 
 if TYPE_CHECKING:
     from rce.guard.lobby import Lobby

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 from rce.tls.alerts import AlertingContext
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 
 if TYPE_CHECKING:
     from collections.abc import Callable

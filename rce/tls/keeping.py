@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ipaddress
+import socket
 from typing import TYPE_CHECKING
 
 from rce.lookups import LOOKUPS
 from rce.masters import split_addresses
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Iterable
 
     from rce.config.settings import EngineSettings
 
 CHECK_EVERY_S = 6 * 3600.0
+
+
+_NAME_SIGNS = str.maketrans("", "", "-._")
+_INTERNET = (socket.AF_INET, socket.AF_INET6)
 
 
 @contextlib.asynccontextmanager
@@ -57,7 +63,6 @@ def ensure(settings: EngineSettings, full_name: str) -> str:
         CertificateError: They cannot be made.
     """
     from rce.tls.folder import CertificateFolder  # takes 10 MB, which only engines with TLS spend
-    from rce.tls.hosts import own_hosts
 
     binds = (settings.master.bind, settings.robot.bind, settings.container.bind)
     named = (*split_addresses(settings.master_host), settings.robot.public_host or "", *binds)
@@ -74,3 +79,24 @@ async def _keep(settings: EngineSettings, say: Callable[[str], None]) -> None:
             done = f"cannot renew certificates: {error}"
         if done:
             say(done)
+
+
+def own_hosts(more: Iterable[str] = ()) -> tuple[str, ...]:
+    """Return this machine's names and addresses, and those of ``more`` that name a machine.
+
+    No name server is asked.
+    """
+    import psutil
+
+    found = ["localhost", "127.0.0.1", "::1", socket.gethostname()]
+    for addresses in psutil.net_if_addrs().values():
+        found += [address.address for address in addresses if address.family in _INTERNET]
+    return tuple(dict.fromkeys(host for host in (*found, *more) if _is_useful(host)))
+
+
+def _is_useful(host: str) -> bool:
+    try:
+        address = ipaddress.ip_address(host.partition("%")[0])
+    except ValueError:
+        return host.isascii() and host.translate(_NAME_SIGNS).isalnum()
+    return not address.is_link_local and not address.is_unspecified

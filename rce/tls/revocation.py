@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from rce.tls.authority import CLOCK_SKEW, Issued
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 
 
 class Record(msgspec.Struct, frozen=True):

@@ -15,15 +15,15 @@ import typer
 import uvloop
 
 from rce.cli.options import Authority
-from rce.cli.streams import open_missing_streams
 from rce.config.documents import read_file
 from rce.config.exceptions import ConfigError, ShippedFileError
+from rce.config.folders import examples_dir
 from rce.config.logs import start_logging
-from rce.config.resources import examples_dir
+from rce.own_process import open_missing_streams
 from rce.ros.errors import RosError
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 from rce.tls.identity import client_contexts
 from rce_client.connection import Connection, State
 from rce_client.exceptions import ClientError

@@ -7,7 +7,7 @@ import contextlib
 import itertools
 from typing import TYPE_CHECKING, assert_never
 
-from rce.model.names import Role
+from rce.model import Role
 from rce.ros.errors import MasterError
 from rce.ros.node import Node
 

@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rce.config.exceptions import ConfigError, Fault
-from rce.model.names import Form, InterfaceType, Role
-from rce.model.requests import ConfigureComponents
+from rce.model import ConfigureComponents, Form, InterfaceType, Role
 from rce.ros.types import TypesError
 
 if TYPE_CHECKING:
     from rce.config.client import ClientConfig
-    from rce.model.requests import Request
+    from rce.model import Request
     from rce.ros.types import TypeRegistry
 
 

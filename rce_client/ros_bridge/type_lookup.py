@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, assert_never
 
 from rce.config.bridges import action_of
 from rce.config.exceptions import ConfigError, Fault
-from rce.ros.errors import RosError
+from rce.ros.errors import RosError, ToolError
 from rce.ros.node.master import MasterClient
-from rce.ros.tools.exceptions import ToolError
 from rce.ros.tools.graph import service_type
 from rce.ros.xmlrpc import RpcClient
 

@@ -25,7 +25,7 @@ from rce.control.model import (
 from rce.control.tags import Unknown
 from rce.link import Endpoint, LinkHub
 from rce.link.handover import HandoverReceiver
-from rce.model.names import EndpointId
+from rce.model import EndpointId
 from rce_container.environment import messages as m
 from rce_container.environment.channel import Channel, accept
 from rce_container.environment.exceptions import ChannelError

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rce.link import Interface, Port
-    from rce.model.specs import ParameterValue
+    from rce.model import ParameterValue
 
 
 class GraphError(Exception):

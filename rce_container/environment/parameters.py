@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from rce.model.specs import ParameterSpec, ParameterValue
+from rce.model import ParameterSpec, ParameterValue
 from rce.ros import names
 from rce.ros.packages import PackageIndex
 from rce.ros.substitution import substitute

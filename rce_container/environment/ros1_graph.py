@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Mapping
 
     from rce.link import Interface, Port
-    from rce.model.specs import ParameterValue
+    from rce.model import ParameterValue
     from rce.ros.packages import PackageIndex
     from rce_container.environment.graph import NodeListener, Subscription
 

@@ -14,8 +14,7 @@ from typing import NamedTuple
 import msgspec
 
 from rce.control.model import EndpointSpec, PackageSpec
-from rce.model.specs import InterfaceSpec, NodeSpec
-from rce.packages.versions import newest, split_package
+from rce.model import InterfaceSpec, NodeSpec, newest, split_package
 from rce.ros.packages import PATH_VARIABLES, PackageIndex
 
 REQUIREMENTS = ".requirements"

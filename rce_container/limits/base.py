@@ -9,8 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from typing import ClassVar, NamedTuple, Protocol
 
-from rce.control.machine import MEGABYTE, MIN_MEMORY
-from rce.model.specs import Resources
+from rce.model import MEGABYTE, MIN_MEMORY, Resources
 
 
 class Limits(NamedTuple):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from rce.control.machine import MEGABYTE
-from rce.model.specs import Resources
+from rce.model import MEGABYTE, Resources
 from rce_container.exceptions import LimitError
 from rce_container.limits.base import ControlGroup, SlotSettings, in_megabytes, limits_of
 

@@ -1,11 +1,13 @@
-"""Chooses the address of a container in its group. Pure."""
+"""Chooses the address of a container in its group, and writes its file ``/etc/hosts``. Pure."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from ipaddress import AddressValueError, IPv4Interface, IPv4Network, NetmaskValueError
 
 from rce_container.exceptions import NetworkError
+
+MAX_HOSTNAME = 63
 
 DEFAULT_NETWORK = IPv4Network("10.77.0.0/24")
 """The network of groups whose containers name no addresses. All groups may use it: they are separate."""
@@ -72,3 +74,20 @@ def _free(network: IPv4Network, taken: Mapping[IPv4Interface, str]) -> IPv4Inter
         if address not in taken:
             return address
     raise NetworkError(f"the group has no free address left in {network}; give its containers groupIps")
+
+
+def hostname(tag: str) -> str:
+    """Return the host name of the container with this tag."""
+    return tag[:MAX_HOSTNAME]
+
+
+def hosts_text(tag: str, members: Iterable[tuple[str, str]] = ()) -> str:
+    """Return the contents of a container's ``/etc/hosts``.
+
+    Args:
+        tag: The container's.
+        members: Tag and address of each container of its group, itself included; empty without a group.
+    """
+    lines = [f"{address} {hostname(name)}" for name, address in sorted(members)]
+    own = "" if lines else f" {hostname(tag)}"
+    return "\n".join([f"127.0.0.1 localhost{own}", *lines, ""])

@@ -12,11 +12,10 @@ from ipaddress import IPv4Interface
 from pathlib import Path
 from typing import NamedTuple
 
-from rce.model.names import EndpointId
+from rce.model import EndpointId
 from rce_container.exceptions import NetworkError
 from rce_container.folder import Record
-from rce_container.network.addresses import choose
-from rce_container.network.hosts import hosts_text
+from rce_container.network.addresses import choose, hosts_text
 from rce_container.network.namespaces import configure, make_namespace, open_namespace
 
 _log = logging.getLogger(__name__)

@@ -23,9 +23,8 @@ from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
 from rce.packages.signing import statement, verify
 from rce.packages.unpacking import unpack
 from rce_container.files import remove, size_of
-from rce_container.packages.disk import forget_before_boot, in_thread, scratch_aside
+from rce_container.packages.disk import Locks, forget_before_boot, in_thread, scratch_aside
 from rce_container.packages.exceptions import FetchError, NoSpaceError, PackageTroubleError, VerificationError
-from rce_container.packages.locks import Locks
 
 Fetch = Callable[[str, int], Awaitable[Piece]]
 """Fetches a piece of a content by its hash and an offset; raises :class:`ContentError`."""

@@ -7,11 +7,15 @@ import contextlib
 import os
 import shutil
 import tempfile
+from collections import Counter, defaultdict
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from rce_container.files import remove
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -107,3 +111,28 @@ def _linked(source: str, target: Path) -> bool:
     except OSError:
         return False  # another disk, or too many links: a copy does it
     return True
+
+
+class Locks:
+    """A lock for each key."""
+
+    def __init__(self) -> None:
+        self._locks: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._busy: Counter[str] = Counter()
+        """How many tasks hold or wait for each lock."""
+
+    def __contains__(self, key: str) -> bool:
+        """Return whether a task holds or waits for a lock."""
+        return key in self._busy
+
+    @contextlib.asynccontextmanager
+    async def of(self, key: str) -> AsyncIterator[None]:
+        """Hold the lock of a key."""
+        self._busy[key] += 1
+        try:
+            async with self._locks[key]:
+                yield
+        finally:
+            self._busy[key] -= 1
+            if not self._busy[key]:
+                del self._busy[key], self._locks[key]

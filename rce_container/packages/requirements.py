@@ -22,9 +22,8 @@ from rce.packages.requirements import FILE_NAME, read_requirements
 from rce.ros.packages import MANIFESTS, BadPackageError, parse_manifest
 from rce_container.exceptions import RuntimeUnavailableError
 from rce_container.files import remove, size_of
-from rce_container.packages.disk import forget_before_boot, in_thread, scratch_aside
+from rce_container.packages.disk import Locks, forget_before_boot, in_thread, scratch_aside
 from rce_container.packages.exceptions import RequirementsTroubleError
-from rce_container.packages.locks import Locks
 from rce_container.runtimes.namespace import interpreter_paths, read_only_mounts, system_mounts
 
 BUILD = "/build"

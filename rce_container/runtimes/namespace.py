@@ -30,7 +30,7 @@ from rce_container.forkserver.confine import USER_ID
 from rce_container.forkserver.messages import SpawnRequest
 from rce_container.forkserver.mounts import HOME, LOGS, TEMPORARY
 from rce_container.forkserver.process import ForkServer
-from rce_container.network.hosts import hostname, hosts_text
+from rce_container.network.addresses import hostname, hosts_text
 from rce_container.runtimes.base import Order, Runtime, clean_environ, source_root
 from rce_container.runtimes.held import HOLDER, HeldHandle
 from rce_container.seccomp.library import FilterUnavailableError, make_filter

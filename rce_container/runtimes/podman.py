@@ -23,7 +23,7 @@ from pathlib import Path
 
 from rce_container.exceptions import RuntimeUnavailableError, StartError
 from rce_container.forkserver.mounts import HOME, LOGS
-from rce_container.network.hosts import hostname
+from rce_container.network.addresses import hostname
 from rce_container.runtimes.base import Order
 from rce_container.runtimes.held import HOLDER, HeldHandle
 from rce_container.runtimes.namespace import (

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _MARK = "answer="
+_NUMBER = "revision="
 _NONE = -1
 
 
@@ -65,3 +66,18 @@ def read_answer(labels: Sequence[str], sizes: Sequence[int], data: Sequence[int]
     cells, progress, blocked = (tuple(data[begin:end]) for begin, end in pairwise(ends))
     reached, target = (None if cell == _NONE else cell for cell in progress)
     return Answer(ClientReport(int(revision), ClientState(state), cells, reached, target), blocked)
+
+
+def numbered_array(cells: Sequence[int], revision: int) -> dict[str, Any]:
+    """Return the fields of a ``std_msgs/Int32MultiArray`` for a numbered list of cells."""
+    dimension = {"label": f"{_NUMBER}{revision}", "size": len(cells), "stride": len(cells)}
+    return {"layout": {"dim": [dimension], "data_offset": 0}, "data": list(cells)}
+
+
+def revision_of(labels: Sequence[str]) -> int | None:
+    """Return the number in the labels of an array's dimensions; ``None`` without one."""
+    for label in labels:
+        text = label.removeprefix(_NUMBER)
+        if text != label and text.isdecimal():
+            return int(text)
+    return None

@@ -16,7 +16,7 @@ import uvloop
 
 from rce.cli.program_files import from_file
 from rce.config.settings import Runtime
-from rce.supervision.signals import end_signals
+from rce.own_process import end_signals
 from rce_fleet.demo.config import CoreProgram, DemoConfig, MachineBackend, Mode
 from rce_fleet.demo.headless import run_headless
 from rce_fleet.demo.modes import start_demo

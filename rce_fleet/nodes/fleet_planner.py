@@ -18,7 +18,7 @@ from rce.ros.node import Node, run
 from rce.ros.node.master import MasterClient
 from rce.ros.types import Time
 from rce.ros.xmlrpc import RpcClient
-from rce_fleet.coordination.answers import is_answer, read_answer
+from rce_fleet.coordination.answers import is_answer, numbered_array, read_answer
 from rce_fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
@@ -39,7 +39,6 @@ from rce_fleet.coordination.events import (
 )
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.planner import FleetPlanner
-from rce_fleet.coordination.revisions import numbered_array
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.geometry.angles import yaw_of
 from rce_fleet.navigation.occupancy import occupancy

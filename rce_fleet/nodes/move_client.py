@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, assert_never
 
 from rce.ros.node import Node, run
 from rce.ros.types import Time
-from rce_fleet.coordination.answers import Answer, answer_array, is_answer
+from rce_fleet.coordination.answers import Answer, answer_array, is_answer, revision_of
 from rce_fleet.coordination.move_client import (
     ClientReport,
     GoalState,
@@ -20,7 +20,6 @@ from rce_fleet.coordination.move_client import (
     SendGoal,
     SendStop,
 )
-from rce_fleet.coordination.revisions import revision_of
 from rce_fleet.geometry.angles import quaternion_z
 from rce_fleet.nodes.grid_parameters import make_grid
 from rce_fleet.planning.grid import GridMap

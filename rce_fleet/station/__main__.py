@@ -20,11 +20,11 @@ from rce.config.client import ClientConfig, load
 from rce.config.exceptions import ConfigError, Fault
 from rce.config.logs import start_logging
 from rce.masters import split_addresses
+from rce.own_process import end_signals
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
-from rce.supervision.signals import end_signals
 from rce.tls.choice import ENGINE, TlsChoice, default_folder, plain_warning
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 from rce.tls.identity import Context, client_contexts
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer

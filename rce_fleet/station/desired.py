@@ -1,9 +1,18 @@
-"""Goals and blocked cells that were requested, to send them again to a restarted planner. Pure."""
+"""Requested goals and blocked cells, to send them again to a restarted planner, and nodes to restart.
+
+A fleet without its planner stands still, so the operator's nodes are started again when they end. Pure.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
+
+from rce.config.client import ClientConfig
+from rce.model import ConfigureComponents, RemoveNode, Request
+
+_ENDED = frozenset({"failed", "exited"})
+_UP = frozenset({"running", "degraded"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,3 +67,28 @@ class Desired:
             if robot["id"] in self._goals and robot["goal"] < 0
         ]
         return [*cells, *goals]
+
+
+def node_requests(config: ClientConfig, engine: dict[str, Any]) -> list[Request]:
+    """Return the requests to the engine that make all nodes of ``config`` run.
+
+    A node that ended is removed first; once the engine does not report it any more, it is added again.
+
+    Args:
+        config: The operator's config.
+        engine: The engine's state, as :class:`~rce_fleet.station.engine_watch.EngineWatch` reports it.
+    """
+    requests: list[Request] = []
+    for container in engine.get("containers", ()):
+        if container["state"] not in _UP:
+            continue
+        states = {node["tag"]: node["state"] for node in container["nodes"]}
+        for add in config.nodes:
+            if add.container != container["tag"]:
+                continue
+            if add.node.tag not in states:
+                requests.append(ConfigureComponents(add_nodes=(add,)))
+            elif states[add.node.tag] in _ENDED:
+                remove = RemoveNode(container=add.container, tag=add.node.tag)
+                requests.append(ConfigureComponents(remove_nodes=(remove,)))
+    return requests

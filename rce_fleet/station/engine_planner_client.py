@@ -7,12 +7,13 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from rce.config.client import ClientConfig
-from rce.model.requests import Request
+from rce.model import Request
 from rce.tls.identity import Context
 from rce_client.connection import Connection, State
 from rce_client.exceptions import CallError, ClientError
 from rce_client.services import ServiceClient
 from rce_client.topics import Subscriber
+from rce_fleet.station.desired import node_requests
 from rce_fleet.station.fleet_link import (
     BLOCK_CELL,
     CALL_TIMEOUT_S,
@@ -29,7 +30,6 @@ from rce_fleet.station.fleet_link import (
     PlannerUnavailableError,
     pose_topic,
 )
-from rce_fleet.station.node_restarts import node_requests
 
 _SERVICES = (("setGoal", SET_GOAL), ("blockCell", BLOCK_CELL))
 

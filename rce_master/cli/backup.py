@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from rce.config.exceptions import ConfigError
 from rce.config.loading import load_settings
-from rce.model.quantities import about
+from rce.model import about
 from rce_master.backup import CERTIFICATES, MASTER, Copy, back_up, restore
 from rce_master.exceptions import StoreError
 from rce_master.store.sqlite import FILE_NAME

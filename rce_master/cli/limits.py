@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from rce.model.quantities import write_memory
+from rce.model import write_memory
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import CliError
 from rce_master.cli.offline import StateDir, choose, open_state

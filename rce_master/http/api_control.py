@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rce.model.faults import SpecError
-from rce.model.requests import (
+from rce.model import (
     AddInterface,
     AddNode,
     ConfigureConnections,
@@ -17,6 +16,7 @@ from rce.model.requests import (
     RemoveNode,
     ResizeContainer,
     SetParameter,
+    SpecError,
 )
 from rce.web.openapi import Query
 from rce_master.exceptions import InvalidRequestError
@@ -26,7 +26,7 @@ from rce_master.http.spec_models import SPELLING
 from rce_master.requests import commands_of
 
 if TYPE_CHECKING:
-    from rce.model.requests import Component, Item, Request
+    from rce.model import Component, Item, Request
     from rce_master.http.model import Model
 
 T = TypeVar("T", bound="Request | Item")

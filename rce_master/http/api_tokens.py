@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rce.model.names import is_name
+from rce.model import is_name
 from rce_master.exceptions import ForbiddenError, InvalidRequestError
 from rce_master.http import models
 from rce_master.http.routes import OF_USER, Call, route_table

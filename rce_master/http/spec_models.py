@@ -12,16 +12,18 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
 from pydantic import Field as Option
 from pydantic import create_model
 
-from rce.model.requests import (
+from rce.model import (
     AddInterface,
     AddNode,
     Connection,
     CreateContainer,
     DestroyContainer,
+    InterfaceSpec,
+    NodeSpec,
     ResizeContainer,
+    Resources,
     SetParameter,
 )
-from rce.model.specs import InterfaceSpec, NodeSpec, Resources
 from rce.model.spelling import Field, Spelling, fields_of
 from rce.model.written import Value
 from rce_master.http.model import Body, Model

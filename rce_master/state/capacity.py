@@ -6,10 +6,8 @@ import ipaddress
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from rce.control.machine import MEGABYTE, MIN_MEMORY
 from rce.control.messages import TaskSetKind
-from rce.model.checks import DEFAULT_PREFIX
-from rce.model.specs import Network, Resources
+from rce.model import DEFAULT_PREFIX, MEGABYTE, MIN_MEMORY, Network, Resources
 from rce_master.exceptions import ConflictError, ForbiddenError, InvalidRequestError
 from rce_master.state import limits
 from rce_master.state.placement import Room

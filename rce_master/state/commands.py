@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
-from rce.model.specs import Resources
+from rce.model import Resources
 
 if TYPE_CHECKING:
     from rce.control.messages import Hello
     from rce.control.model import EndpointStatus, StatusPatch
-    from rce.model.specs import InterfaceSpec, NodeSpec, ParameterValue, ResourceChanges
+    from rce.model import InterfaceSpec, NodeSpec, ParameterValue, ResourceChanges
     from rce_master.state.records import KnownLogin, PackageKey, Token, User, UserPackage, UserRole
 
 

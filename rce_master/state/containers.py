@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
-from rce.model.checks import find_circle
-from rce.model.specs import NodeSpec, ParameterValue
+from rce.model import NodeSpec, ParameterValue, find_circle
 from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
 from rce_master.state import activity, capacity, draining, endpoints, limits, packages, placing
 from rce_master.state.lifecycle import ContainerEvent, ContainerPhase

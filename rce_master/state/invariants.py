@@ -6,7 +6,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from rce.control.messages import TaskSetKind
-from rce.model.names import EndpointId, Form, InterfaceType, Role
+from rce.model import EndpointId, Form, InterfaceType, Role
 from rce_master.state import endpoints
 from rce_master.state.lifecycle import RobotSession
 from rce_master.state.records import Container, ContainerLive, Endpoint, Robot, RobotLive

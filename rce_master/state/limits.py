@@ -6,16 +6,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec.structs import asdict, replace
 
-from rce.control.machine import MEGABYTE
 from rce.control.messages import TaskSetKind
-from rce.model.quantities import write_cores
+from rce.model import MEGABYTE, write_cores
 from rce_master.exceptions import LimitReachedError, NotFoundError
 from rce_master.state.records import UserLimits, UserRole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rce.model.specs import Resources
+    from rce.model import Resources
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import SetLimits
     from rce_master.state.settings import StateSettings

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec import Struct
 
-from rce.model.specs import InterfaceSpec
+from rce.model import InterfaceSpec
 from rce_master.exceptions import StoreError
 from rce_master.state.records import Counter
 from rce_master.state.wiring_records import Connection, Interface

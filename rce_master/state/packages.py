@@ -9,9 +9,8 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from rce.control.model import PackageSpec
-from rce.model.names import is_name, is_version
+from rce.model import is_name, is_version, newest, split_package
 from rce.packages.signing import key_id
-from rce.packages.versions import newest, split_package
 from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
 from rce_master.state import limits
 from rce_master.state.records import Container, UserPackage, package_key_key, user_package_key
@@ -19,7 +18,7 @@ from rce_master.state.records import Container, UserPackage, package_key_key, us
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rce.model.specs import NodeSpec
+    from rce.model import NodeSpec
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import AddPackage, AddPackageKey, RemovePackage, RemovePackageKey
     from rce_master.state.settings import StateSettings

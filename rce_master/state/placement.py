@@ -15,9 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from rce.control.machine import MEGABYTE
-from rce.model.quantities import write_cores
-from rce.model.specs import Network, Resources
+from rce.model import MEGABYTE, Network, Resources, write_cores
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -23,7 +23,7 @@ from rce_master.state.placement import Room, choose, refusals
 from rce_master.state.records import Container, ContainerLive
 
 if TYPE_CHECKING:
-    from rce.model.specs import Resources
+    from rce.model import Resources
     from rce_master.state.changes import Transaction
 
 

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from rce.control.messages import MachineInfo, TaskSetKind
 from rce.control.model import EndpointKind, EndpointStatus, LinkAddress
 from rce.lifecycle import remember
-from rce.model.specs import NodeSpec, ParameterValue, Resources
+from rce.model import NodeSpec, ParameterValue, Resources
 from rce_master.state.lifecycle import (
     CONTAINER_LIFE,
     ROBOT_LIFE,

@@ -6,9 +6,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.control.machine import MEGABYTE
-from rce.model.quantities import write_bandwidth, write_cores
-from rce.model.specs import Resources
+from rce.model import MEGABYTE, Resources, write_bandwidth, write_cores
 from rce_master.exceptions import NoRoomError
 from rce_master.state import capacity, endpoints, placing
 from rce_master.state.containers import find

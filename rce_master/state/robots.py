@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from rce.control.messages import TaskSetKind
 from rce.control.model import EndpointState, EndpointStatus
-from rce.model.names import EndpointId
+from rce.model import EndpointId
 from rce_master.exceptions import (
     ConflictError,
     ForbiddenError,

@@ -14,7 +14,7 @@ from rce.control.model import (
     LinkSpec,
     SpecPatch,
 )
-from rce.model.specs import ParameterSpec
+from rce.model import ParameterSpec
 from rce_master.state import endpoints, packages
 from rce_master.state.records import Container
 from rce_master.state.wiring_records import Connection, Link

@@ -38,7 +38,7 @@ from rce_master.state.wiring_records import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from rce.model.specs import InterfaceSpec
+    from rce.model import InterfaceSpec
 
 R = TypeVar("R")
 

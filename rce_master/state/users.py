@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.model.names import is_name
+from rce.model import is_name
 from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError
 from rce_master.state import endpoints, limits, packages, robots, tokens
 from rce_master.state.records import User, UserRole

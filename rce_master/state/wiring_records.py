@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-from rce.model.specs import InterfaceSpec
+from rce.model import InterfaceSpec
 
 
 class Interface(Struct, frozen=True, kw_only=True):

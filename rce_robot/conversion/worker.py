@@ -20,8 +20,7 @@ import msgspec
 
 from rce.buffers import unfilled
 from rce.link import InterfaceError
-from rce.model.names import InterfaceType
-from rce.model.specs import InterfaceSpec
+from rce.model import InterfaceSpec, InterfaceType
 from rce.protocol.exceptions import ProtocolError
 from rce.protocol.large import read_large
 from rce.protocol.weight import Address

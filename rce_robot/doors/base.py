@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
     from rce.aio.queues import OverflowPolicy
     from rce.control.model import EndpointSpec
-    from rce.model.names import EndpointId
-    from rce.model.requests import Request
+    from rce.model import EndpointId, Request
     from rce.protocol.http import Credentials
     from rce.protocol.messages import CallId, DataMessage
     from rce.protocol.stream import LargeData

@@ -13,7 +13,7 @@ import pytest
 from support.engine import Program, running_engine
 from support.ros_real import GRAPHS, Graph
 
-from rce.config.resources import examples_dir
+from rce.config.folders import examples_dir
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry

@@ -16,7 +16,7 @@ import pytest
 from support.engine import Engine, Program, running_engine
 from support.ros_real import our_graph
 
-from rce.config.resources import examples_dir
+from rce.config.folders import examples_dir
 from rce.ros.errors import ServiceError
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex

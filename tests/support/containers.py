@@ -13,7 +13,7 @@ from typing import TypedDict, TypeVar, Unpack
 import msgspec
 import pytest
 
-from rce.config.resources import examples_dir
+from rce.config.folders import examples_dir
 from rce.control.contents import Piece
 from rce.control.exceptions import ContentError
 from rce.control.messages import (

@@ -14,9 +14,8 @@ from rce.ros.actions import topics
 from rce.ros.actions.client_goal import ChangeCallback, ClientGoal, FeedbackCallback
 from rce.ros.actions.exceptions import IllegalTransitionError
 from rce.ros.actions.goal_id import GoalId
-from rce.ros.actions.patience import PatientClock
 from rce.ros.actions.states import CommState, GoalState
-from rce.ros.actions.tracker import GoalTracker
+from rce.ros.actions.tracker import GoalTracker, SilenceClock
 from rce.ros.closing import release
 
 if TYPE_CHECKING:
@@ -71,7 +70,7 @@ class ActionClient:
         self._heard = asyncio.Event()
         self._busy = asyncio.Event()
         self._stack = AsyncExitStack()
-        self._clock: PatientClock
+        self._clock: SilenceClock
         self._goal: Publisher
         self._cancel: Publisher
         self._inputs: list[Subscriber] = []
@@ -88,7 +87,7 @@ class ActionClient:
 
     async def __aenter__(self) -> Self:
         node, types = self._node, self._types
-        self._clock = _patient_clock(node)
+        self._clock = _silence_clock(node)
         async with AsyncExitStack() as stack:
             stack.callback(self._lose_all, "the client was closed")
             tasks = await stack.enter_async_context(TaskScope())
@@ -245,7 +244,7 @@ class ActionClient:
         goal.changed(passed, result)
 
 
-def _patient_clock(node: Node) -> PatientClock:
+def _silence_clock(node: Node) -> SilenceClock:
     """Return the clock for silence: not the time of day, which may be set back, unless time is simulated."""
     machine = asyncio.get_running_loop().time
-    return PatientClock(machine, node.time if node.is_time_simulated else machine)
+    return SilenceClock(machine, node.time if node.is_time_simulated else machine)

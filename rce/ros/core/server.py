@@ -13,11 +13,10 @@ from types import TracebackType
 from typing import Any, Self
 
 from rce.aio.tasks import TaskScope
-from rce.ros.core.api import NOTHING, MasterApi
+from rce.ros.core.api import NOTHING, MasterApi, roslaunch_methods
 from rce.ros.core.events import Call, GraphEvent, Outcome
 from rce.ros.core.graph import Graph
 from rce.ros.core.notifier import Notifier
-from rce.ros.core.roslaunch import roslaunch_methods
 from rce.ros.errors import ParameterMissingError
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
 

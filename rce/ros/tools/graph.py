@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from rce.dialing import open_socket
-from rce.ros.errors import RosError, TcprosError
+from rce.ros.errors import RosError, TcprosError, ToolError
 from rce.ros.tcpros.header import ANY, MAX_HEADER, decode_header, encode_header, raise_error_field
-from rce.ros.tools.exceptions import ToolError
 from rce.ros.types.exceptions import TypesError
 from rce.ros.xmlrpc.dispatch import SUCCESS
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from rce.ros.tools.exceptions import ToolError
+from rce.ros.errors import ToolError
 from rce.ros.tools.plain import read_value
 
 if TYPE_CHECKING:

@@ -12,11 +12,10 @@ from typing import Annotated, Concatenate, ParamSpec
 import typer
 
 from rce.protocol.printable import for_terminal
-from rce.ros.errors import RosError
+from rce.ros.errors import RosError, ToolError
 from rce.ros.node import Node, run
 from rce.ros.node.master import MasterClient
 from rce.ros.tools import parameters, services, topics
-from rce.ros.tools.exceptions import ToolError
 from rce.ros.tools.topics import WINDOW, ToolContext
 from rce.ros.types import TypeRegistry
 from rce.ros.types.exceptions import TypesError

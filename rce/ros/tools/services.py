@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.ros.tools.exceptions import ToolError
+from rce.ros.errors import ToolError
 from rce.ros.tools.graph import look, service_type
 from rce.ros.tools.plain import as_json, as_yaml, read_fields
 

@@ -8,7 +8,7 @@ from collections import deque
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
-from rce.ros.tools.exceptions import ToolError
+from rce.ros.errors import ToolError
 from rce.ros.tools.graph import look, message_type
 from rce.ros.tools.plain import as_json, as_yaml, read_fields
 

@@ -13,7 +13,7 @@ from typing import assert_never
 
 from rce.aio.backoff import Backoff
 from rce.control.model import NodeState, NodeStatus
-from rce.model.specs import NodeSpec
+from rce.model import NodeSpec
 from rce_container.environment.nodes.events import (
     Beat,
     Desire,

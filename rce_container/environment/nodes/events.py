@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rce.model.specs import NodeSpec
+from rce.model import NodeSpec
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from rce.model.specs import NodeSpec
+from rce.model import NodeSpec
 from rce.ros import names
 from rce_container.environment.graph import Graph, GraphError, Subscription
 

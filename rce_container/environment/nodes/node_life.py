@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from rce.model.specs import NodeSpec
+from rce.model import NodeSpec
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.logs.node_log import NodeLog
 from rce_container.environment.logs.pump import Pump

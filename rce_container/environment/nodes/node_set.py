@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import assert_never
 
 from rce.control.model import NodeStatus
-from rce.model.specs import NodeSpec
+from rce.model import NodeSpec
 from rce_container.environment.logs.files import remove_log
 from rce_container.environment.logs.node_log import NodeLog
 from rce_container.environment.nodes import events as e

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 
-from rce.model.specs import NodeSpec
+from rce.model import NodeSpec
 
 
 class StartOrder:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from rce.control.model import NodeState, NodeStatus
 from rce.lifecycle import StateMachine
-from rce.model.specs import NodeSpec, RestartPolicy
+from rce.model import NodeSpec, RestartPolicy
 from rce_container.environment.nodes.life import NODE_LIFE, WITH_PROCESS, LifeEvent
 
 WELL_S = 30.0

@@ -10,7 +10,7 @@ from websockets.protocol import State
 
 from rce.guard.loop_share import LoopShare
 from rce.guard.proxies import TrustedProxies
-from rce.model.names import EndpointId
+from rce.model import EndpointId
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.http import FEATURES_HEADER, read_credentials, read_features
 from rce_robot.doors.client.session import Session

@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
 from rce.aio.queues import OverflowPolicy
-from rce.model.requests import (
+from rce.model import (
     ConfigureComponents,
     ConfigureConnections,
     CreateContainer,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Coroutine, Iterator, Sequence
 
-    from rce.model.requests import Request
+    from rce.model import Request
     from rce.protocol.messages import CallId
     from rce.protocol.stream import Event
     from rce_robot.doors.base import Owner, Queued

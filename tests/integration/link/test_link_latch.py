@@ -52,7 +52,7 @@ async def test_a_lost_link_ends_no_source_but_what_ended_meanwhile(rig: Rig, way
     for source in "xy":
         port.send(source.encode(), latched=True, source=source)
     await heard.until_latched(b"x", b"y")
-    (link,) = b.endpoint._links.values()
+    (link,) = b.endpoint._links
     link.detach()
     port.keep_latched(["y"])
     assert sorted(heard.latched.values()) == [b"x", b"y"]

@@ -10,7 +10,7 @@ import pytest
 from support.ros_nodes import MakeNode
 
 from rce.ros.actions import ActionClient, ActionServer, GoalState, ServerGoal
-from rce.ros.actions.patience import PatientClock
+from rce.ros.actions.tracker import SilenceClock
 from rce.ros.core import Core
 from rce.ros.node import Node, Publisher
 from rce.ros.types import Time
@@ -113,7 +113,7 @@ async def test_goals_after_a_jump_back_are_new_ones(core: Core, make_node: MakeN
 
 def test_patience_counts_what_passed_for_both() -> None:
     machine, graph = 10.0, 1000.0
-    clock = PatientClock(lambda: machine, lambda: graph)
+    clock = SilenceClock(lambda: machine, lambda: graph)
     seen = [clock.now()]
     for machine_step, graph_step in ((1, 1), (1, 0), (1, 100), (1, -500), (1, 0.25)):
         machine += machine_step

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 _SHOW = (
-    "from rce.cli.streams import open_missing_streams; import os; open_missing_streams();"
+    "from rce.own_process import open_missing_streams; import os; open_missing_streams();"
     " os.write(int(os.environ['OUT']), ' '.join(sorted(os.listdir('/proc/self/fd'))).encode())"
 )
 

@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 
 from rce.config.exceptions import ConfigError, RunDirError, SecretError
-from rce.config.folders import private_folder, run_dir
+from rce.config.folders import configs_dir, examples_dir, private_folder, run_dir
 from rce.config.loading import load_settings
-from rce.config.resources import configs_dir, examples_dir
 from rce.config.secret import (
     Secret,
     default_secret_file,

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from rce.config.handover import handed_over
+from rce.config.loading import handed_over
 
 DOCUMENT = json.dumps({"dev": True, "master_host": "192.0.2.1", "master": {"http_port": 9100}})
 

@@ -14,7 +14,7 @@ import typer.main
 
 from rce.cli.main import GROUP, build_app
 from rce.cli.program_files import keys_of
-from rce.config.resources import configs_dir
+from rce.config.folders import configs_dir
 from rce.config.settings import PROGRAM_SECTIONS
 
 FILE = """

@@ -9,7 +9,7 @@ import typer.main
 from typer.testing import CliRunner
 
 from rce.cli.up import OPTIONS as UP
-from rce.config.resources import configs_dir
+from rce.config.folders import configs_dir
 from rce.config.settings import Runtime
 from rce_container.command import OPTIONS as CONTAINER
 from rce_container.command import app as container

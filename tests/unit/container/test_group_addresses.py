@@ -7,8 +7,7 @@ from ipaddress import IPv4Interface
 import pytest
 
 from rce_container.exceptions import NetworkError
-from rce_container.network.addresses import choose, parse_address
-from rce_container.network.hosts import hosts_text
+from rce_container.network.addresses import choose, hosts_text, parse_address
 
 TAKEN = {IPv4Interface("10.0.0.1/24"): "one", IPv4Interface("10.0.0.2/24"): "two"}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import psutil
 
-from rce.control.machine import cpu_seconds, machine_memory, resident_bytes
+from rce.own_process import cpu_seconds, machine_memory, resident_bytes
 
 MB = 1_000_000
 

@@ -7,9 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.ros.types import TypeRegistry
-from rce_fleet.coordination.answers import Answer, answer_array, is_answer, read_answer
+from rce_fleet.coordination.answers import (
+    Answer,
+    answer_array,
+    is_answer,
+    numbered_array,
+    read_answer,
+    revision_of,
+)
 from rce_fleet.coordination.move_client import ClientReport, ClientState
-from rce_fleet.coordination.revisions import numbered_array, revision_of
 from rce_fleet.nodes.grid_parameters import make_grid
 
 CELLS = st.lists(st.integers(0, 2**31 - 1), max_size=5).map(tuple)

@@ -6,6 +6,7 @@ from math import pi
 
 import pytest
 
+from rce_fleet.coordination.answers import numbered_array, revision_of
 from rce_fleet.coordination.move_client import (
     QUIET_TIME,
     REPEAT_AFTER,
@@ -17,7 +18,6 @@ from rce_fleet.coordination.move_client import (
     SendGoal,
     SendStop,
 )
-from rce_fleet.coordination.revisions import numbered_array, revision_of
 from rce_fleet.planning.grid import GridMap
 
 

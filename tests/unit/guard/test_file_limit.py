@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce.guard.files import raise_file_limit
+from rce.own_process import raise_file_limit
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -3,8 +3,7 @@ from __future__ import annotations
 import stat
 from typing import TYPE_CHECKING
 
-from rce_master.audit import MAX_TEXT, AuditLog
-from rce_master.audit_words import describe
+from rce_master.audit import MAX_TEXT, AuditLog, describe
 from rce_master.state import commands
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 from support.master_world import World
 
-from rce.control.machine import MEGABYTE as MB
+from rce.model.quantities import MEGABYTE as MB
 from rce_master.exceptions import LimitReachedError, NotFoundError
 from rce_master.state import commands
 from rce_master.state.limits import limit_of, used_of

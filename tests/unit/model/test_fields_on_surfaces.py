@@ -222,19 +222,25 @@ def test_every_route_takes_the_models_that_are_tested_here() -> None:
 
 
 NEW_FIELD = """
-import importlib.util, json, sys
+import json, sys
+from importlib.abc import InspectLoader, MetaPathFinder
+from importlib.machinery import PathFinder
+from importlib.util import spec_from_loader
 
-import rce.model
-import rce.model.checks, rce.model.written
+class Changed(MetaPathFinder, InspectLoader):
+    def find_spec(self, name, path=None, target=None):
+        if name != "rce.model.specs":
+            return None
+        self.file = PathFinder.find_spec(name, path).origin
+        return spec_from_loader(name, self)
 
-found = importlib.util.find_spec("rce.model.specs")
-source = found.loader.get_source("rce.model.specs")
-line = '    image: Annotated[str, '
-assert source.count(line) == 1
-source = source.replace(line, '    gpu_count: Annotated[int, _TIMES] = 0\\n' + line)
-module = importlib.util.module_from_spec(found)
-sys.modules["rce.model.specs"] = rce.model.specs = module
-exec(compile(source, found.origin, "exec"), module.__dict__)
+    def get_source(self, name):
+        source = open(self.file).read()
+        line = '    image: Annotated[str, '
+        assert source.count(line) == 1
+        return source.replace(line, '    gpu_count: Annotated[int, _TIMES] = 0\\n' + line)
+
+sys.meta_path.insert(0, Changed())
 
 from rce.config.client import loads
 from rce.control.messages import ClientRequest, decode_to_master, encode

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rce.config.resources import examples_dir
+from rce.config.folders import examples_dir
 from rce.packages.exceptions import BadArchiveError
 from rce.packages.folder import look_into
 from rce.packages.limits import ArchiveLimits

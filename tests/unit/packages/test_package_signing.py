@@ -11,11 +11,10 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.model.names import VERSION_PATTERN, is_version
+from rce.model.names import VERSION_PATTERN, is_version, newest, split_package, version_key
 from rce.packages.exceptions import BadKeyError, BadSignatureError
 from rce.packages.requirements import read_requirements
 from rce.packages.signing import SigningKey, key_id, statement, verify
-from rce.packages.versions import newest, split_package, version_key
 
 SIGNED = statement("anna", "nav", "1.0", "0" * 64)
 

@@ -7,8 +7,7 @@ from typing import Any
 from rce.config.client import loads
 from rce.config.documents import write_items
 from rce.model.requests import ConfigureComponents, RemoveNode
-from rce_fleet.station.desired import Desired, DesiredCell, DesiredGoal
-from rce_fleet.station.node_restarts import node_requests
+from rce_fleet.station.desired import Desired, DesiredCell, DesiredGoal, node_requests
 from rce_fleet.wiring import fleet_config
 
 CONFIG = loads(write_items(fleet_config()))

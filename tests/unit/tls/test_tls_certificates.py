@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rce.tls.authority import Issued, is_signed_by, issue, make_authority, read_details
-from rce.tls.exceptions import CertificateError
+from rce.tls.faults import CertificateError
 from rce.tls.folder import AUTHORITY, CertificateFolder
 
 

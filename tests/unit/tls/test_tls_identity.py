@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from rce.tls.choice import WARNED_VARIABLE, TlsChoice, plain_warning
-from rce.tls.exceptions import CertificateError
 from rce.tls.expiry import expiry_warning, name_warning
+from rce.tls.faults import CertificateError
 from rce.tls.folder import CertificateFolder
 from rce.tls.identity import TlsFiles, TlsIdentity
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from rce.aio.backoff import Backoff
 from rce.aio.tasks import TaskScope
 from rce.dialing import open_socket
-from rce.guard.complaints import Complaints
 from rce.guard.lobby import Lobby
+from rce.guard.rates import Complaints
 from rce.ros.multimaster.errors import LinkBrokenError, MultimasterError
 from rce.ros.multimaster.relay.connection import RelayConnection
 from rce.ros.multimaster.relay.exporter import Exporter

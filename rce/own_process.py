@@ -1,0 +1,77 @@
+"""This process: the signals that end it, its standard streams, its limit of open files, its time and memory.
+
+The kernel is asked directly: a library for it would cost each task set 4 MB.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import resource
+import signal
+import time
+from pathlib import Path
+
+_ENOUGH = 1 << 20
+_log = logging.getLogger(__name__)
+
+
+_STATM = Path("/proc/self/statm")
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
+
+
+def end_signals() -> tuple[signal.Signals, ...]:
+    """Return the signals that tell this program to end: Ctrl-C, SIGTERM, and a terminal that is closed.
+
+    SIGHUP counts only if it is not ignored, as it is for programs that ``nohup`` starts.
+    """
+    ends = (signal.SIGINT, signal.SIGTERM)
+    return ends if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (*ends, signal.SIGHUP)
+
+
+def open_missing_streams() -> None:
+    """Open closed standard streams (``rce up <&-``) on the null device.
+
+    Otherwise the next file or socket takes their number, and what writes to the stream writes to it.
+    """
+    while (fd := os.open(os.devnull, os.O_RDWR)) <= 2:  # noqa: PLR2004 - standard error
+        os.set_inheritable(fd, True)
+    os.close(fd)
+
+
+def raise_file_limit() -> int:
+    """Raise the limit of open files to the most that the system allows, also for child processes.
+
+    The usual soft limit of 1024 is there for old programs; a server needs a socket for each of its clients.
+
+    Returns:
+        The new limit.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _ENOUGH if hard == resource.RLIM_INFINITY else min(hard, _ENOUGH)
+    if soft == resource.RLIM_INFINITY or soft >= wanted:
+        return soft
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    except (OSError, ValueError) as error:
+        _log.info("this process can have only %d files open: %s", soft, error)
+        return soft
+    return wanted
+
+
+def cpu_seconds() -> float:
+    """Return the processor time that all threads of this process have used."""
+    return time.process_time()
+
+
+def resident_bytes() -> int:
+    """Return how much memory of this process is resident; 0 where there is no ``/proc``."""
+    try:
+        return int(_STATM.read_text().split()[1]) * _PAGE_BYTES
+    except FileNotFoundError:
+        return 0
+
+
+def machine_memory() -> int:
+    """Return the size of this machine's memory in bytes."""
+    return os.sysconf("SC_PHYS_PAGES") * _PAGE_BYTES
