@@ -164,7 +164,7 @@ class Connection(Requests, OwnInterfaces):
 
         Example:
             ```python
-            from rce.model.requests import CreateContainer
+            from rce.model import CreateContainer
 
             await robot.request(CreateContainer(tag="brain"))
             ```

@@ -35,7 +35,19 @@ TINY = {
     "rce_robot/command.py": TYPER,
 }
 """Modules under 40 lines, and why they are not merged with another one."""
-TINY_ROOMS = ("rce_fleet/navigation", "rce_fleet/nodes")
+BEING_BUILT = tuple(
+    f"rce_fleet/{room}/"
+    for room in [
+        "geometry",
+        "maps",
+        "localization",
+        "mapping",
+        "navigation",
+        "simulation",
+        "nodes",
+        "drivers",
+    ]
+)
 """Packages that are being built; they are not looked at yet."""
 _RULER = re.compile(r"^\s*#\s*[-=~]{2,}|^\s*#.*[-=~]{4,}\s*$", re.MULTILINE)
 
@@ -88,6 +100,6 @@ def test_a_tiny_module_has_a_reason() -> None:
         path
         for file in files()
         if not file.name.startswith("__") and len(file.read_text().splitlines()) < MIN_LINES
-        if not (path := file.relative_to(ROOT).as_posix()).startswith(TINY_ROOMS)
+        if not (path := file.relative_to(ROOT).as_posix()).startswith(BEING_BUILT)
     }
     assert sorted(tiny ^ TINY.keys()) == []
