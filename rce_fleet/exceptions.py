@@ -7,6 +7,7 @@
     +-- LogError            a log of laser scans, or a trajectory, that cannot be read
     +-- ScenarioError       no scenario of the requested size exists on the map
     +-- OccupiedError       a box cannot stand where a robot is
+    +-- PlaceTakenError     a thing of the simulated world cannot stand where a robot or a walking person is
     +-- TransitionError     an event that the life cycle of a robot does not allow
     +-- InvariantError      the planner's records contradict each other: a bug
     +-- PlanWorkerError     the process that makes plans ended twice over one plan
@@ -60,6 +61,25 @@ class OccupiedError(FleetError):
 
     def __str__(self) -> str:
         return f"cell {self.cell} cannot get a box: robot {', '.join(self.robots)} is in the way"
+
+
+class PlaceTakenError(FleetError):
+    """A robot or box of the simulated world cannot stand where a robot or a walking person is.
+
+    Attributes:
+        x: The place, metres.
+        y: The place, metres.
+        things: Names of the robots and walkers in the way.
+    """
+
+    def __init__(self, x: float, y: float, things: tuple[str, ...]) -> None:
+        self.x = x
+        self.y = y
+        self.things = things
+        super().__init__(x, y, things)
+
+    def __str__(self) -> str:
+        return f"({self.x:.2f}, {self.y:.2f}) is taken: {', '.join(self.things)} is in the way"
 
 
 class TransitionError(InvalidTransitionError, FleetError):

@@ -129,7 +129,7 @@ class RobotDriver:
     # What goes out
 
     def _sense(self, topics: _Topics, stamp: Time) -> None:
-        robot, spec = self._robot, self._world.spec.lidar
+        robot, spec = self._robot, self._robot.model.lidar
         ranges = self._world.scan(robot.id)
         self._points = hit_points(spec, ranges, robot.estimate)
         topics.pose.publish(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import exp, inf, sqrt
 from typing import TYPE_CHECKING, ClassVar
 
-from rce_fleet.navigation.navigation import Twist
+from rce_fleet.geometry.poses import Twist
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,8 +29,8 @@ class DriveSpec:
         slip: Share of the wheels' motion that does not move the robot: its mean.
         slip_noise: Standard deviation of this share.
         slip_memory: Correlation time of this share, seconds.
-        wheels_stall: Whether wheels stop when the robot is held by an obstacle. If not, they spin, and odometry
-            counts on.
+        wheels_stall: Whether wheels stop when the robot is held by an obstacle. If not, they spin, and
+            odometry counts on.
     """
 
     speed: float = inf

@@ -25,9 +25,9 @@ class LidarSpec:
 
     Attributes:
         beams: Number of beams.
-        field_of_view: Angle that the beams cover, radians. Over the full circle beam 0 points backwards (-pi);
-            else the first and the last beam are at the ends of the field. Angles of ``sensor_msgs/LaserScan``
-            run upwards.
+        field_of_view: Angle that the beams cover, radians. Over the full circle beam 0 points backwards
+            (-pi); else the first and the last beam are at the ends of the field. Angles of
+            ``sensor_msgs/LaserScan`` run upwards.
         min_range: A nearer obstacle gives no range but NaN, metres.
         max_range: Farthest range, metres.
         noise: Standard deviation of a range, metres.
@@ -62,14 +62,18 @@ class LidarSpec:
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "strict": True}
 
     def __post_init__(self) -> None:
-        if self.beams < 2:
+        if self.beams <= 1:
             raise ValueError(f"beams must be at least 2, not {self.beams}")
         if not 0 < self.field_of_view <= _TURN + 1e-9:
             raise ValueError(f"field_of_view must be within 0 .. 2 pi radians, not {self.field_of_view}")
         if not 0 <= self.min_range < self.max_range or not isfinite(self.max_range):
-            raise ValueError(f"ranges must be 0 <= min_range < max_range, not {self.min_range}, {self.max_range}")
+            raise ValueError(
+                f"ranges must be 0 <= min_range < max_range, not {self.min_range}, {self.max_range}"
+            )
         if min(self.noise, self.noise_squared, self.quantum) < 0 or not self.rate > 0:
-            raise ValueError("noise, noise_squared and quantum must not be negative, and rate must be positive")
+            raise ValueError(
+                "noise, noise_squared and quantum must not be negative, and rate must be positive"
+            )
         if not (0 <= self.drop_outs <= 1 and 0 <= self.glass_returns <= 1):
             raise ValueError("drop_outs and glass_returns are probabilities within 0 .. 1")
 
@@ -110,7 +114,8 @@ def cast(
     spec: LidarSpec, origin: tuple[float, float], yaw: float, segments: Floats, circles: Floats
 ) -> Floats:
     """Return the exact ranges of one scan, shape (beams,); as :func:`cast_many`."""
-    return cast_many(spec, np.array([(*origin, yaw)], np.float64), segments, circles)[0]
+    ranges: Floats = cast_many(spec, np.array([(*origin, yaw)], np.float64), segments, circles)[0]
+    return ranges
 
 
 def cast_many(spec: LidarSpec, poses: Floats, segments: Floats, circles: Floats) -> Floats:

@@ -18,12 +18,13 @@ def hit_points(spec: LidarSpec, ranges: Floats, pose: Pose) -> Floats:
 
     Args:
         spec: The lidar.
-        ranges: One scan, shape (beams,).
+        ranges: One scan, shape (beams,); infinite or NaN where a beam found nothing.
         pose: Pose of the robot at the time of the scan.
     """
     hit = ranges < spec.max_range
-    angles = spec.angles()[hit] + pose.yaw
-    return np.stack((pose.x + ranges[hit] * np.cos(angles), pose.y + ranges[hit] * np.sin(angles)), axis=1)
+    x, y, yaw = spec.poses(pose.as_array()[None])[0]
+    angles = spec.angles()[hit] + yaw
+    return np.stack((x + ranges[hit] * np.cos(angles), y + ranges[hit] * np.sin(angles)), axis=1)
 
 
 def clear_ahead(points: Floats, pose: Pose, radius: float) -> float:

@@ -1,11 +1,11 @@
 """Dead reckoning from wheels: biased, and noisy by the ``alpha`` model of ROS's ``amcl``.
 
 The model (Thrun, Burgard, Fox: Probabilistic Robotics, section 5.4) gives variances for one update of the
-filter: ``alpha1 rot^2 + alpha2 trans^2`` for each of the two turns of a motion and ``alpha3 trans^2 + alpha4
-(rot1^2 + rot2^2)`` for its length. Odometry comes in much smaller steps, whose variances add up. A step of
-length ``d`` therefore gets the share ``d / STRIDE`` of the variance of one update of the length ``STRIDE``, and
-a step that turns by ``a`` the share ``a / STRIDE_TURN``: after one update the variances are those of the model,
-and they grow linearly with the way, whatever the time step is.
+filter: ``alpha1 rot^2 + alpha2 trans^2`` for each of the two turns of a motion, and ``alpha3 trans^2 +
+alpha4 (rot1^2 + rot2^2)`` for its length. Odometry comes in much smaller steps, whose variances add up. A
+step of length ``d`` therefore gets the share ``d / STRIDE`` of the variance of one update of the length
+``STRIDE``, and a step that turns by ``a`` the share ``a / STRIDE_TURN``: after one update the variances are
+those of the model, and they grow linearly with the way, whatever the time step is.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from math import cos, pi, sin, sqrt
 from typing import TYPE_CHECKING, ClassVar
 
-from rce_fleet.navigation.angles import wrap
-from rce_fleet.navigation.navigation import Pose
+from rce_fleet.geometry.angles import wrap
+from rce_fleet.geometry.poses import Pose
 from rce_fleet.simulation.drive import Normals
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The simulated world: walls, boxes and robots in a pymunk space.
+"""The simulated world: walls, boxes, doors, walkers and robots in a pymunk space.
 
 Time advances in fixed steps and all noise is seeded, so the same commands give the same run. A world belongs
 to one thread. The caller decides how fast time advances.
@@ -6,41 +6,51 @@ to one thread. The caller decides how fast time advances.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from itertools import pairwise
-from math import inf
+from dataclasses import dataclass, field, replace
+from math import hypot, inf
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pymunk
 
-from rce_fleet.exceptions import OccupiedError
+from rce_fleet.exceptions import OccupiedError, PlaceTakenError
 from rce_fleet.geometry.poses import Pose
-from rce_fleet.simulation.lidar import Floats, LidarSpec, cast
-from rce_fleet.simulation.noise import NoiseSpec
+from rce_fleet.simulation.box import BoxSpec
+from rce_fleet.simulation.contacts import Collisions, ContactWatch, Kind
+from rce_fleet.simulation.doors import Door, DoorSpec
+from rce_fleet.simulation.lidar import Floats
+from rce_fleet.simulation.models import DISC, RobotModel
 from rce_fleet.simulation.robot import SimulatedRobot
+from rce_fleet.simulation.sensing import scan_all
+from rce_fleet.simulation.solids import Solids
+from rce_fleet.simulation.walkers import Walker, WalkerSpec
+from rce_fleet.simulation.walls import Walls, grid_walls
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Mapping
 
     from rce_fleet.planning.grid import GridMap
+    from rce_fleet.simulation.walls import Block
 
-_ROBOT, _BOX, _WALL = 1, 2, 3
-_WALL_THICKNESS = 0.1
+_OVERLAP = 0.002
+"""How far things that touch may overlap, metres: so much that a contact that lasts is one contact."""
+_STANDS = 0.01
+"""A slower robot stands, metres per second."""
 
 
-@dataclass(slots=True)
-class Collisions:
-    """Number of collisions; each contact counts once, when it begins."""
+@dataclass(frozen=True, slots=True)
+class Dock:
+    """A place where standing robots are charged.
 
-    robot_robot: int = 0
-    robot_box: int = 0
-    robot_wall: int = 0
+    Attributes:
+        x: Its middle, metres.
+        y: Its middle, metres.
+        reach: How near a robot's middle must be, metres.
+    """
 
-    @property
-    def total(self) -> int:
-        """All contacts."""
-        return self.robot_robot + self.robot_box + self.robot_wall
+    x: float
+    y: float
+    reach: float = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,86 +59,157 @@ class WorldSpec:
 
     Attributes:
         time_step: Length of a step, seconds.
-        robot_radius: Radius of the robots' hulls, metres.
-        box_size: Edge of a box, metres.
-        lidar: Properties of the robots' lidars.
-        noise: The robots' sensor noise.
+        box_size: Edge of the box in a cell, metres.
+        model: The model of robots that name none.
+        docks: Where robots are charged.
     """
 
     time_step: float = 0.02
-    robot_radius: float = 0.22
     box_size: float = 0.6
-    lidar: LidarSpec = field(default_factory=LidarSpec)
-    noise: NoiseSpec = field(default_factory=NoiseSpec)
+    model: RobotModel = DISC
+    docks: tuple[Dock, ...] = field(default=())
 
 
 class World:
-    """A floor with a wall around it; the map's blocked cells are solid.
+    """A floor with cells, walls and what moves on it.
 
     Args:
-        grid: The map.
+        grid: The cells; the fleet's map of the floor.
         spec: Properties of the world.
         seed: Seed of all noise.
+        walls: What never moves; None: the blocked cells, and a wall around the floor.
 
     Attributes:
         time: Simulated time, seconds.
-        collisions: Collisions so far.
         min_separation: Smallest distance between the hulls of two robots so far, metres; ``inf`` while
             there are fewer than two.
     """
 
-    def __init__(self, grid: GridMap, spec: WorldSpec | None = None, *, seed: int = 0) -> None:
+    def __init__(
+        self, grid: GridMap, spec: WorldSpec | None = None, *, seed: int = 0, walls: Walls | None = None
+    ) -> None:
         self.grid = grid
         self.spec = spec or WorldSpec()
+        self.walls = grid_walls(grid) if walls is None else walls
         self.time = 0.0
-        self.collisions = Collisions()
         self.min_separation = inf
         self._seed = seed
         self._steps = 0
         self._space = pymunk.Space()
+        self._space.collision_slop = _OVERLAP
         self._robots: dict[str, SimulatedRobot] = {}
-        self._boxes: dict[int, pymunk.Poly] = {}
-        self._watch_contacts()
-        self._wall_edges = self._build_walls()
-        self._edges = self._wall_edges
+        self._boxes: dict[str, BoxSpec] = {}
+        self._timed: dict[str, BoxSpec] = {}
+        self._doors: dict[str, Door] = {}
+        self._walkers: dict[str, Walker] = {}
+        self._solids = Solids(self._space, self.walls)
+        self._contacts = ContactWatch(self._space, self._robots)
+        self._places = np.empty((0, 3))
 
-    # Things in it
+    # What there is
 
     @property
-    def robots(self) -> dict[str, SimulatedRobot]:
+    def robots(self) -> Mapping[str, SimulatedRobot]:
         """The robots by id. Read only."""
         return self._robots
 
     @property
     def boxes(self) -> tuple[int, ...]:
         """Cells with a box, ascending."""
-        return tuple(sorted(self._boxes))
+        return tuple(sorted(int(name[len(_CELL) :]) for name in self._boxes if name.startswith(_CELL)))
 
-    def add_robot(self, robot: str, cell: int, yaw: float = 0.0) -> SimulatedRobot:
-        """Put a robot at the centre of a cell.
+    @property
+    def all_boxes(self) -> Mapping[str, BoxSpec]:
+        """The boxes that are there now, by name; that of cell 3 is ``cell_3``. Read only."""
+        return self._boxes
+
+    @property
+    def doors(self) -> Mapping[str, Door]:
+        """The doors by name. Read only."""
+        return self._doors
+
+    @property
+    def walkers(self) -> Mapping[str, Walker]:
+        """The walkers by name. Read only."""
+        return self._walkers
+
+    @property
+    def collisions(self) -> Collisions:
+        """Collisions so far."""
+        return self._contacts.collisions
+
+    @property
+    def edges(self) -> Floats:
+        """All edges of what is not glass, shape (N, 4): x, y of both ends, metres."""
+        return self._solids.edges(glass=False)
+
+    @property
+    def space(self) -> pymunk.Space:
+        """The physics engine's space, for queries."""
+        return self._space
+
+    def touched(self, robot: str) -> list[float]:
+        """Return the directions in which something touches a robot, radians in its frame."""
+        return self._contacts.bearings(robot)
+
+    # Robots
+
+    def add_robot(
+        self, robot: str, cell: int, yaw: float = 0.0, model: RobotModel | None = None
+    ) -> SimulatedRobot:
+        """Put a robot at the middle of a cell; as :meth:`place_robot`.
 
         Raises:
-            ValueError: A robot of this id exists, or the cell is not on the map.
+            ValueError: A robot of this id exists.
             OccupiedError: Another robot is there.
+        """
+        x, y = self.grid.centre(cell)
+        try:
+            return self.place_robot(robot, Pose(x, y, yaw), model)
+        except PlaceTakenError as error:
+            raise OccupiedError(cell, error.things) from error
+
+    def place_robot(self, robot: str, pose: Pose, model: RobotModel | None = None) -> SimulatedRobot:
+        """Put a robot on the floor.
+
+        Args:
+            robot: Its id.
+            pose: Where.
+            model: What kind of robot; None for that of ``spec``.
+
+        Raises:
+            ValueError: A robot of this id exists.
+            PlaceTakenError: Another robot or a walker is there.
         """
         if robot in self._robots:
             raise ValueError(f"robot {robot} exists already")
-        x, y = self.grid.centre(cell)
-        others = self._robots_within(x, y, 2 * self.spec.robot_radius)
-        if others:
-            raise OccupiedError(cell, others)
-        # A robot's noise depends on the seed and its own id only, not on the other robots.
-        rng = np.random.default_rng([self._seed, *robot.encode()])
-        made = SimulatedRobot(robot, Pose(x, y, yaw), self.spec.robot_radius, self.spec.noise, rng)
-        made.shape.collision_type = _ROBOT
+        made = SimulatedRobot(robot, pose, model or self.spec.model, self._seed)
+        self._check_free(pose, made.radius)
         self._space.add(made.body, made.shape)
         self._robots[robot] = made
+        self._note_places()
         return made
+
+    def move_robot(self, robot: str, pose: Pose) -> None:
+        """Put a robot elsewhere, as a hand would: it stands there, and its odometry does not notice.
+
+        Raises:
+            PlaceTakenError: Another robot or a walker is there.
+        """
+        moved = self._robots[robot]
+        self._check_free(pose, moved.radius, but=robot)
+        moved.put(pose)
+        self._space.reindex_shapes_for_body(moved.body)
+        self._note_places()
 
     def remove_robot(self, robot: str) -> None:
         """Remove a robot."""
-        gone = self._robots.pop(robot)
+        gone = self._robots[robot]
         self._space.remove(gone.shape, gone.body)
+        del self._robots[robot]
+        self._note_places()
+
+    # Boxes, doors, walkers
 
     def add_box(self, cell: int) -> None:
         """Put a box into the middle of a cell; do nothing if it has one.
@@ -136,28 +217,64 @@ class World:
         Raises:
             OccupiedError: A robot is in the way.
         """
-        if cell in self._boxes:
+        if cell in self.boxes:
             return
         if cell not in self.grid:
             raise ValueError(f"cell {cell} is not on the map")
         x, y = self.grid.centre(cell)
-        half = self.spec.box_size / 2
-        in_the_way = tuple(
-            robot.id for robot in self._robots.values() if _overlaps(robot.pose, robot.radius, x, y, half)
-        )
-        if in_the_way:
-            raise OccupiedError(cell, in_the_way)
-        box = self._block(x - half, y - half, x + half, y + half, _BOX)
-        self._space.add(box)
-        self._boxes[cell] = box
-        self._rebuild_edges()
+        size = self.spec.box_size
+        try:
+            self.put_box(f"{_CELL}{cell}", BoxSpec(Pose(x, y, 0.0), size, size))
+        except PlaceTakenError as error:
+            raise OccupiedError(cell, error.things) from error
 
     def remove_box(self, cell: int) -> None:
         """Remove the box from a cell; do nothing if it has none."""
-        box = self._boxes.pop(cell, None)
-        if box is not None:
-            self._space.remove(box)
-            self._rebuild_edges()
+        self.take_box(f"{_CELL}{cell}")
+
+    def put_box(self, name: str, box: BoxSpec) -> None:
+        """Put a box somewhere, in place of the one of this name; if it is timed, now or when it is due.
+
+        Raises:
+            PlaceTakenError: A robot or a walker is in the way, and the box is not timed.
+        """
+        if box.timed:
+            self._timed[name] = box
+            self._update_timed()
+            return
+        in_the_way = self._near(box.block, 0.0)
+        if in_the_way:
+            raise PlaceTakenError(box.pose.x, box.pose.y, in_the_way)
+        self._boxes[name] = box
+        self._solids.put(name, box.block, Kind.BOX)
+
+    def move_box(self, name: str, pose: Pose) -> None:
+        """Put a box elsewhere.
+
+        Raises:
+            KeyError: There is none of this name.
+            PlaceTakenError: A robot or a walker is in the way.
+        """
+        self.put_box(name, replace(self._boxes[name], pose=pose))
+
+    def take_box(self, name: str) -> None:
+        """Remove a box; do nothing if there is none of this name."""
+        self._timed.pop(name, None)
+        if self._boxes.pop(name, None) is not None:
+            self._solids.take(name)
+
+    def add_door(self, door: str, spec: DoorSpec) -> Door:
+        """Add a door."""
+        made = self._doors[door] = Door(door, spec)
+        self._solids.put(door, made.block, Kind.DOOR)
+        return made
+
+    def add_walker(self, walker: str, spec: WalkerSpec) -> Walker:
+        """Add a walker."""
+        made = self._walkers[walker] = Walker(walker, spec)
+        made.shape.collision_type = Kind.WALKER
+        self._space.add(made.body, made.shape)
+        return made
 
     # Time
 
@@ -171,124 +288,108 @@ class World:
             self._one_step()
         self.time = max(goal, self._steps * self.spec.time_step)
 
-    def scan(self, robot: str) -> Floats:
-        """Return a scan of the robot's lidar, with noise: shape (beams,), metres.
+    def reset(self) -> None:
+        """Begin anew: time 0, all robots, doors and walkers at their starts, the same noise to come.
 
-        A range of ``lidar.max_range`` means that the beam hit nothing.
+        Boxes stay where they are, unless they are timed.
         """
-        spec = self.spec.lidar
-        seer = self._robots[robot]
-        others = [
-            (other.pose.x, other.pose.y, other.radius) for other in self._robots.values() if other is not seer
-        ]
-        pose = seer.pose
-        circles = np.array(others, np.float64).reshape(-1, 3)
-        ranges = cast(spec, (pose.x, pose.y), pose.yaw, self._edges, circles)
-        hit = ranges < spec.max_range
-        noisy = ranges + spec.noise * seer.rng.standard_normal(spec.beams)
-        return np.where(hit, np.clip(noisy, 0.0, spec.max_range), spec.max_range)
+        self.time, self._steps, self.min_separation = 0.0, 0, inf
+        for robot in self._robots.values():
+            self._space.remove(robot.shape, robot.body)
+            robot.reset()
+            self._space.add(robot.body, robot.shape)
+        for walker in self._walkers.values():
+            walker.reset()
+            self._space.reindex_shapes_for_body(walker.body)
+        for door in self._doors.values():
+            door.reset()
+            self._solids.put(door.id, door.block, Kind.DOOR)
+        self._contacts.reset()
+        self._note_places()
+        self._update_timed()
 
-    @property
-    def edges(self) -> Floats:
-        """All edges of walls and boxes, shape (N, 4): x, y of both ends, metres."""
-        return self._edges
+    def scan(self, robot: str) -> Floats:
+        """Return a scan of a robot; as :meth:`scans`."""
+        return self.scans((robot,))[robot]
 
-    @property
-    def space(self) -> pymunk.Space:
-        """The physics engine's space, for queries."""
-        return self._space
+    def scans(self, robots: Iterable[str]) -> dict[str, Floats]:
+        """Return what the range sensors of robots measure now, with noise.
+
+        Two scans of the same moment are the same.
+
+        Returns:
+            For each robot shape (beams,), metres: infinite where nothing returned, NaN where something is
+            nearer than the sensor measures.
+        """
+        seers = [self._robots[robot] for robot in robots]
+        walkers = [(*walker.position, walker.spec.radius) for walker in self._walkers.values()]
+        circles = np.concatenate((self._places, np.array(walkers, np.float64).reshape(-1, 3)))
+        return scan_all(seers, self._solids, circles, self._steps)
+
+    # Inside
 
     def _one_step(self) -> None:
-        dt = self.spec.time_step
+        dt, now = self.spec.time_step, self._steps * self.spec.time_step
+        for walker in self._walkers.values():
+            walker.walk(now, dt, self._places)
+        for door in self._doors.values():
+            if door.advance(now, dt, lambda leaf, apart: bool(self._near(leaf, apart))):
+                self._solids.put(door.id, door.block, Kind.DOOR)
         for robot in self._robots.values():
-            robot.push()
+            robot.push(dt, touched=bool(self._contacts.bearings(robot.id)))
         self._space.step(dt)
         for robot in self._robots.values():
-            robot.settle(dt)
+            robot.settle(dt, docked=bool(self.spec.docks) and self._docked(robot))
         self._steps += 1
+        self._note_places()
+        self._update_timed()
         if len(self._robots) > 1:
-            places = np.array([robot.body.position for robot in self._robots.values()])
+            places, radii = self._places[:, :2], self._places[:, 2]
             apart = np.hypot(*(places[:, None, :] - places[None, :, :]).transpose(2, 0, 1))
-            nearest = float(apart[np.triu_indices(len(places), 1)].min())
-            self.min_separation = min(self.min_separation, nearest - 2 * self.spec.robot_radius)
+            apart -= radii[:, None] + radii[None, :]
+            np.fill_diagonal(apart, inf)
+            self.min_separation = min(self.min_separation, float(apart.min()))
 
-    # Making it
+    def _note_places(self) -> None:
+        """Note the robots' places and radii, shape (N, 3)."""
+        rows = [(*robot.place[:2], robot.radius) for robot in self._robots.values()]
+        self._places = np.array(rows, np.float64).reshape(-1, 3)
 
-    def _watch_contacts(self) -> None:
-        def count_robot(_arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: object) -> None:
-            self.collisions.robot_robot += 1
+    def _update_timed(self) -> None:
+        """Let timed boxes come and go; one that has no room yet comes later."""
+        for name, box in self._timed.items():
+            due = box.is_due(self._steps * self.spec.time_step)
+            if due and name not in self._boxes and not self._near(box.block, 0.0):
+                self._boxes[name] = box
+                self._solids.put(name, box.block, Kind.BOX)
+            elif not due and self._boxes.pop(name, None) is not None:
+                self._solids.take(name)
 
-        def count_box(_arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: object) -> None:
-            self.collisions.robot_box += 1
+    def _docked(self, robot: SimulatedRobot) -> bool:
+        x, y, _ = robot.place
+        stands = abs(robot.wheels.wheels.speed) < _STANDS
+        return stands and any(hypot(dock.x - x, dock.y - y) <= dock.reach for dock in self.spec.docks)
 
-        def count_wall(_arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: object) -> None:
-            self.collisions.robot_wall += 1
+    def _discs(self) -> list[tuple[str, float, float, float]]:
+        """Return name, place and radius of all robots and walkers."""
+        robots = [(robot.id, *robot.place[:2], robot.radius) for robot in self._robots.values()]
+        walkers = [(walker.id, *walker.position, walker.spec.radius) for walker in self._walkers.values()]
+        return robots + walkers
 
-        self._space.on_collision(_ROBOT, _ROBOT, begin=count_robot)
-        self._space.on_collision(_ROBOT, _BOX, begin=count_box)
-        self._space.on_collision(_ROBOT, _WALL, begin=count_wall)
+    def _near(self, block: Block, apart: float) -> tuple[str, ...]:
+        """Return the robots and walkers that are nearer to a block than ``apart``, metres."""
+        return tuple(name for name, x, y, radius in self._discs() if block.distance(x, y) < radius + apart)
 
-    def _build_walls(self) -> Floats:
-        """Add the wall around the floor and the map's blocked cells; return their edges."""
-        grid = self.grid
-        (left, low), size = grid.origin, grid.cell_size
-        right, high = left + grid.columns * size, low + grid.rows * size
-        corners = [(left, low), (right, low), (right, high), (left, high), (left, low)]
-        edges: list[tuple[float, float, float, float]] = []
-        thick = _WALL_THICKNESS
-        for sides in (
-            (left - thick, low - thick, left, high + thick),
-            (right, low - thick, right + thick, high + thick),
-            (left, low - thick, right, low),
-            (left, high, right, high + thick),
-        ):
-            self._space.add(self._block(*sides, _WALL))
-        edges += [(*a, *b) for a, b in pairwise(corners)]
-        for row, first, last in _runs(grid):
-            x, y = left + first * size, low + row * size
-            block = self._block(x, y, left + (last + 1) * size, y + size, _WALL)
-            self._space.add(block)
-            edges += _edges_of(block)
-        return np.array(edges, np.float64)
-
-    def _block(self, left: float, low: float, right: float, high: float, kind: int) -> pymunk.Poly:
-        corners = [(left, low), (right, low), (right, high), (left, high)]
-        block = pymunk.Poly(self._space.static_body, corners)
-        block.collision_type = kind
-        return block
-
-    def _rebuild_edges(self) -> None:
-        edges = [edge for box in self._boxes.values() for edge in _edges_of(box)]
-        self._edges = np.concatenate((self._wall_edges, np.array(edges, np.float64).reshape(-1, 4)))
-
-    def _robots_within(self, x: float, y: float, reach: float) -> tuple[str, ...]:
-        return tuple(
-            robot.id
-            for robot in self._robots.values()
-            if (robot.pose.x - x) ** 2 + (robot.pose.y - y) ** 2 < reach * reach
+    def _check_free(self, pose: Pose, radius: float, but: str = "") -> None:
+        """Raise PlaceTakenError if a robot or a walker is where a disc is to stand."""
+        taken = tuple(
+            name
+            for name, x, y, other in self._discs()
+            if name != but and hypot(x - pose.x, y - pose.y) < radius + other
         )
+        if taken:
+            raise PlaceTakenError(pose.x, pose.y, taken)
 
 
-def _runs(grid: GridMap) -> Iterator[tuple[int, int, int]]:
-    """Yield blocked cells joined along rows: row, first and last column."""
-    for row in range(grid.rows):
-        first: int | None = None
-        for column in range(grid.columns + 1):
-            solid = column < grid.columns and grid.cell(row, column) in grid.blocked
-            if solid and first is None:
-                first = column
-            elif not solid and first is not None:
-                yield row, first, column - 1
-                first = None
-
-
-def _edges_of(block: pymunk.Poly) -> list[tuple[float, float, float, float]]:
-    corners = block.get_vertices()
-    return [(*a, *b) for a, b in pairwise([*corners, corners[0]])]
-
-
-def _overlaps(pose: Pose, radius: float, x: float, y: float, half: float) -> bool:
-    """Return whether a disc and a square with centre ``(x, y)`` overlap."""
-    dx = max(abs(pose.x - x) - half, 0.0)
-    dy = max(abs(pose.y - y) - half, 0.0)
-    return dx * dx + dy * dy < radius * radius
+_CELL = "cell_"
+"""Beginning of the name of a cell's box."""

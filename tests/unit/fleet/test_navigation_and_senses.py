@@ -20,6 +20,7 @@ from rce_fleet.navigation.navigation import DriveLimits, Navigator
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.simulation.boxes import BoxKeeper
 from rce_fleet.simulation.lidar import LidarSpec, cast
+from rce_fleet.simulation.models import RobotModel
 from rce_fleet.simulation.move_base import SimulatedMoveBase
 from rce_fleet.simulation.obstacles import blocked_cell, cells_ahead, clear_ahead, hit_points
 from rce_fleet.simulation.world import World, WorldSpec
@@ -134,15 +135,15 @@ def oracle(world: World, spec: LidarSpec, seer: str) -> npt.NDArray[np.float64]:
 def test_the_lidar_sees_what_pymunk_sees(seed: int) -> None:
     rng = np.random.default_rng(seed)
     cells = [int(cell) for cell in rng.choice(64, 14, replace=False)]
-    spec = WorldSpec(lidar=LidarSpec(beams=180, noise=0.0))
+    spec = WorldSpec(model=RobotModel(sensors={"lidar": LidarSpec(beams=180, noise=0.0)}))
     world = World(GridMap(blocked=frozenset(cells[:4])), spec, seed=seed)
     for number, cell in enumerate(cells[4:8]):
         world.add_robot(f"R{number}", cell, float(rng.uniform(-pi, pi)))
     for cell in cells[8:]:
         world.add_box(cell)
     world.space.reindex_static()
-    ranges = world.scan("R0")
-    expected = oracle(world, spec.lidar, "R0")
+    ranges = np.minimum(world.scan("R0"), spec.model.lidar.max_range)
+    expected = oracle(world, spec.model.lidar, "R0")
     # At a corner rounding decides whether a beam just hits or just misses.
     assert np.count_nonzero(np.abs(ranges - expected) > 1e-6) <= 2
 
@@ -209,7 +210,7 @@ class Bench:
         for _ in range(int(seconds / 0.05)):
             self.world.step(0.05)
             pose = self.robot.estimate
-            points = hit_points(self.world.spec.lidar, self.world.scan("R"), pose)
+            points = hit_points(self.robot.model.lidar, self.world.scan("R"), pose)
             self.robot.drive(self.base.update(self.world.time, pose, points))
             self.ended.update({goal.id: goal.state for goal in self.base.take_ended()})
 

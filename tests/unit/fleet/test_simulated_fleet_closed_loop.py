@@ -91,7 +91,7 @@ class SimulatedFleet:
             body, client = self.world.robots[robot], self.clients[robot]
             if number % 2 == 0:
                 ranges = self.world.scan(robot)
-                self.points[robot] = hit_points(self.world.spec.lidar, ranges, body.estimate)
+                self.points[robot] = hit_points(body.model.lidar, ranges, body.estimate)
                 pose = body.estimate
                 self.plan(PoseSeen(robot, pose.x, pose.y, pose.yaw))
                 self.tell(robot, client.tick(now))

@@ -24,7 +24,7 @@ def test_a_report_says_what_is_and_was(tmp_path: Path) -> None:
     assert report.time_s == pytest.approx(0.1)
     assert report.boxes == [9]
     assert report.collisions.total == 0
-    assert report.min_separation_m == pytest.approx(2 - 2 * world.spec.robot_radius, abs=1e-3)
+    assert report.min_separation_m == pytest.approx(2 - 2 * world.spec.model.radius, abs=1e-3)
     assert (report.robot("a").cell, report.robot("b").cell) == (0, 2)
     assert [path.name for path in tmp_path.iterdir()] == ["r.json"]
     with pytest.raises(KeyError):
