@@ -6,7 +6,8 @@ import asyncio
 from typing import TYPE_CHECKING, Protocol
 
 from rce.link.exceptions import LinkLostError, LinkRefusedError, ProtocolError
-from rce.link.frames import HANDSHAKE_SIZE, HEADER_SIZE, FrameReader, FrameType
+from rce.link.frame_reader import FrameReader
+from rce.link.frames import HANDSHAKE_SIZE, HEADER_SIZE, FrameType
 from rce.link.handshake import parse_opening
 
 if TYPE_CHECKING:

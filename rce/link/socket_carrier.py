@@ -11,14 +11,8 @@ from rce.buffers import write_together
 from rce.link.carrier import Carrier, CarrierHandler
 from rce.link.exceptions import LinkLostError, ProtocolError
 from rce.link.flow_control import FlowControl
-from rce.link.frames import (
-    FRAGMENT_SIZE,
-    HANDSHAKE_SIZE,
-    Frame,
-    FrameReader,
-    FrameType,
-    encode,
-)
+from rce.link.frame_reader import FrameReader
+from rce.link.frames import FRAGMENT_SIZE, HANDSHAKE_SIZE, Frame, FrameType, encode
 from rce.link.lanes import Lanes, frame_chunk
 from rce.link.settings import KIB, MIB
 

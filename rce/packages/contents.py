@@ -14,7 +14,8 @@ from rce.packages.archive import read_archive
 from rce.packages.exceptions import BadArchiveError
 from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
 from rce.packages.tree import Entry, Kind, Tree
-from rce.ros.packages import FOLDERS, MANIFESTS, BadPackageError, Package, parse_manifest
+from rce.ros.errors import BadPackageError
+from rce.ros.packages import FOLDERS, MANIFESTS, Package, parse_manifest
 
 _DEFINITIONS = ("msg", "srv", "action")
 _SHOWN = 100

@@ -16,7 +16,8 @@ from rce.packages.exceptions import BadArchiveError
 from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
 from rce.packages.requirements import FILE_NAME as REQUIREMENTS
 from rce.packages.tree import Entry, Kind, Tree, path_fault
-from rce.ros.packages import MANIFESTS, BadPackageError, parse_manifest
+from rce.ros.errors import BadPackageError
+from rce.ros.packages import MANIFESTS, parse_manifest
 
 _CHUNK = 1 << 16
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC

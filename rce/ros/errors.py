@@ -198,3 +198,19 @@ class NodeClosedError(RosError):
 
 class ToolError(Exception):
     """The command cannot be done; its text says why and what to do."""
+
+
+class PackageError(Exception):
+    """Base of all errors of packages."""
+
+
+class PackageNotFoundError(PackageError, LookupError):
+    """A package was not found on the path."""
+
+
+class ExecutableNotFoundError(PackageError, LookupError):
+    """A package has no such executable, or it may not be executed."""
+
+
+class BadPackageError(PackageError, ValueError):
+    """A package's manifest cannot be read."""

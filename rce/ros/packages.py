@@ -26,22 +26,18 @@ import os
 import re
 import reprlib
 import sys
-from functools import cache
 from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from rce.ros.entry_points import arguments_of, distributed_nodes, distributed_packages, folder_of, scripts_of
+from rce.ros.errors import BadPackageError, ExecutableNotFoundError, PackageNotFoundError
 from rce.ros.executables import ExecutableFinder, is_executable
 from rce.ros.package_tree import PackageTree
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-NODE_ENTRY_POINTS = "rce.nodes"
-"""Entry point group by which Python distributions add nodes."""
-
-PACKAGE_ENTRY_POINTS = "rce.packages"
-"""Entry point group by which Python distributions add packages."""
 
 PATH_VARIABLES = ("RCE_PACKAGE_PATH", "ROS_PACKAGE_PATH")
 """Environment variables that hold package paths, the more important first."""
@@ -57,22 +53,6 @@ ROSBUILD_MANIFEST = "manifest.xml"
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _PYTHONS = ("engine", "system")
-
-
-class PackageError(Exception):
-    """Base of all errors of packages."""
-
-
-class PackageNotFoundError(PackageError, LookupError):
-    """A package was not found on the path."""
-
-
-class ExecutableNotFoundError(PackageError, LookupError):
-    """A package has no such executable, or it may not be executed."""
-
-
-class BadPackageError(PackageError, ValueError):
-    """A package's manifest cannot be read."""
 
 
 class Package(NamedTuple):
@@ -107,9 +87,9 @@ class Package(NamedTuple):
             return [str(found)]
         if meant:
             raise ExecutableNotFoundError(f"{meant[0]} may not be executed (chmod +x makes it so)")
-        for name, target in _scripts(self.name):  # last, because it searches all installed distributions
+        for name, target in scripts_of(self.name):  # last, because it searches all installed distributions
             if name == exe:
-                return [sys.executable, *_arguments_of(target)]
+                return [sys.executable, *arguments_of(target)]
         where = ", ".join(str(folder) for folder in self._folders() if folder.is_dir())
         raise ExecutableNotFoundError(
             f"package {self.name} has no executable {exe!r} (looked in {where or self.path}, and below"
@@ -159,9 +139,9 @@ class PackageIndex:
         folder = self.locate(name)
         if folder is not None:
             return _read_package(folder, name)
-        scripts = _scripts(name)
+        scripts = scripts_of(name)
         if scripts:
-            return Package(name, _folder_of(scripts[0][1]), python="engine")
+            return Package(name, folder_of(scripts[0][1]), python="engine")
         closed = [str(root) for root in self.path if root.exists() and not os.access(root, os.R_OK | os.X_OK)]
         hint = f"; {os.pathsep.join(closed)} may not be read here" if closed else ""
         raise PackageNotFoundError(f"no package {name!r} on the package path ({self.describe_path()}){hint}")
@@ -178,8 +158,8 @@ class PackageIndex:
             found = _find_below(root, name)
             if found is not None:
                 return found
-        target = _distributed().get(name)
-        return None if target is None else _folder_of(target)
+        target = distributed_packages().get(name)
+        return None if target is None else folder_of(target)
 
     def describe_path(self) -> str:
         """Return the path as text for errors."""
@@ -188,7 +168,7 @@ class PackageIndex:
 
 def distributed_folders() -> list[Path]:
     """Return the folders of the Python packages that add packages or nodes by entry points."""
-    targets = [*_distributed().values(), *(target for _, _, target in _distributed_nodes())]
+    targets = [*distributed_packages().values(), *(target for _, _, target in distributed_nodes())]
     names = sorted({target.partition(":")[0].partition(".")[0] for target in targets})
     specs = [spec for name in names if (spec := find_spec(name)) is not None]
     return [Path(folder) for spec in specs for folder in spec.submodule_search_locations or ()]
@@ -325,47 +305,3 @@ def _parse_xml(manifest: Path, text: bytes, name: str) -> Package:
     declared = (root.findtext("name") or name).strip()
     description = " ".join((root.findtext("description") or "").split())
     return Package(declared, manifest.parent, description, version=(root.findtext("version") or "").strip())
-
-
-@cache
-def _distributed() -> Mapping[str, str]:
-    """Return the packages that Python distributions add: name to Python package."""
-    from importlib.metadata import entry_points
-
-    return {point.name: point.value for point in entry_points(group=PACKAGE_ENTRY_POINTS)}
-
-
-def _scripts(package: str) -> tuple[tuple[str, str], ...]:
-    """Read the executables that Python distributions add to a package: name and ``module[:function]``."""
-    return tuple((exe, target) for owner, exe, target in _distributed_nodes() if owner == package)
-
-
-@cache
-def _distributed_nodes() -> tuple[tuple[str, str, str], ...]:
-    from importlib.metadata import entry_points
-
-    points = ((*point.name.partition(":"), point.value) for point in entry_points(group=NODE_ENTRY_POINTS))
-    return tuple((owner, exe, target) for owner, _, exe, target in points)
-
-
-def _arguments_of(target: str) -> list[str]:
-    """Return Python's arguments for running an entry point."""
-    module, _, function = target.partition(":")
-    if not function:
-        return [str(_file_of(target))]
-    return ["-c", f"import importlib, sys; sys.exit(importlib.import_module({module!r}).{function}())"]
-
-
-def _folder_of(target: str) -> Path:
-    return _file_of(target).parent
-
-
-def _file_of(target: str) -> Path:
-    module = target.partition(":")[0]
-    try:
-        spec = find_spec(module)
-    except ImportError as error:
-        raise BadPackageError(f"entry point {target}: {error}") from error
-    if spec is None or spec.origin is None or not spec.has_location:
-        raise BadPackageError(f"entry point {target}: there is no file of a module {module}")
-    return Path(spec.origin)

@@ -19,7 +19,8 @@ from pathlib import Path
 
 from rce.guard.turns import CrowdedError, Turns
 from rce.packages.requirements import FILE_NAME, read_requirements
-from rce.ros.packages import MANIFESTS, BadPackageError, parse_manifest
+from rce.ros.errors import BadPackageError
+from rce.ros.packages import MANIFESTS, parse_manifest
 from rce_container.exceptions import RuntimeUnavailableError
 from rce_container.files import remove, size_of
 from rce_container.packages.disk import Locks, forget_before_boot, in_thread, scratch_aside

@@ -28,20 +28,12 @@ from rce.control.messages import (
     Usage,
 )
 from rce.control.model import (
-    ConnectionSpec,
-    EndpointKind,
-    EndpointSpec,
     EndpointState,
     EndpointStatus,
-    LinkAddress,
-    LinkSpec,
     NodeState,
     NodeStatus,
 )
-from rce.link import Buffer, Endpoint, Interface, LinkHub, Port
 from rce.link.handover import LinkAcceptor
-from rce.model.names import EndpointId
-from rce.model.specs import InterfaceSpec, NodeSpec
 from rce_container.environment import proc
 from rce_container.folder import Record, StateFolder
 from rce_container.limits import choose_limiter
@@ -54,65 +46,10 @@ from rce_container.runtimes.namespace import HOME_BYTES, NamespaceRuntime
 from rce_container.runtimes.podman import PodmanRuntime
 from rce_container.runtimes.process import ProcessRuntime
 from rce_container.settings import ContainerSettings
-from support.parts import SpecParts
+from support.container_nodes import NODES
+from support.container_specs import MACHINE, ContainerParts, container
 
-MACHINE = "testmachine"
 RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]
-ECHO = NodeSpec(tag="echo", pkg="Test", exe="stringEcho.py")
-
-NODES = {
-    "talk.py": "import os, sys, time\nprint('hello', *sys.argv[1:], flush=True)\ntime.sleep(600)\n",
-    "fail.py": "import sys\nprint('it is broken', flush=True)\nsys.exit(3)\n",
-    "end.py": "print('done')\n",
-    "stubborn.py": (
-        "import signal, time\n"
-        "for number in (signal.SIGINT, signal.SIGTERM):\n"
-        "    signal.signal(number, lambda *_: print('no', number, flush=True))\n"
-        "print('ready', flush=True)\n"
-        "while True:\n    time.sleep(1)\n"
-    ),
-    "daemon.py": (
-        "import os, time\n"
-        "if os.fork() == 0:\n"
-        "    os.setsid()\n"
-        "    if os.fork() == 0:\n"
-        "        print('daemon', flush=True)\n"
-        "        time.sleep(600)\n"
-        "    os._exit(0)\n"
-        "os.wait()\n"
-        "time.sleep(600)\n"
-    ),
-    "flood.py": "import sys\nwhile True:\n    sys.stdout.write('x' * 99 + chr(10))\n",
-    "look.py": (
-        "import json, os, socket\n"
-        "def can(path):\n"
-        "    try:\n        open(path, 'w').close()\n"
-        "    except OSError:\n        return False\n"
-        "    os.unlink(path)\n    return True\n"
-        "def net(address):\n"
-        "    try:\n        socket.create_connection(address, 2).close()\n"
-        "    except OSError:\n        return False\n"
-        "    return True\n"
-        "def spy():\n"
-        "    for act in (lambda: open('/proc/1/mem'), lambda: os.readlink('/proc/1/fd/0')):\n"
-        "        try:\n            act()\n"
-        "        except OSError:\n            continue\n"
-        "        return True\n"
-        "    return False\n"
-        "import sys\n"
-        "host, port, secret = sys.argv[1], int(sys.argv[2]), sys.argv[3]\n"
-        "print(json.dumps({\n"
-        "    'env': dict(os.environ), 'root': sorted(os.listdir('/')), 'uid': os.getuid(),\n"
-        "    'pids': sorted(int(p) for p in os.listdir('/proc') if p.isdigit()),\n"
-        "    'host': socket.gethostname(), 'home': can('home.txt'), 'tmp': can('/tmp/x'),\n"
-        "    'usr': can('/usr/x'), 'slash': can('/x'), 'package': can(__file__ + 'x'),\n"
-        "    'loopback': net((host, port)), 'secret': os.path.exists(secret),\n"
-        "    'environment': spy(),\n"
-        "    'caps': next(l for l in open('/proc/self/status') if l.startswith('CapEff')).split()[1],\n"
-        "    'nnp': next(l for l in open('/proc/self/status') if l.startswith('NoNewPrivs')).split()[1],\n"
-        "}), flush=True)\n"
-    ),
-}
 
 
 T = TypeVar("T")
@@ -142,13 +79,6 @@ class ManagerOptions(TypedDict, total=False):
     starts_at_once: int
     slot_memory: int
     slot_processes: int
-
-
-class ContainerParts(SpecParts, total=False):
-    """What :func:`container` makes a spec of."""
-
-    peer: str
-    dial: LinkAddress | None
 
 
 class Machine:
@@ -409,138 +339,6 @@ class Machine:
 def is_in(machine: Machine, id_: str, state: EndpointState) -> bool:
     """Whether a container's newest status says this state."""
     return machine.reported(id_).state is state
-
-
-def container(
-    id_: str,
-    revision: int,
-    *,
-    peer: str = "",
-    dial: LinkAddress | None = None,
-    **parts: Unpack[SpecParts],
-) -> EndpointSpec:
-    """A container's spec; with ``peer``, wired to it over one link."""
-    if peer:
-        parts["links"], parts["connections"] = wiring(
-            peer, dial, [i.tag for i in parts.get("interfaces", ())]
-        )
-    return EndpointSpec(id=id_, kind=EndpointKind.CONTAINER, revision=revision, **parts)
-
-
-def wiring(
-    peer: str, dial: LinkAddress | None, tags: list[str]
-) -> tuple[tuple[LinkSpec, ...], tuple[ConnectionSpec, ...]]:
-    """The link to a peer, and a connection over it for each tag, with the interface of the same tag there."""
-    link = LinkSpec(id="link", peer=peer, token="token", dial=dial is not None, address=dial or LinkAddress())
-    connections = tuple(
-        ConnectionSpec(id=number, link="link", interface=tag, peer_interface=tag)
-        for number, tag in enumerate(tags, 1)
-    )
-    return (link,), connections
-
-
-STRING = "std_msgs/String"
-ECHO_INTERFACES = (
-    InterfaceSpec(tag="req", type="PublisherInterface", message_type=STRING, addr="stringEchoReq"),
-    InterfaceSpec(tag="resp", type="SubscriberInterface", message_type=STRING, addr="stringEchoResp"),
-    InterfaceSpec(
-        tag="srv", type="ServiceClientInterface", message_type="Test/StringEcho", addr="stringEchoService"
-    ),
-)
-
-
-class PeerEnd(Interface):
-    """A peer's end of a connection, for a test to play on."""
-
-    def __init__(self, port: Port) -> None:
-        super().__init__(port)
-        self.active = asyncio.Event()
-        self.history: list[bool] = []
-        self.received: asyncio.Queue[bytes] = asyncio.Queue()
-
-    async def start(self) -> None: ...
-
-    async def close(self) -> None: ...
-
-    def on_active(self, active: bool) -> None:
-        self.history.append(active)
-        self.active.set() if active else self.active.clear()
-
-    def receive(self, payload: bytes, *, latched: bool) -> None:
-        self.received.put_nowait(payload)
-
-    async def serve(self, payload: bytes) -> Buffer:
-        return payload
-
-
-COMPLEMENT = {
-    "PublisherInterface": "SubscriberForwarder",
-    "SubscriberInterface": "PublisherForwarder",
-    "ServiceClientInterface": "ServiceProviderForwarder",
-    "ServiceProviderInterface": "ServiceClientForwarder",
-}
-
-
-class Peer:
-    """A robot that is wired to a container."""
-
-    def __init__(self, machine: str) -> None:
-        self.hub = LinkHub(machine)
-        self.ends: dict[str, PeerEnd] = {}
-        self.faults: list[str] = []
-        self.endpoint = Endpoint(
-            EndpointId.parse("user/robot"),
-            self._make,
-            self.hub,
-            on_change=lambda: None,
-            on_fault=self.faults.append,
-        )
-
-    def _make(self, port: Port) -> PeerEnd:
-        end = self.ends[port.spec.tag] = PeerEnd(port)
-        return end
-
-    async def wire(
-        self,
-        address: LinkAddress,
-        interfaces: tuple[InterfaceSpec, ...],
-        revision: int = 1,
-        id_: str = "user/box",
-    ) -> None:
-        """Connect to a container's interfaces."""
-        own = tuple(
-            InterfaceSpec(tag=i.tag, type=COMPLEMENT[i.type], message_type=i.message_type) for i in interfaces
-        )
-        links, connections = wiring(id_, address, [i.tag for i in interfaces])
-        await self.endpoint.apply(
-            EndpointSpec(
-                id="user/robot",
-                kind=EndpointKind.ROBOT,
-                revision=revision,
-                interfaces=own,
-                links=links,
-                connections=connections,
-            )
-        )
-
-    async def active(self, *tags: str) -> None:
-        async with asyncio.timeout(60):
-            for tag in tags or self.ends:
-                await self.ends[tag].active.wait()
-
-    async def close(self) -> None:
-        await self.endpoint.close()
-        await self.hub.close()
-
-
-@contextlib.asynccontextmanager
-async def joined(address: LinkAddress, machine: str = MACHINE) -> AsyncIterator[Peer]:
-    peer = Peer(machine)
-    try:
-        await peer.wire(address, ECHO_INTERFACES)
-        yield peer
-    finally:
-        await peer.close()
 
 
 def program_of(pid: int) -> str:

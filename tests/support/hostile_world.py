@@ -33,17 +33,9 @@ from rce.model.specs import InterfaceSpec, NodeSpec, Resources
 from rce_container.environment import proc
 from rce_container.runtimes.namespace import NamespaceRuntime
 from rce_container.seccomp.library import FilterUnavailableError
-from support.containers import (
-    ECHO,
-    ECHO_INTERFACES,
-    MACHINE,
-    ContainerParts,
-    Machine,
-    ManagerOptions,
-    Peer,
-    container,
-    until,
-)
+from support.container_peers import Peer
+from support.container_specs import ECHO, ECHO_INTERFACES, MACHINE, ContainerParts, container
+from support.containers import Machine, ManagerOptions, until
 from support.persons import SECRET
 
 HOSTILE = Path(__file__).parent / "hostile"

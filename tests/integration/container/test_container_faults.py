@@ -13,7 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support.containers import ECHO, Machine, until
+from support.container_specs import ECHO
+from support.containers import Machine, until
 
 from rce.control.model import EndpointState, NodeState
 from rce.model.specs import NodeSpec, RestartPolicy

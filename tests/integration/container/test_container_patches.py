@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
-from support.containers import ECHO, Machine, until
+from support.container_specs import ECHO
+from support.containers import Machine, until
 
 from rce.control.messages import CONTROL_VERSION, PatchSpec, PatchStatus, SpecWanted, Status, Welcome
 from rce.control.model import PATCHES, EndpointContents, NodeState, SpecPatch

@@ -11,7 +11,9 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from support.containers import ECHO, ECHO_INTERFACES, MACHINE, Machine, Peer, is_in, joined, until
+from support.container_peers import Peer, joined
+from support.container_specs import ECHO, ECHO_INTERFACES, MACHINE
+from support.containers import Machine, is_in, until
 
 from rce.control.model import EndpointState, LinkAddress, NodeState
 from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec

@@ -9,7 +9,8 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from support.containers import ECHO, Machine, program_of, until
+from support.container_specs import ECHO
+from support.containers import Machine, program_of, until
 
 from rce.control.model import EndpointState, NodeState
 from rce.model.specs import NodeSpec

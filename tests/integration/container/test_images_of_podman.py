@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.containers import ECHO, ECHO_INTERFACES, Machine, is_in, joined, program_of, until
+from support.container_peers import joined
+from support.container_specs import ECHO, ECHO_INTERFACES
+from support.containers import Machine, is_in, program_of, until
 from support.rootfs import image_of, make_rootfs
 
 from rce.control.messages import Fault

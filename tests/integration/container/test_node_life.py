@@ -8,7 +8,8 @@ import signal
 from typing import TypedDict, Unpack
 
 import pytest
-from support.containers import Machine, joined, until
+from support.container_peers import joined
+from support.containers import Machine, until
 from support.parts import NodeLife
 
 from rce.control.logs import LogLevel, LogQuery, LogStream

@@ -16,7 +16,7 @@ from websockets.asyncio.client import connect
 from rce.control.server import ControlServer
 from rce.guard.lobby import Lobby
 from rce.link.exceptions import LinkRefusedError
-from rce.link.frames import FrameReader
+from rce.link.frame_reader import FrameReader
 from rce.link.handover import HandoverReceiver, HandoverSender, LinkAcceptor
 from rce.link.handshake import check_answer, encode_hello
 from rce.link.hub import LinkHub

@@ -20,7 +20,8 @@ from rce.link import (
     OverloadedError,
     PeerLostError,
 )
-from rce.link.frames import HEADER, Frame, FrameReader, FrameType, encode
+from rce.link.frame_reader import FrameReader
+from rce.link.frames import HEADER, Frame, FrameType, encode
 from rce.link.handshake import check_answer, encode_hello, encode_welcome
 
 if TYPE_CHECKING:

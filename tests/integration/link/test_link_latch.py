@@ -9,7 +9,8 @@ import msgspec
 import pytest
 
 from rce.control.model import ConnectionSpec, LinkSpec
-from rce.link.frames import LATCHED, VERSION, Frame, FrameReader, FrameType, encode
+from rce.link.frame_reader import FrameReader
+from rce.link.frames import LATCHED, VERSION, Frame, FrameType, encode
 from rce.link.latch import MAX_SOURCES
 from rce.link.settings import LinkLimits
 

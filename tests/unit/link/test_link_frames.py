@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.link.exceptions import LinkRefusedError, ProtocolError
+from rce.link.frame_reader import FrameReader
 from rce.link.frames import (
     HANDSHAKE_SIZE,
     HEADER,
     LATCHED,
     Frame,
-    FrameReader,
     FrameType,
     encode,
     pack_fragment,

@@ -11,15 +11,8 @@ from hypothesis import strategies as st
 
 from rce.aio.queues import OverflowPolicy
 from rce.link.exceptions import OverloadedError, ProtocolError
-from rce.link.frames import (
-    FRAGMENT_SIZE,
-    LATCHED,
-    Frame,
-    FrameReader,
-    FrameType,
-    encode_sources,
-    parse_sources,
-)
+from rce.link.frame_reader import FrameReader
+from rce.link.frames import FRAGMENT_SIZE, LATCHED, Frame, FrameType, encode_sources, parse_sources
 from rce.link.lanes import MAX_CONTROL_FRAMES, URGENT_BURST, Lanes
 from rce.link.queues import SMALL_MESSAGE, Backlog, Counters, OutgoingQueue
 from rce.link.settings import LinkLimits

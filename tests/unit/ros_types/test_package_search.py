@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from rce.ros import package_tree
+from rce.ros.errors import PackageNotFoundError
 from rce.ros.package_tree import PackageTree
-from rce.ros.packages import PackageIndex, PackageNotFoundError
+from rce.ros.packages import PackageIndex
 
 LIST = """
 import json, sys, rospkg

@@ -12,8 +12,9 @@ from typing import Protocol
 
 import pytest
 
-from rce.ros import packages
-from rce.ros.packages import BadPackageError, ExecutableNotFoundError, PackageIndex, PackageNotFoundError
+from rce.ros import entry_points
+from rce.ros.errors import BadPackageError, ExecutableNotFoundError, PackageNotFoundError
+from rce.ros.packages import PackageIndex
 from rce.ros.substitution import SubstitutionError, split_arguments, substitute
 
 
@@ -152,8 +153,8 @@ def distributed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Distributed]:
     """Lets installed distributions have the entry points that a test gives."""
 
     def forget() -> None:
-        packages._distributed.cache_clear()
-        packages._distributed_nodes.cache_clear()
+        entry_points.distributed_packages.cache_clear()
+        entry_points.distributed_nodes.cache_clear()
 
     def have(*points: tuple[str, str, str]) -> None:
         found = EntryPoints(EntryPoint(name, value, group) for group, name, value in points)

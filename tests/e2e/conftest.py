@@ -1,0 +1,28 @@
+"""An engine with TLS, which the tests of a module share."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+import pytest_asyncio
+from support.tls_engine import World
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def shared_engine() -> AsyncIterator[World]:
+    with tempfile.TemporaryDirectory(prefix="rce-", dir="/tmp") as folder:
+        found = World(Path(folder))
+        await found.start()
+        try:
+            yield found
+            assert "Traceback" not in found.output()
+        finally:
+            await found.stop()
+
+
+@pytest.fixture
+def world(shared_engine: World) -> World:
+    return shared_engine

@@ -1,0 +1,57 @@
+"""Programs of nodes that tests run in containers."""
+
+from __future__ import annotations
+
+NODES = {
+    "talk.py": "import os, sys, time\nprint('hello', *sys.argv[1:], flush=True)\ntime.sleep(600)\n",
+    "fail.py": "import sys\nprint('it is broken', flush=True)\nsys.exit(3)\n",
+    "end.py": "print('done')\n",
+    "stubborn.py": (
+        "import signal, time\n"
+        "for number in (signal.SIGINT, signal.SIGTERM):\n"
+        "    signal.signal(number, lambda *_: print('no', number, flush=True))\n"
+        "print('ready', flush=True)\n"
+        "while True:\n    time.sleep(1)\n"
+    ),
+    "daemon.py": (
+        "import os, time\n"
+        "if os.fork() == 0:\n"
+        "    os.setsid()\n"
+        "    if os.fork() == 0:\n"
+        "        print('daemon', flush=True)\n"
+        "        time.sleep(600)\n"
+        "    os._exit(0)\n"
+        "os.wait()\n"
+        "time.sleep(600)\n"
+    ),
+    "flood.py": "import sys\nwhile True:\n    sys.stdout.write('x' * 99 + chr(10))\n",
+    "look.py": (
+        "import json, os, socket\n"
+        "def can(path):\n"
+        "    try:\n        open(path, 'w').close()\n"
+        "    except OSError:\n        return False\n"
+        "    os.unlink(path)\n    return True\n"
+        "def net(address):\n"
+        "    try:\n        socket.create_connection(address, 2).close()\n"
+        "    except OSError:\n        return False\n"
+        "    return True\n"
+        "def spy():\n"
+        "    for act in (lambda: open('/proc/1/mem'), lambda: os.readlink('/proc/1/fd/0')):\n"
+        "        try:\n            act()\n"
+        "        except OSError:\n            continue\n"
+        "        return True\n"
+        "    return False\n"
+        "import sys\n"
+        "host, port, secret = sys.argv[1], int(sys.argv[2]), sys.argv[3]\n"
+        "print(json.dumps({\n"
+        "    'env': dict(os.environ), 'root': sorted(os.listdir('/')), 'uid': os.getuid(),\n"
+        "    'pids': sorted(int(p) for p in os.listdir('/proc') if p.isdigit()),\n"
+        "    'host': socket.gethostname(), 'home': can('home.txt'), 'tmp': can('/tmp/x'),\n"
+        "    'usr': can('/usr/x'), 'slash': can('/x'), 'package': can(__file__ + 'x'),\n"
+        "    'loopback': net((host, port)), 'secret': os.path.exists(secret),\n"
+        "    'environment': spy(),\n"
+        "    'caps': next(l for l in open('/proc/self/status') if l.startswith('CapEff')).split()[1],\n"
+        "    'nnp': next(l for l in open('/proc/self/status') if l.startswith('NoNewPrivs')).split()[1],\n"
+        "}), flush=True)\n"
+    ),
+}

@@ -1,0 +1,125 @@
+"""Both ends of a control channel, for tests to play on."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from rce.aio.backoff import Backoff
+from rce.config.secret import Secret
+from rce.control.channel import TaskSetChannel
+from rce.control.exceptions import (
+    PeerRefusedError,
+)
+from rce.control.messages import (
+    CONTROL_VERSION,
+    ClientReply,
+    ClientRequest,
+    Hello,
+    Left,
+    LogChunk,
+    Login,
+    LoginReply,
+    MachineInfo,
+    Notify,
+    ReadLog,
+    Sync,
+    TaskSetKind,
+    ToMaster,
+    ToTaskSet,
+)
+from rce.control.peer import Peer
+from rce.control.server import ControlServer
+from rce.control.timeouts import ControlTimeouts
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+SECRET = Secret("the engine's secret")
+
+
+QUICK = ControlTimeouts(
+    open=2, close=0.2, request=5, log=0.2, backoff=Backoff(0.05, 0.05, jitter=1.0), backoff_refused=0.02
+)
+
+
+class Master:
+    """A master that answers and remembers."""
+
+    def __init__(self, port: int = 0, timeouts: ControlTimeouts = QUICK) -> None:
+        self.hellos: asyncio.Queue[tuple[Peer, Hello]] = asyncio.Queue()
+        self.messages: asyncio.Queue[ToMaster] = asyncio.Queue()
+        self.gone: asyncio.Queue[Peer] = asyncio.Queue()
+        self.story: list[str] = []
+        self.seen: Counter[str] = Counter()
+        self.mute = False
+        self.refuse = ""
+        self.server = ControlServer(
+            SECRET,
+            on_hello=self.on_hello,
+            on_message=self.on_message,
+            on_gone=self.on_gone,
+            port=port,
+            timeouts=timeouts,
+        )
+
+    async def on_hello(self, peer: Peer, hello: Hello) -> None:
+        if self.refuse:
+            raise PeerRefusedError(self.refuse)
+        self.story.append("hello")
+        peer.send(Sync(endpoints=()))
+        self.hellos.put_nowait((peer, hello))
+
+    async def on_message(self, peer: Peer, message: ToMaster) -> None:
+        self.seen[type(message).__name__] += 1
+        if isinstance(message, Left) and message.reason == "boom":
+            raise RuntimeError("boom")
+        if isinstance(message, Login) and not self.mute:
+            peer.send(LoginReply(request=message.request, status=401, reason=message.user))
+        elif isinstance(message, ClientRequest) and not self.mute:
+            peer.send(ClientReply(request=message.request, errors=(message.type, str(message.data))))
+        self.messages.put_nowait(message)
+
+    async def on_gone(self, peer: Peer) -> None:
+        self.story.append("gone")
+        self.gone.put_nowait(peer)
+
+
+class TaskSet:
+    """A task set that remembers what it was told."""
+
+    def __init__(self, port: int, *, secret: Secret = SECRET, timeouts: ControlTimeouts = QUICK) -> None:
+        self.told: asyncio.Queue[ToTaskSet] = asyncio.Queue()
+        self.channel = TaskSetChannel(f"ws://127.0.0.1:{port}", secret, hello, self.handle, timeouts=timeouts)
+
+    async def handle(self, message: ToTaskSet) -> None:
+        if isinstance(message, ReadLog) and message.node == "talker":
+            self.channel.send(LogChunk(request=message.request, offset=5, text="hello"))
+        if isinstance(message, Notify) and message.text == "boom":
+            raise RuntimeError("boom")
+        self.told.put_nowait(message)
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[TaskSet]:
+        task = asyncio.create_task(self.channel.run())
+        try:
+            yield self
+        finally:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+
+
+def hello() -> Hello:
+    return Hello(
+        version=CONTROL_VERSION,
+        kind=TaskSetKind.ROBOT,
+        process="robots-1",
+        machine=MachineInfo(name="m"),
+    )
+
+
+def headers(secret: str = SECRET.reveal()) -> dict[str, str]:
+    return {"Authorization": f"Bearer {secret}"}

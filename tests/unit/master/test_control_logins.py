@@ -1,0 +1,113 @@
+"""Logins and requests that task sets hand to the control handler."""
+
+from __future__ import annotations
+
+from support.master_cloud import PASSWORD, Cloud, wire
+
+from rce.control.messages import (
+    ClientReply,
+    ClientRequest,
+    Left,
+    Login,
+    LoginReply,
+    Probe,
+)
+from rce_master.auth import client_digest
+
+
+async def test_a_logins_answer_carries_the_spec_and_no_put_precedes_it(cloud: Cloud) -> None:
+    robots = cloud.robots()
+    await robots.hello()
+    reply = await robots.login()
+    assert reply.endpoint is not None
+    assert reply.endpoint.id == "anna/rob"
+    assert robots.inbox.empty()
+
+
+async def test_logins_that_are_refused_say_why(cloud: Cloud) -> None:
+    robots, containers = cloud.robots(), cloud.containers()
+    await robots.hello()
+    wrong = await robots.login(password=client_digest("wrong"))
+    assert (wrong.status, wrong.endpoint) == (401, None)
+    assert (await robots.login()).status == 200
+    twice = await robots.login()
+    assert twice.status == 409
+    assert "connected already" in twice.reason
+    await containers.hello()
+    await robots.ask("CC", {"containerTag": "c"})
+    assert (await robots.login("c")).status == 409
+    cloud.store.broken = True
+    assert (await robots.login("other")).status == 503
+    cloud.store.broken = False
+
+
+async def test_a_robot_that_is_connected_elsewhere_is_looked_after(cloud: Cloud) -> None:
+    first, second = cloud.robots(), cloud.robots("r2")
+    for peer in (first, second):
+        await peer.hello()
+    await first.login()
+    assert (await first.login()).status == 409
+    assert first.inbox.empty(), "its own task set probes it by itself"
+    assert (await second.login(password=client_digest("wrong"))).status == 401
+    assert first.inbox.empty(), "strangers bother nobody"
+    assert (await second.login()).status == 409
+    assert await first.get(Probe) == Probe(id="anna/rob")
+    await first.say(Left(id="anna/rob", reason="it does not answer"))
+    await cloud.flush()
+    assert (await second.login()).status == 200
+
+
+async def test_robot_leaving_during_login_is_disconnected(cloud: Cloud) -> None:
+    """A robot that leaves while it logs in is not connected for ever."""
+    robots = cloud.robots()
+    await robots.hello()
+    await robots.say(Login(request=1, user="anna", robot="rob", password=PASSWORD))
+    await robots.say(Left(id="anna/rob", reason="gone"))
+    await robots.get(LoginReply)
+    assert (await robots.login()).status == 200
+
+
+async def test_every_bad_item_is_told_and_the_others_are_done(cloud: Cloud) -> None:
+    robots = cloud.robots()
+    await robots.hello()
+    await wire(robots)
+    errors = await robots.ask(
+        "CN",
+        {
+            "addNodes": [
+                {"containerTag": "c", "nodeTag": "good", "pkg": "Test", "exe": "x.py"},
+                {"containerTag": "none", "nodeTag": "n", "pkg": "Test", "exe": "x.py"},
+                {"containerTag": "c", "nodeTag": "9bad", "pkg": "Test", "exe": "x.py"},
+            ],
+            "setParam": [{"containerTag": "c", "name": "p", "value": 2**40}],
+        },
+    )
+    assert len(errors) == 3
+    assert any("addNodes[2].nodeTag" in error for error in errors)
+    assert any("there is no container 'none'" in error for error in errors)
+    assert any("32 bits" in error for error in errors)
+    assert {n.tag for n in cloud.state_service.spec("anna/c").nodes} == {"n", "good"}
+    assert len(await robots.ask("XX", {})) == 1
+    assert len(await robots.ask("CN", "nonsense")) == 1
+    assert "connect again" in (await robots.ask("CC", {"containerTag": "d"}, robot="stranger"))[0]
+
+
+async def test_one_message_can_replace_something(cloud: Cloud) -> None:
+    robots = cloud.robots()
+    await robots.hello()
+    await wire(robots)
+    new = {"containerTag": "c", "nodeTag": "n", "pkg": "Test", "exe": "other.py"}
+    old = {"containerTag": "c", "nodeTag": "n"}
+    assert await robots.ask("CN", {"addNodes": [new], "removeNodes": [old]}) == ()
+    assert [n.exe for n in cloud.state_service.spec("anna/c").nodes] == ["other.py"]
+
+
+async def test_requests_of_one_channel_are_done_in_order(cloud: Cloud) -> None:
+    robots = cloud.robots()
+    await robots.hello()
+    await robots.login()
+    for number in range(20):
+        kind = "CC" if number % 2 == 0 else "DC"
+        await robots.say(ClientRequest(request=number, id="anna/rob", type=kind, data={"containerTag": "c"}))
+    replies = [await robots.get(ClientReply) for _ in range(20)]
+    assert [(r.request, r.errors) for r in replies] == [(number, ()) for number in range(20)]

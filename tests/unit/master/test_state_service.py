@@ -1,0 +1,136 @@
+"""The state service, the reconciler and the desk, with task sets that live in the test."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+from support.master_cloud import Cloud, FragileStore, running, wire
+
+from rce.control.messages import (
+    Put,
+    Status,
+)
+from rce.control.model import EndpointState, EndpointStatus, LinkAddress
+from rce_master.exceptions import MasterError, NotFoundError, StoreError
+from rce_master.state import commands
+
+# StateService
+
+
+async def test_nothing_changes_if_it_cannot_be_stored(cloud: Cloud) -> None:
+    heard: list[object] = []
+    cloud.state_service.listeners.append(heard.append)
+    cloud.store.broken = True
+    with pytest.raises(StoreError, match="disk full"):
+        await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="c"))
+    assert heard == []
+    assert len(cloud.state_service.tables.endpoints) == 0
+    cloud.store.broken = False
+    await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="c"))
+    assert len(heard) == 1
+
+
+async def test_reports_do_not_suffer_from_a_broken_store(cloud: Cloud) -> None:
+    robots = cloud.robots()
+    await robots.hello()
+    cloud.store.broken = True
+    cloud.store.free.clear()
+    creating = asyncio.ensure_future(
+        cloud.state_service.submit(commands.CreateContainer(user="anna", tag="a"))
+    )
+    await asyncio.sleep(0)
+    more = asyncio.ensure_future(cloud.state_service.submit(commands.CreateContainer(user="anna", tag="b")))
+    leaving = asyncio.ensure_future(cloud.control_handler.on_gone(robots))
+    await asyncio.sleep(0)
+    cloud.store.free.set()
+    await leaving
+    assert not cloud.state_service.tables.is_connected("r1")
+    for refused in (creating, more):
+        with pytest.raises(StoreError, match="disk full"):
+            await refused
+    assert len(cloud.state_service.tables.endpoints) == 0
+    cloud.store.broken = False
+
+
+async def test_changes_are_stored_before_anybody_hears_of_them(cloud: Cloud) -> None:
+    stored: list[bool] = []
+    cloud.state_service.listeners.append(lambda _: stored.append("anna/c" in cloud.store.tables["endpoints"]))
+    await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="c"))
+    assert stored == [True]
+
+
+async def test_a_storm_is_stored_at_once(cloud: Cloud) -> None:
+    cloud.store.free.clear()
+    saves = cloud.store.saves
+    made = [
+        asyncio.ensure_future(cloud.state_service.submit(commands.CreateContainer(user="anna", tag=f"c{i}")))
+        for i in range(100)
+    ]
+    await asyncio.sleep(0)
+    cloud.store.free.set()
+    await asyncio.gather(*made)
+    assert cloud.store.saves - saves <= 2
+    assert len(cloud.store.tables["endpoints"]) == 100
+
+
+async def test_of_several_commands_only_the_bad_ones_are_refused(cloud: Cloud) -> None:
+    outcomes = await cloud.state_service.submit_all(
+        [
+            commands.CreateContainer(user="anna", tag="c"),
+            commands.DestroyContainer(user="anna", tag="none"),
+            commands.CreateContainer(user="anna", tag="d"),
+        ]
+    )
+    assert [type(outcome) for outcome in outcomes] == [type(None), NotFoundError, type(None)]
+    assert await cloud.state_service.submit_all([]) == []
+
+
+async def test_a_fault_of_ours_is_no_end(cloud: Cloud, caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(MasterError, match="internal error"):
+        await cloud.state_service.submit("nonsense")  # type: ignore[arg-type]  # it is refused
+    assert "could not apply 'nonsense'" in caplog.text
+    await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="c"))
+
+
+# Reconciling
+
+
+async def test_a_restarted_master_takes_over_what_runs() -> None:
+    store = FragileStore()
+    address = LinkAddress(machine="m", unix="/run/c")
+    running_c = EndpointStatus(id="anna/c", revision=1, state=EndpointState.RUNNING, address=address)
+    async with running(store) as cloud:
+        robots, containers = cloud.robots(), cloud.containers()
+        await robots.hello()
+        await containers.hello()
+        await wire(robots)
+        await containers.say(Status(status=running_c))
+        await cloud.flush()
+        before = cloud.state_service.spec("anna/rob"), cloud.state_service.spec("anna/c")
+    async with running(store) as cloud:
+        robots, containers = cloud.robots(), cloud.containers()
+        status = EndpointStatus(id="anna/rob", revision=before[0].revision, state=EndpointState.RUNNING)
+        assert (await robots.hello(status)).endpoints == (before[0],)
+        assert (await containers.hello(running_c)).endpoints == (before[1],)
+        assert robots.inbox.empty(), "nothing changed, so nothing is to be said"
+        assert await robots.ask("CC", {"containerTag": "second"}) == ()
+        assert (await containers.get(Put)).endpoint.id == "anna/second"
+        twice = await robots.login()
+        assert twice.status == 409
+
+
+async def test_a_request_of_many_parts_is_stored_and_sent_once(cloud: Cloud) -> None:
+    robots, containers = cloud.robots(), cloud.containers()
+    await robots.hello()
+    await containers.hello()
+    await wire(robots)
+    await cloud.flush()
+    while not containers.inbox.empty():
+        containers.inbox.get_nowait()
+    parts = [{"containerTag": "c", "name": f"p{number}", "value": number} for number in range(50)]
+    assert await robots.ask("CN", {"setParam": parts}) == ()
+    put = await containers.get(Put)
+    assert len(put.endpoint.parameters) == 50
+    assert put.endpoint.revision == cloud.state_service.spec("anna/c").revision
+    assert containers.inbox.empty()
