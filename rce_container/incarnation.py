@@ -7,7 +7,7 @@ import contextlib
 import logging
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import assert_never
 
@@ -21,11 +21,9 @@ from rce.control.model import (
     PATCHES,
     EndpointSpec,
     EndpointStatus,
-    NodeStatus,
     SpecPatch,
     StatusPatch,
 )
-from rce.control.observed import ObservedStatus
 from rce.control.tags import Unknown
 from rce.link.handover import LinkAcceptor
 from rce.model import EndpointId, Resources
@@ -48,6 +46,7 @@ from rce_container.limits.enforcer import LimitEnforcer
 from rce_container.links import ContainerLinks
 from rce_container.logs import last_line
 from rce_container.network import Networks
+from rce_container.observed import OuterStatus
 from rce_container.packages.shelf import Shelf
 from rce_container.packages.supply import Library, Supply
 from rce_container.runtimes.base import Handle
@@ -100,18 +99,15 @@ class Incarnation:
         self.enforcer = enforcer
         self.counters = m.Counters()
         """The traffic of links and interfaces, as last reported by the environment."""
-        self._observed: ObservedStatus | None = None
-        """What the environment reported last."""
+        self._observed = OuterStatus(self._outer_pids if isolated else None)
         self.reported = asyncio.Event()
         """Set by the first report, or by an end without a report."""
         self._context = context
-        self._isolated = isolated
         self._channel: Channel | None = None
         self._links = ContainerLinks(context.acceptor, context.settings)
         self._takes_errands = False
         """Whether an environment runs for which links and limits are handled."""
         self._desired: DesiredState | None = None
-        self._pids: dict[int, int] = {}
         self._deadline: asyncio.Timeout | None = None
         self._features: frozenset[str] = frozenset()
         self._stopping = False
@@ -135,12 +131,12 @@ class Incarnation:
     @property
     def node_pids(self) -> dict[str, int]:
         """The pids of the nodes' first processes, as the machine sees them, by tag."""
-        return {node.tag: node.pid for node in self._observed.header.nodes} if self._observed else {}
+        return self._observed.node_pids
 
     @property
     def status(self) -> EndpointStatus | None:
         """What the environment reported last; None if it has not."""
-        return self._observed.whole if self._observed is not None else None
+        return self._observed.whole
 
     def apply(self, spec: EndpointSpec) -> None:
         """Give the environment its desired state."""
@@ -352,36 +348,16 @@ class Incarnation:
     def _report(self, status: EndpointStatus, pace: intake.Pace) -> None:
         if not self._stopping:
             self._limit(None)
-        status = self._outside(status, pace)
-        self._observed = ObservedStatus(status, intake.MAX_CONNECTIONS)
+        status = self._observed.replace(status, pace)
         self.reported.set()
         self._context.feed(events.Reported(self.id, self.incarnation_id, status))
 
     def _report_patch(self, patch: StatusPatch, pace: intake.Pace) -> None:
-        if self._observed is None:
-            return
-        patch = msgspec.structs.replace(patch, status=self._outside(patch.status, pace))
-        self._observed.patch(patch)
-        self._context.feed(events.Changed(self.id, self.incarnation_id, patch))
+        if (outer := self._observed.patch(patch, pace)) is not None:
+            self._context.feed(events.Changed(self.id, self.incarnation_id, outer))
 
-    def _outside(self, status: EndpointStatus, pace: intake.Pace) -> EndpointStatus:
-        """Return a status as seen from outside the container."""
-        if not self._isolated:
-            return status
-        return msgspec.structs.replace(status, nodes=self._with_outer_pids(status, pace))
-
-    def _with_outer_pids(self, status: EndpointStatus, pace: intake.Pace) -> tuple[NodeStatus, ...]:
-        """Replace the nodes' pids inside the container by their pids outside."""
-        if any(node.pid and node.pid not in self._pids for node in status.nodes):
-            pace.pay(intake.PER_LOOK)
-            pids = self.enforcer.control_group.pids() or [
-                one.pid for one in self.handle.members(proc.table())
-            ]
-            self._pids = {proc.inner_pid(pid): pid for pid in pids}
-        return tuple(
-            msgspec.structs.replace(node, pid=self._pids.get(node.pid, 0)) if node.pid else node
-            for node in status.nodes
-        )
+    def _outer_pids(self) -> Iterable[int]:
+        return self.enforcer.control_group.pids() or [one.pid for one in self.handle.members(proc.table())]
 
     def _limit(self, seconds: float | None) -> None:
         if self._deadline is not None:

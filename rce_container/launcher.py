@@ -69,6 +69,10 @@ class Launcher:
         self._limiter = limiter
         self._networks = networks
 
+    def runtime_of(self, record: Record) -> Runtime:
+        """Return the runtime that runs a container of an earlier manager."""
+        return self._runtimes.get(record.runtime, self._runtime)
+
     def launch(self, id_: str, folder: ContainerFolder, resources: Resources) -> Launched:
         """Start a container's first process, and write its record to its folder.
 

@@ -42,14 +42,11 @@ from rce.control.model import PATCHES, EndpointStatus, LinkAddress
 from rce.model import EndpointId
 from rce.own_process import cpu_seconds, resident_bytes
 from rce_container import core, events
-from rce_container.environment import messages as m
 from rce_container.environment import proc
-from rce_container.environment.channel import connect
-from rce_container.environment.exceptions import ChannelError
-from rce_container.environment.process import kill_marked
 from rce_container.exceptions import ContainerError, ExecutionError, NetworkError, StateError
 from rce_container.executions import Executions
-from rce_container.folder import ContainerFolder
+from rce_container.folder import ContainerFolder, Record
+from rce_container.former import FormerContainers
 from rce_container.incarnation import Incarnation, IncarnationContext
 from rce_container.launcher import Launcher
 from rce_container.life import Phase
@@ -111,8 +108,6 @@ class Manager:
         self._name = name
         self._info = info
         self._settings = settings
-        self._runtimes = runtimes
-        self._runtime = runtime
         self._state = state
         self._links = links
         self._limiter = limiter
@@ -128,6 +123,7 @@ class Manager:
             limiter=limiter,
             networks=self._networks,
         )
+        self._former = FormerContainers(state, settings, limiter, self._launcher)
         self._context = IncarnationContext(
             settings=settings,
             acceptor=acceptor,
@@ -210,10 +206,10 @@ class Manager:
         """
         with contextlib.closing(self._networks):
             async with asyncio.TaskGroup() as self._tasks:
-                await self._deal_with_the_past()
+                await self._former.take_over(self, self._tasks)
                 ready()
                 usage = self._tasks.create_task(self._report_usage(), name="usage")
-                pruning = self._tasks.create_task(self._prune_logs(), name="old logs")
+                pruning = self._tasks.create_task(self._former.prune_logs(), name="old logs")
                 await quit_.wait()
                 self._feed(events.Quit())
                 self._start_waiting()
@@ -228,27 +224,14 @@ class Manager:
         for incarnation in self._incarnations.values():
             incarnation.kill()
 
-    async def _deal_with_the_past(self) -> None:
-        folders = await asyncio.to_thread(self._state.existing)
-        await self._sweep_control_groups({folder.incarnation_id for folder in folders})
-        incarnation_ids = {folder.incarnation_id for folder in folders}
-        await asyncio.to_thread(self._state.archive.settle, incarnation_ids, time.time())
-        async with asyncio.TaskGroup() as tasks:
-            for folder in folders:
-                tasks.create_task(self._adopt_or_prune(folder))
-
-    async def _adopt_or_prune(self, folder: ContainerFolder) -> None:
-        record = folder.read_record()
-        process = proc.read(record.pid) if record is not None else None
-        runtime = self._runtimes.get(record.runtime, self._runtime) if record is not None else self._runtime
-        if record is None or process is None or process.start != record.start or runtime.is_starting(record):
-            self._tasks.create_task(self._prune(folder), name=f"prune {folder.incarnation_id}")
-            return
+    async def adopt(self, folder: ContainerFolder, record: Record, process: proc.Process) -> None:
+        """Adopt a container of an earlier manager, or kill it if it does not answer."""
         if record.group:
             try:
                 self._networks.adopt(EndpointId.parse(record.id), record, folder.hosts)
             except NetworkError as error:
                 _log.warning("container %s has lost its group: %s", record.id, error)
+        runtime = self._launcher.runtime_of(record)
         handle = runtime.adopt(process, record)
         control_group = self._limiter.adopt(folder.incarnation_id)
         incarnation = self._own(record.id, folder, handle, control_group, isolated=runtime.isolated)
@@ -265,36 +248,6 @@ class Manager:
             return
         _log.info("adopted container %s", record.id)
         self._feed(events.Adopted(incarnation.incarnation_id, incarnation.status, self._address(folder)))
-
-    async def _prune(self, folder: ContainerFolder) -> None:
-        """Remove the remains of an ended container."""
-        with contextlib.suppress(OSError, ChannelError, TimeoutError):
-            # It may still run, if its manager ended before it wrote the record; or it may be ending just now.
-            channel = await connect(str(folder.control_socket))
-            try:
-                channel.send(m.encode(m.Stop()))
-                async with asyncio.timeout(self._settings.stop_timeout):
-                    while await channel.receive() is not None:
-                        pass
-            finally:
-                channel.close()
-        await kill_marked(folder.incarnation_id)
-        await self._launcher.undo(folder.incarnation_id)
-        await asyncio.to_thread(folder.remove)
-        await asyncio.to_thread(self._state.archive.settle_one, folder.incarnation_id, time.time())
-
-    async def _prune_logs(self) -> None:
-        """Periodically remove the logs of containers that ended long ago."""
-        while True:
-            await asyncio.to_thread(self._state.archive.prune, time.time())
-            await asyncio.sleep(self._settings.prune_interval)
-
-    async def _sweep_control_groups(self, keep: set[str]) -> None:
-        """Remove the control groups of containers that have no other remains."""
-        try:
-            await asyncio.to_thread(self._limiter.sweep, keep)
-        except (ContainerError, OSError) as error:
-            _log.error("what earlier containers left cannot be removed: %s", error)
 
     # Instructions of the core
 

@@ -1,0 +1,76 @@
+"""What a container's environment reports, as it is seen from outside the container."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from rce.control.observed import ObservedStatus
+from rce_container import intake
+from rce_container.environment import proc
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from rce.control.model import EndpointStatus, NodeStatus, StatusPatch
+
+
+class OuterStatus:
+    """The reported status of one incarnation, with the pids that the machine sees.
+
+    Args:
+        pids: Return the pids of the container's processes as the machine sees them; None if the environment
+            reports these.
+    """
+
+    def __init__(self, pids: Callable[[], Iterable[int]] | None) -> None:
+        self._list_pids = pids
+        self._observed: ObservedStatus | None = None
+        self._pids: dict[int, int] = {}
+        """Pid inside the container to pid outside."""
+
+    @property
+    def node_pids(self) -> dict[str, int]:
+        """The pids of the nodes' first processes by tag."""
+        return {node.tag: node.pid for node in self._observed.header.nodes} if self._observed else {}
+
+    @property
+    def whole(self) -> EndpointStatus | None:
+        """The newest status; None before the first report."""
+        return self._observed.whole if self._observed is not None else None
+
+    def replace(self, status: EndpointStatus, pace: intake.Pace) -> EndpointStatus:
+        """Take over a whole report, and return it as seen from outside.
+
+        Args:
+            status: The report, sanitized.
+            pace: Pays for the work that it causes.
+        """
+        status = self._outside(status, pace)
+        self._observed = ObservedStatus(status, intake.MAX_CONNECTIONS)
+        return status
+
+    def patch(self, patch: StatusPatch, pace: intake.Pace) -> StatusPatch | None:
+        """Take over a patch, and return it as seen from outside; None before the first report."""
+        if self._observed is None:
+            return None
+        patch = msgspec.structs.replace(patch, status=self._outside(patch.status, pace))
+        self._observed.patch(patch)
+        return patch
+
+    def _outside(self, status: EndpointStatus, pace: intake.Pace) -> EndpointStatus:
+        if self._list_pids is None:
+            return status
+        return msgspec.structs.replace(status, nodes=self._with_outer_pids(status, self._list_pids, pace))
+
+    def _with_outer_pids(
+        self, status: EndpointStatus, pids: Callable[[], Iterable[int]], pace: intake.Pace
+    ) -> tuple[NodeStatus, ...]:
+        if any(node.pid and node.pid not in self._pids for node in status.nodes):
+            pace.pay(intake.PER_LOOK)
+            self._pids = {proc.inner_pid(pid): pid for pid in pids()}
+        return tuple(
+            msgspec.structs.replace(node, pid=self._pids.get(node.pid, 0)) if node.pid else node
+            for node in status.nodes
+        )
