@@ -75,6 +75,7 @@ class EnginePlannerClient(PlannerClient):
                     group.create_task(self._follow_robots(connection))
                     group.create_task(self._restart_nodes(connection))
                     group.create_task(self._follow_changes(connection))
+                    group.create_task(self._follow_states(connection))
             finally:
                 await connection.remove_all()
 
@@ -84,8 +85,7 @@ class EnginePlannerClient(PlannerClient):
             self._node_requests.put_nowait(request)
 
     async def _join_planner(self, connection: Connection) -> None:
-        self._states = await connection.subscriber("fleetState", STATE, self._listener.take_state)
-        await self._join(connection, "fleetState", "SubscriberInterface", STATE, STATE_TOPIC)
+        await self._receive_states(connection)
         for tag, service in _SERVICES:
             self._calls[service] = _caller(await connection.service_client(tag, service.type_name))
             await self._join(connection, tag, "ServiceClientInterface", service.type_name, service.name)
@@ -93,16 +93,26 @@ class EnginePlannerClient(PlannerClient):
             await connection.wait_active(tag)
 
     async def _follow_changes(self, connection: Connection) -> None:
-        """Receive changes instead of whole states, once the planner is known to publish them."""
+        """Receive changes, beside whole states until the planner is known to publish changes."""
         service = GET_STATE
         self._calls[service] = _caller(await connection.service_client("getState", service.type_name))
         await self._join(connection, "getState", "ServiceClientInterface", service.type_name, service.name)
         await connection.subscriber("fleetChanges", CHANGES, self._listener.take_changes)
         await self._join(connection, "fleetChanges", "SubscriberInterface", CHANGES, CHANGES_TOPIC)
         self._listener.may_have_missed()
-        await self._changes_followed.wait()
-        await self._states.close()
-        await connection.remove_interface(self._container, "fleetState")
+
+    async def _follow_states(self, connection: Connection) -> None:
+        """Receive whole states while changes are not followed."""
+        while True:
+            await self._changes_followed.wait()
+            await self._states.close()
+            await connection.remove_interface(self._container, "fleetState")
+            await self._states_needed.wait()
+            await self._receive_states(connection)
+
+    async def _receive_states(self, connection: Connection) -> None:
+        self._states = await connection.subscriber("fleetState", STATE, self._listener.take_state)
+        await self._join(connection, "fleetState", "SubscriberInterface", STATE, STATE_TOPIC)
 
     async def _follow_robots(self, connection: Connection) -> None:
         while True:

@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
 from typing import Any, NamedTuple, Protocol, TypeAlias, assert_never
 
+from rce.aio.backoff import Backoff
 from rce_fleet.station.desired import Desired, DesiredCell, DesiredGoal
 from rce_fleet.station.following import ChangeFollower
 from rce_fleet.station.view import FleetView, ViewChange
@@ -21,8 +22,11 @@ CALL_TIMEOUT_S = 10.0
 RESEND_FOR_S = 20.0
 """How long goals and blocked cells are sent again to a restarted planner."""
 RESEND_EVERY_S = 0.5
-ASK_AGAIN_S = 1.0
-"""Seconds after which the complete state is requested again without an answer."""
+ASK_AGAIN = Backoff(first=1.0, longest=60.0)
+"""Pauses before the complete state is requested again, while a planner does not answer."""
+SILENT_S = 10.0
+"""A planner publishes a change, or the number of the last one, every second. After this time without one, the
+planner is asked whether it still publishes changes."""
 
 
 class PlannerService(NamedTuple):
@@ -85,6 +89,7 @@ class PlannerClient(ABC):
         self._new_robots: asyncio.Queue[str] = asyncio.Queue()
         self._calls: dict[PlannerService, Call] = {}
         self._changes_followed = asyncio.Event()
+        self._states_needed = asyncio.Event()
 
     @abstractmethod
     async def run(self, listener: PlannerListener, ready: Callable[[], Awaitable[None]]) -> None:
@@ -96,7 +101,13 @@ class PlannerClient(ABC):
 
     def stop_states(self) -> None:
         """Stop receiving complete states; changes are enough."""
+        self._states_needed.clear()
         self._changes_followed.set()
+
+    def receive_states(self) -> None:
+        """Receive complete states again, if this was stopped."""
+        self._changes_followed.clear()
+        self._states_needed.set()
 
     async def call(self, service: PlannerService, request: dict[str, Any]) -> dict[str, Any]:
         """Call a service of the planner.
@@ -136,6 +147,12 @@ class FleetLink:
         self._on_pose = on_pose
         self._follower = ChangeFollower()
         self._state_needed = asyncio.Event()
+        self._changes_came = asyncio.Event()
+        self._changes_at = 0.0
+        """When a change, or the number of the last one, came."""
+        self._asked_in_vain = False
+        self._told = False
+        """Whether an event told that the planner publishes no changes."""
         self._on_event = on_event
         self._desired = Desired()
         self._planner_started: str | None = None
@@ -144,10 +161,12 @@ class FleetLink:
 
     async def run(self, ready: Callable[[], Awaitable[None]]) -> None:
         """Receive messages until cancelled; ``ready`` is called once the planner is connected."""
+        self._changes_at = _now()
         async with asyncio.TaskGroup() as group:
             group.create_task(self._client.run(self, ready))
             group.create_task(self._resend())
             group.create_task(self._keep_up())
+            group.create_task(self._notice_silence())
 
     async def set_goal(self, robot: str, cell: int | None) -> str:
         """Send a robot to a cell, or stop it (None); return the planner's answer.
@@ -188,14 +207,29 @@ class FleetLink:
                         await asyncio.sleep(RESEND_EVERY_S)
 
     async def _keep_up(self) -> None:
-        """Request the complete state whenever changes are missing."""
+        """Request the complete state whenever changes are missing.
+
+        A planner that does not answer may be of an earlier release, which publishes complete states only.
+        They are followed until it answers. It is asked again after a pause that grows, and as soon as it
+        publishes a change.
+        """
+        pauses = ASK_AGAIN.start()
         while True:
             await self._state_needed.wait()
+            self._changes_came.clear()
             try:
                 answer = await self._client.call(GET_STATE, {})
             except PlannerUnavailableError:
-                await asyncio.sleep(ASK_AGAIN_S)
+                self._asked_in_vain = True
+                self._follower.fall_back()
+                self._client.receive_states()
+                await asyncio.sleep(ASK_AGAIN.first)
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(pauses.next() - ASK_AGAIN.first):
+                        await self._changes_came.wait()
                 continue
+            pauses.reset()
+            self._asked_in_vain = self._told = False
             self._state_needed.clear()
             early = self._follower.take_snapshot(answer)
             self._client.stop_states()
@@ -203,6 +237,15 @@ class FleetLink:
             for message in early:
                 self._take(message["started"], self._view.on_changes(message))
             self._request_if_behind()
+
+    async def _notice_silence(self) -> None:
+        """Ask a planner that stopped publishing changes: another one may have taken its place."""
+        while True:
+            await asyncio.sleep(max(0.1, self._changes_at + SILENT_S - _now()))
+            if _now() - self._changes_at >= SILENT_S:
+                if self._follower.follows:
+                    self.may_have_missed()
+                self._changes_at = _now()
 
     def _request_if_behind(self) -> None:
         if self._follower.is_behind:
@@ -223,11 +266,17 @@ class FleetLink:
 
     def take_state(self, message: dict[str, Any]) -> None:
         """Handle a ``fleet/FleetState``; ignore it if the planner publishes changes."""
-        if not self._follower.follows:
-            self._take(message["started"], self._view.on_state(message))
+        if self._follower.follows:
+            return
+        self._take(message["started"], self._view.on_state(message))
+        if self._asked_in_vain and not self._told and not self._changes_came.is_set():
+            self._told = True
+            self._on_event("the planner publishes no changes; following its complete state instead", "warn")
 
     def take_changes(self, message: dict[str, Any]) -> None:
         """Handle a ``fleet/FleetChanges``."""
+        self._changes_at = _now()
+        self._changes_came.set()
         if self._follower.take_changes(message):
             self._take(message["started"], self._view.on_changes(message))
         self._request_if_behind()
@@ -256,3 +305,7 @@ class FleetLink:
     def take_event(self, text: str, tone: str) -> None:
         """Handle an event."""
         self._on_event(text, tone)
+
+
+def _now() -> float:
+    return asyncio.get_running_loop().time()

@@ -21,7 +21,7 @@ class ChangeFollower:
 
     Attributes:
         is_behind: Whether the complete state is needed.
-        follows: Whether a complete state with a number arrived: the planner publishes changes.
+        follows: Whether changes are followed: a complete state with a number arrived.
     """
 
     def __init__(self) -> None:
@@ -49,6 +49,10 @@ class ChangeFollower:
     def lose(self) -> None:
         """Note that changes may have been missed."""
         self.is_behind = True
+
+    def fall_back(self) -> None:
+        """Note that the planner does not answer: complete states are taken as they come until it does."""
+        self.is_behind, self.follows = True, False
 
     def _is_next(self, message: dict[str, Any]) -> bool:
         if self.is_behind:

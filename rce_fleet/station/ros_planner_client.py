@@ -64,8 +64,11 @@ class RosPlannerClient(PlannerClient):
             listener.may_have_missed()
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._follow_robots(listener))
-                await self._changes_followed.wait()
-                await states.close()
+                while True:
+                    await self._changes_followed.wait()
+                    await states.close()
+                    await self._states_needed.wait()
+                    states = await node.subscribe(STATE_TOPIC, STATE, take_state)
 
     async def _follow_robots(self, listener: PlannerListener) -> None:
         while True:

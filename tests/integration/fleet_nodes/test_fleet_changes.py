@@ -11,12 +11,15 @@ from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
-from rce_fleet.station.fleet_link import FleetLink
+from rce_fleet.station import fleet_link
+from rce_fleet.station.fleet_link import FleetLink, PlannerUnavailableError
 from rce_fleet.station.ros_planner_client import RosPlannerClient
 from rce_fleet.station.view import FleetView, ViewChange
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
+
+    import pytest
 
 PACKAGES = PackageIndex([])
 WAIT_S = 60.0
@@ -100,6 +103,17 @@ class Station:
                 self._changed.clear()
                 await self._changed.wait()
 
+    async def block(self, cell: int) -> None:
+        """Block a cell, as soon as a planner that is starting takes requests."""
+        async with asyncio.timeout(WAIT_S):
+            while True:
+                try:
+                    await self.link.block_cell(cell, blocked=True)
+                except PlannerUnavailableError:
+                    await asyncio.sleep(0.1)
+                else:
+                    return
+
     def _take(self, change: ViewChange) -> None:
         self.changes.append(change)
         self._changed.set()
@@ -123,11 +137,11 @@ async def test_a_station_follows_changes_and_stops_whole_states() -> None:
             await first.until(lambda: first.client.follows_changes)
             await put_robot(core, stack, "Robot1", 0.5, 0.5)
             await first.until(lambda: first.view.robot_ids() == ["Robot1"])
-            await first.link.block_cell(9, blocked=True)
+            await first.block(9)
             await first.until(lambda: first.view.blocked() == [9])
             states = first.link.states
             for count, cell in enumerate((10, 11, 12), start=2):
-                await first.link.block_cell(cell, blocked=True)
+                await first.block(cell)
                 await first.until(lambda count=count: len(first.view.blocked()) == count)  # type: ignore[misc]  # mypy cannot type a lambda's default
             assert first.link.states == states
             assert [change.blocked for change in first.changes if change.blocked][-3:] == [
@@ -148,7 +162,7 @@ async def test_missed_last_change_makes_a_station_ask_for_the_state() -> None:
         async with station.running():
             await station.until(lambda: station.client.follows_changes)
             station.link.loses_changes = True
-            await station.link.block_cell(9, blocked=True)
+            await station.block(9)
             await station.until(lambda: station.view.blocked() == [9])
 
 
@@ -158,7 +172,7 @@ async def test_a_station_follows_the_planner_that_comes_after() -> None:
         station = Station(core)
         async with station.running():
             await station.until(lambda: station.client.follows_changes)
-            await station.link.block_cell(9, blocked=True)
+            await station.block(9)
             await station.until(lambda: station.view.blocked() == [9])
             before = len(station.changes)
             process.kill()
@@ -184,3 +198,29 @@ async def test_an_earlier_planner_is_followed_by_its_whole_states() -> None:
             await station.until(lambda: station.view.blocked() == [2])
             assert station.changes[-1] == ViewChange(blocked=(2,), freed=(1,))
             assert not station.client.follows_changes
+
+
+async def test_an_earlier_planner_may_replace_a_newer_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its whole states are followed until a newer planner takes its place again."""
+    monkeypatch.setattr(fleet_link, "SILENT_S", 2.0)
+    async with Core(port=0) as core:
+        station = Station(core)
+        async with AsyncExitStack() as stack:
+            async with planner(core):
+                await stack.enter_async_context(station.running())
+                await station.until(lambda: station.client.follows_changes)
+            async with Node(
+                "planner", argv=[], master_uri=core.uri, types=TypeRegistry(PACKAGES), signals=False
+            ) as node:
+                states = await node.advertise("/fleet/state", "fleet/FleetState", latch=True)
+                states.publish(rows=4, columns=4, cell_size=1.0, blocked=[1])
+                await station.until(lambda: station.view.blocked() == [1])
+                states.publish(rows=4, columns=4, cell_size=1.0, blocked=[2])
+                await station.until(lambda: station.view.blocked() == [2])
+                station.client.follows_changes = False
+            async with planner(core):
+                await station.until(lambda: station.client.follows_changes)
+                await station.block(9)
+                await station.until(lambda: station.view.blocked() == [9])
+        told = [text for text in station.events if "publishes no changes" in text]
+        assert len(told) == 1

@@ -1,0 +1,142 @@
+"""What the link asks of a planner that publishes no changes, with a client that lives in the test."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from rce.aio.backoff import Backoff
+from rce_fleet.station import fleet_link
+from rce_fleet.station.fleet_link import (
+    GET_STATE,
+    FleetLink,
+    PlannerClient,
+    PlannerListener,
+    PlannerUnavailableError,
+)
+from rce_fleet.station.view import FleetView
+
+GRID = {
+    "rows": 2,
+    "columns": 2,
+    "cell_size": 1.0,
+    "origin_x": 0.0,
+    "origin_y": 0.0,
+    "walls": [],
+    "pending": [],
+}
+
+
+def state(*blocked: int, started: str = "1.0") -> dict[str, Any]:
+    return {**GRID, "started": started, "blocked": list(blocked), "robots": []}
+
+
+def repeated(sequence: int) -> dict[str, Any]:
+    parts: dict[str, Any] = {"robots": [], "removed": [], "blocked": [], "pending": [], "freed": []}
+    return {**parts, "started": "1.0", "sequence": sequence}
+
+
+class Planner(PlannerClient):
+    """A planner that answers when it is told to."""
+
+    def __init__(self) -> None:
+        super().__init__("away")
+        self.asked: list[float] = []
+        self.answer: dict[str, Any] | None = None
+        self._calls[GET_STATE] = self._get_state
+
+    async def run(self, listener: PlannerListener, ready: Callable[[], Awaitable[None]]) -> None:
+        await ready()
+        listener.may_have_missed()
+        await asyncio.Event().wait()
+
+    async def _get_state(self, request: dict[str, Any]) -> dict[str, Any]:
+        self.asked.append(asyncio.get_running_loop().time())
+        if self.answer is None:
+            raise PlannerUnavailableError("no such service")
+        return self.answer
+
+    @property
+    def receives_states(self) -> bool:
+        return self._states_needed.is_set()
+
+
+class Station:
+    def __init__(self) -> None:
+        self.planner = Planner()
+        self.view = FleetView()
+        self.events: list[str] = []
+        self.link = FleetLink(
+            self.planner,
+            self.view,
+            on_change=lambda _: None,
+            on_pose=lambda _: None,
+            on_event=lambda text, _: self.events.append(text),
+        )
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(30):
+        while not condition():
+            await asyncio.sleep(0.005)
+
+
+@asynccontextmanager
+async def running(monkeypatch: pytest.MonkeyPatch, first: float, longest: float) -> AsyncIterator[Station]:
+    monkeypatch.setattr(fleet_link, "ASK_AGAIN", Backoff(first=first, longest=longest))
+    station = Station()
+
+    async def ready() -> None: ...
+
+    task = asyncio.create_task(station.link.run(ready))
+    try:
+        yield station
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_pauses_between_questions_grow(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with running(monkeypatch, first=0.05, longest=60.0) as station:
+        await until(lambda: len(station.planner.asked) == 5)
+        asked = station.planner.asked
+        pauses = [later - earlier for earlier, later in pairwise(asked)]
+        assert all(pause >= least for pause, least in zip(pauses, (0.05, 0.1, 0.2, 0.4), strict=True))
+
+
+async def test_whole_states_are_followed_and_it_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with running(monkeypatch, first=60.0, longest=60.0) as station:
+        await until(lambda: station.planner.receives_states)
+        for cell in (1, 2):
+            station.link.take_state(state(cell))
+            assert station.view.blocked() == [cell]
+        assert len(station.planner.asked) == 1
+        (event,) = station.events
+        assert "publishes no changes" in event
+
+
+async def test_a_change_is_a_reason_to_ask_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with running(monkeypatch, first=0.01, longest=60.0) as station:
+        await until(lambda: len(station.planner.asked) == 3)
+        station.planner.answer = {"sequence": 7, "state": state(3)}
+        station.link.take_changes(repeated(7))
+        await until(lambda: station.view.blocked() == [3])
+        await until(lambda: not station.planner.receives_states)
+        station.link.take_state(state(1))
+        assert station.view.blocked() == [3], "changes are followed now"
+
+
+async def test_a_planner_that_falls_silent_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet_link, "SILENT_S", 0.2)
+    async with running(monkeypatch, first=60.0, longest=60.0) as station:
+        station.planner.answer = {"sequence": 7, "state": state(3)}
+        await until(lambda: station.view.blocked() == [3])
+        station.planner.answer = None
+        await until(lambda: station.planner.receives_states)
+        station.link.take_state(state(1, started="2.0"))
+        assert station.view.blocked() == [1]
