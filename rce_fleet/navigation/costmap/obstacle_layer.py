@@ -1,0 +1,201 @@
+"""The layer of what sensors see: hits mark cells, rays clear them."""
+
+from __future__ import annotations
+
+from math import pi, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rce_fleet.navigation.costmap.cost_grid import NOWHERE, Area, CostGrid, shifted
+from rce_fleet.navigation.costmap.costs import FREE, LETHAL
+from rce_fleet.navigation.costmap.layer import fill_of, write_known, write_larger
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from rce_fleet.geometry.poses import Pose
+    from rce_fleet.navigation.costmap.footprint import Footprint
+    from rce_fleet.navigation.costmap.observation import Observation
+    from rce_fleet.navigation.costmap.parameters import ObservationSource, ObstacleLayerParameters
+
+    Floats = NDArray[np.float64]
+
+
+class ObstacleLayer:
+    """Marks the cells of hits and clears the cells that rays pass.
+
+    Rays are not walked cell by cell: only cells that are not free need a decision, and each is looked up in
+    the ray nearest to its bearing. The ray clears the cell if it passes within the cell's half diagonal and
+    reaches beyond the cell's centre.
+
+    Args:
+        parameters: Of the layer.
+        sources: The sensors by name.
+        footprint: The robot's outline, under which cells are cleared.
+        grid: The costmap.
+
+    Attributes:
+        hits: The last point that was hit in each marked cell, shape (rows, columns, 2), metres; NaN elsewhere.
+    """
+
+    def __init__(
+        self,
+        parameters: ObstacleLayerParameters,
+        sources: dict[str, ObservationSource],
+        footprint: Footprint,
+        grid: CostGrid,
+    ) -> None:
+        self.parameters = parameters
+        self.sources = sources
+        self._footprint = footprint
+        self._fill = fill_of(track_unknown=parameters.track_unknown_space)
+        self._kept: dict[str, list[Observation]] = {name: [] for name in sources}
+        self.match(grid)
+
+    def take(self, source: str, observation: Observation) -> None:
+        """Take an observation of a source; it is used at the next update."""
+        self._kept[source].append(observation)
+
+    def late_sources(self, now: float) -> list[str]:
+        """Return the sources whose last observation is older than their ``expected_update_rate`` allows."""
+        late = []
+        for name, source in self.sources.items():
+            kept = self._kept[name]
+            newest = max((one.stamp for one in kept), default=-np.inf)
+            if source.expected_update_rate > 0 and now - newest > source.expected_update_rate:
+                late.append(name)
+        return late
+
+    # The layer
+
+    def match(self, grid: CostGrid) -> None:
+        """Begin with nothing marked."""
+        self._costs = np.full(grid.shape, self._fill, np.uint8)
+        self.hits = np.full((*grid.shape, 2), np.nan, np.float32)
+
+    def move(self, _grid: CostGrid, rows: int, columns: int) -> None:
+        """Shift the marks."""
+        self._costs = shifted(self._costs, rows, columns, self._fill)
+        self.hits = shifted(self.hits, rows, columns, np.nan)
+
+    def update_bounds(self, grid: CostGrid, robot: Pose, now: float) -> Area:
+        """Clear and mark by the observations that are kept; return what may have changed."""
+        changed = NOWHERE
+        observations = []
+        for name, kept in self._kept.items():
+            self._drop_old(kept, now - self.sources[name].observation_persistence)
+            observations += [(self.sources[name], one) for one in kept]
+        for source, one in observations:
+            changed = changed.joined(self._clear_rays(grid, one, source.raytrace_min_range))
+        for _, one in observations:
+            changed = changed.joined(self._mark(grid, one.hits))
+        if self.parameters.footprint_clearing_enabled:
+            changed = changed.joined(self._clear_footprint(grid, robot))
+        return changed
+
+    def update_costs(self, grid: CostGrid, area: Area) -> None:
+        """Write the marks."""
+        write = write_larger if self.parameters.combination_method else write_known
+        write(grid.values[area.slices], self._costs[area.slices])
+
+    def clear(self, grid: CostGrid, keep: Area) -> None:
+        """Forget the marks outside an area, and the observations."""
+        inside = keep.clipped(*grid.shape)
+        costs, hits = self._costs, self.hits
+        self.match(grid)
+        self._costs[inside.slices], self.hits[inside.slices] = costs[inside.slices], hits[inside.slices]
+        for kept in self._kept.values():
+            kept.clear()
+
+    def _drop_old(self, kept: list[Observation], since: float) -> None:
+        """Leave the newest observation, and those that are younger than ``since``."""
+        newest = max((one.stamp for one in kept), default=0.0)
+        kept[:] = [one for one in kept if one.stamp >= min(since, newest)]
+
+    def _clear_rays(self, grid: CostGrid, seen: Observation, nearest: float) -> Area:
+        if not len(seen.bearings):
+            return NOWHERE
+        area = grid.area_around(seen.x, seen.y, float(seen.reach.max()))
+        filled = self._costs[area.slices] != FREE
+        rows, columns = np.nonzero(filled)
+        if not len(rows):
+            return NOWHERE
+        cells = np.stack((rows + area.low, columns + area.left), axis=1)
+        passed = passed_by_rays(grid.centres_of(cells), seen, grid.resolution, nearest)
+        if not passed.any():
+            return NOWHERE
+        rows, columns = cells[passed].T
+        self._costs[rows, columns], self.hits[rows, columns] = FREE, np.nan
+        return _bounds(cells[passed])
+
+    def _mark(self, grid: CostGrid, hits: Floats) -> Area:
+        cells = grid.cells_of(hits)
+        inside = grid.contains(cells)
+        if not inside.any():
+            return NOWHERE
+        rows, columns = cells[inside].T
+        self._costs[rows, columns], self.hits[rows, columns] = LETHAL, hits[inside]
+        return _bounds(cells[inside])
+
+    def _clear_footprint(self, grid: CostGrid, robot: Pose) -> Area:
+        area = grid.area_around(robot.x, robot.y, self._footprint.circumscribed_radius)
+        rows, columns = np.nonzero(self._costs[area.slices] != FREE)
+        if not len(rows):
+            return NOWHERE
+        cells = np.stack((rows + area.low, columns + area.left), axis=1)
+        centres = grid.centres_of(cells)
+        pose = np.array(((robot.x, robot.y, robot.yaw),))
+        under = np.array([self._footprint.clearance(pose, one[None])[0] < 0 for one in centres])
+        if not under.any():
+            return NOWHERE
+        rows, columns = cells[under].T
+        self._costs[rows, columns], self.hits[rows, columns] = FREE, np.nan
+        return _bounds(cells[under])
+
+
+def passed_by_rays(
+    centres: Floats, seen: Observation, resolution: float, nearest: float = 0.0
+) -> NDArray[np.bool_]:
+    """Return through which cells a sensor saw, shape (N,).
+
+    Args:
+        centres: Centres of the cells, shape (N, 2), metres.
+        seen: The observation, with at least one ray.
+        resolution: Edge of a cell, metres.
+        nearest: Cells nearer to the sensor than this are not passed, metres.
+    """
+    dx, dy = centres[:, 0] - seen.x, centres[:, 1] - seen.y
+    away, bearing = np.hypot(dx, dy), np.arctan2(dy, dx)
+    count = len(seen.bearings)
+    after = np.searchsorted(seen.bearings, bearing)
+    before, after = (after - 1) % count, after % count
+    off_before = np.abs((bearing - seen.bearings[before] + pi) % (2 * pi) - pi)
+    off_after = np.abs((bearing - seen.bearings[after] + pi) % (2 * pi) - pi)
+    ray = np.where(off_before <= off_after, before, after)
+    off = np.minimum(off_before, off_after)
+    half_diagonal = resolution / sqrt(2)
+    meets = (np.sin(np.minimum(off, pi / 2)) * away <= half_diagonal) | (away <= half_diagonal)
+    return np.asarray(meets & (seen.reach[ray] > away + resolution / 2) & (away >= nearest))
+
+
+def _bounds(cells: NDArray[np.intp]) -> Area:
+    low, left = cells.min(axis=0)
+    high, right = cells.max(axis=0)
+    return Area(int(low), int(left), int(high) + 1, int(right) + 1)
+
+
+def lethal_points(grid: CostGrid, layer: ObstacleLayer | None, area: Area) -> Floats:
+    """Return a point for each lethal cell of an area, shape (M, 2), metres.
+
+    The point is the one that a sensor hit, else the cell's centre.
+    """
+    rows, columns = np.nonzero(grid.values[area.slices] == LETHAL)
+    if not len(rows):
+        return np.empty((0, 2))
+    cells = np.stack((rows + area.low, columns + area.left), axis=1)
+    points = grid.centres_of(cells)
+    if layer is None:
+        return points
+    hits = layer.hits[cells[:, 0], cells[:, 1]].astype(np.float64)
+    return np.where(np.isnan(hits), points, hits)
