@@ -2,7 +2,8 @@
 
 An answer is a ``std_msgs/Int32MultiArray`` with three parts, one for each dimension: the list's cells; the
 last cell reached and the one driven to, -1 for none; and cells that the robot has found blocked. The label of
-the first is ``answer=17 driving``: the list's number and the move client's state. Lists have other labels.
+the first is ``answer=17 driving``: the list's number and the move client's state. Lists have other labels. A
+fourth part, cells that the robot saw free again, is there only if there are such cells.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 _MARK = "answer="
 _NUMBER = "revision="
 _NONE = -1
+_PARTS = (3, 4)
 
 
 class Answer(NamedTuple):
@@ -26,6 +28,8 @@ class Answer(NamedTuple):
     report: ClientReport
     blocked: tuple[int, ...] = ()
     """Cells that the robot has found blocked."""
+    freed: tuple[int, ...] = ()
+    """Cells that the robot has seen free again."""
 
 
 def is_answer(labels: Sequence[str]) -> bool:
@@ -42,6 +46,8 @@ def answer_array(answer: Answer) -> dict[str, Any]:
         "reached and target": progress,
         "blocked": list(answer.blocked),
     }
+    if answer.freed:
+        parts["freed"] = list(answer.freed)
     dimensions = [{"label": label, "size": len(part), "stride": len(part)} for label, part in parts.items()]
     return {"layout": {"dim": dimensions}, "data": [cell for part in parts.values() for cell in part]}
 
@@ -57,15 +63,16 @@ def read_answer(labels: Sequence[str], sizes: Sequence[int], data: Sequence[int]
     Raises:
         ValueError: The array has another form.
     """
-    if not is_answer(labels) or len(sizes) != 3 or sizes[1] != 2 or sum(sizes) != len(data):  # noqa: PLR2004
+    if not is_answer(labels) or len(sizes) not in _PARTS or sizes[1] != 2 or sum(sizes) != len(data):  # noqa: PLR2004
         raise ValueError(
             f"not a move client's answer: labels {list(labels)}, sizes {list(sizes)}, {len(data)} numbers"
         )
     revision, _, state = labels[0].removeprefix(_MARK).partition(" ")
     ends = accumulate(sizes, initial=0)
-    cells, progress, blocked = (tuple(data[begin:end]) for begin, end in pairwise(ends))
+    cells, progress, blocked, *rest = (tuple(data[begin:end]) for begin, end in pairwise(ends))
     reached, target = (None if cell == _NONE else cell for cell in progress)
-    return Answer(ClientReport(int(revision), ClientState(state), cells, reached, target), blocked)
+    report = ClientReport(int(revision), ClientState(state), cells, reached, target)
+    return Answer(report, blocked, rest[0] if rest else ())
 
 
 def numbered_array(cells: Sequence[int], revision: int) -> dict[str, Any]:

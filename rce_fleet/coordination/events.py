@@ -39,6 +39,14 @@ class ObstacleSeen:
 
 
 @dataclass(frozen=True, slots=True)
+class ObstacleGone:
+    """A robot's sensor saw that nothing blocks cells any more. Cells that people blocked stay blocked."""
+
+    robot: str
+    cells: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class GoalSet:
     """A robot is sent to a cell, or (``None``) its goal is removed. Answered by :class:`Reply`."""
 
@@ -80,7 +88,16 @@ class Tick:
 
 
 Event = (
-    PoseSeen | ReportSeen | ObstacleSeen | GoalSet | CellBlocked | CellFreed | RobotRemoved | PlanMade | Tick
+    PoseSeen
+    | ReportSeen
+    | ObstacleSeen
+    | ObstacleGone
+    | GoalSet
+    | CellBlocked
+    | CellFreed
+    | RobotRemoved
+    | PlanMade
+    | Tick
 )
 
 # Instructions

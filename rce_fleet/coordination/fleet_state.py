@@ -29,6 +29,7 @@ class FleetState:
         ledger: Which robot claims which cell.
         blocked: Cells that were blocked; no robot claims one.
         pending: Cells that will be blocked once no robot claims them; no robot may enter one.
+        sensed: Those of both that only robots' sensors found blocked.
         index: Indexes of the robots.
         log: Changes that are not published yet.
     """
@@ -38,6 +39,7 @@ class FleetState:
     ledger: CellLedger = field(default_factory=CellLedger)
     blocked: set[int] = field(default_factory=set)
     pending: set[int] = field(default_factory=set)
+    sensed: set[int] = field(default_factory=set)
     index: FleetIndex = field(default_factory=FleetIndex)
     log: ChangeLog = field(default_factory=ChangeLog)
     _touched: set[str] = field(default_factory=set)
@@ -92,6 +94,7 @@ class FleetState:
         """Let robots enter a cell again."""
         self.pending.discard(cell)
         self.blocked.discard(cell)
+        self.sensed.discard(cell)
         self.log.note_cell(cell)
 
     def refresh(self) -> None:
@@ -139,6 +142,8 @@ class FleetState:
         self.index.validate(self.robots.values(), self.ledger)
         if self.blocked & (self.pending | self.grid.blocked) or self.pending & self.grid.blocked:
             raise InvariantError("a cell is a wall, blocked or pending, and only one of these")
+        if not self.sensed <= self.blocked | self.pending:
+            raise InvariantError(f"cells {self.sensed} were sensed and are not all blocked or pending")
         for record in self.robots.values():
             route, claims = self.ledger.route(record.id), self.ledger.claims(record.id)
             if not self.grid.is_path(route):

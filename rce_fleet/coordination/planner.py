@@ -17,15 +17,16 @@ from __future__ import annotations
 from math import inf, isfinite
 from typing import TYPE_CHECKING, Any
 
+from rce_fleet.coordination.blocking import CellBlocking
 from rce_fleet.coordination.deadlines import ROUNDING, Deadlines
 from rce_fleet.coordination.dispatcher import Dispatcher
 from rce_fleet.coordination.events import (
-    BlockedChanged,
     CellBlocked,
     CellFreed,
     Event,
     GoalSet,
     Instruction,
+    ObstacleGone,
     ObstacleSeen,
     PlanMade,
     PoseSeen,
@@ -37,7 +38,7 @@ from rce_fleet.coordination.events import (
     Tick,
 )
 from rce_fleet.coordination.fleet_state import FleetState
-from rce_fleet.coordination.refusals import refuse_block, refuse_goal
+from rce_fleet.coordination.refusals import refuse_goal
 from rce_fleet.coordination.robot import Cause, Phase, RobotRecord
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.exceptions import InvariantError
@@ -69,14 +70,16 @@ class FleetPlanner:
         self._deaf_until: dict[str, float] = {}
         self._deadlines = Deadlines()
         self._dispatcher = Dispatcher(self.state, self.settings)
+        self._blocking = CellBlocking(self.state, self._dispatcher)
         self._now = 0.0
         self._handlers: dict[type, Callable[[Any], Reply | None]] = {
             PoseSeen: self._take_pose,
             ReportSeen: self._take_report,
-            ObstacleSeen: self._take_obstacle,
+            ObstacleSeen: self._blocking.take_obstacle,
+            ObstacleGone: self._blocking.take_gone,
             GoalSet: self._set_goal,
-            CellBlocked: self._block_cell,
-            CellFreed: self._free_cell,
+            CellBlocked: self._blocking.block_cell,
+            CellFreed: self._blocking.free_cell,
             RobotRemoved: self._remove_robot,
             PlanMade: lambda event: self._dispatcher.take_plan(event.result),
             Tick: self._take_tick,
@@ -157,14 +160,6 @@ class FleetPlanner:
         if record.phase is Phase.SILENT:
             self._deadlines.hasten(record.id, self._now)
 
-    def _take_obstacle(self, event: ObstacleSeen) -> None:
-        for cell in event.cells:
-            owner = self.state.ledger.owner(cell) if cell in self.state.grid else None
-            standing = cell in self.state.ledger.route(event.robot)[:1]
-            # In cells of other robots the sensor has seen these robots.
-            if cell in self.state.grid and owner in (None, event.robot) and not standing:
-                self._shut(cell)
-
     def _follow(self, record: RobotRecord) -> None:
         """Update the progress of an active robot."""
         if not self._dispatcher.arrive(record):
@@ -212,32 +207,6 @@ class FleetPlanner:
             return Reply(True, f"{record.id} has no goal")
         return Reply(True, f"{record.id} goes to cell {event.cell}")
 
-    def _block_cell(self, event: CellBlocked) -> Reply:
-        cell = event.cell
-        refusal = refuse_block(self.state, cell)
-        if refusal:
-            return Reply(False, refusal)
-        self._shut(cell)
-        owner = self.state.ledger.owner(cell)
-        if owner is None:
-            return Reply(True, f"cell {cell} is blocked")
-        return Reply(True, f"cell {cell} will be blocked when {owner} has left it")
-
-    def _free_cell(self, event: CellFreed) -> Reply:
-        cell = event.cell
-        refusal = refuse_block(self.state, cell)
-        if refusal:
-            return Reply(False, refusal)
-        was_blocked = cell in self.state.blocked
-        if not was_blocked and cell not in self.state.pending:
-            return Reply(True, f"cell {cell} is not blocked")
-        self.state.free(cell)
-        self._dispatcher.to_settle |= self.state.index.hindered_at([cell])
-        if was_blocked:
-            self._dispatcher.out.append(BlockedChanged(tuple(sorted(self.state.blocked))))
-        self._dispatcher.outdated = True
-        return Reply(True, f"cell {cell} is free")
-
     def _remove_robot(self, event: RobotRemoved) -> Reply:
         if event.robot not in self.state.robots:
             return Reply(False, f"robot {event.robot} is unknown")
@@ -247,20 +216,6 @@ class FleetPlanner:
         self.state.remove(event.robot)
         self._dispatcher.outdated = True
         return Reply(True, f"{event.robot} was removed")
-
-    def _shut(self, cell: int) -> None:
-        """Block a cell once no robot claims it; stop robots whose paths lead through it."""
-        state = self.state
-        if state.is_shut(cell):
-            return
-        state.want_blocked(cell)
-        self._dispatcher.left.add(cell)
-        self._dispatcher.outdated = True
-        for robot in sorted(state.ledger.visitors(cell)):
-            record = state.robots[robot]
-            if record.phase is Phase.ACTIVE and cell in state.ledger.route(robot)[1:]:
-                record.replans += 1
-                self._dispatcher.hold(record, f"cell {cell} on its path is blocked")
 
     # Time
 

@@ -27,6 +27,7 @@ from rce_fleet.coordination.events import (
     GoalSet,
     Instruction,
     MakePlan,
+    ObstacleGone,
     ObstacleSeen,
     PlanMade,
     PoseSeen,
@@ -153,6 +154,11 @@ class PlannerNode:
             "std_msgs/Int32MultiArray",
             lambda message: self._take(ObstacleSeen(robot, tuple(message.data))),
         )
+        await self._node.subscribe(
+            f"/{robot}/freedCells",
+            "std_msgs/Int32MultiArray",
+            lambda message: self._take(ObstacleGone(robot, tuple(message.data))),
+        )
 
     def _take_answer(self, robot: str, message: Message) -> None:
         """Handle a move client's answer; the planner's own lists arrive here too."""
@@ -161,13 +167,15 @@ class PlannerNode:
         if not is_answer(labels):
             return
         try:
-            report, blocked = read_answer(labels, [dimension.size for dimension in dimensions], message.data)
+            answer = read_answer(labels, [dimension.size for dimension in dimensions], message.data)
         except ValueError as error:
             self._node.log.warning("%s: %s", robot, error)
             return
-        self._take(ReportSeen(robot, report))
-        if blocked:
-            self._take(ObstacleSeen(robot, blocked))
+        self._take(ReportSeen(robot, answer.report))
+        if answer.blocked:
+            self._take(ObstacleSeen(robot, answer.blocked))
+        if answer.freed:
+            self._take(ObstacleGone(robot, answer.freed))
 
     async def _keep_time(self) -> None:
         while await self._node.sleep(TICK):

@@ -65,6 +65,7 @@ class MoveClientNode:
         if self._answers:
             self._reports = await node.advertise("goalNodesList", "std_msgs/Int32MultiArray")
             await node.subscribe("blockedCells", "std_msgs/Int32MultiArray", self._take_blocked)
+            await node.subscribe("freedCells", "std_msgs/Int32MultiArray", self._take_freed)
         else:
             self._reports = await node.advertise("moveClient/status", "fleet/MoveStatus")
         await node.subscribe("goalNodesList", "std_msgs/Int32MultiArray", self._take_cells)
@@ -99,6 +100,10 @@ class MoveClientNode:
     def _take_blocked(self, message: Message) -> None:
         if self._client is not None:
             self._report(self._client.report, blocked=tuple(message.data))
+
+    def _take_freed(self, message: Message) -> None:
+        if self._client is not None:
+            self._report(self._client.report, freed=tuple(message.data))
 
     def _take_cells(self, message: Message) -> None:
         labels = [dimension.label for dimension in message.layout.dim]
@@ -155,10 +160,12 @@ class MoveClientNode:
             },
         )
 
-    def _report(self, report: ClientReport, blocked: tuple[int, ...] = ()) -> None:
+    def _report(
+        self, report: ClientReport, blocked: tuple[int, ...] = (), freed: tuple[int, ...] = ()
+    ) -> None:
         self._reported_at = time.time()
         if self._answers:
-            self._reports.publish(answer_array(Answer(report, blocked)))
+            self._reports.publish(answer_array(Answer(report, blocked, freed)))
             return
         self._reports.publish(
             revision=report.revision,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -11,6 +11,9 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
     Cells = NDArray[np.intp]
+
+
+T = TypeVar("T", bound=np.generic)
 
 
 class Area(NamedTuple):
@@ -120,7 +123,7 @@ class CostGrid:
 
     def centres_of(self, cells: Cells) -> Floats:
         """Return the centres of cells in metres, shape (N, 2), from rows and columns, shape (N, 2)."""
-        return (cells[:, ::-1] + 0.5) * self.resolution + np.asarray(self.origin)
+        return np.asarray((cells[:, ::-1] + 0.5) * self.resolution + np.asarray(self.origin), np.float64)
 
     def contains(self, cells: Cells) -> NDArray[np.bool_]:
         """Return which of the cells, shape (N, 2), are inside the grid."""
@@ -154,16 +157,20 @@ class CostGrid:
         return Area(low, left, high + 1, right + 1).clipped(*self.shape)
 
 
-def shift_of(origin: tuple[float, float], centre: tuple[float, float], shape: tuple[int, int], resolution: float
-             ) -> tuple[int, int]:
+def shift_of(
+    origin: tuple[float, float], centre: tuple[float, float], shape: tuple[int, int], resolution: float
+) -> tuple[int, int]:
     """Return by how many rows and columns a rolling window moves to have ``centre`` in its middle."""
     rows = int(np.floor((centre[1] - shape[0] * resolution / 2 - origin[1]) / resolution + 0.5))
     columns = int(np.floor((centre[0] - shape[1] * resolution / 2 - origin[0]) / resolution + 0.5))
     return rows, columns
 
 
-def shifted(values: NDArray[np.generic], rows: int, columns: int, fill: float) -> NDArray[np.generic]:
-    """Return an array, shape (rows, columns, ...), whose window moved by whole cells; new cells get ``fill``."""
+def shifted(values: NDArray[T], rows: int, columns: int, fill: float) -> NDArray[T]:
+    """Return an array, shape (rows, columns, ...), whose window moved by whole cells.
+
+    Cells that came into the window get ``fill``.
+    """
     moved = np.full_like(values, fill)
     height, width = values.shape[:2]
     if abs(rows) < height and abs(columns) < width:

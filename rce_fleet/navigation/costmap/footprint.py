@@ -99,7 +99,7 @@ class Footprint:
     def at(self, x: float, y: float, yaw: float) -> Floats:
         """Return the corners of the polygon for a pose of the robot, shape (N, 2), metres."""
         turn = np.array(((cos(yaw), sin(yaw)), (-sin(yaw), cos(yaw))))
-        return self.polygon @ turn + (x, y)
+        return np.asarray(self.polygon @ turn + (x, y))
 
     def clearance(self, poses: Floats, points: Floats, *, enough: float = 0.5) -> Floats:
         """Return the distance from the outline to the nearest obstacle for each pose, shape (T,), metres.

@@ -59,8 +59,9 @@ class InflationLayer:
         if free.all():
             return
         squared = np.rint(distance_transform_edt(free) ** 2).astype(np.intp)
-        inner = Area(area.low - around.low, area.left - around.left, area.high - around.low,
-                     area.right - around.left)
+        inner = Area(
+            area.low - around.low, area.left - around.left, area.high - around.low, area.right - around.left
+        )
         table = self._costs_by_square(grid.resolution, reach)
         costs = table[np.minimum(squared[inner.slices], len(table) - 1)]
         below = grid.values[area.slices]

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rce_fleet.geometry.poses import Pose
+    from rce_fleet.maps.occupancy_map import OccupancyMap
     from rce_fleet.navigation.costmap.footprint import Footprint
     from rce_fleet.navigation.costmap.parameters import CostmapParameters
 
@@ -70,24 +71,16 @@ class LayeredCostmap:
         """Whether the map is there, if one is used."""
         return self.static is None or self.static.has_map
 
-    def set_map(self, values: NDArray[np.int8], resolution: float, origin: Pose) -> None:
-        """Set the map; a costmap that does not roll takes on its size, place and resolution.
-
-        Args:
-            values: Shape (rows, columns): -1 unknown, 0 .. 100.
-            resolution: Edge of a pixel, metres.
-            origin: Pose of the outer corner of pixel (0, 0).
-
-        Raises:
-            ValueError: The map has no pixels, or its resolution is not positive.
-        """
+    def set_map(self, picture: OccupancyMap) -> None:
+        """Set the map; a costmap that does not roll takes on its size, place and resolution."""
         if self.static is None:
             return
-        self.static.set_map(values, resolution, origin)
-        place = (origin.x, origin.y)
-        same = (values.shape, resolution, place) == (self.grid.shape, self.grid.resolution, self.grid.origin)
+        self.static.set_map(picture)
+        place = (picture.origin.x, picture.origin.y)
+        size = (picture.rows, picture.columns)
+        same = (size, picture.resolution, place) == (self.grid.shape, self.grid.resolution, self.grid.origin)
         if not self.parameters.rolling_window and not same:
-            self.grid = CostGrid(*values.shape, resolution, place, fill=self._fill)
+            self.grid = CostGrid(*size, picture.resolution, place, fill=self._fill)
             for layer in self._layers:
                 layer.match(self.grid)
             self._outdated = self.grid.whole

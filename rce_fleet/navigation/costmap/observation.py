@@ -1,4 +1,4 @@
-"""One message of a sensor in the plane of a costmap: where it saw obstacles, and how far it saw free space."""
+"""One message of a sensor in the plane of a costmap: where it saw obstacles, and how far free space."""
 
 from __future__ import annotations
 
@@ -104,8 +104,8 @@ def observe_points(points: Floats, sensor: Pose, source: ObservationSource, stam
         stamp,
         sensor,
         points[used, :2][near],
-        np.arctan2(y, x)[clearing],
-        np.minimum(away, source.raytrace_range)[clearing],
+        np.asarray(np.arctan2(y, x), np.float64)[clearing],
+        np.asarray(np.minimum(away, source.raytrace_range))[clearing],
     )
 
 

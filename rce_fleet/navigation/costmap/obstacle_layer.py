@@ -36,7 +36,7 @@ class ObstacleLayer:
         grid: The costmap.
 
     Attributes:
-        hits: The last point that was hit in each marked cell, shape (rows, columns, 2), metres; NaN elsewhere.
+        hits: The last point that was hit in each marked cell, shape (rows, columns, 2), metres; else NaN.
     """
 
     def __init__(
@@ -71,8 +71,8 @@ class ObstacleLayer:
 
     def match(self, grid: CostGrid) -> None:
         """Begin with nothing marked."""
-        self._costs = np.full(grid.shape, self._fill, np.uint8)
-        self.hits = np.full((*grid.shape, 2), np.nan, np.float32)
+        self._costs: NDArray[np.uint8] = np.full(grid.shape, self._fill, np.uint8)
+        self.hits: NDArray[np.float32] = np.full((*grid.shape, 2), np.nan, np.float32)
 
     def move(self, _grid: CostGrid, rows: int, columns: int) -> None:
         """Shift the marks."""

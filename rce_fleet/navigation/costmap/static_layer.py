@@ -15,6 +15,7 @@ from rce_fleet.navigation.costmap.layer import write_known, write_larger
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from rce_fleet.maps.occupancy_map import OccupancyMap
     from rce_fleet.navigation.costmap.parameters import StaticLayerParameters
 
 
@@ -43,19 +44,11 @@ class StaticLayer:
         """Whether a map was set."""
         return self._map is not None
 
-    def set_map(self, values: NDArray[np.int8], resolution: float, origin: Pose) -> None:
-        """Set the map.
-
-        Args:
-            values: Shape (rows, columns): -1 unknown, 0 .. 100.
-            resolution: Edge of a pixel, metres.
-            origin: Pose of the outer corner of pixel (0, 0).
-
-        Raises:
-            ValueError: The map has no pixels, or its resolution is not positive.
-        """
-        made = CostGrid(*values.shape, resolution, (origin.x, origin.y))
-        made.values = self._costs(values)
+    def set_map(self, picture: OccupancyMap) -> None:
+        """Set the map."""
+        origin = picture.origin
+        made = CostGrid(picture.rows, picture.columns, picture.resolution, (origin.x, origin.y))
+        made.values = self._costs(picture.data)
         self._map, self._origin_yaw, self._changed = made, origin.yaw, True
 
     def update_map(self, values: NDArray[np.int8], row: int, column: int) -> None:

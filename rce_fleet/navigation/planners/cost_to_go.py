@@ -1,8 +1,8 @@
 """The cost of the cheapest way from cells to a goal: a field over a costmap, in whole numbers.
 
-As the costs are whole numbers, the field does not depend on the order in which cells are visited: the compiled
-loop (Dial's algorithm, a queue of buckets by cost) and the numpy form (scipy's Dijkstra) give the same field,
-and the same path is read from it.
+As the costs are whole numbers, the field does not depend on the order in which cells are visited: the
+compiled loop (Dial's algorithm, a queue of buckets by cost) and the numpy form (scipy's Dijkstra) give the
+same field, and the same path is read from it.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ def _spread_numpy(steps: Ints, goal: int, stop: int) -> Ints:
         weights.append(flat[into])
     for down in (columns, -columns):
         for across in (1, -1):
-            open_ones = (flat[cells + down + across] > 0) & (flat[cells + down] > 0) & (flat[cells + across] > 0)
+            open_ones = (
+                (flat[cells + down + across] > 0) & (flat[cells + down] > 0) & (flat[cells + across] > 0)
+            )
             into = cells[open_ones] + down + across
             origins.append(into - down - across)
             targets.append(into)
@@ -76,7 +78,7 @@ def _spread_numpy(steps: Ints, goal: int, stop: int) -> Ints:
 
 
 @kernel("int64[:,::1](int64[:,::1], int64, int64)", numpy=_spread_numpy)
-def spread(steps: Ints, goal: int, stop: int) -> Ints:
+def spread(steps: Ints, goal: int, stop: int) -> Ints:  # noqa: C901, PLR0912, PLR0915 - one loop, to compile
     """Return the cost of the cheapest way from each cell to the goal, shape as ``steps``.
 
     A way makes straight and diagonal steps; a diagonal one only where both cells beside it can be entered.
@@ -118,7 +120,7 @@ def spread(steps: Ints, goal: int, stop: int) -> Ints:
             step = flat[other]
             if step == 0:
                 continue
-            if way >= 4:
+            if beside[way] != 0:
                 if flat[cell + beside[way]] == 0 or flat[cell + offsets[way] - beside[way]] == 0:
                     continue
                 step = (step * 181) >> 7

@@ -1,7 +1,7 @@
 """The global planner: the cheapest way to a goal on a costmap, straightened.
 
-It reads the way from the field of :mod:`~rce_fleet.navigation.planners.cost_to_go` and replaces parts of it by
-straight lines where these cost no more, so that the way is not bound to eight directions.
+It reads the way from the field of :mod:`~rce_fleet.navigation.planners.cost_to_go` and replaces parts of it
+by straight lines where these cost no more, so that the way is not bound to eight directions.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.navigation.costmap.costs import INSCRIBED, LETHAL, UNKNOWN
 from rce_fleet.navigation.planners.cost_to_go import UNREACHED, descend, spread, steps_of
-from rce_fleet.navigation.planners.shortcuts import straighten
+from rce_fleet.navigation.planners.shortcuts import line_cost, straighten
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -101,12 +101,30 @@ def make_plan(
     way = np.array(descend(field, steps, begin))
     cells = np.stack(divmod(way, columns), axis=1)
     corners = straighten(steps, cells) - 1
-    points = grid.centres_of(corners)
-    # The ends are exact: the way begins at the robot and, unless the goal is in an obstacle, ends at the goal.
-    if last == grid.cell_of(goal.x, goal.y):
-        points[-1] = goal.x, goal.y
-    points = np.concatenate((((start.x, start.y),), points[1:] if len(points) > 1 else points))
+    points = _with_exact_ends(grid, steps, grid.centres_of(corners), start, goal, last)
     return Plan(_with_headings(points, grid.resolution, goal.yaw))
+
+
+def _with_exact_ends(
+    grid: CostGrid, steps: Ints, points: Floats, start: Pose, goal: Pose, last: tuple[int, int]
+) -> Floats:
+    """Return a way from the start itself and, unless that is in an obstacle, to the goal itself.
+
+    The centres of their cells stay where a straight line past them would cross an obstacle.
+    """
+    reaches = last == grid.cell_of(goal.x, goal.y)
+    ends = [np.array(((start.x, start.y),)), np.array(((goal.x, goal.y),)) if reaches else points[-1:]]
+    if len(points) == 1:
+        return np.concatenate(ends)
+
+    def is_free(one: Floats, other: Floats) -> bool:
+        at, to = (((p - grid.origin) / grid.resolution + 1)[::-1] for p in (one, other))
+        return bool(np.isfinite(line_cost(steps, at, to)))
+
+    first = 1 if is_free(ends[0][0], points[1]) else 0
+    before = points[-2] if len(points) > first + 1 else ends[0][0]
+    until = -1 if is_free(before, ends[1][0]) else len(points)
+    return np.concatenate((ends[0], points[first:until], ends[1]))
 
 
 def _failed(reason: str) -> Plan:

@@ -57,8 +57,17 @@ class LocalPlannerParameters:
     sampling: str = "pursuit"
 
     def __post_init__(self) -> None:
-        for name in ("max_vel_x", "max_vel_theta", "acc_lim_x", "acc_lim_theta", "sim_time", "sim_granularity",
-                     "xy_goal_tolerance", "yaw_goal_tolerance", "min_lookahead_dist"):
+        for name in (
+            "max_vel_x",
+            "max_vel_theta",
+            "acc_lim_x",
+            "acc_lim_theta",
+            "sim_time",
+            "sim_granularity",
+            "xy_goal_tolerance",
+            "yaw_goal_tolerance",
+            "min_lookahead_dist",
+        ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected a number above 0, found {getattr(self, name)}")
         if self.sampling not in ("pursuit", "window"):

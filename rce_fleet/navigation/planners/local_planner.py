@@ -1,10 +1,10 @@
 """The local planner: follows a path within the robot's limits, and checks its footprint on the way exactly.
 
 Regulated pure pursuit (Macenski et al., "Regulated Pure Pursuit for Robot Path Tracking", 2023) over several
-lookahead distances and speeds: each pair is one trajectory, rolled out with the robot's accelerations, and the
-cheapest one that keeps clear of obstacles is driven. A long lookahead distance is smooth; near obstacles, where
-it would cut a corner, a short one follows the path as it is. With ``sampling: window`` the trajectories are the
-dynamic window's instead (Fox, Burgard and Thrun, 1997).
+lookahead distances and speeds: each pair is one trajectory, rolled out with the robot's accelerations, and
+the cheapest one that keeps clear of obstacles is driven. A long lookahead distance is smooth; near obstacles,
+where it would cut a corner, a short one follows the path as it is. With ``sampling: window`` the trajectories
+are those of the dynamic window instead (Fox, Burgard and Thrun, 1997).
 """
 
 from __future__ import annotations
@@ -132,10 +132,14 @@ class LocalPlanner:
 
     def _sight(self) -> float:
         limits = self.parameters
-        return limits.max_vel_x * limits.sim_time + self.footprint.circumscribed_radius + limits.comfort_clearance
+        return (
+            limits.max_vel_x * limits.sim_time
+            + self.footprint.circumscribed_radius
+            + limits.comfort_clearance
+        )
 
     def _speeds_now(self, measured: Twist) -> Twist:
-        """Return the last command, or the measured speeds where they are far from it: another stage braked."""
+        """Return the last command, or the measured speeds if they are far from it: another stage braked."""
         limits, last = self.parameters, self._command
         speed, turn_rate = last.speed, last.turn_rate
         if abs(measured.speed - speed) > limits.acc_lim_x * limits.stop_time_buffer:
@@ -208,7 +212,9 @@ class LocalPlanner:
         if not self.footprint.is_round:
             here = float(self.footprint.clearance(np.array(((pose.x, pose.y, pose.yaw),)), near)[0])
             clear = self.footprint.clearance(poses, near)[None, :]
-            if free_steps(clear, 0.0, here)[0] < min(count, 2 + ceil(now.turn_rate**2 / limits.acc_lim_theta * 6)):
+            if free_steps(clear, 0.0, here)[0] < min(
+                count, 2 + ceil(now.turn_rate**2 / limits.acc_lim_theta * 6)
+            ):
                 return self._towards(now, Twist(), dt, Following.BLOCKED, poses[:1])
         wanted = Twist(0.0, copysign(rate, off) if abs(now.speed) < limits.trans_stopped_vel else 0.0)
         return self._towards(now, wanted, dt, Following.DRIVING, poses)
@@ -231,7 +237,9 @@ class LocalPlanner:
         rows = np.arange(many)
         way = np.where(free > 0, driven[rows, free - 1], 0.0)
         blocked = free < count
-        reached = np.abs(now.speed + np.clip(speeds - now.speed, -limits.acc_lim_x * dt, limits.acc_lim_x * dt))
+        reached = np.abs(
+            now.speed + np.clip(speeds - now.speed, -limits.acc_lim_x * dt, limits.acc_lim_x * dt)
+        )
         needed = stopping_distance(reached, limits.acc_lim_x, limits.stop_time_buffer + dt)
         possible = ~blocked | (way >= needed)
         ends = poses[rows, np.maximum(free - 1, 0)]

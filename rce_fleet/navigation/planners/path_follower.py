@@ -42,7 +42,7 @@ class TrackedPath:
         return path
 
     def advance(self, x: float, y: float, reach: float) -> float:
-        """Find the robot on the path, at most ``reach`` metres after its last progress; return its distance."""
+        """Find the robot on the path, at most ``reach`` metres ahead; return its distance from the path."""
         along, away = self.project(np.array(((x, y),)), reach)
         self.progress = max(self.progress, float(along[0]))
         return float(away[0])

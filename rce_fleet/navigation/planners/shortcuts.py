@@ -68,7 +68,7 @@ def straighten(steps: Ints, cells: Ints) -> Ints:
 
     def is_cheap(there: int) -> bool:
         budget = (spent[there] - spent[here]) * _TOLERANCE
-        return line_cost(steps, points[here], points[there]) <= budget
+        return line_cost(steps, points[here], points[there]) <= float(budget)
 
     while here < last:
         good, stride = here + 1, 2

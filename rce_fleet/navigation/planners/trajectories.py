@@ -41,9 +41,9 @@ def roll_out(
         Poses after each step, shape (K, T, 3), and the distance driven until then, shape (K, T), metres.
     """
     count, dt = times
-    after = np.arange(1, count + 1) * dt
-    v = _ramp(twist.speed, speeds, acceleration[0], after - dt / 2)
-    w = _ramp(twist.turn_rate, turn_rates, acceleration[1], after - dt / 2)
+    after = np.arange(1, count + 1, dtype=np.float64) * dt
+    v = _ramp(twist.speed, speeds, acceleration[0], np.asarray(after - dt / 2))
+    w = _ramp(twist.turn_rate, turn_rates, acceleration[1], np.asarray(after - dt / 2))
     turned = np.cumsum(w * dt, axis=1)
     middle = pose.yaw + turned - w * dt / 2
     half = w * dt / 2
@@ -69,7 +69,7 @@ def free_steps(clearances: Floats, margin: float, now: float) -> NDArray[np.intp
             it does not get nearer.
     """
     blocked = (clearances < margin) & (clearances < now - CONTACT)
-    return np.where(blocked.any(axis=1), blocked.argmax(axis=1), clearances.shape[1])
+    return np.asarray(np.where(blocked.any(axis=1), blocked.argmax(axis=1), clearances.shape[1]))
 
 
 def stopping_distance(speed: Floats | float, deceleration: float, delay: float) -> Floats:

@@ -1,0 +1,1 @@
+"""How well robots navigate: seeded runs among boxes and walkers."""

@@ -1,0 +1,70 @@
+"""Cells that sensors found blocked are freed by sensors; those that people blocked only by people."""
+
+from __future__ import annotations
+
+import pytest
+
+from rce_fleet.coordination.answers import Answer, answer_array, read_answer
+from rce_fleet.coordination.events import (
+    BlockedChanged,
+    CellBlocked,
+    CellFreed,
+    Instruction,
+    ObstacleGone,
+    ObstacleSeen,
+    PoseSeen,
+)
+from rce_fleet.coordination.move_client import ClientReport, ClientState
+from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.planning.grid import GridMap
+
+
+@pytest.fixture
+def planner() -> FleetPlanner:
+    made = FleetPlanner(GridMap(4, 4))
+    made.handle(PoseSeen("Robot1", 0.5, 0.5, 0.0), 0.0)
+    return made
+
+
+def blocked(instructions: list[Instruction]) -> list[tuple[int, ...]]:
+    return [one.cells for one in instructions if isinstance(one, BlockedChanged)]
+
+
+def test_a_sensed_cell_is_freed_when_it_is_seen_free(planner: FleetPlanner) -> None:
+    assert blocked(planner.handle(ObstacleSeen("Robot1", (5, 6)), 1.0))[-1] == (5, 6)
+    assert blocked(planner.handle(ObstacleGone("Robot1", (5, 9)), 2.0)) == [(6,)]
+    assert planner.state.sensed == {6}
+    planner.validate()
+
+
+def test_another_robot_may_see_that_a_cell_is_free(planner: FleetPlanner) -> None:
+    planner.handle(ObstacleSeen("Robot1", (5,)), 1.0)
+    assert blocked(planner.handle(ObstacleGone("Robot2", (5,)), 2.0)) == [()]
+
+
+def test_sensors_do_not_free_what_a_person_blocked(planner: FleetPlanner) -> None:
+    planner.handle(CellBlocked(5), 1.0)
+    planner.handle(ObstacleSeen("Robot1", (5,)), 2.0)
+    assert blocked(planner.handle(ObstacleGone("Robot1", (5,)), 3.0)) == []
+    assert planner.state.blocked == {5}
+
+
+def test_a_person_takes_a_sensed_cell_over(planner: FleetPlanner) -> None:
+    planner.handle(ObstacleSeen("Robot1", (5,)), 1.0)
+    planner.handle(CellBlocked(5), 2.0)
+    planner.handle(ObstacleGone("Robot1", (5,)), 3.0)
+    assert planner.state.blocked == {5}
+    planner.handle(CellFreed(5), 4.0)
+    assert planner.state.blocked == set()
+    planner.validate()
+
+
+def test_an_answer_carries_freed_cells_only_if_there_are_any() -> None:
+    """Planners of the release before take answers of three parts only."""
+    report = ClientReport(3, ClientState.IDLE, (1, 2), 1, None)
+    for answer in (Answer(report, (4,)), Answer(report, (4,), (7, 8))):
+        fields = answer_array(answer)
+        dimensions = fields["layout"]["dim"]
+        assert len(dimensions) == (4 if answer.freed else 3)
+        labels, sizes = ([one[key] for one in dimensions] for key in ("label", "size"))
+        assert read_answer(labels, sizes, fields["data"]) == answer
