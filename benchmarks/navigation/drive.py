@@ -57,7 +57,7 @@ def settings(sampling: str = "pursuit") -> NavigationSettings:
         sources={"scan": ObservationSource("scan", data_type="LaserScan", clearing=True, inf_is_valid=True)},
     )
     return NavigationSettings(
-        MoveBaseParameters(controller_frequency=10.0, controller_patience=5.0, oscillation_timeout=20.0),
+        MoveBaseParameters(controller_frequency=10.0, controller_timeout=5.0, oscillation_timeout=20.0),
         replace(local, global_frame="map", rolling_window=False, static_layer=StaticLayerParameters()),
         local,
         local_planner=LocalPlannerParameters(

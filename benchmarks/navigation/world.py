@@ -30,7 +30,7 @@ PIXEL = 0.05
 WALKER_RADIUS = 0.25
 LOOK = 0.35
 """A walker stops if the robot or a wall is this near in front of it, metres."""
-PATIENCE = 1.5
+STOPPED_AT_MOST = 1.5
 """Seconds after which a walker that was stopped goes elsewhere."""
 OWN_MOTION = 0.02
 """A contact is the robot's own if it moves towards the other by more than this, m/s."""
@@ -168,7 +168,7 @@ class World:
         for one in self.walkers:
             dx, dy = one.goal[0] - one.x, one.goal[1] - one.y
             away = hypot(dx, dy)
-            if away < one.speed * dt or one.stopped_for > PATIENCE:
+            if away < one.speed * dt or one.stopped_for > STOPPED_AT_MOST:
                 one.goal, one.stopped_for = self._somewhere(), 0.0
                 continue
             ux, uy = dx / away, dy / away

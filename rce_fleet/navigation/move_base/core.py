@@ -190,7 +190,7 @@ class MoveBase:
             return
         self._retries += 1
         limit = self.parameters.max_planning_retries
-        late = now - self._valid_plan_at > self.parameters.planner_patience
+        late = now - self._valid_plan_at > self.parameters.planner_timeout
         if self.state is State.PLANNING and (late or 0 <= limit < self._retries):
             self._give_up_or_recover(f"failed to find a valid plan: {plan.reason}")
 
@@ -214,14 +214,12 @@ class MoveBase:
             self._local.reset()
             return Decision(text=situation.problem)
         self._watch_motion(situation)
-        match self.state:
-            case State.PLANNING:
-                step = self._local.step(situation.pose, situation.measured, situation.obstacles, situation.dt)
-                return Decision(step.twist, wants_plan=self._wants_plan(situation.now))
-            case State.CONTROLLING:
-                return self._control(situation, costs)
-            case State.RECOVERING:
-                return self._recover(situation)
+        if self.state is State.CONTROLLING:
+            return self._control(situation, costs)
+        if self.state is State.RECOVERING:
+            return self._recover(situation)
+        step = self._local.step(situation.pose, situation.measured, situation.obstacles, situation.dt)
+        return Decision(step.twist, wants_plan=self._wants_plan(situation.now))
 
     # Driving
 
@@ -241,7 +239,7 @@ class MoveBase:
         )
         if step.following is Following.BLOCKED:
             wants_plan = True
-            if now - self._valid_control_at > parameters.controller_patience:
+            if now - self._valid_control_at > parameters.controller_timeout:
                 self._give_up_or_recover("failed to find a valid control")
                 return Decision(step.twist)
         else:

@@ -6,7 +6,7 @@ real deceleration and all delays::
     v (delay + age of the scan) + v^2 / (2 deceleration) <= free distance - margin
 
 In front of something that moves it must also leave the distance by which that may come nearer meanwhile (the
-separation of ISO 13855, with ``person_speed``). A command, scan or pose that is late stops the robot, and so
+separation of ISO 13855, with ``walking_speed``). A command, scan or pose that is late stops the robot, and so
 does an emergency stop until it is released.
 """
 
@@ -159,11 +159,11 @@ class VelocityLimiter:
         unseen = limits.unseen_speed
         if allowed > unseen and not self._is_seen(0.0 if twist.speed > 0 else pi):
             allowed, reason = unseen, "no scan covers the direction"
-        if limits.person_speed > 0:
+        if limits.walking_speed > 0:
             assert self._pose is not None
-            person = self._allowed_beside_moving(twist, in_frame(self._pose, self.seen.moving), delay)
-            if person < allowed:
-                allowed, reason = person, "something moves near the robot"
+            beside = self._allowed_beside_moving(twist, in_frame(self._pose, self.seen.moving), delay)
+            if beside < allowed:
+                allowed, reason = beside, "something moves near the robot"
         return min(1.0, allowed / speed), reason
 
     def _limit_turn(self, twist: Twist, points: Floats, delay: float) -> tuple[float, str]:
@@ -215,9 +215,9 @@ class VelocityLimiter:
             return float("inf")
         limits = self.parameters
         clear = float(self.footprint.clearance(np.zeros((1, 3)), ahead, enough=3.0)[0]) - limits.margin
-        # v (delay + person / deceleration) + v^2 / (2 deceleration) <= clear - person * delay
-        slow = delay + limits.person_speed / limits.deceleration
-        return allowed_speed(clear - limits.person_speed * delay, limits.deceleration, slow)
+        # v (delay + walking / deceleration) + v^2 / (2 deceleration) <= clear - walking * delay
+        slow = delay + limits.walking_speed / limits.deceleration
+        return allowed_speed(clear - limits.walking_speed * delay, limits.deceleration, slow)
 
     def _is_seen(self, direction: float) -> bool:
         """Return whether the newest scan has a beam in a direction, seen from the robot."""

@@ -22,7 +22,7 @@ class SafetyParameters:
         max_speed: Highest speed that passes, m/s.
         max_turn_rate: Highest turn rate that passes, rad/s.
         unseen_speed: Highest speed in a direction that no scan covers, m/s.
-        person_speed: How fast something that moves may come nearer, m/s; 0: motion is not watched.
+        walking_speed: How fast something that moves may come nearer, m/s; 0: motion is not watched.
         scan_timeout: A scan older than this stops the robot, seconds.
         command_timeout: A command older than this stops it, seconds.
         transform_timeout: An odometry pose older than this stops it, seconds.
@@ -42,7 +42,7 @@ class SafetyParameters:
     max_speed: float = 0.65
     max_turn_rate: float = 3.14
     unseen_speed: float = 0.1
-    person_speed: float = 1.0
+    walking_speed: float = 1.0
     scan_timeout: float = 0.5
     command_timeout: float = 0.5
     transform_timeout: float = 0.5
@@ -62,6 +62,6 @@ class SafetyParameters:
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected a number above 0, found {getattr(self, name)}")
-        for name in ("delay", "margin", "unseen_speed", "person_speed", "memory"):
+        for name in ("delay", "margin", "unseen_speed", "walking_speed", "memory"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name}: expected a number of at least 0, found {getattr(self, name)}")

@@ -19,7 +19,7 @@ from rce_fleet.simulation.lidar import LidarSpec, cast
 BEAMS = 360
 STEP = 2 * pi / BEAMS
 HERE = Pose(0.0, 0.0, 0.0)
-PARAMETERS = SafetyParameters(deceleration=1.0, delay=0.1, margin=0.05, person_speed=0.0)
+PARAMETERS = SafetyParameters(deceleration=1.0, delay=0.1, margin=0.05, walking_speed=0.0)
 DISC = Footprint(0.2)
 
 
@@ -168,7 +168,7 @@ def test_backwards_without_a_view_the_robot_is_slow() -> None:
 
 def test_something_that_moves_nearby_slows_the_robot() -> None:
     """A person steps into space that was free; a box that stands at the same place does not slow it."""
-    parameters = SafetyParameters(margin=0.05, person_speed=1.0)
+    parameters = SafetyParameters(margin=0.05, walking_speed=1.0)
     for before, slow in ((circles((1.1, 1.2, 0.2)), True), (circles((1.1, 0.6, 0.2)), False)):
         stage = VelocityLimiter(parameters, DISC)
         stage.take_pose(HERE, 0.3)
