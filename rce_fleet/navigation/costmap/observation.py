@@ -65,7 +65,7 @@ def observe_scan(
         stamp: Time of the scan, seconds.
     """
     shortest, longest = range_limits
-    directions = sensor.yaw + angle_min + angle_increment * np.arange(len(ranges))
+    directions = sensor.yaw + angle_min + angle_increment * np.arange(len(ranges), dtype=np.float64)
     with np.errstate(invalid="ignore"):
         hit = (ranges >= shortest) & (ranges < longest)
         endless = np.isposinf(ranges) if source.inf_is_valid else np.zeros(len(ranges), np.bool_)

@@ -122,7 +122,8 @@ def test_inflation_equals_the_formula(cells: list[tuple[int, int]], radius: floa
 
 def test_a_static_costmap_takes_the_size_of_its_map() -> None:
     costmap = LayeredCostmap(CostmapParameters(static_layer=StaticLayerParameters()), Footprint(0.2))
-    assert not costmap.is_ready
+    ready = costmap.is_ready
+    assert not ready
     picture = np.zeros((20, 30), np.int8)
     picture[3, 7] = 100
     costmap.set_map(OccupancyMap(picture, 0.1, Pose(-1.0, -2.0, 0.0)))

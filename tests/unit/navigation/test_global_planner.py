@@ -20,7 +20,7 @@ ROWS, COLUMNS = 24, 30
 
 
 def grid_of(costs: np.ndarray, resolution: float = 0.1) -> CostGrid:
-    grid = CostGrid(*costs.shape, resolution)
+    grid = CostGrid(costs.shape[0], costs.shape[1], resolution)
     grid.values = costs.astype(np.uint8)
     return grid
 
