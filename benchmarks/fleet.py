@@ -128,8 +128,8 @@ def joined(count: int) -> Fleet:
 
 def finish_plans(fleet: Fleet) -> None:
     """Make all requested plans, one after another."""
-    while fleet.requests:
-        fleet.tell(PlanMade(compute_plan(fleet.requests.pop())))
+    while fleet.requests or fleet.planner.is_taking_over():
+        fleet.tell(PlanMade(compute_plan(fleet.requests.pop())) if fleet.requests else Tick())
 
 
 def pose_cost(count: int, *, batches: int) -> dict[str, Any]:
@@ -174,6 +174,8 @@ async def plan_cost(count: int) -> dict[str, Any]:
         await worker.compute(PlanRequest(0, 1, 1, (), (), (), (), (), 0, 1))
         # This plan has the first goal only; the next one has all of them.
         fleet.tell(PlanMade(compute_plan(fleet.requests.pop())))
+        while fleet.planner.is_taking_over():
+            fleet.tell(Tick())
         request = fleet.requests.pop()
         steps: dict[str, float] = {}
 
@@ -195,6 +197,8 @@ async def plan_cost(count: int) -> dict[str, Any]:
         result = await worker.compute(request)
         took = perf_counter() - began
         step("plan", PlanMade(result))
+        while fleet.planner.is_taking_over():
+            step("plan", Tick())
         feeding.cancel()
         await asyncio.gather(feeding, return_exceptions=True)
     gc.unfreeze()

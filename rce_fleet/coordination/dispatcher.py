@@ -13,7 +13,7 @@ from rce_fleet.coordination.events import BlockedChanged, Instruction, MakePlan,
 from rce_fleet.coordination.fleet_state import FleetState
 from rce_fleet.coordination.progress import arrived_index, standing_cell
 from rce_fleet.coordination.refusals import hindrance
-from rce_fleet.coordination.replanning import PlanRequest, PlanResult, adopt_plan, request_plan
+from rce_fleet.coordination.replanning import PlanAdoption, PlanRequest, PlanResult, request_plan
 from rce_fleet.coordination.robot import Cause, Phase, RobotRecord
 from rce_fleet.exceptions import InvariantError
 
@@ -47,11 +47,16 @@ class Dispatcher:
         self._partial = False
         self._asked: PlanRequest | None = None
         self._plans = 0
+        self._adoption: PlanAdoption | None = None
+        self._ripe: set[str] = set()
+        """Robots that may be granted further cells, and had no turn yet."""
 
     def advance(self) -> None:
         """Do everything that has become possible."""
         self._settle_standing()
         self._block_left_cells()
+        if self._adoption is not None:
+            self._take_over(self._adoption)
         self.state.refresh()
         if self._asked is None:
             if self._partial and not self.state.index.under_way:
@@ -61,6 +66,10 @@ class Dispatcher:
                 self.state.refresh()
             elif not self._awaited():
                 self._ask_for_plan()
+
+    def is_taking_over(self) -> bool:
+        """Return whether the rest of a plan, or of its first grants, follows with the next events."""
+        return self._adoption is not None or bool(self._ripe)
 
     def hold(self, record: RobotRecord, reason: str) -> None:
         """Stop a robot, to take its cells back once it stands still."""
@@ -127,9 +136,12 @@ class Dispatcher:
             self.out.append(BlockedChanged(tuple(sorted(self.state.blocked))))
 
     def _grant(self) -> None:
-        """Grant cells to robots whose turn it may be."""
+        """Grant cells to robots whose turn it may be; to some of them, if there are many."""
         ledger = self.state.ledger
-        for robot in sorted(ledger.take_ripe()):
+        self._ripe |= ledger.take_ripe()
+        turn = sorted(self._ripe)[: self.settings.robots_per_step]
+        self._ripe.difference_update(turn)
+        for robot in turn:
             record = self.state.robots.get(robot)
             if record is None or record.phase is not Phase.ACTIVE:
                 continue
@@ -150,17 +162,23 @@ class Dispatcher:
         self.out.append(MakePlan(self._asked))
 
     def take_plan(self, result: PlanResult) -> None:
-        """Adopt the requested plan; ignore any other."""
+        """Begin to take over the requested plan; ignore any other."""
         request = self._asked
-        if request is None or request.number != result.number:
+        if request is None or request.number != result.number or self._adoption is not None:
             return
-        self._asked = None
-        if not self.outdated:
-            adopt_plan(self.state, request, result)
-            # After a plan that makes progress, request another; otherwise wait for a change.
-            self._partial = not result.complete and bool(result.cells)
-        elif not self._awaited():
-            adopt_plan(self.state, request, result)
+        if self.outdated and self._awaited():
+            self._asked = None
+            return
+        self._adoption = PlanAdoption(self.state, request, result)
+        # After a plan that makes progress, request another; otherwise wait for a change.
+        self._partial = not result.complete and bool(result.cells)
+
+    def _take_over(self, adoption: PlanAdoption) -> None:
+        """Take over the next part of a plan; the part after it follows with the next event."""
+        if not adoption.step(self.settings.visits_per_step):
+            return
+        self._asked = self._adoption = None
+        if self.outdated and not self._awaited():
             self._grant()
 
     # One robot
@@ -195,7 +213,7 @@ class Dispatcher:
         Raises:
             InvariantError: Something was not done.
         """
-        state, quiet = self.state, not self.outdated and self._asked is None
+        state, quiet = self.state, not self.outdated and self._asked is None and not self._ripe
         for record in state.robots.values():
             stands = record.phase is Phase.HOLDING and record.stands(self.settings)
             if stands and not self._place_of(record)[2]:

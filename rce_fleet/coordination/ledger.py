@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import count
 from typing import TYPE_CHECKING
 
 from rce_fleet.exceptions import InvariantError
@@ -31,6 +32,7 @@ class _Account:
         extra: Further cells that it overlaps.
         passed: Number of cells that it has left so far; numbers its visits.
         owned: The cells whose owner it is.
+        version: Changes whenever the route changes otherwise than by a plan, or by the robot's progress.
     """
 
     route: list[int] = field(default_factory=list)
@@ -38,6 +40,7 @@ class _Account:
     extra: frozenset[int] = frozenset()
     passed: int = 0
     owned: set[int] = field(default_factory=set)
+    version: int = 0
 
     @property
     def claims(self) -> set[int]:
@@ -62,6 +65,7 @@ class CellLedger:
         self._changed: set[str] = set()
         self._freed: set[int] = set()
         self._ripe: set[str] = set()
+        self._versions = count(1)
 
     # Reading
 
@@ -97,6 +101,11 @@ class CellLedger:
         """Return the last cell that the robot may enter; None for a robot without a cell."""
         account = self._accounts.get(robot)
         return account.route[account.granted - 1] if account and account.granted else None
+
+    def version(self, robot: str) -> int:
+        """Return a number that changes when the robot is placed or removed, or its route is cut."""
+        account = self._accounts.get(robot)
+        return account.version if account else 0
 
     def extra(self, robot: str) -> frozenset[int]:
         """Return cells that the robot overlaps outside its route."""
@@ -135,6 +144,7 @@ class CellLedger:
         account = self._account(robot)
         self._withdraw(robot, account)
         account.passed += len(account.route)
+        account.version = next(self._versions)
         account.route, account.granted, account.extra = [cell], 1, frozenset(wanted - {cell})
         self._queues.setdefault(cell, deque()).appendleft((robot, account.passed))
         self._changed.add(robot)
@@ -167,14 +177,14 @@ class CellLedger:
         for index in range(account.granted, len(account.route)):
             self._drop_visit(account.route[index], (robot, account.passed + index))
         del account.route[account.granted :]
+        account.version = next(self._versions)
         self._changed.add(robot)
 
-    def adopt(self, starts: Mapping[str, int], visits: Iterable[tuple[str, int]]) -> None:
-        """Set a new plan. It begins where the granted cells end; the rest of older plans is dropped.
+    def begin_plan(self, starts: Mapping[str, int]) -> None:
+        """Begin a new plan where the granted cells end; the rest of older plans is dropped.
 
         Args:
             starts: For every robot with a plan its last granted cell.
-            visits: The cells that these robots enter next, in the order of the plan: ``(robot, cell)``.
 
         Raises:
             InvariantError: A robot's start is not its last granted cell; nothing was changed.
@@ -184,8 +194,17 @@ class CellLedger:
                 raise InvariantError(f"the plan of {robot} does not begin where its granted cells end")
         for robot in self._accounts:
             self.truncate(robot)
-        # A plan has tens of thousands of visits: this is the planner's longest operation.
+        self._changed.update(starts)
+        self._ripe.update(starts)
+
+    def extend_plan(self, visits: Iterable[tuple[str, int]]) -> None:
+        """Add to a plan that was begun.
+
+        Args:
+            visits: The cells that robots enter next, in the order of the plan: ``(robot, cell)``.
+        """
         accounts, queues = self._accounts, self._queues
+        extended: set[str] = set()
         for robot, cell in visits:
             account = accounts[robot]
             route = account.route
@@ -196,8 +215,9 @@ class CellLedger:
             else:
                 queue.append(visit)
             route.append(cell)
-        self._changed.update(starts)
-        self._ripe.update(starts)
+            extended.add(robot)
+        self._changed |= extended
+        self._ripe |= extended
 
     def grant(self, robot: str, ahead: int) -> bool:
         """Grant a robot the next cells of its route, at most ``ahead`` beyond its own.

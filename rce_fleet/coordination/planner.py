@@ -106,6 +106,10 @@ class FleetPlanner:
         """Return what changed of the snapshot since the last call, poses not counted; None if nothing did."""
         return self.state.take_changes()
 
+    def is_taking_over(self) -> bool:
+        """Return whether the rest of a plan is taken over with the next events."""
+        return self._dispatcher.is_taking_over()
+
     @property
     def sequence(self) -> int:
         """Number of the last change that :meth:`take_changes` returned; the snapshot holds it."""

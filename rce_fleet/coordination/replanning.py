@@ -1,8 +1,8 @@
 """One plan for all active robots, from the cells that they are committed to.
 
 A plan is made in three steps, so that the long one can run in another process: :func:`request_plan` copies
-its input from the fleet's state, :func:`compute_plan` uses only this copy, and :func:`adopt_plan` enters the
-result into the ledger, as far as the robots are still where the plan begins.
+its input from the fleet's state, :func:`compute_plan` uses only this copy, and :class:`PlanAdoption` enters
+the result into the ledger, as far as the robots are still where the plan begins.
 """
 
 from __future__ import annotations
@@ -143,46 +143,68 @@ def compute_plan(request: PlanRequest) -> PlanResult:
     )
 
 
-def adopt_plan(state: FleetState, request: PlanRequest, result: PlanResult) -> None:
-    """Enter a plan's routes into the ledger.
+class PlanAdoption:
+    """Enters a plan's routes into the ledger, a part at a time.
 
-    The state may have changed since the request. A robot that is not active any more, was granted other cells
-    or has another goal gets no route, and a route ends before a cell that no robot may enter any more. That
-    is safe, because robots drive only on granted cells, and the ledger checks each grant; but robots may not
-    reach their goals, so another plan has to follow.
+    The state may have changed since the request, and may change between two parts. A robot that is not active
+    any more, was granted other cells or has another goal gets no route, or no more of it, and a route ends
+    before a cell that no robot may enter any more. That is safe, because robots drive only on granted cells,
+    and the ledger checks each grant; but robots may not reach their goals, so another plan has to follow.
 
     Args:
         state: The fleet; its ledger and the robots' ``unreachable`` are changed.
         request: The plan's request.
         result: The plan.
     """
-    unreachable = frozenset(result.unreachable)
-    present: list[str | None] = []
-    for index, robot in enumerate(request.robots):
-        record = state.robots.get(robot)
-        goal = NO_CELL if record is None or record.goal is None else record.goal
-        if (
-            record is None
-            or record.phase is not Phase.ACTIVE
-            or state.ledger.end_of_grant(robot) != request.starts[index]
-            or goal != request.goals[index]
-        ):
-            present.append(None)
-            continue
-        present.append(robot)
-        if record.unreachable != (index in unreachable):
-            record.unreachable = index in unreachable
-            state.touch(record)
-    starts = {robot: start for robot, start in zip(present, request.starts, strict=True) if robot is not None}
-    state.ledger.adopt(starts, _visits(state, present, result))
 
+    def __init__(self, state: FleetState, request: PlanRequest, result: PlanResult) -> None:
+        self._state = state
+        self._request = request
+        self._result = result
+        self._next = 0
+        self._present: list[str | None] = []
+        unreachable = frozenset(result.unreachable)
+        starts = {}
+        for index, robot in enumerate(request.robots):
+            is_present = self._wants(index) and state.ledger.end_of_grant(robot) == request.starts[index]
+            self._present.append(robot if is_present else None)
+            if not is_present:
+                continue
+            starts[robot] = request.starts[index]
+            record = state.robots[robot]
+            if record.unreachable != (index in unreachable):
+                record.unreachable = index in unreachable
+                state.touch(record)
+        state.ledger.begin_plan(starts)
+        self._versions = [state.ledger.version(robot) for robot in request.robots]
 
-def _visits(state: FleetState, present: list[str | None], result: PlanResult) -> Iterator[tuple[str, int]]:
-    """Yield the visits in order, as far as they are still possible."""
-    shut = state.shut
-    for index, cell in zip(result.visitors, result.cells, strict=True):
-        robot = present[index]
-        if robot is not None and cell in shut:
-            present[index] = robot = None  # Its route ends here.
-        if robot is not None:
-            yield robot, cell
+    def step(self, visits: int) -> bool:
+        """Enter the next ``visits`` visits; return whether these were the last ones."""
+        begin, end = self._next, self._next + visits
+        self._next = end
+        for index, robot in enumerate(self._present):
+            if robot is not None and not self._is_on_plan(index):
+                self._present[index] = None
+        self._state.ledger.extend_plan(self._visits(begin, end))
+        return end >= len(self._result.cells)
+
+    def _wants(self, index: int) -> bool:
+        """Return whether a robot still takes part, with the goal that was planned for."""
+        record = self._state.robots.get(self._request.robots[index])
+        if record is None or record.phase is not Phase.ACTIVE:
+            return False
+        return (NO_CELL if record.goal is None else record.goal) == self._request.goals[index]
+
+    def _is_on_plan(self, index: int) -> bool:
+        robot = self._request.robots[index]
+        return self._wants(index) and self._state.ledger.version(robot) == self._versions[index]
+
+    def _visits(self, begin: int, end: int) -> Iterator[tuple[str, int]]:
+        """Yield visits in order, as far as they are still possible."""
+        shut, present, result = self._state.shut, self._present, self._result
+        for index, cell in zip(result.visitors[begin:end], result.cells[begin:end], strict=True):
+            robot = present[index]
+            if robot is not None and cell in shut:
+                present[index] = robot = None  # Its route ends here.
+            if robot is not None:
+                yield robot, cell

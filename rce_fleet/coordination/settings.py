@@ -24,6 +24,8 @@ class FleetSettings:
         stall_timeout: A robot with cells to drive to that stands still this long is stopped and sent again.
         seed: Breaks ties in plans.
         effort: Work spent on one plan, see :func:`rce_fleet.planning.lacam.plan`.
+        visits_per_step: With one event, so many entries of a plan are taken over, so that none takes long.
+        robots_per_step: With one event, so many robots are granted further cells.
     """
 
     robot_radius: float = 0.22
@@ -39,3 +41,5 @@ class FleetSettings:
     stall_timeout: float = 8.0
     seed: int = 0
     effort: int = 20_000
+    visits_per_step: int = 4_000
+    robots_per_step: int = 200

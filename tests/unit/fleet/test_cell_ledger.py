@@ -19,7 +19,8 @@ def adopt(ledger: CellLedger, routes: dict[str, list[tuple[int, int]]]) -> None:
     """Adopt a plan given as ``(step, cell)`` for each robot, its last granted cell first."""
     visits = sorted((step, robot, cell) for robot, route in routes.items() for step, cell in route[1:])
     starts = {robot: route[0][1] for robot, route in routes.items()}
-    ledger.adopt(starts, [(robot, cell) for _, robot, cell in visits])
+    ledger.begin_plan(starts)
+    ledger.extend_plan((robot, cell) for _, robot, cell in visits)
 
 
 def test_a_cell_is_granted_in_the_order_of_the_plan() -> None:

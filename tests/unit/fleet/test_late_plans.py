@@ -23,14 +23,15 @@ from rce_fleet.coordination.events import (
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.replanning import PlanRequest, PlanResult, compute_plan
+from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.planning.grid import GridMap
 
 
 class PlannerHarness:
     """A planner whose plans are made when a test says so, and robots that stand in their cells."""
 
-    def __init__(self, *starts: int) -> None:
-        self.planner = FleetPlanner(GridMap(1, 8) if len(starts) == 1 else GridMap())
+    def __init__(self, *starts: int, settings: FleetSettings | None = None) -> None:
+        self.planner = FleetPlanner(GridMap(1, 8) if len(starts) == 1 else GridMap(), settings)
         self.now = 0.0
         self.requests: list[PlanRequest] = []
         self.sent: dict[str, tuple[int, ...]] = {}
@@ -59,6 +60,20 @@ class PlannerHarness:
             self.now += 0.5
         self.tell(PoseSeen(robot, x, y, 0.0))
         assert self.sent[robot] == (cell,)
+
+    def events(self, count: int) -> None:
+        """Give the planner events without any news."""
+        for _ in range(count):
+            self.tell(Tick())
+
+    def stand(self) -> None:
+        """Have all robots say that they stand in their cells and took their lists."""
+        for robot in self.revisions:
+            x, y = self.planner.state.grid.centre(self.planner.state.ledger.route(robot)[0])
+            for _ in range(3):
+                self.tell(PoseSeen(robot, x, y, 0.0))
+                self.tell(ReportSeen(robot, ClientReport(self.revisions[robot], ClientState.IDLE)))
+                self.now += 0.25
 
     def finish(self) -> PlanResult:
         """Finish the plan that was asked for last."""
@@ -175,3 +190,50 @@ def test_hindered_robot_gets_its_place_once_the_cell_is_free() -> None:
     assert "cell 3 is held by R1" in harness.planner.snapshot().robots[1].reason
     harness.tell(RobotRemoved("R1"))
     assert harness.sent["R2"] == (4,)
+
+
+# Plans that are taken over in parts
+
+
+@pytest.fixture
+def slow() -> PlannerHarness:
+    """The same two robots; each event takes over three entries of a plan, and one robot gets cells."""
+    harness = PlannerHarness(0, 7, settings=FleetSettings(visits_per_step=3, robots_per_step=1))
+    for _ in range(3):
+        harness.finish()
+        harness.events(10)
+    harness.tell(GoalSet("R1", 56))
+    harness.tell(GoalSet("R2", 63))
+    harness.sent.clear()
+    return harness
+
+
+def test_a_plan_is_taken_over_with_the_events_after_it(slow: PlannerHarness) -> None:
+    slow.finish()
+    assert len(slow.planner.state.ledger.route("R1")) < 8
+    assert slow.sent == {}
+    slow.events(10)
+    slow.finish()
+    slow.events(10)
+    assert slow.planner.state.ledger.route("R1") == [0, 8, 16, 24, 32, 40, 48, 56]
+    assert len(slow.sent["R1"]) == len(slow.sent["R2"]) == 5
+
+
+@pytest.mark.parametrize("parts", range(5))
+def test_what_changes_between_two_parts_of_a_plan_counts(slow: PlannerHarness, parts: int) -> None:
+    """A route ends where a cell was blocked, or where its robot was stopped, and the others go on."""
+    slow.finish()
+    slow.events(10)
+    slow.finish()
+    slow.events(parts)
+    slow.tell(CellBlocked(23))
+    slow.tell(GoalSet("R1", 3))
+    for _ in range(4):
+        slow.events(10)
+        slow.stand()
+        slow.finish()
+    slow.events(10)
+    routes = slow.planner.state.ledger
+    assert routes.route("R1")[-1] == 3
+    assert routes.route("R2")[-1] == 63
+    assert 23 not in routes.route("R2")
