@@ -1,0 +1,248 @@
+"""The filter: Monte Carlo localization with an adaptive number of particles.
+
+Thrun, Burgard, Fox: Probabilistic Robotics, sections 8.3 (augmented MCL) and 8.3.7 (KLD sampling), with the
+behaviour and the parameters of ROS's ``amcl``. The caller gives odometry and scans; the filter gives the pose of
+the robot on the map, and where the odometry's frame is on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import hypot
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rce_fleet.exceptions import MapError
+from rce_fleet.geometry.angles import wrap, wrap_array
+from rce_fleet.geometry.poses import Pose
+from rce_fleet.localization.beam_model import BeamModel
+from rce_fleet.localization.clusters import Hypothesis, find_hypotheses
+from rce_fleet.localization.likelihood import LikelihoodField
+from rce_fleet.localization.motion import move_particles
+from rce_fleet.localization.parameters import AmclParameters, LaserModel
+from rce_fleet.localization.resampling import effective_count, resample
+from rce_fleet.localization.scan import Beams, LaserScan, select_beams
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from rce_fleet.maps.occupancy_map import OccupancyMap
+
+CONVERGED_M = 0.5
+"""Beams are skipped only while all particles are this near to their mean, in x and in y (ROS's constant)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What an update found.
+
+    Attributes:
+        pose: The robot's most probable pose on the map.
+        covariance: shape (3, 3): x, y (metres), yaw (radians).
+        map_from_odom: Pose of the odometry's frame on the map.
+        hypotheses: All places where the robot may be, the most probable first.
+        resampled: Whether particles were chosen anew.
+        agreement: How well the scan fits, averaged over the particles: 0 (not at all) .. 1 (each beam ends at
+            an obstacle of the map).
+    """
+
+    pose: Pose
+    covariance: NDArray[np.float64]
+    map_from_odom: Pose
+    hypotheses: list[Hypothesis]
+    resampled: bool
+    agreement: float
+
+
+class Amcl:
+    """The filter on one map. It begins at the parameters' initial pose.
+
+    Args:
+        grid: The map.
+        parameters: Those of the filter.
+        rng: Draws everything; the same state gives the same run.
+
+    Raises:
+        MapError: The map has no free cell.
+    """
+
+    def __init__(self, grid: OccupancyMap, parameters: AmclParameters, rng: np.random.Generator) -> None:
+        self.parameters = parameters
+        self._rng = rng
+        self.set_map(grid)
+        start = Pose(parameters.initial_pose_x, parameters.initial_pose_y, parameters.initial_pose_a)
+        spread = (parameters.initial_cov_xx, parameters.initial_cov_yy, parameters.initial_cov_aa)
+        self.set_pose(start, np.diag(spread))
+
+    @property
+    def particles(self) -> NDArray[np.float64]:
+        """The particles, shape (N, 3): x, y, yaw on the map."""
+        return self._particles.T
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """The particles' weights, shape (N,), with the sum 1."""
+        return self._weights
+
+    @property
+    def grid(self) -> OccupancyMap:
+        """The map."""
+        return self._grid
+
+    # From outside
+
+    def set_map(self, grid: OccupancyMap) -> None:
+        """Use another map; the particles stay where they are.
+
+        Raises:
+            MapError: The map has no free cell; the filter keeps the one it has.
+        """
+        free = np.argwhere(grid.free)
+        if not len(free):
+            raise MapError("the map has no free cell, so the robot cannot be anywhere on it")
+        self._grid = grid
+        self._free = free
+        parameters = self.parameters
+        if parameters.laser_model_type is LaserModel.BEAM:
+            self._field, self._beams = None, BeamModel(grid, parameters)
+        else:
+            self._field, self._beams = LikelihoodField(grid, parameters), None
+
+    def set_pose(self, pose: Pose, covariance: ArrayLike) -> None:
+        """Draw the particles around a pose.
+
+        Args:
+            pose: Where the robot probably is on the map.
+            covariance: shape (3, 3), of x, y (metres) and yaw (radians); must be symmetric.
+        """
+        values, axes = np.linalg.eigh(np.asarray(covariance, np.float64))
+        normals = self._rng.standard_normal((3, self.parameters.max_particles))
+        drawn = axes @ (np.sqrt(np.maximum(values, 0.0))[:, None] * normals) + pose.as_array()[:, None]
+        self._start_with(drawn)
+
+    def scatter(self) -> None:
+        """Draw the particles evenly over all free cells: the robot may be anywhere."""
+        self._start_with(self._anywhere(self.parameters.max_particles))
+
+    def request_update(self) -> None:
+        """Let the next scan update the filter, even if the robot stands."""
+        self._forced = True
+
+    def _start_with(self, particles: NDArray[np.float64]) -> None:
+        self._particles = particles
+        self._particles[2] = wrap_array(particles[2])
+        self._weights = np.full(particles.shape[1], 1.0 / particles.shape[1])
+        self._odometry: Pose | None = None
+        self._forced = True
+        self._updates = 0
+        self._slow = self._fast = 0.0
+
+    # Updates
+
+    def needs_update(self, odometry: Pose) -> bool:
+        """Return whether :meth:`update` would use a scan taken at this pose of the odometry."""
+        if self._odometry is None or self._forced:
+            return True
+        before, parameters = self._odometry, self.parameters
+        return (
+            hypot(odometry.x - before.x, odometry.y - before.y) >= parameters.update_min_d
+            or abs(wrap(odometry.yaw - before.yaw)) >= parameters.update_min_a
+        )
+
+    def update(self, odometry: Pose, scan: LaserScan) -> Estimate | None:
+        """Update the filter with a scan, if the robot has moved enough.
+
+        Args:
+            odometry: Pose by odometry at the time of the scan.
+            scan: The scan.
+
+        Returns:
+            What was found; None if the robot has not moved enough.
+        """
+        if not self.needs_update(odometry):
+            return None
+        if self._odometry is not None:
+            self._particles = move_particles(
+                self._particles, self._odometry, odometry, self.parameters, self._rng
+            )
+        self._odometry = odometry
+        self._forced = False
+        agreement = self._weigh(select_beams(scan, self.parameters))
+        self._updates += 1
+        hypotheses = find_hypotheses(self._particles, self._weights)
+        resampled = self._updates % self.parameters.resample_interval == 0 and self._resample()
+        best = hypotheses[0]
+        map_from_odom = best.pose.compose(odometry.inverse())
+        return Estimate(best.pose, best.covariance, map_from_odom, hypotheses, resampled, agreement)
+
+    def _weigh(self, beams: Beams) -> float:
+        """Multiply the weights with those of a scan; return how well it fits."""
+        parameters = self.parameters
+        count = int(beams.returned.sum()) if self._field is not None else len(beams.ranges)
+        if not count:
+            return 0.0
+        best = parameters.laser_z_hit + parameters.laser_z_rand / beams.range_max
+        if self._field is None:
+            assert self._beams is not None
+            factors = self._beams.sums_of_cubes(self._particles, beams)
+        elif parameters.laser_model_type is LaserModel.LIKELIHOOD_FIELD_PROB:
+            skip = parameters.do_beamskip and self._has_converged()
+            logs = self._field.log_products(self._particles, beams, skip=skip)
+            top = float(logs.max())
+            factors = np.exp(logs - top)
+            # The averages for recovery need a scale that all updates share: the beams' geometric mean.
+            fit = np.exp(logs / count)
+            return self._apply(factors, fit, best)
+        else:
+            factors = self._field.sums_of_cubes(self._particles, beams)
+        return self._apply(factors, np.cbrt((factors - 1.0) / count), best)
+
+    def _apply(self, factors: NDArray[np.float64], fit: NDArray[np.float64], best: float) -> float:
+        average = float(self._weights @ fit)
+        weights = self._weights * factors
+        total = float(weights.sum())
+        if total > 0:
+            self._weights = weights / total
+        else:  # no particle can explain the scan: keep what is known
+            self._weights = np.full_like(weights, 1.0 / len(weights))
+        parameters = self.parameters
+        self._slow += (average - self._slow) * (parameters.recovery_alpha_slow if self._slow else 1.0)
+        self._fast += (average - self._fast) * (parameters.recovery_alpha_fast if self._fast else 1.0)
+        return min(average / best, 1.0)
+
+    def _has_converged(self) -> bool:
+        off = np.abs(self._particles[:2] - self._particles[:2].mean(axis=1, keepdims=True))
+        return bool((off <= CONVERGED_M).all())
+
+    # Resampling
+
+    def _resample(self) -> bool:
+        count = len(self._weights)
+        parameters = self.parameters
+        if parameters.selective_resampling and effective_count(self._weights) > count / 2:
+            return False
+        chosen = self._particles[:, resample(self._particles, self._weights, parameters, self._rng)]
+        anywhere = self._share_anywhere()
+        if anywhere > 0:
+            extra = self._rng.binomial(parameters.max_particles, anywhere)
+            kept = self._rng.permutation(chosen.shape[1])[: parameters.max_particles - extra]
+            chosen = np.concatenate((chosen[:, kept], self._anywhere(extra)), axis=1)
+        self._particles = chosen
+        self._particles[2] = wrap_array(chosen[2])
+        self._weights = np.full(chosen.shape[1], 1.0 / chosen.shape[1])
+        return True
+
+    def _share_anywhere(self) -> float:
+        """Return the share of particles to draw anywhere, because scans fit worse than they used to."""
+        if self.parameters.recovery_alpha_fast <= 0 or self._slow <= 0:
+            return 0.0
+        return max(0.0, 1.0 - self._fast / self._slow)
+
+    def _anywhere(self, count: int) -> NDArray[np.float64]:
+        cells = self._free[self._rng.integers(len(self._free), size=count)]
+        inside = cells + self._rng.random((count, 2)) - 0.5
+        drawn = np.empty((3, count))
+        drawn[:2] = self._grid.cell_to_world(inside).T
+        drawn[2] = self._rng.uniform(-np.pi, np.pi, count)
+        return drawn
