@@ -1,8 +1,8 @@
 """The filter: Monte Carlo localization with an adaptive number of particles.
 
-Thrun, Burgard, Fox: Probabilistic Robotics, sections 8.3 (augmented MCL) and 8.3.7 (KLD sampling), with the
-behaviour and the parameters of ROS's ``amcl``. The caller gives odometry and scans; the filter gives the pose of
-the robot on the map, and where the odometry's frame is on it.
+Thrun, Burgard, Fox: Probabilistic Robotics, section 8.3 (augmented MCL and KLD sampling), with the behaviour
+and the parameters of ROS's ``amcl``. The caller gives odometry and scans; the filter gives the pose of the
+robot on the map, and where the odometry's frame is on it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rce_fleet.localization.clusters import Hypothesis, find_hypotheses
 from rce_fleet.localization.likelihood import LikelihoodField
 from rce_fleet.localization.motion import move_particles
 from rce_fleet.localization.parameters import AmclParameters, LaserModel
-from rce_fleet.localization.resampling import effective_count, resample
+from rce_fleet.localization.resampling import effective_count, resample, systematic, temper
 from rce_fleet.localization.scan import Beams, LaserScan, select_beams
 
 if TYPE_CHECKING:
@@ -31,6 +31,17 @@ if TYPE_CHECKING:
 
 CONVERGED_M = 0.5
 """Beams are skipped only while all particles are this near to their mean, in x and in y (ROS's constant)."""
+
+
+APART = 0.3
+"""Least effective share of the particles after a scan, while they are apart. Then they are far from dense,
+and the best of them may be a wrong one."""
+TOGETHER = 0.02
+"""The same while all particles are within ``CONVERGED_M``."""
+CAUTION = 1.05
+"""Random particles are drawn if scans fit worse than they used to by more than this factor: nu of Gutmann
+and Fox, "An experimental comparison of localization methods continued", IROS 2002."""
+_JUDGES = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +114,9 @@ class Amcl:
             raise MapError("the map has no free cell, so the robot cannot be anywhere on it")
         self._grid = grid
         self._free = free
-        parameters = self.parameters
-        if parameters.laser_model_type is LaserModel.BEAM:
-            self._field, self._beams = None, BeamModel(grid, parameters)
-        else:
-            self._field, self._beams = LikelihoodField(grid, parameters), None
+        uses_beams = self.parameters.laser_model_type is LaserModel.BEAM
+        self._beams = BeamModel(grid, self.parameters) if uses_beams else None
+        self._field = None if uses_beams else LikelihoodField(grid, self.parameters)
 
     def set_pose(self, pose: Pose, covariance: ArrayLike) -> None:
         """Draw the particles around a pose.
@@ -178,38 +187,43 @@ class Amcl:
 
     def _weigh(self, beams: Beams) -> float:
         """Multiply the weights with those of a scan; return how well it fits."""
-        parameters = self.parameters
-        count = int(beams.returned.sum()) if self._field is not None else len(beams.ranges)
-        if not count:
-            return 0.0
-        best = parameters.laser_z_hit + parameters.laser_z_rand / beams.range_max
+        parameters, particles = self.parameters, self._particles
         if self._field is None:
             assert self._beams is not None
-            factors = self._beams.sums_of_cubes(self._particles, beams)
-        elif parameters.laser_model_type is LaserModel.LIKELIHOOD_FIELD_PROB:
-            skip = parameters.do_beamskip and self._has_converged()
-            logs = self._field.log_products(self._particles, beams, skip=skip)
-            top = float(logs.max())
-            factors = np.exp(logs - top)
-            # The averages for recovery need a scale that all updates share: the beams' geometric mean.
-            fit = np.exp(logs / count)
-            return self._apply(factors, fit, best)
-        else:
-            factors = self._field.sums_of_cubes(self._particles, beams)
-        return self._apply(factors, np.cbrt((factors - 1.0) / count), best)
+            count = len(beams.ranges)
+            if not count:
+                return 0.0
+            factors = self._beams.sums_of_cubes(particles, beams)
+            return self._fit(self._apply(np.log(factors)), factors, count, beams)
+        count = int(beams.returned.sum())
+        if not count:
+            return 0.0
+        if parameters.laser_model_type is LaserModel.LIKELIHOOD_FIELD:
+            factors = self._field.sums_of_cubes(particles, beams)
+            return self._fit(self._apply(np.log(factors)), factors, count, beams)
+        skip = parameters.do_beamskip and self._has_converged()
+        self._apply(self._field.log_products(particles, beams, skip=skip))
+        judges = systematic(self._weights, min(_JUDGES, len(self._weights)), self._rng)
+        shares = np.full(len(judges), 1.0 / len(judges))
+        return self._fit(shares, self._field.sums_of_cubes(particles[:, judges], beams), count, beams)
 
-    def _apply(self, factors: NDArray[np.float64], fit: NDArray[np.float64], best: float) -> float:
-        average = float(self._weights @ fit)
-        weights = self._weights * factors
-        total = float(weights.sum())
-        if total > 0:
-            self._weights = weights / total
-        else:  # no particle can explain the scan: keep what is known
-            self._weights = np.full_like(weights, 1.0 / len(weights))
+    def _apply(self, logs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Multiply the weights by the exponentials of ``logs``, tempered; return the new weights."""
+        self._weights = temper(self._weights, logs, TOGETHER if self._has_converged() else APART)
+        return self._weights
+
+    def _fit(
+        self, weights: NDArray[np.float64], cubes: NDArray[np.float64], count: int, beams: Beams
+    ) -> float:
+        """Return how well a scan fits, and keep the averages that tell when the robot was moved by hand."""
         parameters = self.parameters
-        self._slow += (average - self._slow) * (parameters.recovery_alpha_slow if self._slow else 1.0)
+        best = parameters.laser_z_hit + parameters.laser_z_rand / beams.range_max
+        average = float(weights @ np.cbrt((cubes - 1.0) / count)) / best
+        # The slow average rises as fast as the other one: a bad beginning is no standard for later.
+        rate = parameters.recovery_alpha_slow if average < self._slow else parameters.recovery_alpha_fast
+        self._slow += (average - self._slow) * (rate if self._slow else 1.0)
         self._fast += (average - self._fast) * (parameters.recovery_alpha_fast if self._fast else 1.0)
-        return min(average / best, 1.0)
+        return min(average, 1.0)
 
     def _has_converged(self) -> bool:
         off = np.abs(self._particles[:2] - self._particles[:2].mean(axis=1, keepdims=True))
@@ -237,7 +251,7 @@ class Amcl:
         """Return the share of particles to draw anywhere, because scans fit worse than they used to."""
         if self.parameters.recovery_alpha_fast <= 0 or self._slow <= 0:
             return 0.0
-        return max(0.0, 1.0 - self._fast / self._slow)
+        return max(0.0, 1.0 - CAUTION * self._fast / self._slow)
 
     def _anywhere(self, count: int) -> NDArray[np.float64]:
         cells = self._free[self._rng.integers(len(self._free), size=count)]

@@ -1,8 +1,8 @@
 """The beam model: compares each range with the one that the map gives.
 
-Thrun, Burgard, Fox: Probabilistic Robotics, section 6.3. As in ROS's ``amcl``, the cubes of the beams' probabilities
-are added. It casts a ray for each particle and beam, which costs about a hundred times as much as the likelihood
-field; with the compiled ray casting it is usable.
+Thrun, Burgard, Fox: Probabilistic Robotics, section 6.3. As in ROS's ``amcl``, the cubes of the beams'
+probabilities are added. It casts a ray for each particle and beam, which costs about a hundred times as much
+as the likelihood field; with the compiled ray casting it is usable.
 """
 
 from __future__ import annotations

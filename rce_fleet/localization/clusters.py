@@ -1,7 +1,7 @@
 """The pose that particles stand for: the mean of their heaviest cluster, with its covariance.
 
-Particles are in one cluster if their bins touch, also over a corner, as in ROS's ``amcl``; unlike there, headings
-of -180 and 180 degrees touch too.
+Particles are in one cluster if their bins touch, also over a corner, as in ROS's ``amcl``; unlike there,
+headings of -180 and 180 degrees touch too.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The likelihood field: how probable it is that beams end where they would, seen from each particle.
 
-Thrun, Burgard, Fox: Probabilistic Robotics, section 6.4. As in ROS's ``amcl``, ``likelihood_field`` adds the cubes
-of the beams' probabilities (beams are far from independent, and a product makes the filter too sure of itself),
-and ``likelihood_field_prob`` multiplies them and can leave out beams that contradict the map.
+Thrun, Burgard, Fox: Probabilistic Robotics, section 6.4. As in ROS's ``amcl``, ``likelihood_field`` adds the
+cubes of the beams' probabilities (beams are far from independent). ``likelihood_field_prob`` multiplies the
+probabilities, and can leave out beams that contradict the map.
 """
 
 from __future__ import annotations
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from rce_fleet.localization.parameters import AmclParameters
     from rce_fleet.localization.scan import Beams
     from rce_fleet.maps.occupancy_map import OccupancyMap
-
-Floats = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 
 
 class LikelihoodField:
@@ -82,7 +80,7 @@ class LikelihoodField:
         return np.asarray(agrees)
 
     def _local(self, particles: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return shape (4, N): x, y in cells of the padded table, cosine and sine of yaw in the map's frame."""
+        """Return shape (4, N): x, y in cells of the padded table, cosine and sine of yaw on the map."""
         places = transform_points(self._to_map, particles[:2].T)
         local = np.empty((4, particles.shape[1]))
         local[:2] = places.T / self._resolution + 1.0

@@ -1,8 +1,8 @@
 """How a robot's odometry errs: moves particles by what the odometry says, with noise.
 
 The differential model is ``sample_motion_model_odometry`` of Thrun, Burgard, Fox: Probabilistic Robotics,
-section 5.4; the omnidirectional one is that of ROS's ``amcl``. The models ``diff`` and ``omni`` use the sums of
-squares as standard deviations, as ROS's always did; the corrected ones use them as variances.
+section 5.4; the omnidirectional one is that of ROS's ``amcl``. The models ``diff`` and ``omni`` use the sums
+of squares as standard deviations, as ROS's always did; the corrected ones use them as variances.
 """
 
 from __future__ import annotations

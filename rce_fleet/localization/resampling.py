@@ -22,6 +22,7 @@ BIN_RAD = pi / 18
 """Width of a bin of headings, radians."""
 HEADINGS = round(2 * pi / BIN_RAD)
 _ROWS = 1 << 24
+_LEAST_POWER = 1e-9
 
 
 def bin_numbers(particles: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -84,7 +85,7 @@ def systematic(weights: NDArray[np.float64], count: int, rng: np.random.Generato
     """
     sums = np.cumsum(weights)
     places = (np.arange(count) + rng.random()) * (sums[-1] / count)
-    return np.minimum(np.searchsorted(sums, places, side="right"), len(weights) - 1)
+    return np.asarray(np.minimum(np.searchsorted(sums, places, side="right"), len(weights) - 1), np.intp)
 
 
 def resample(
@@ -125,3 +126,36 @@ def effective_count(weights: NDArray[np.float64]) -> float:
     return 1.0 / float(weights @ weights)
 
 
+def temper(weights: NDArray[np.float64], logs: NDArray[np.float64], least: float) -> NDArray[np.float64]:
+    """Return weights multiplied by likelihoods, or by a root of them if few particles would keep any weight.
+
+    Args:
+        weights: shape (N,), normalized.
+        logs: shape (N,): logarithms of the likelihoods.
+        least: Share of the effective number of particles that must remain.
+
+    Returns:
+        shape (N,), normalized.
+    """
+    logs = logs - logs.max()
+    wanted = min(least * len(weights), effective_count(weights))
+    made = _times(weights, logs)
+    if effective_count(made) >= wanted:
+        return made
+    low = 1.0
+    while low > _LEAST_POWER and effective_count(_times(weights, low * logs)) < wanted:
+        low /= 2
+    high = 2 * low
+    for _ in range(4):
+        middle = (low + high) / 2
+        if effective_count(_times(weights, middle * logs)) >= wanted:
+            low = middle
+        else:
+            high = middle
+    return _times(weights, low * logs)
+
+
+def _times(weights: NDArray[np.float64], logs: NDArray[np.float64]) -> NDArray[np.float64]:
+    made = weights * np.exp(logs)
+    made /= made.sum()
+    return made

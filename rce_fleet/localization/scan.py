@@ -81,6 +81,6 @@ def select_beams(scan: LaserScan, parameters: AmclParameters) -> Beams:
     ranges = np.asarray(scan.ranges, np.float64)[chosen]
     measured = ~np.isnan(ranges)
     chosen, ranges = chosen[measured], ranges[measured]
-    ranges = np.where((ranges <= nearest) | (ranges > farthest), farthest, ranges)
+    ranges[(ranges <= nearest) | (ranges > farthest)] = farthest
     angles = scan.laser.yaw + scan.angle_min + chosen * scan.angle_increment
     return Beams(ranges, angles, farthest, scan.laser)
