@@ -78,10 +78,10 @@ def select_beams(scan: LaserScan, parameters: AmclParameters) -> Beams:
         farthest = min(farthest, parameters.laser_max_range)
     step = max((len(scan.ranges) - 1) // (parameters.laser_max_beams - 1), 1)
     chosen = np.arange(0, len(scan.ranges), step)
-    ranges: NDArray[np.float64] = np.asarray(scan.ranges, np.float64)[chosen]
+    ranges = np.asarray(scan.ranges, np.float64)[chosen]
     measured = ~np.isnan(ranges)
     chosen = chosen[measured]
     ranges = ranges[measured]
     ranges[(ranges <= nearest) | (ranges > farthest)] = farthest
-    angles = scan.laser.yaw + scan.angle_min + chosen * scan.angle_increment
+    angles = np.asarray(scan.laser.yaw + scan.angle_min + chosen * scan.angle_increment, np.float64)
     return Beams(ranges, angles, farthest, scan.laser)
