@@ -76,25 +76,50 @@ class Package(NamedTuple):
             ExecutableNotFoundError: The file does not exist, may not be executed, or the name leads out of
             the package.
         """
+        return self.program(exe).command
+
+    def program(self, exe: str) -> Program:
+        """Return a node's program: a file of the package, else one that a Python distribution adds.
+
+        Args:
+            exe: As for :meth:`executable`.
+
+        Raises:
+            ExecutableNotFoundError: As for :meth:`executable`.
+        """
         if not exe or exe.startswith("/") or "\0" in exe or ".." in PurePosixPath(exe).parts:
             raise ExecutableNotFoundError(f"{exe!r} is not a file inside package {self.name}")
         files = [folder / exe for folder in self._folders()]
         meant = [file for file in files if os.path.isfile(file)]  # noqa: PTH113 - pathlib's method may raise
         for file in meant:
             if command := self._command(file):
-                return command
+                return self._found(exe, command)
         if "/" not in exe and (found := _finder.find(self.path, exe)) is not None:
-            return [str(found)]
+            return self._found(exe, [str(found)])
         if meant:
             raise ExecutableNotFoundError(f"{meant[0]} may not be executed (chmod +x makes it so)")
-        for name, target in scripts_of(self.name):  # last, because it searches all installed distributions
-            if name == exe:
-                return [sys.executable, *arguments_of(target)]
+        if target := dict(scripts_of(self.name)).get(exe):  # last: it searches all installed distributions
+            return self._distributed_program(exe, target)
         where = ", ".join(str(folder) for folder in self._folders() if folder.is_dir())
         raise ExecutableNotFoundError(
             f"package {self.name} has no executable {exe!r} (looked in {where or self.path}, and below"
             f" {self.path} for one that may be executed)"
         )
+
+    def _found(self, exe: str, command: list[str]) -> Program:
+        """Return the program of a file; a distribution may add one of the same name, which is not used."""
+        rival = dict(scripts_of(self.name)).get(exe)
+        choice = f"{self.name}/{exe} is {command[-1]}, not {rival}" if rival else ""
+        return Program(command, self, choice)
+
+    def _distributed_program(self, exe: str, target: str) -> Program:
+        command = [sys.executable, *arguments_of(target)]
+        if self.name in distributed_packages():
+            return Program(command, self)
+        folder = folder_of(target)
+        why = "" if self.path == folder else f"; the package in {self.path} does not have it"
+        package = Package(self.name, folder, python="engine")
+        return Program(command, package, f"{self.name}/{exe} is {target}{why}")
 
     def _folders(self) -> Iterator[Path]:
         for folder in FOLDERS:
@@ -107,6 +132,17 @@ class Package(NamedTuple):
         if self.python == "engine" and file.suffix == ".py":
             return [sys.executable, str(file)]
         return [str(file)] if is_executable(file) else []
+
+
+class Program(NamedTuple):
+    """A package's executable that was found."""
+
+    command: list[str]
+    """The first words of its command line."""
+    package: Package
+    """To which it belongs; a program of a Python distribution is not part of a ROS package of its name."""
+    choice: str = ""
+    """For the log: which one was chosen, if a distribution adds one of this name; else empty."""
 
 
 class PackageIndex:

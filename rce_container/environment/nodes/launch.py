@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from rce.ros.substitution import split_arguments
+from rce.ros.system import system_environ
 from rce_container.environment.exceptions import NodeError
-from rce_container.environment.nodes.system import system_environ
 from rce_container.environment.user_packages import LaunchEnvironment
 
 NODE_MARK = "RCE_NODE"
@@ -26,6 +26,8 @@ class Launch(NamedTuple):
     env: dict[str, str]
     ros_name: str
     """The global ROS name that it is to take; empty if it chooses its own name."""
+    choice: str = ""
+    """For its log: which of several programs of its name was chosen; empty if there is only one."""
 
 
 def prepare(launch_environment: LaunchEnvironment, mark: str) -> Launch:
@@ -41,8 +43,7 @@ def prepare(launch_environment: LaunchEnvironment, mark: str) -> Launch:
     spec, packages = launch_environment.spec, launch_environment.packages
     environ: Mapping[str, str] = launch_environment.environ
     try:
-        package = packages.find(spec.pkg)
-        executable = package.executable(spec.exe)
+        executable, package, choice = packages.find(spec.pkg).program(spec.exe)
         arguments = split_arguments(spec.args, packages, environ)
     except (LookupError, ValueError, OSError) as error:
         raise NodeError(str(error)) from error
@@ -64,4 +65,4 @@ def prepare(launch_environment: LaunchEnvironment, mark: str) -> Launch:
         raise NodeError(
             f"{ros_name} is the node that joins the container to others; give this one another name"
         )
-    return Launch([*executable, *arguments], env, ros_name)
+    return Launch([*executable, *arguments], env, ros_name, choice)

@@ -93,6 +93,8 @@ class NodeLife:
 
     async def _live(self, launch: Launch) -> Event:
         self._log.begin()
+        if launch.choice:
+            self._log.note(launch.choice)
         with ExitStack() as pumps:
             child = self._start(launch, pumps)
             try:

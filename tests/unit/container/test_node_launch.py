@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from rce.model.specs import NodeSpec
+from rce.ros import system
 from rce.ros.packages import PackageIndex
 from rce_container.environment.exceptions import NodeError
-from rce_container.environment.nodes import system
 from rce_container.environment.nodes.launch import NODE_MARK, prepare
 from rce_container.environment.nodes.node_life import describe_exit
 from rce_container.environment.user_packages import LaunchEnvironment

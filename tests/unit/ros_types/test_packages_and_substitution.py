@@ -199,6 +199,21 @@ def test_packages_on_the_path_go_before_those_of_distributions(
     assert PackageIndex([tmp_path]).find("shop").path == folder
 
 
+def test_a_real_package_goes_before_a_distributed_node(distributed: Distributed, tmp_path: Path) -> None:
+    distributed(("rce.nodes", "shop:tool", "json.tool"), ("rce.nodes", "shop:till", "json.tool"))
+    ours = PackageIndex([]).find("shop").program("tool")
+    script = Path(json.__file__).parent / "tool.py"
+    assert (ours.command, ours.package.python) == ([sys.executable, str(script)], "engine")
+    assert ours.choice == "shop/tool is json.tool"
+    folder = make(tmp_path / "shop", manifest="package.xml", text="<package/>", nodes__tool=0o755)
+    real = PackageIndex([tmp_path]).find("shop")
+    file = folder / "nodes" / "tool"
+    assert real.program("tool") == ([str(file)], real, f"shop/tool is {file}, not json.tool")
+    till = real.program("till")
+    assert (till.command, till.package.python) == ([sys.executable, str(script)], "engine")
+    assert till.choice == f"shop/till is json.tool; the package in {folder} does not have it"
+
+
 def test_the_fleet_is_such_a_package() -> None:
     found = PackageIndex([]).find("fleet")
     assert [Path(found.executable(exe)[-1]).name for exe in ("fleet_planner.py", "move_client.py")] == [
