@@ -162,6 +162,11 @@ class PackageIndex:
         texts = (environ.get(variable, "") for variable in PATH_VARIABLES)
         return cls(folder for text in texts for folder in text.split(os.pathsep) if folder)
 
+    @classmethod
+    def of_machine(cls, environ: Mapping[str, str] = os.environ) -> PackageIndex:
+        """Make an index of the paths in the environment, and of this machine's ROS distributions."""
+        return cls(dict.fromkeys([*cls.from_environ(environ).path, *installed_shares()]))
+
     def __repr__(self) -> str:
         return f"<PackageIndex {self.describe_path()}>"
 

@@ -1,0 +1,204 @@
+"""``rce launch`` and ``rce run``: nodes of a launch file, or one node, without a ROS installation."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+import uvloop
+
+from rce.cli.main import Plugged
+from rce.ros.launch.exceptions import LaunchError
+
+if TYPE_CHECKING:
+    from rce.launching import StopTimeouts
+    from rce.ros.launch import LaunchPlan, MachineInputs
+    from rce.ros.packages import PackageIndex
+
+ASSIGN = ":="
+
+
+def launch(
+    what: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="[PKG] FILE... [ARG:=VALUE]...",
+            help="Launch files, or a package and a file of it; values of their arguments.",
+        ),
+    ],
+    nodes: Annotated[bool, typer.Option("--nodes", help="List the nodes; start none.")] = False,
+    dump_params: Annotated[bool, typer.Option(help="Print the parameters as YAML; start no node.")] = False,
+    args: Annotated[
+        str, typer.Option(metavar="NODE", help="Print the command line of a node; start none.")
+    ] = "",
+    ros_args: Annotated[bool, typer.Option(help="List the arguments of the files; start no node.")] = False,
+    files: Annotated[bool, typer.Option("--files", help="List the files with those they include.")] = False,
+    screen: Annotated[bool, typer.Option("--screen", help="Show the output of all nodes.")] = False,
+    log: Annotated[bool, typer.Option(help="Write the logs of the run into a folder of its own.")] = True,
+    wait: Annotated[bool, typer.Option("--wait", help="Wait for the master; do not start one.")] = False,
+    port: Annotated[
+        int, typer.Option("--port", "-p", help="Port of a master on this machine; default: ROS_MASTER_URI.")
+    ] = 0,
+    sigint_timeout: Annotated[
+        float, typer.Option(help="Seconds that a node may take to end on SIGINT.")
+    ] = 15.0,
+    sigterm_timeout: Annotated[
+        float, typer.Option(help="Seconds that a node may take to end on SIGTERM, which comes next.")
+    ] = 2.0,
+) -> None:
+    """Start the nodes of a launch file."""
+    from rce.launching import StopTimeouts
+    from rce.ros.launch import MachineInputs
+
+    inputs = MachineInputs()
+    uri = _master_uri(port)
+    try:
+        plan = _load(what, inputs)
+        for warning in plan.warnings:
+            typer.echo(f"warning: {warning}", err=True)
+        if _explain(plan, nodes=nodes, parameters=dump_params, arguments=ros_args, files=files):
+            return
+        if args:
+            _print_command(plan, inputs.packages, uri, args)
+            return
+        timeouts = StopTimeouts(sigint_timeout, sigterm_timeout)
+        code = uvloop.run(_launch(plan, inputs, uri, timeouts, logs=log, waits=wait, shows_all=screen))
+    except LaunchError as error:
+        typer.echo(f"rce launch: {error}", err=True)
+        raise typer.Exit(1) from error
+    raise typer.Exit(code)
+
+
+def run(
+    package: Annotated[str, typer.Argument(metavar="PKG", help="Package of the node.")],
+    executable: Annotated[str, typer.Argument(metavar="EXE", help="Its executable.")],
+    arguments: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[ARGUMENT]...", help="Its arguments, such as _rate:=5 or scan:=/front/scan."),
+    ] = None,
+    prefix: Annotated[str, typer.Option(help="Words before the command, such as 'nice -n 5'.")] = "",
+) -> None:
+    """Run one node of a package."""
+    import shlex
+
+    from rce.ros.errors import PackageError
+    from rce.ros.packages import PackageIndex
+    from rce.ros.system import system_environ
+
+    try:
+        program = PackageIndex.of_machine().find(package).program(executable)
+        words = [*shlex.split(prefix), *program.command, *(arguments or [])]
+    except (PackageError, ValueError) as error:
+        typer.echo(f"rce run: {error}", err=True)
+        raise typer.Exit(1) from error
+    if program.choice:
+        typer.echo(program.choice, err=True)
+    environ = dict(os.environ)
+    if program.package.python == "system":
+        environ = system_environ(environ, program.package.path)
+    try:
+        os.execvpe(words[0], words, environ)  # noqa: S606 - the node takes this program's place
+    except OSError as error:
+        typer.echo(f"rce run: {words[0]} cannot be started: {error.strerror}", err=True)
+        raise typer.Exit(1) from error
+
+
+run_command = Plugged(run, {"allow_interspersed_args": False, "ignore_unknown_options": True})
+
+
+def _master_uri(port: int) -> str:
+    from rce.ros.node.settings import DEFAULT_MASTER_URI
+
+    if port:
+        return f"http://127.0.0.1:{port}/"
+    return os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER_URI
+
+
+def _load(what: list[str], inputs: MachineInputs) -> LaunchPlan:
+    from rce.ros.launch import load_launch_files
+
+    values = dict(word.split(ASSIGN, 1) for word in what if ASSIGN in word)
+    names = [word for word in what if ASSIGN not in word]
+    special = {name: value for name, value in values.items() if name.startswith("_")}
+    if unknown := sorted(special.keys() - {"__ns"}):
+        raise LaunchError(f"{unknown[0]}:= is not an argument of launch files; only __ns:= is known")
+    namespace = special.get("__ns") or inputs.environ.get("ROS_NAMESPACE") or "/"
+    arguments = {name: value for name, value in values.items() if name not in special}
+    return load_launch_files(_files(names, inputs), arguments, inputs=inputs, namespace=namespace)
+
+
+def _files(names: list[str], inputs: MachineInputs) -> list[str]:
+    """Return the launch files that a command line names: a package and a file of it, or paths."""
+    from rce.ros.launch.inputs import find_launch_file
+    from rce.ros.errors import PackageError
+
+    if not names:
+        raise LaunchError("give a launch file, or a package and one of its launch files")
+    missing = [name for name in names if not Path(name).is_file()]
+    if not missing:
+        return names
+    if len(names) != 2:  # noqa: PLR2004 - a package and a file
+        raise LaunchError(f"there is no file {missing[0]}")
+    try:
+        return [str(find_launch_file(inputs.find(names[0]), names[1]))]
+    except (PackageError, ValueError) as error:
+        raise LaunchError(f"there is no file {missing[0]}; {error}") from error
+
+
+def _explain(
+    plan: LaunchPlan,
+    *,
+    nodes: bool,
+    parameters: bool,
+    arguments: bool,
+    files: bool,
+) -> bool:
+    """Print what is asked for instead of a launch; return whether anything was."""
+    from rce.launching.graph import parameters_as_yaml
+
+    if nodes:
+        typer.echo("\n".join(node.name for node in plan.nodes))
+    if parameters:
+        typer.echo(parameters_as_yaml(plan.parameters), nl=False)
+    if arguments:
+        for one in plan.arguments.values():
+            needed = "must be given" if one.default is None else f"default {one.default!r}"
+            typer.echo(f"{one.name}: {needed}" + (f"; {one.doc}" if one.doc else ""))
+    if files:
+        typer.echo("\n".join(plan.files))
+    return nodes or parameters or arguments or files
+
+
+def _print_command(plan: LaunchPlan, packages: PackageIndex, uri: str, name: str) -> None:
+    import shlex
+
+    from rce.launching.command import node_command
+    from rce.ros.errors import PackageError
+
+    node = next((node for node in plan.nodes if node.name.strip("/") == name.strip("/")), None)
+    if node is None:
+        known = ", ".join(node.name for node in plan.nodes) or "none"
+        raise LaunchError(f"there is no node {name}; the nodes are: {known}")
+    try:
+        command = node_command(node, packages, os.environ, uri)
+    except PackageError as error:
+        raise LaunchError(f"{node.place}: {error}") from error
+    changed = [f"{key}={value}" for key, value in command.env.items() if os.environ.get(key) != value]
+    typer.echo(shlex.join([*changed, *command.argv]))
+
+
+async def _launch(
+    plan: LaunchPlan, inputs: MachineInputs, uri: str, timeouts: StopTimeouts, *, logs: bool, **options: Any
+) -> int:
+    from rce.launching import Launcher
+    from rce.ros.logfiles import log_folder
+    from rce.own_process import end_signals
+
+    folder = log_folder(inputs.environ) if logs else None
+    launcher = Launcher(plan, inputs.packages, uri, folder, report=typer.echo, timeouts=timeouts, **options)
+    for number in end_signals():
+        asyncio.get_running_loop().add_signal_handler(number, launcher.stop)
+    return await launcher.run()

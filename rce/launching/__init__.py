@@ -1,0 +1,9 @@
+"""Carries out a launch plan: a master if there is none, parameters, and nodes as processes until they end.
+
+:class:`~rce.launching.launcher.Launcher` does what ``roslaunch`` does with its files.
+"""
+
+from rce.launching.launcher import Launcher
+from rce.launching.process import StopTimeouts
+
+__all__ = ["Launcher", "StopTimeouts"]
