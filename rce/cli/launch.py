@@ -132,8 +132,8 @@ def _load(what: list[str], inputs: MachineInputs) -> LaunchPlan:
 
 def _files(names: list[str], inputs: MachineInputs) -> list[str]:
     """Return the launch files that a command line names: a package and a file of it, or paths."""
-    from rce.ros.launch.inputs import find_launch_file
     from rce.ros.errors import PackageError
+    from rce.ros.launch.inputs import find_launch_file
 
     if not names:
         raise LaunchError("give a launch file, or a package and one of its launch files")
@@ -194,8 +194,8 @@ async def _launch(
     plan: LaunchPlan, inputs: MachineInputs, uri: str, timeouts: StopTimeouts, *, logs: bool, **options: Any
 ) -> int:
     from rce.launching import Launcher
-    from rce.ros.logfiles import log_folder
     from rce.own_process import end_signals
+    from rce.ros.logfiles import log_folder
 
     folder = log_folder(inputs.environ) if logs else None
     launcher = Launcher(plan, inputs.packages, uri, folder, report=typer.echo, timeouts=timeouts, **options)

@@ -17,9 +17,9 @@ from rce.ros.launch.plan import Output
 from rce.ros.names import segments
 
 if TYPE_CHECKING:
-    from rce.ros.packages import PackageIndex
     from rce.launching.graph import LaunchGraph
     from rce.ros.launch.plan import LaunchPlan, NodePlan
+    from rce.ros.packages import PackageIndex
 
 
 class Launcher:
