@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rce.model import (
     AddInterface,
@@ -24,10 +25,11 @@ from rce.model import (
 from rce.model.spelling import PLAIN
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from rce.model import Request
     from rce.model.written import NetworkName, Quantity, RestartName, Value
+
+
+R = TypeVar("R", CreateContainer, ResizeContainer, AddNode)
 
 
 class Requests(ABC):
@@ -93,22 +95,7 @@ class Requests(ABC):
             await robot.create_container("brain", cpu="50%", memory="256M", wait=True)
             ```
         """
-        given = {
-            "tag": tag,
-            "size": size,
-            "cpu": cpu,
-            "memory": memory,
-            "bandwidth": bandwidth,
-            "network": network,
-            "group": group,
-            "group_ip": group_ip,
-            "image": image,
-            "special_features": special_features
-            if isinstance(special_features, str)
-            else list(special_features),
-            "wait": wait,
-        }
-        await self.request(PLAIN.read(CreateContainer, given))
+        await self.request(_read(CreateContainer, locals()))
 
     async def resize_container(
         self,
@@ -142,8 +129,7 @@ class Requests(ABC):
             await robot.resize_container("brain", cpu=0.5, memory="512M")
             ```
         """
-        changes = {"size": size, "cpu": cpu, "memory": memory, "bandwidth": bandwidth}
-        await self.request(PLAIN.read(ResizeContainer, {"tag": tag, **changes}))
+        await self.request(_read(ResizeContainer, locals()))
 
     async def destroy_container(self, tag: str) -> None:
         """Remove a container with its nodes, interfaces and connections.
@@ -212,21 +198,8 @@ class Requests(ABC):
             await robot.add_node("brain", "plan", "Test", "stringEcho.py", args="_rate:=5", after=["map"])
             ```
         """
-        given = {
-            "container": container,
-            "tag": tag,
-            "pkg": pkg,
-            "exe": exe,
-            "args": args,
-            "name": name,
-            "namespace": namespace,
-            "restart": restart,
-            "max_restarts": max_restarts,
-            "after": (after,) if isinstance(after, str) else tuple(after),
-            "heartbeat": heartbeat,
-            "heartbeat_timeout": heartbeat_timeout,
-        }
-        await self.request(ConfigureComponents(add_nodes=(PLAIN.read(AddNode, given),)))
+        after = (after,) if isinstance(after, str) else after
+        await self.request(ConfigureComponents(add_nodes=(_read(AddNode, locals()),)))
 
     async def remove_node(self, container: str, tag: str) -> None:
         """Stop a node. Cancelling does not withdraw the request.
@@ -375,3 +348,17 @@ class Requests(ABC):
             ```
         """
         await self.request(ConfigureConnections(disconnect=(Connection(tag_a=a, tag_b=b),)))
+
+
+def _read(request_type: type[R], arguments: dict[str, Any]) -> R:
+    """Read a request from the arguments of a method, whose keywords are its fields.
+
+    Raises:
+        ValueError: An argument is invalid.
+    """
+    given = {
+        name: list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+        for name, value in arguments.items()
+        if name != "self"
+    }
+    return PLAIN.read(request_type, given)

@@ -18,6 +18,7 @@ from rce.control.messages import (
     Login,
     LoginReply,
     PatchStatus,
+    RequestFault,
     SpecWanted,
     Status,
     Usage,
@@ -252,15 +253,26 @@ class ControlHandler:
         outcomes = [await self._state_service.enqueue(part) for part in parts]
         if self._audit is not None and wanted:
             self._audit.add(user, f"request_{request.type.lower()}", detail=describe(wanted), via=request.id)
-        await self._spawn(self._answer(peer, request, outcomes, faults))
+        await self._spawn(self._answer(peer, request, wanted, outcomes, faults))
 
     async def _answer(
         self,
         peer: Peer,
         request: ClientRequest,
+        wanted: list[commands.Request],
         outcomes: list[asyncio.Future[list[Outcome]]],
         faults: list[str],
     ) -> None:
         found = [error for part in outcomes for error in await part]
-        errors = [f"{request.type}: {error}" for error in found if error is not None]
-        peer.send(ClientReply(request=request.request, errors=(*faults, *errors)))
+        refused = [(one, error) for one, error in zip(wanted, found, strict=True) if error is not None]
+        reply = ClientReply(
+            request=request.request,
+            errors=(*faults, *(f"{request.type}: {error}" for _, error in refused)),
+            faults=(*(RequestFault() for _ in faults), *(_fault_of(one, error) for one, error in refused)),
+        )
+        peer.send(reply)
+
+
+def _fault_of(command: commands.Request, error: MasterError) -> RequestFault:
+    code = error.code.value if isinstance(error, RefusedError) else ""
+    return RequestFault(code=code, ids=requests.ids_of(command))

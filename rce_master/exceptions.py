@@ -28,6 +28,7 @@ from __future__ import annotations
 import math
 
 from rce.lifecycle import InvalidTransitionError
+from rce.model import FaultCode
 
 
 class MasterError(Exception):
@@ -39,51 +40,60 @@ class RefusedError(MasterError):
 
     Attributes:
         status: The matching HTTP status.
+        code: The kind of the refusal, for programs.
     """
 
     status = 400
+    code = FaultCode.INVALID
 
 
 class InvalidRequestError(RefusedError):
     """The request is invalid."""
 
     status = 422
+    code = FaultCode.INVALID
 
 
 class NotFoundError(RefusedError):
     """The request names an object that does not exist."""
 
     status = 404
+    code = FaultCode.NOT_FOUND
 
 
 class ConflictError(RefusedError):
     """The request conflicts with the present state."""
 
     status = 409
+    code = FaultCode.CONFLICT
 
 
 class LimitReachedError(RefusedError):
     """The maximum number of objects of this kind is reached."""
 
     status = 409
+    code = FaultCode.LIMIT
 
 
 class NoRoomError(RefusedError):
     """No machine, or not the container's own one, has the resources that it asks for."""
 
     status = 409
+    code = FaultCode.NO_ROOM
 
 
 class ForbiddenError(RefusedError):
     """The user may not do it."""
 
     status = 403
+    code = FaultCode.FORBIDDEN
 
 
 class BusyError(RefusedError):
     """Too many requests of this kind are in progress."""
 
     status = 503
+    code = FaultCode.BUSY
 
 
 class TooMuchError(RefusedError):
@@ -94,6 +104,7 @@ class TooMuchError(RefusedError):
     """
 
     status = 429
+    code = FaultCode.BUSY
 
     def __init__(self, text: str, retry_after: float) -> None:
         self.retry_after = retry_after

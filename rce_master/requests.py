@@ -43,6 +43,28 @@ def read(user: str, request: ClientRequest) -> tuple[list[commands.Request], lis
     return list(commands_of(content, user)), [f"{request.type}: {fault}" for fault in faults]
 
 
+def ids_of(command: commands.Request) -> dict[str, str]:
+    """Return what a command is about, for programs; see :class:`rce.control.messages.RequestFault`."""
+    match command:
+        case commands.CreateContainer() | commands.ResizeContainer() | commands.DestroyContainer():
+            ids = {"container": command.tag}
+        case commands.AddNode():
+            ids = {"container": command.container, "node": command.node.tag}
+        case commands.RemoveNode():
+            ids = {"container": command.container, "node": command.tag}
+        case commands.SetParameter() | commands.DeleteParameter():
+            ids = {"container": command.container, "parameter": command.name}
+        case commands.AddInterface():
+            ids = {"endpoint": command.endpoint, "interface": command.interface.tag}
+        case commands.RemoveInterface():
+            ids = {"endpoint": command.endpoint, "interface": command.tag}
+        case commands.Connect() | commands.Disconnect():
+            ids = {"a": command.tag_a, "b": command.tag_b}
+        case _:
+            assert_never(command)
+    return ids
+
+
 def commands_of(request: Request | Component, user: str) -> Iterator[commands.Request]:
     """Return the commands of a request, in the order in which they are to be done.
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rce.guard.holdings import Holding
     from rce.link import Interface, LinkHub, Port
     from rce.model import InterfaceSpec, Request
-    from rce.protocol.messages import CallId, DataMessage
+    from rce.protocol.messages import CallId, DataMessage, ErrorReport
     from rce.protocol.stream import LargeData
     from rce_robot.conversion import ConversionPool, Result
     from rce_robot.conversion.jobs import Job
@@ -64,7 +64,7 @@ class NamespaceListener(Protocol):
     def robot_left(self, namespace: Namespace, reason: str) -> None:
         """The robot's connection ended."""
 
-    async def ask_master(self, id: EndpointId, request: Request) -> tuple[str, ...]:  # noqa: A002
+    async def ask_master(self, id: EndpointId, request: Request) -> tuple[ErrorReport, ...]:  # noqa: A002
         """Have the master carry out a robot's request; return the faults."""
 
 
@@ -255,7 +255,7 @@ class Namespace:
         if interface is not None:
             interface.refused(call.msg_id, problem)
 
-    async def ask_master(self, request: Request) -> tuple[str, ...]:
+    async def ask_master(self, request: Request) -> tuple[ErrorReport, ...]:
         """Have a request of the robot carried out; return the faults."""
         return await self._listener.ask_master(self.id, request)
 

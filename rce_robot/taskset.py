@@ -44,11 +44,12 @@ from rce.guard.budget import Ledger
 from rce.model import EndpointId
 from rce.own_process import cpu_seconds, machine_memory, resident_bytes
 from rce.protocol.exceptions import HandshakeError
-from rce.protocol.messages import type_of
+from rce.protocol.messages import ErrorReport, type_of
 from rce.protocol.requests import write_request
 from rce.ros.tcpros.allocator import give_back_free_memory
 from rce_robot.memory import UnusedMemory
 from rce_robot.namespace import Namespace
+from rce_robot.refusals import reports_of
 
 if TYPE_CHECKING:
     from rce.control.messages import ToMaster, ToTaskSet
@@ -271,7 +272,7 @@ class RobotTaskSet:
         if self._is_current(namespace):
             self._channel.send(Left(id=str(namespace.id), reason=reason))
 
-    async def ask_master(self, id: EndpointId, request: Request) -> tuple[str, ...]:  # noqa: A002
+    async def ask_master(self, id: EndpointId, request: Request) -> tuple[ErrorReport, ...]:  # noqa: A002
         """Have a client's request carried out; return the faults."""
         type_ = type_of(request)
         try:
@@ -281,8 +282,8 @@ class RobotTaskSet:
                 data = write_request(request)
                 reply = await self._channel.client_request(str(id), type_, data=data)
         except ControlError as error:
-            return (f"{type_}: not done: {error}",)
-        return reply.errors
+            return (ErrorReport(problem=f"{type_}: not done: {error}"),)
+        return reports_of(reply)
 
     # Private
 

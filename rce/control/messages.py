@@ -281,11 +281,22 @@ class LoginReply(_Message, frozen=True, kw_only=True, omit_defaults=True):
     reason: str = ""
 
 
+class RequestFault(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Why a part of a request was refused, as data; the text is in :class:`ClientReply`."""
+
+    code: str = ""
+    """A :class:`rce.model.FaultCode`, or one of a later release; empty if there is none."""
+    ids: dict[str, str] = {}
+    """What it is about: ``container``, ``node``, ``parameter``, ``endpoint``, ``interface``, ``a``, ``b``."""
+
+
 class ClientReply(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Answer to :class:`ClientRequest`: the texts of the ``ER`` messages to send, empty if all was done."""
 
     request: int
     errors: tuple[str, ...] = ()
+    faults: tuple[RequestFault, ...] = ()
+    """The same as data, one for each of ``errors``; empty from masters of the release before."""
 
 
 class ReadLog(_Message, frozen=True, kw_only=True, omit_defaults=True):

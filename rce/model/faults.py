@@ -25,7 +25,17 @@ class FaultCode(Enum):
     INVALID = "invalid"
     """A value that the field cannot have."""
     LIMIT = "limit"
-    """Too much."""
+    """Too much, or too many."""
+    NOT_FOUND = "not_found"
+    """It names something that does not exist."""
+    CONFLICT = "conflict"
+    """It contradicts what exists."""
+    FORBIDDEN = "forbidden"
+    """This user may not do it."""
+    NO_ROOM = "no_room"
+    """No machine has enough of a resource."""
+    BUSY = "busy"
+    """Too much is being done now; a later attempt may succeed."""
 
 
 class FieldFault(Struct, frozen=True):

@@ -17,6 +17,7 @@ from rce.model import (
     CreateContainer,
     DestroyContainer,
     FaultCode,
+    FieldFault,
     Path,
     Request,
     ResizeContainer,
@@ -81,9 +82,13 @@ class ErrorReport(Struct, frozen=True, kw_only=True):
     call: CallId | None = None
     """The service call that failed."""
     path: Path = ()
-    """The place of the fault in a message."""
+    """The place of the fault in a message; of the first one, if there are several."""
     code: FaultCode | None = None
     """The kind of the fault; None if it is not given."""
+    faults: tuple[FieldFault, ...] = ()
+    """All faults of the message, if there are several."""
+    ids: dict[str, str] = {}
+    """What the refused request is about, by the keys of the request: ``{"containerTag": "brain"}``."""
 
     @property
     def text(self) -> str:

@@ -4,6 +4,8 @@
 
     {"type": "ER", "data": "ask, msgID call7: no answer within 30 s",
      "fault": {"iTag": "ask", "msgID": "call7"}}
+    {"type": "ER", "data": "DC: there is no container 'brain'; create it first",
+     "fault": {"code": "not_found", "path": [], "ids": {"containerTag": "brain"}}}
 
 Engines of the release before send the text only, and clients of it read the text only.
 """
@@ -12,7 +14,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rce.model import FaultCode
+from rce.model import FaultCode, FieldFault
 from rce.protocol.calls import call_at
 from rce.protocol.messages import ErrorReport
 
@@ -25,6 +27,12 @@ def write_report(report: ErrorReport) -> dict[str, Any]:
     fault: dict[str, Any] = {}
     if report.code is not None:
         fault |= {"code": report.code.value, "path": list(report.path)}
+    if report.faults:
+        fault["faults"] = [
+            {"code": one.code.value, "path": list(one.path), "problem": one.problem} for one in report.faults
+        ]
+    if report.ids:
+        fault["ids"] = report.ids
     if report.call is not None:
         fault |= {"iTag": report.call.i_tag, "msgID": report.call.msg_id}
     return {"type": "ER", "data": report.text, **({"fault": fault} if fault else {})}
@@ -40,13 +48,40 @@ def read_report(text: str, fault: Any) -> ErrorReport:
     if not isinstance(fault, dict):
         return ErrorReport(problem=text)
     call = call_at(fault.get("iTag"), fault.get("msgID"))
-    known = fault.get("code") in [code.value for code in FaultCode]
+    code = _read_code(fault)
     return ErrorReport(
         problem=text if call is None else text.removeprefix(f"{call}: "),
         call=call,
-        path=_read_path(fault.get("path")) if known else (),
-        code=FaultCode(fault["code"]) if known else None,
+        path=_read_path(fault.get("path")) if code is not None else (),
+        code=code,
+        faults=_read_faults(fault.get("faults")),
+        ids=_read_ids(fault.get("ids")),
     )
+
+
+def _read_code(fault: dict[str, Any]) -> FaultCode | None:
+    found = fault.get("code")
+    return next((code for code in FaultCode if code.value == found), None)
+
+
+def _read_faults(items: Any) -> tuple[FieldFault, ...]:
+    if not isinstance(items, list):
+        return ()
+    faults = []
+    for item in items:
+        code = _read_code(item) if isinstance(item, dict) else None
+        if code is not None:
+            problem = item.get("problem")
+            faults.append(
+                FieldFault(_read_path(item.get("path")), code, problem if isinstance(problem, str) else "")
+            )
+    return tuple(faults)
+
+
+def _read_ids(ids: Any) -> dict[str, str]:
+    if not isinstance(ids, dict):
+        return {}
+    return {key: value for key, value in ids.items() if isinstance(key, str) and isinstance(value, str)}
 
 
 def _read_path(steps: Any) -> Path:

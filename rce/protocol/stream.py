@@ -59,7 +59,10 @@ class Fault(Struct, frozen=True):
         if not self.fields:
             return ErrorReport(problem=self.problem, call=self.call)
         first = self.fields[0]
-        return ErrorReport(problem=self.problem, call=self.call, path=first.path, code=first.code)
+        several = self.fields if len(self.fields) > 1 else ()
+        return ErrorReport(
+            problem=self.problem, call=self.call, path=first.path, code=first.code, faults=several
+        )
 
     @property
     def text(self) -> str:

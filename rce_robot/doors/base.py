@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rce.control.model import EndpointSpec
     from rce.model import EndpointId, Request
     from rce.protocol.http import Credentials
-    from rce.protocol.messages import CallId, DataMessage
+    from rce.protocol.messages import CallId, DataMessage, ErrorReport
     from rce.protocol.stream import LargeData
     from rce_robot.namespace import Namespace
     from rce_robot.outgoing import Rendered
@@ -126,8 +126,8 @@ class Owner(Protocol):
     def refused(self, call: CallId, problem: str) -> None:
         """A message of a service call was refused before it could be handled."""
 
-    async def ask_master(self, request: Request) -> tuple[str, ...]:
-        """Have a request carried out; return the faults as texts."""
+    async def ask_master(self, request: Request) -> tuple[ErrorReport, ...]:
+        """Have a request carried out; return a report for each part that was refused."""
 
     def joined(self, session: DoorSession) -> None:
         """The session can send now."""

@@ -406,8 +406,8 @@ class Session:
         """Pass on requests to the master, one at a time and in order."""
         while (item := await self._requests.get()) is not None:
             request, size = item
-            for error in await self._owner.ask_master(request):
-                self.report(error)
+            for report in await self._owner.ask_master(request):
+                self._send_report(report)
             self._waiting_bytes -= size
 
 

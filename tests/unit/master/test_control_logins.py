@@ -11,7 +11,9 @@ from rce.control.messages import (
     Login,
     LoginReply,
     Probe,
+    RequestFault,
 )
+from rce.model import AddNode, ConfigureComponents, CreateContainer, NodeSpec, RemoveInterface, Resources
 from rce_master.auth import client_digest
 
 
@@ -90,6 +92,35 @@ async def test_every_bad_item_is_told_and_the_others_are_done(cloud: Cloud) -> N
     assert len(await robots.ask("XX", {})) == 1
     assert len(await robots.ask("CN", "nonsense")) == 1
     assert "connect again" in (await robots.ask("CC", {"containerTag": "d"}, robot="stranger"))[0]
+
+
+async def test_refusal_carries_its_code_and_what_it_is_about(cloud: Cloud) -> None:
+    robots = cloud.robots()
+    await robots.hello()
+    await wire(robots)
+    node = NodeSpec(tag="n", pkg="Test", exe="x.py")
+    content = ConfigureComponents(
+        add_nodes=(AddNode(container="none", node=node), AddNode(container="c", node=node)),
+        remove_interfaces=(RemoveInterface(endpoint="c", tag="away"),),
+    )
+    await robots.say(ClientRequest(request=9, id="anna/rob", type="CN", data=None, content=content))
+    reply = await robots.get(ClientReply)
+    assert reply.faults == (
+        RequestFault(code="not_found", ids={"endpoint": "c", "interface": "away"}),
+        RequestFault(code="not_found", ids={"container": "none", "node": "n"}),
+    )
+    assert len(reply.errors) == 2
+    await robots.say(
+        ClientRequest(
+            request=10,
+            id="anna/rob",
+            type="CC",
+            data=None,
+            content=CreateContainer(tag="c", resources=Resources(cpu=2)),
+        )
+    )
+    (fault,) = (await robots.get(ClientReply)).faults
+    assert fault == RequestFault(code="conflict", ids={"container": "c"})
 
 
 async def test_one_message_can_replace_something(cloud: Cloud) -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.model.faults import FaultCode
+from rce.model import FaultCode, FieldFault
 from rce.protocol.codec import encode
 from rce.protocol.messages import CallId, ErrorReport
 from rce.protocol.reading import decode
@@ -39,6 +39,37 @@ CALL = CallId("ask", "call7")
                 "fault": {"code": "missing", "path": ["data", "x"]},
             },
         ),
+        (
+            ErrorReport(
+                problem="a: is missing; b: is over 3",
+                path=("a",),
+                code=FaultCode.MISSING,
+                faults=(
+                    FieldFault(("a",), FaultCode.MISSING, "is missing"),
+                    FieldFault(("b", 0), FaultCode.LIMIT, "is over 3"),
+                ),
+            ),
+            {
+                "type": "ER",
+                "data": "a: is missing; b: is over 3",
+                "fault": {
+                    "code": "missing",
+                    "path": ["a"],
+                    "faults": [
+                        {"code": "missing", "path": ["a"], "problem": "is missing"},
+                        {"code": "limit", "path": ["b", 0], "problem": "is over 3"},
+                    ],
+                },
+            },
+        ),
+        (
+            ErrorReport(problem="DC: no", code=FaultCode.NOT_FOUND, ids={"containerTag": "c"}),
+            {
+                "type": "ER",
+                "data": "DC: no",
+                "fault": {"code": "not_found", "path": [], "ids": {"containerTag": "c"}},
+            },
+        ),
     ],
 )
 def test_report_returns_from_the_wire(report: ErrorReport, wire: dict[str, Any]) -> None:
@@ -57,7 +88,7 @@ JSON = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
     max_leaves=6,
 )
-KEYS = ["code", "path", "iTag", "msgID"]
+KEYS = ["code", "path", "iTag", "msgID", "faults", "ids"]
 
 
 @given(JSON | st.dictionaries(st.sampled_from(KEYS), JSON))
@@ -74,6 +105,15 @@ def test_fault_in_a_request_has_its_path_and_code() -> None:
     assert fault.report.path == ("data", "containerData", "cpu")
     assert fault.report.code is FaultCode.INVALID
     assert fault.report.text.startswith("data.containerData.cpu: must be a number of cores")
+
+
+def test_faults_of_one_request_have_all_their_paths() -> None:
+    stream = ProtocolStream.for_engine()
+    data = {"containerTag": "c", "containerData": {"cpu": "half", "memory": "much"}}
+    (fault,) = stream.feed(json.dumps({"type": "CC", "data": data}), 0.0)
+    assert isinstance(fault, Fault)
+    paths = [one.path for one in fault.report.faults]
+    assert paths == [("data", "containerData", "cpu"), ("data", "containerData", "memory")]
 
 
 def test_fault_of_a_call_has_its_ids() -> None:
