@@ -16,6 +16,7 @@ import rce_container.environment.nodes.life
 import rce_container.life
 import rce_fleet.coordination.move_client
 import rce_fleet.coordination.robot
+import rce_fleet.navigation.move_base.core
 import rce_master.state.lifecycle
 from rce.lifecycle import LifeCycle
 from tools.state_diagram import draw, word
@@ -93,6 +94,12 @@ CYCLES = (
         "move-client",
         "The node that sends one robot along its cells.",
         rce_fleet.coordination.move_client.CLIENT_LIFE,
+    ),
+    Cycle(
+        "Navigation of a robot",
+        "move-base",
+        "What `move_base` does with a goal.",
+        rce_fleet.navigation.move_base.core.MOVE_BASE,
     ),
 )
 

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Floats = NDArray[np.float64]
-    Rectangle = tuple[float, float, float, float]
 
+Rectangle = tuple[float, float, float, float]
+"""Left, low, right and high sides, metres."""
 WIDTH, HEIGHT = 10.0, 8.0
 """Size of the floor, metres."""
 PIXEL = 0.05
@@ -71,6 +72,7 @@ class World:
         walkers: The persons.
         pose: True pose of the robot.
         rng: Source of all randomness.
+        size: Size of the floor, metres.
         twist: True speeds of the robot.
         time: Seconds.
         contacts: Contacts by the robot's own motion.
@@ -85,6 +87,7 @@ class World:
     rng: np.random.Generator
     model: RobotModel = field(default_factory=RobotModel)
     lidar: LidarSpec = field(default_factory=LidarSpec)
+    size: tuple[float, float] = (WIDTH, HEIGHT)
     twist: Twist = field(default_factory=Twist)
     time: float = 0.0
     contacts: int = 0
@@ -145,7 +148,7 @@ class World:
 
     def map(self) -> OccupancyMap:
         """Return the map of the walls."""
-        return OccupancyMap(drawn(self.walls, PIXEL), PIXEL, Pose(0.0, 0.0, 0.0))
+        return OccupancyMap(drawn(self.walls, PIXEL, self.size), PIXEL, Pose(0.0, 0.0, 0.0))
 
     def _touch(self, moved: Pose, vx: float, vy: float, dt: float) -> None:
         before = self.clearance(self.pose.x, self.pose.y)
@@ -208,9 +211,11 @@ def edges_of(rectangles: list[Rectangle]) -> Floats:
     return np.array(edges, np.float64).reshape(-1, 4)
 
 
-def drawn(rectangles: list[Rectangle], pixel: float) -> NDArray[np.int8]:
-    """Return an occupancy grid of the floor in which rectangles are occupied."""
-    picture = np.zeros((round(HEIGHT / pixel), round(WIDTH / pixel)), np.int8)
+def drawn(
+    rectangles: list[Rectangle], pixel: float, size: tuple[float, float] = (WIDTH, HEIGHT)
+) -> NDArray[np.int8]:
+    """Return an occupancy grid of a floor in which rectangles are occupied."""
+    picture = np.zeros((round(size[1] / pixel), round(size[0] / pixel)), np.int8)
     for left, low, right, high in rectangles:
         rows = slice(max(0, int(np.floor(low / pixel + 1e-6))), max(0, int(np.ceil(high / pixel - 1e-6))))
         columns = slice(

@@ -55,7 +55,9 @@ class ObstacleLayer:
 
     def take(self, source: str, observation: Observation) -> None:
         """Take an observation of a source; it is used at the next update."""
-        self._kept[source].append(observation)
+        kept = self._kept[source]
+        kept.append(observation)
+        self._drop_old(kept, observation.stamp - self.sources[source].observation_persistence)
 
     def late_sources(self, now: float) -> list[str]:
         """Return the sources whose last observation is older than their ``expected_update_rate`` allows."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-GLOBAL_LAYERS = ("static_layer", "obstacle_layer", "inflation_layer")
-
 
 @dataclass(frozen=True, slots=True)
 class ObservationSource:
@@ -107,9 +105,9 @@ class InflationParameters:
     inflate_unknown: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class CostmapParameters:
-    """A costmap: ``~global_costmap/...`` or ``~local_costmap/...``.
+@dataclass(frozen=True)
+class CostmapGridParameters:
+    """Size and frame of a costmap: ``~global_costmap/...`` or ``~local_costmap/...``.
 
     Attributes:
         global_frame: Frame of the costmap.
@@ -128,10 +126,6 @@ class CostmapParameters:
         robot_radius: Metres.
         footprint_padding: Metres by which the footprint is made larger.
         track_unknown_space: Cells of which nothing is known are unknown; else they are free.
-        static_layer: The map; None: not used.
-        obstacle_layer: What sensors see; None: not used.
-        inflation_layer: Costs around obstacles; None: not used.
-        sources: Sensors of the obstacle layer by name.
     """
 
     global_frame: str = "map"
@@ -146,10 +140,28 @@ class CostmapParameters:
     origin_x: float = 0.0
     origin_y: float = 0.0
     always_send_full_costmap: bool = False
-    footprint: tuple[tuple[float, float], ...] = ()
+    footprint: str | tuple[tuple[float, float], ...] = ()
     robot_radius: float = 0.46
     footprint_padding: float = 0.01
     track_unknown_space: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("update_frequency", "width", "height", "resolution", "transform_tolerance"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a number above 0, found {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class CostmapParameters(CostmapGridParameters):
+    """A costmap with its layers.
+
+    Attributes:
+        static_layer: The map; None: not used.
+        obstacle_layer: What sensors see; None: not used.
+        inflation_layer: Costs around obstacles; None: not used.
+        sources: Sensors of the obstacle layer by name.
+    """
+
     static_layer: StaticLayerParameters | None = None
     obstacle_layer: ObstacleLayerParameters | None = None
     inflation_layer: InflationParameters | None = None

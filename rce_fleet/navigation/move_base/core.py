@@ -36,35 +36,31 @@ REPLAN_EVERY = 0.5
 
 
 class State(Enum):
-    """What ``move_base`` does.
-
-    - idle: It has no goal; the robot stands.
-    - planning: It waits for a first plan; the robot brakes.
-    - controlling: It drives along a path.
-    - recovering: A recovery behavior moves the robot.
-    """
+    """What ``move_base`` does."""
 
     IDLE = "idle"
+    """It has no goal; the robot stands."""
     PLANNING = "planning"
+    """It waits for a first plan; the robot brakes."""
     CONTROLLING = "controlling"
+    """It drives along a path."""
     RECOVERING = "recovering"
+    """A recovery behavior moves the robot."""
 
 
 class Event(Enum):
-    """What happens to ``move_base``.
-
-    - goal: A goal came; it replaces the present one.
-    - planned: There is a plan.
-    - stuck: There was no plan or no valid command for too long.
-    - recovered: A recovery behavior ended.
-    - end: The goal was reached, given up or cancelled.
-    """
+    """What happens to ``move_base``."""
 
     GOAL = "goal"
+    """A goal came; it replaces the present one."""
     PLANNED = "planned"
+    """There is a plan."""
     STUCK = "stuck"
+    """There was no plan or no valid command for too long."""
     RECOVERED = "recovered"
+    """A recovery behavior ended."""
     END = "end"
+    """The goal was reached, given up or cancelled."""
 
 
 MOVE_BASE: LifeCycle[State, Event] = LifeCycle(

@@ -23,8 +23,6 @@ class MoveBaseParameters:
         conservative_reset_dist: Obstacles farther away than half of this are forgotten first, metres.
         recovery_behavior_enabled: Recover; else a goal is aborted at once.
         clearing_rotation_allowed: Recovery may turn the robot on the spot.
-        shutdown_costmaps: Costmaps are not updated without a goal.
-        make_plan_clear_costmap: Clear the costmaps before a plan of the service ``make_plan``.
         make_plan_add_unreachable_goal: Add the goal to a plan of that service that ends near it.
     """
 
@@ -40,8 +38,6 @@ class MoveBaseParameters:
     conservative_reset_dist: float = 3.0
     recovery_behavior_enabled: bool = True
     clearing_rotation_allowed: bool = True
-    shutdown_costmaps: bool = False
-    make_plan_clear_costmap: bool = True
     make_plan_add_unreachable_goal: bool = True
 
     def __post_init__(self) -> None:

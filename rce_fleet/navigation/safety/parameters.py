@@ -32,7 +32,7 @@ class SafetyParameters:
 
     robot_base_frame: str = "base_link"
     odom_frame: str = "odom"
-    footprint: tuple[tuple[float, float], ...] = ()
+    footprint: str | tuple[tuple[float, float], ...] = ()
     robot_radius: float = 0.177
     footprint_padding: float = 0.0
     deceleration: float = 1.0

@@ -1,0 +1,304 @@
+"""``move_base``: drives a robot to goals. Runs in the robot's namespace, on the robot or in a container.
+
+The action ``move_base``, the topics and the parameters are those of ROS 1's node. The work is done by
+:mod:`rce_fleet.navigation`; :mod:`rce_fleet.nodes.move_base_goals` takes the goals.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rce.ros.node import Node, run
+from rce.ros.tf import TransformListener
+from rce_fleet.compiled import compile_kernels
+from rce_fleet.geometry.poses import Pose, Twist
+from rce_fleet.navigation.costmap.layered import LayeredCostmap
+from rce_fleet.navigation.move_base.core import Decision, State
+from rce_fleet.navigation.move_base.situation import Situation
+from rce_fleet.navigation.move_base.stack import NavigationSettings, NavigationStack
+from rce_fleet.nodes.complaints import Complaints
+from rce_fleet.nodes.costmap_publisher import CostmapPublisher
+from rce_fleet.nodes.diagnostics import Diagnostics, Level
+from rce_fleet.nodes.move_base_goals import MoveBaseGoals
+from rce_fleet.nodes.move_base_parameters import read_settings, space_of
+from rce_fleet.nodes.observation_sources import ObservationSources
+from rce_fleet.nodes.planar import path_fields, read_map, twist_fields
+from rce_fleet.nodes.robot_place import RobotPlace
+
+if TYPE_CHECKING:
+    from rce.ros.node import Publisher
+    from rce.ros.types import Message
+
+DIAGNOSTICS_EVERY = 1.0
+"""Seconds between two messages on ``/diagnostics``."""
+STANDING = Twist()
+
+
+class MoveBaseNode:
+    """``move_base`` in a ROS graph.
+
+    Args:
+        node: Running node.
+        settings: All parameters.
+
+    Attributes:
+        stack: Costmaps, planners and decisions.
+    """
+
+    def __init__(self, node: Node, settings: NavigationSettings) -> None:
+        self._node = node
+        self._settings = settings
+        self.stack = NavigationStack(settings)
+        self._complaints = Complaints(node)
+        self._commanded = STANDING
+        self._global_at = float("-inf")
+        self._steps: deque[float] = deque(maxlen=500)
+        self._problem = ""
+        self._plan_seconds = 0.0
+        self._place: RobotPlace
+        self._goals: MoveBaseGoals
+        self._sources: list[ObservationSources]
+        self._velocity: Publisher
+        self._plans: Publisher
+        self._global_plan: Publisher
+        self._local_plan: Publisher
+
+    async def run(self) -> None:
+        """Drive until the node is stopped."""
+        node, stack, parameters = self._node, self.stack, self._settings.move_base
+        planner, controller = (
+            space_of(one) for one in (parameters.base_global_planner, parameters.base_local_planner)
+        )
+        self._velocity = await node.advertise("cmd_vel", "geometry_msgs/Twist", queue_size=1)
+        self._plans = await node.advertise(f"~{planner}/plan", "nav_msgs/Path", latch=True)
+        self._global_plan = await node.advertise(f"~{controller}/global_plan", "nav_msgs/Path")
+        self._local_plan = await node.advertise(f"~{controller}/local_plan", "nav_msgs/Path")
+        diagnostics = await Diagnostics.start(node, "navigation")
+        publishers = [
+            CostmapPublisher(node, name, costmap)
+            for name, costmap in (
+                ("global_costmap", stack.global_costmap),
+                ("local_costmap", stack.local_costmap),
+            )
+        ]
+        for publisher in publishers:
+            await publisher.start()
+        async with TransformListener(node) as transforms:
+            costmaps = (stack.global_costmap, stack.local_costmap)
+            world, local = (one.parameters for one in costmaps)
+            self._place = RobotPlace(
+                node,
+                transforms,
+                (world.global_frame, local.global_frame, local.robot_base_frame),
+                max(world.transform_tolerance, local.transform_tolerance),
+                self._complaints,
+            )
+            self._sources = [ObservationSources(node, transforms, one, self._complaints) for one in costmaps]
+            for costmap in costmaps:
+                await self._hear_map(costmap)
+            for source in self._sources:
+                await source.start()
+            await node.subscribe("odom", "nav_msgs/Odometry", self._place.take_odometry)
+            self._goals = MoveBaseGoals(node, self, transforms, self._complaints)
+            async with self._goals, asyncio.TaskGroup() as tasks:
+                told = float("-inf")
+                async for _ in node.rate(parameters.controller_frequency):
+                    self._step(tasks, publishers)
+                    now = node.time()
+                    if not 0 <= now - told < DIAGNOSTICS_EVERY:
+                        told = now
+                        self._report(diagnostics)
+        self._velocity.publish(twist_fields(STANDING))
+
+    # For the goals
+
+    @property
+    def settings(self) -> NavigationSettings:
+        """All parameters."""
+        return self._settings
+
+    @property
+    def commanded(self) -> Twist:
+        """The last command."""
+        return self._commanded
+
+    def global_pose(self) -> Pose | None:
+        """Return the robot's pose in the global frame; None if it is not known."""
+        place = self._place.look()
+        return None if place.problem else place.pose.relative_to(place.local_from_global)
+
+    def start(self) -> None:
+        """Begin to drive to the goal that the goals hold now."""
+        self.stack.core.start(self._node.time())
+
+    def stop(self) -> None:
+        """Drop the goal and stop the robot at once."""
+        self.stack.core.cancel()
+        self._command(STANDING)
+
+    # Maps
+
+    async def _hear_map(self, costmap: LayeredCostmap) -> None:
+        layer = costmap.static
+        if layer is None:
+            return
+        topic = layer.parameters.map_topic
+
+        def take(message: Message) -> None:
+            if layer.has_map and layer.parameters.first_map_only:
+                return
+            try:
+                costmap.set_map(read_map(message))
+            except ValueError as error:
+                self._complaints.warn("map", f"a map on {self._node.resolve(topic)} is ignored: {error}")
+
+        def update(message: Message) -> None:
+            try:
+                values = np.asarray(message.data, np.int8).reshape(message.height, message.width)
+                layer.update_map(values, message.y, message.x)
+            except ValueError as error:
+                self._complaints.warn("map", f"an update of a map is ignored: {error}")
+
+        await self._node.subscribe(topic, "nav_msgs/OccupancyGrid", take)
+        if layer.parameters.subscribe_to_updates:
+            await self._node.subscribe(f"{topic}_updates", "map_msgs/OccupancyGridUpdate", update)
+
+    # A control step
+
+    def _step(self, tasks: asyncio.TaskGroup, publishers: list[CostmapPublisher]) -> None:
+        began = time.perf_counter()
+        node, stack = self._node, self.stack
+        for source in self._sources:
+            source.flush()
+        place = self._place.look()
+        now = node.time()
+        if place.jumped:
+            node.log.warning("odometry jumped: the local costmap is cleared")
+            stack.local_costmap.clear()
+        at = place.pose.relative_to(place.local_from_global)
+        if not place.problem:
+            every = 1 / stack.global_costmap.parameters.update_frequency
+            if stack.global_costmap.is_ready and not 0 <= now - self._global_at < every:
+                self._global_at = now
+                publishers[0].note(stack.update_global(at, now))
+        problem = place.problem or self._problem_of_costmaps(now)
+        situation = Situation(
+            now=now,
+            dt=1 / self._settings.move_base.controller_frequency,
+            pose=place.pose,
+            measured=self._place.speeds(self._commanded),
+            local_from_global=place.local_from_global,
+            problem=problem,
+        )
+        drives = stack.core.state is not State.IDLE
+        decision = stack.control(situation)
+        if drives or decision.ending is not None:
+            self._command(decision.twist)
+            self._goals.tell(at, decision)
+        self._note(problem, decision)
+        if decision.wants_plan:
+            tasks.create_task(self._plan(at))
+        self._steps.append(time.perf_counter() - began)
+        if not place.problem:
+            self._publish_local_plan(decision)
+            publishers[0].publish(at)
+            publishers[1].note(stack.local_costmap.grid.whole)
+            publishers[1].publish(place.pose)
+
+    def _command(self, twist: Twist) -> None:
+        self._commanded = twist
+        self._velocity.publish(twist_fields(twist))
+
+    def _problem_of_costmaps(self, now: float) -> str:
+        """Return why the robot must stand; empty if it may drive."""
+        for costmap in (self.stack.global_costmap, self.stack.local_costmap):
+            if not costmap.is_ready:
+                assert costmap.static is not None
+                return f"waiting for the map on {self._node.resolve(costmap.static.parameters.map_topic)}"
+            late = costmap.obstacles.late_sources(now) if costmap.obstacles is not None else []
+            if late:
+                return f"no recent message of source {', '.join(late)}"
+        return ""
+
+    def _note(self, problem: str, decision: Decision) -> None:
+        if problem and self.stack.core.state is not State.IDLE:
+            self._complaints.warn("problem", f"the robot stands: {problem}")
+        elif decision.text and decision.ending is None and not problem:
+            self._node.log.warning("%s", decision.text)
+        self._problem = problem
+
+    # Plans
+
+    async def _plan(self, start: Pose) -> None:
+        """Make the plan that is wanted, in a thread."""
+        goal, stack = self._goals.target, self.stack
+        if goal is None:
+            return
+        began = time.perf_counter()
+        plan = await asyncio.to_thread(stack.plan, stack.snapshot(), start, goal)
+        self._plan_seconds = time.perf_counter() - began
+        if goal is not self._goals.target:
+            return
+        stack.core.take_plan(plan, self._node.time())
+        if not plan.found:
+            self._complaints.warn("plan", f"no plan: {plan.reason}")
+            return
+        header = {
+            "stamp": self._node.now(),
+            "frame_id": stack.global_costmap.parameters.global_frame,
+        }
+        self._plans.publish(path_fields(plan.path, header))
+
+    def _publish_local_plan(self, decision: Decision) -> None:
+        frame = self.stack.local_costmap.parameters.global_frame
+        header = {"stamp": self._node.now(), "frame_id": frame}
+        if decision.trajectory is not None and self._local_plan.connections:
+            self._local_plan.publish(path_fields(decision.trajectory, header))
+        path = self.stack.local_planner.path
+        if path is not None and self._global_plan.connections:
+            rest = path.poses[path.at >= path.progress]
+            self._global_plan.publish(path_fields(rest, header))
+
+    # State
+
+    def _report(self, diagnostics: Diagnostics) -> None:
+        core = self.stack.core
+        steps = sorted(self._steps)
+        slowest = steps[int(0.99 * (len(steps) - 1))] if steps else 0.0
+        level = Level.OK
+        if self._problem:
+            level = Level.WARN if core.state is State.IDLE else Level.ERROR
+        diagnostics.publish(
+            level,
+            self._problem or core.state.value,
+            {
+                "state": core.state.value,
+                "recoveries": str(core.recovered),
+                "control step p99 (ms)": f"{1e3 * slowest:.2f}",
+                "last plan (ms)": f"{1e3 * self._plan_seconds:.2f}",
+                "warnings": str(self._complaints.count),
+                "speed": f"{self._commanded.speed:.3f}",
+            },
+        )
+
+
+async def main() -> None:
+    """Run the node until it is stopped."""
+    async with Node("move_base") as node:
+        found = await node.get_param("~", {})
+        values = found if isinstance(found, Mapping) else {}
+        settings, problems = read_settings(values, node.resolve("~").rstrip("/") + "/")
+        for problem in problems:
+            (node.log.warning if problem.is_unknown else node.log.error)("%s", problem.text)
+        compile_kernels()
+        await MoveBaseNode(node, settings).run()
+
+
+if __name__ == "__main__":
+    run(main())

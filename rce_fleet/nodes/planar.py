@@ -1,0 +1,80 @@
+"""Poses and transforms in the plane as ROS messages, and back."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rce_fleet.geometry.angles import quaternion_z, yaw_of
+from rce_fleet.geometry.poses import Pose, Twist
+from rce_fleet.maps.occupancy_map import OccupancyMap
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from rce.ros.tf import Transform
+    from rce.ros.types import Message
+
+_LEAST_TURN = 1e-3
+"""A quaternion shorter than this is no rotation."""
+
+
+def pose_of(transform: Transform) -> Pose:
+    """Return a transform's part in the plane."""
+    return Pose(transform.translation.x, transform.translation.y, transform.yaw)
+
+
+def read_pose(message: Message) -> Pose:
+    """Return a ``geometry_msgs/Pose`` in the plane.
+
+    Raises:
+        ValueError: A number is not finite, or the orientation is not a rotation about z.
+    """
+    at, turn = message.position, message.orientation
+    values = (at.x, at.y, turn.x, turn.y, turn.z, turn.w)
+    if not all(map(isfinite, values)):
+        raise ValueError(f"the pose ({at.x}, {at.y}) has numbers that are not finite")
+    length = sum(value * value for value in (turn.x, turn.y, turn.z, turn.w)) ** 0.5
+    if length < _LEAST_TURN:
+        raise ValueError(
+            "the orientation is (0, 0, 0, 0), which is no rotation; (0, 0, 0, 1) is straight ahead"
+        )
+    x, y, z, w = (value / length for value in (turn.x, turn.y, turn.z, turn.w))
+    if x * x + y * y > 0.1:  # noqa: PLR2004 - upright by less than about 35 degrees
+        raise ValueError("the orientation is not a rotation about z: the robot would not stand upright")
+    return Pose(at.x, at.y, yaw_of(x, y, z, w))
+
+
+def pose_fields(pose: Pose) -> dict[str, Any]:
+    """Return the fields of a ``geometry_msgs/Pose``."""
+    z, w = quaternion_z(pose.yaw)
+    return {"position": {"x": pose.x, "y": pose.y}, "orientation": {"z": z, "w": w}}
+
+
+def twist_fields(twist: Twist) -> dict[str, Any]:
+    """Return the fields of a ``geometry_msgs/Twist``."""
+    return {"linear": {"x": twist.speed}, "angular": {"z": twist.turn_rate}}
+
+
+def read_twist(message: Message) -> Twist:
+    """Return a ``geometry_msgs/Twist`` in the plane."""
+    return Twist(message.linear.x, message.angular.z)
+
+
+def path_fields(poses: NDArray[np.float64], header: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of a ``nav_msgs/Path`` of poses, shape (N, 3)."""
+    stamped = [{"header": header, "pose": pose_fields(Pose.from_array(one))} for one in poses]
+    return {"header": header, "poses": stamped}
+
+
+def read_map(message: Message) -> OccupancyMap:
+    """Return a ``nav_msgs/OccupancyGrid``.
+
+    Raises:
+        ValueError: Its size, resolution, values or origin are not those of a map.
+    """
+    info = message.info
+    values = np.asarray(message.data, np.int16)
+    return OccupancyMap.from_message(info.width, info.height, values, info.resolution, read_pose(info.origin))

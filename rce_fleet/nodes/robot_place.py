@@ -1,0 +1,100 @@
+"""Where the robot is and how it moves: from tf and odometry, with what is wrong with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import hypot, isfinite
+from typing import TYPE_CHECKING
+
+from rce.ros.tf.exceptions import TransformError
+from rce_fleet.geometry.poses import Pose, Twist
+from rce_fleet.nodes.planar import pose_of, read_twist
+
+if TYPE_CHECKING:
+    from rce.ros.node import Node
+    from rce.ros.tf import TransformListener
+    from rce.ros.types import Message
+    from rce_fleet.nodes.complaints import Complaints
+
+ODOMETRY_TIMEOUT = 0.5
+"""Odometry older than this does not tell the robot's speeds any more, seconds."""
+JUMP = 1.0
+"""A robot that moves by more than this between two control steps has jumped, metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the robot is.
+
+    Attributes:
+        pose: In the local frame.
+        local_from_global: Pose of the global frame in the local one.
+        problem: Why it is not known; else empty.
+        jumped: Whether odometry jumped since the last step.
+    """
+
+    pose: Pose
+    local_from_global: Pose
+    problem: str = ""
+    jumped: bool = False
+
+
+class RobotPlace:
+    """Looks up where the robot is.
+
+    Args:
+        node: Running node.
+        transforms: What is known of frames.
+        frames: The global frame, the local frame and the robot's frame.
+        tolerance: Oldest transform that counts, seconds.
+        complaints: Where warnings go.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        transforms: TransformListener,
+        frames: tuple[str, str, str],
+        tolerance: float,
+        complaints: Complaints,
+    ) -> None:
+        self._node = node
+        self._transforms = transforms
+        self._global, self._local, self._base = frames
+        self._tolerance = tolerance
+        self._complaints = complaints
+        self._last: Pose | None = None
+        self._twist = Twist()
+        self._moved_at = float("-inf")
+
+    def take_odometry(self, message: Message) -> None:
+        """Take the robot's speeds."""
+        twist = read_twist(message.twist.twist)
+        if not (isfinite(twist.speed) and isfinite(twist.turn_rate)):
+            self._complaints.warn("odom", "odometry is ignored: its speeds are not finite")
+            return
+        self._twist, self._moved_at = twist, self._node.time()
+
+    def speeds(self, commanded: Twist) -> Twist:
+        """Return the robot's speeds; those commanded last if odometry is late."""
+        late = not 0 <= self._node.time() - self._moved_at <= ODOMETRY_TIMEOUT
+        return commanded if late else self._twist
+
+    def look(self) -> Place:
+        """Return where the robot is now."""
+        nowhere = Pose(0.0, 0.0, 0.0)
+        try:
+            found = self._transforms.lookup(self._local, self._base)
+            moved = self._transforms.lookup(self._local, self._global)
+        except TransformError as error:
+            return Place(nowhere, nowhere, f"waiting for transforms: {error}")
+        now = self._node.time()
+        for one in (found, moved):
+            age = now - one.stamp.to_sec()
+            if one.stamp and age > self._tolerance and one.parent != one.child:
+                text = f"the transform from {one.child} to {one.parent} is {age:.2f} s old"
+                return Place(nowhere, nowhere, f"{text} (transform_tolerance {self._tolerance:.2f} s)")
+        pose = pose_of(found.transform)
+        last, self._last = self._last, pose
+        jumped = last is not None and hypot(pose.x - last.x, pose.y - last.y) > JUMP
+        return Place(pose, pose_of(moved.transform), jumped=jumped)

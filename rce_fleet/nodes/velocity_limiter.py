@@ -1,0 +1,185 @@
+"""The safety stage between planner and wheels, as a node. Runs on the robot, in its namespace.
+
+It subscribes to ``raw_cmd_vel``, ``scan`` and ``odom`` (or tf), and publishes ``cmd_vel``. A message true on
+``emergency_stop``, or the service ``~set_emergency_stop``, stops the robot until false releases it. The work
+is done by :mod:`rce_fleet.navigation.safety`.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rce.ros.node import Node, run
+from rce.ros.tf import TransformListener
+from rce.ros.tf.exceptions import TransformError
+from rce_fleet.geometry.poses import Pose
+from rce_fleet.navigation.costmap.footprint import Footprint
+from rce_fleet.navigation.safety.limiter import STANDING, VelocityLimiter, Verdict
+from rce_fleet.navigation.safety.parameters import SafetyParameters
+from rce_fleet.navigation.safety.seen import Scan, sensor_pose
+from rce_fleet.navigation.scans import fault_of_scan, fault_of_stamp
+from rce_fleet.nodes.complaints import Complaints
+from rce_fleet.nodes.diagnostics import Diagnostics, Level
+from rce_fleet.nodes.parameters import read_parameters
+from rce_fleet.nodes.planar import pose_of, read_pose, read_twist, twist_fields
+
+if TYPE_CHECKING:
+    from rce.ros.node import Publisher
+    from rce.ros.types import Message
+
+DIAGNOSTICS_EVERY = 1.0
+"""Seconds between two messages on ``/diagnostics``."""
+
+
+class VelocityLimiterNode:
+    """The safety stage in a ROS graph.
+
+    Args:
+        node: Running node, in the robot's namespace.
+        parameters: Of the stage.
+    """
+
+    def __init__(self, node: Node, parameters: SafetyParameters) -> None:
+        self._node = node
+        self._parameters = parameters
+        self._complaints = Complaints(node)
+        footprint = Footprint.read(
+            parameters.footprint, parameters.robot_radius, parameters.footprint_padding
+        )
+        self._limiter = VelocityLimiter(parameters, footprint)
+        self._odometry: list[tuple[float, Pose]] = []
+        self._last = Verdict(STANDING)
+        self._limited = 0
+        self._tf: TransformListener
+        self._out: Publisher
+        self._stopped: Publisher
+
+    async def run(self) -> None:
+        """Pass commands until the node is stopped."""
+        node = self._node
+        self._out = await node.advertise("cmd_vel", "geometry_msgs/Twist", queue_size=1)
+        self._stopped = await node.advertise("~emergency_stopped", "std_msgs/Bool", latch=True)
+        self._stopped.publish(data=False)
+        diagnostics = await Diagnostics.start(node, "velocity_limiter: safety")
+        async with TransformListener(node) as self._tf:
+            await node.subscribe("odom", "nav_msgs/Odometry", self._take_odometry)
+            await node.subscribe("scan", "sensor_msgs/LaserScan", self._take_scan)
+            await node.subscribe("raw_cmd_vel", "geometry_msgs/Twist", self._take_command)
+            await node.subscribe("emergency_stop", "std_msgs/Bool", lambda message: self._halt(message.data))
+            await node.advertise_service("~set_emergency_stop", "std_srvs/SetBool", self._answer_stop)
+            told = float("-inf")
+            async for _ in node.rate(self._parameters.frequency):
+                self._pass_on()
+                now = node.time()
+                if not 0 <= now - told < DIAGNOSTICS_EVERY:
+                    told = now
+                    self._report(diagnostics)
+        self._out.publish(twist_fields(STANDING))
+
+    # What comes in
+
+    def _take_command(self, message: Message) -> None:
+        self._limiter.take_command(read_twist(message), self._node.time())
+        self._pass_on()
+
+    def _take_odometry(self, message: Message) -> None:
+        try:
+            pose = read_pose(message.pose.pose)
+        except ValueError as error:
+            self._complaints.warn("odom", f"odometry is ignored: {error}")
+            return
+        stamp, now = message.header.stamp.to_sec(), self._node.time()
+        fault = fault_of_stamp(stamp, now, self._parameters.transform_timeout)
+        if fault:
+            self._complaints.warn("odom", f"odometry is ignored: {fault}")
+            return
+        self._limiter.take_pose(pose, stamp)
+        self._odometry.append((stamp, pose))
+        del self._odometry[:-200]
+
+    def _take_scan(self, message: Message) -> None:
+        angles = (message.angle_min, message.angle_max, message.angle_increment)
+        limits = (message.range_min, message.range_max)
+        stamp, now = message.header.stamp.to_sec(), self._node.time()
+        fault = fault_of_scan(len(message.ranges), angles, limits)
+        fault = fault or fault_of_stamp(stamp, now, self._parameters.scan_timeout)
+        at = self._pose_at(stamp)
+        if not fault and at is None:
+            fault = "there is no odometry at its time"
+        try:
+            mounted = self._tf.lookup(self._parameters.robot_base_frame, message.header.frame_id)
+        except TransformError as error:
+            fault = fault or str(error)
+        if fault:
+            self._complaints.warn("scan", f"a scan of {self._node.resolve('scan')} is ignored: {fault}")
+            return
+        assert at is not None
+        ranges = np.asarray(message.ranges, np.float64)
+        with np.errstate(invalid="ignore"):
+            ranges = np.where(ranges >= limits[1], np.inf, ranges)
+            ranges = np.where(ranges < limits[0], np.nan, ranges)
+        sensor = Pose.from_array(sensor_pose(at, pose_of(mounted.transform)))
+        self._limiter.take_scan(Scan(stamp, sensor, ranges, angles[0], angles[2], limits[0]))
+
+    def _pose_at(self, stamp: float) -> Pose | None:
+        """Return the odometry nearest to a time."""
+        if not self._odometry:
+            return None
+        return min(self._odometry, key=lambda known: abs(known[0] - stamp))[1]
+
+    # Emergency stop
+
+    def _halt(self, stop: bool) -> None:
+        if stop:
+            self._limiter.stop("emergency stop")
+            self._node.log.error("emergency stop: the robot stands until it is released")
+        elif self._limiter.emergency:
+            self._limiter.release()
+            self._node.log.warning("the emergency stop was released")
+        self._stopped.publish(data=stop)
+        self._pass_on()
+
+    def _answer_stop(self, request: Message) -> dict[str, Any]:
+        self._halt(request.data)
+        return {"success": True, "message": "stopped until released" if request.data else "released"}
+
+    # What goes out
+
+    def _pass_on(self) -> None:
+        verdict = self._limiter.limit(self._node.time())
+        if verdict.stopped and not self._last.stopped and "no command" not in verdict.reason:
+            self._complaints.warn("stop", f"the robot stands: {verdict.reason}")
+        self._limited += bool(verdict.reason and not verdict.stopped)
+        self._last = verdict
+        self._out.publish(twist_fields(verdict.twist))
+
+    def _report(self, diagnostics: Diagnostics) -> None:
+        verdict = self._last
+        idle = verdict.stopped and "no command" in verdict.reason
+        level = Level.OK if not verdict.stopped or idle else Level.ERROR
+        scan = self._limiter.seen.newest
+        age = self._node.time() - scan.stamp if scan is not None else float("inf")
+        diagnostics.publish(
+            level,
+            verdict.reason or "commands pass",
+            {
+                "speed": f"{verdict.twist.speed:.3f}",
+                "turn rate": f"{verdict.twist.turn_rate:.3f}",
+                "age of the scan": f"{age:.3f}" if isfinite(age) else "no scan",
+                "limited commands": str(self._limited),
+                "emergency stop": self._limiter.emergency or "no",
+            },
+        )
+
+
+async def main() -> None:
+    """Run the node until it is stopped."""
+    async with Node("velocity_limiter") as node:
+        await VelocityLimiterNode(node, await read_parameters(node, SafetyParameters)).run()
+
+
+if __name__ == "__main__":
+    run(main())
