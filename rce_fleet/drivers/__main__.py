@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import signal
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -13,11 +13,14 @@ import uvloop
 
 from rce.config.exceptions import ConfigError
 from rce.config.logs import start_logging
+from rce.own_process import end_signals
+from rce.ros.core.server import DEFAULT_PORT
+from rce.ros.errors import MasterError
 from rce.ros.types import TypeRegistry
 from rce_client.exceptions import RefusedError
 from rce_fleet.drivers.cell_watch import CellWatch, GraphCellWatch
 from rce_fleet.drivers.engine_cell_watch import EngineCellWatch, WorldAccount
-from rce_fleet.drivers.program import Cores, Simulation
+from rce_fleet.drivers.program import Cores, PortTakenError, RunOptions, Simulation
 from rce_fleet.drivers.scene import load_scene
 
 BAD_SCENE = 2
@@ -68,10 +71,79 @@ def simulate(
         raise typer.Exit(FAILED) from None
 
 
+def sim(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The world: walls, boxes, robots (YAML).")],
+    factor: Annotated[
+        float,
+        typer.Option("--factor", "--rate", help="Simulated seconds per second; 0: as many as possible."),
+    ] = 1.0,
+    clock: Annotated[
+        bool | None,
+        typer.Option(
+            "--clock/--no-clock",
+            help="Publish simulated time on /clock and set use_sim_time; default: unless the factor is 1.",
+        ),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of all noise, instead of the scene's.")] = None,
+    core_port: Annotated[
+        int, typer.Option(help="Port of the first robot's ROS core; the others follow. 0: any free ports.")
+    ] = DEFAULT_PORT,
+    world_port: Annotated[
+        int, typer.Option(help="Port of the core with the world's services; 0: any free port.")
+    ] = DEFAULT_PORT - 1,
+    core: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="ROS master that robots join in their namespaces: URI or ROBOT=URI; may be repeated."
+        ),
+    ] = None,
+    stand_ins: Annotated[
+        bool | None,
+        typer.Option(
+            "--stand-ins/--no-stand-ins",
+            help="Run what stands for amcl and move_base on the robots; default: as the scene says.",
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Write the state of the world to this file (JSON).")
+    ] = None,
+    headless: Annotated[bool, typer.Option(help="Accepted for scripts; the program has no window.")] = True,
+) -> None:
+    """Simulate a world; each robot has its own ROS core."""
+    del headless
+    start_logging(logging.WARNING)
+    if factor < 0 or not math.isfinite(factor):
+        raise typer.BadParameter(f"must be 0 or more, not {factor}", param_hint="--factor")
+    options = RunOptions(
+        factor=factor,
+        clock=factor != 1.0 if clock is None else clock,
+        core_port=core_port,
+        world_port=world_port,
+        stand_ins=stand_ins,
+    )
+    try:
+        read = load_scene(scene)
+        read = read if seed is None else read.model_copy(update={"seed": seed})
+        simulation = Simulation(
+            read, TypeRegistry(), typer.echo, report=report, cores=Cores.read(core or ()), options=options
+        )
+    except ConfigError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(BAD_SCENE) from None
+    try:
+        uvloop.run(_until_signal(simulation))
+    except* PortTakenError as group:
+        typer.echo(f"rce sim: {group.exceptions[0]}", err=True)
+        raise typer.Exit(FAILED) from None
+    except* MasterError as group:
+        typer.echo(f"rce sim: {group.exceptions[0]}", err=True)
+        raise typer.Exit(FAILED) from None
+
+
 async def _until_signal(simulation: Simulation) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in end_signals():
         loop.add_signal_handler(number, stop.set)
     await simulation.run(stop)
 

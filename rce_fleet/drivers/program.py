@@ -1,4 +1,4 @@
-"""Runs a world and its robots in real time."""
+"""Runs a world and its robots, each with its ROS graph."""
 
 from __future__ import annotations
 
@@ -9,28 +9,30 @@ from typing import TYPE_CHECKING
 
 from rce.ros.core import Core
 from rce.ros.node import Node
+from rce.ros.node.clock import PARAMETER as USE_SIM_TIME
 from rce.ros.tf import frames
 from rce_fleet.drivers.report import look_at, write_report
 from rce_fleet.drivers.robot_driver import RobotDriver
+from rce_fleet.drivers.runner import WorldRunner, run_world
+from rce_fleet.drivers.world_services import WorldServices
 from rce_fleet.simulation.boxes import BoxKeeper
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Awaitable, Callable, Iterable, Mapping
     from pathlib import Path
 
     from rce.ros.types import TypeRegistry
     from rce_fleet.drivers.cell_watch import CellWatch
-    from rce_fleet.drivers.scene import Scene
+    from rce_fleet.drivers.scene import RobotStart, Scene
     from rce_fleet.simulation.world import World
+
+__all__ = ["Cores", "RunOptions", "Simulation", "run_world"]
 
 REPORT_EVERY = 0.5
 """Seconds between two reports."""
 ROBOT_NODE = "robot"
 """Name of a robot's node in its namespace, if it joins an existing graph."""
-PERIOD = 0.05
-"""Seconds between two updates of the robots."""
-MAX_LAG = 0.5
-"""Maximum delay behind the clock that is caught up, seconds."""
+WORLD_NODE = "simulation"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +60,31 @@ class Cores:
         return self.robots.get(robot, self.default)
 
 
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """How a world runs.
+
+    Attributes:
+        factor: Simulated seconds per second; 0: as many as the machine can.
+        clock: Whether time is simulated: ``/clock``, and the parameter ``use_sim_time``.
+        core_port: Port of the first robot's core, the others' follow; 0: any free ports.
+        world_port: Port of the core with the world's services; 0: any free port; None: no services.
+        stand_ins: Whether robots run what stands for ``amcl`` and ``move_base``; None: as the scene says.
+    """
+
+    factor: float = 1.0
+    clock: bool = False
+    core_port: int = 0
+    world_port: int | None = None
+    stand_ins: bool | None = None
+
+
+class PortTakenError(Exception):
+    """The port of a core is in use."""
+
+
 class Simulation:
-    """Runs a world in real time, with a ROS node for each robot.
+    """Runs a world, with a ROS node for each robot.
 
     Args:
         scene: Map, boxes and robots.
@@ -68,6 +93,10 @@ class Simulation:
         report: File that the report is written to; none if None.
         watch: Watches the cells that the planner blocks; None if no planner does.
         cores: The ROS graphs that the robots join.
+        options: How it runs.
+
+    Raises:
+        ConfigError: Something in the scene is wrong.
     """
 
     def __init__(
@@ -79,6 +108,7 @@ class Simulation:
         report: Path | None = None,
         watch: CellWatch | None = None,
         cores: Cores = Cores(),
+        options: RunOptions = RunOptions(),
     ) -> None:
         self._scene = scene
         self._types = types
@@ -88,6 +118,13 @@ class Simulation:
         self._boxes = BoxKeeper(self._world)
         self._watch = watch
         self._cores = cores
+        self._options = options
+        self._runner = WorldRunner(self._world, factor=options.factor, simulated_clock=options.clock)
+        self._runner.on_update.append(self._update_boxes)
+        self._runner.on_slow = self._report_speed
+        self._tasks: asyncio.TaskGroup | None = None
+        self._graphs: dict[str, _RobotGraph] = {}
+        self._ports = 0
 
     @property
     def world(self) -> World:
@@ -95,48 +132,123 @@ class Simulation:
         return self._world
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Run until ``stop`` is set; the last report is written at the end."""
+        """Run until ``stop`` is set; the last report is written at the end.
+
+        Raises:
+            PortTakenError: The port of a core is in use (in an exception group).
+        """
         try:
-            async with AsyncExitStack() as graphs:
-                drivers = [await self._start_robot(graphs, robot.id) for robot in self._scene.robots]
-                async with asyncio.TaskGroup() as tasks:
-                    work = [
-                        tasks.create_task(run_world(self._world, drivers, after_update=self._after_update)),
-                        tasks.create_task(self._keep_report()),
-                    ]
-                    if self._watch is not None:
-                        work.append(tasks.create_task(self._watch.run(self._boxes.follow)))
-                    work.append(tasks.create_task(self._announce()))
-                    await stop.wait()
-                    for task in work:
-                        task.cancel()
+            async with asyncio.TaskGroup() as tasks, AsyncExitStack() as stack:
+                self._tasks = tasks
+                stack.push_async_callback(self._stop_graphs)
+                for robot in self._scene.robots:
+                    await self._start_graph(robot.id)
+                await self._start_services(stack)
+                work = [tasks.create_task(self._runner.run()), tasks.create_task(self._keep_report())]
+                if self._watch is not None:
+                    work.append(tasks.create_task(self._watch.run(self._boxes.follow)))
+                work.append(tasks.create_task(self._announce()))
+                await stop.wait()
+                for task in work:
+                    task.cancel()
         finally:
             self._write_report()
 
-    async def _start_robot(self, graphs: AsyncExitStack, robot: str) -> RobotDriver:
+    # Robots that come and go
+
+    async def add_robot(self, start: RobotStart) -> None:
+        """Put a robot into the world, and start its node.
+
+        Raises:
+            ConfigError: Its model is not known.
+            FleetError: It has no room.
+        """
+        self._scene.place(start, self._world)
+        await self._start_graph(start.id)
+
+    async def remove_robot(self, robot: str) -> None:
+        """Stop a robot's node, and take the robot out of the world."""
+        await self._graphs.pop(robot).stop()
+        self._world.remove_robot(robot)
+
+    # Inside
+
+    async def _start_graph(self, robot: str) -> None:
+        assert self._tasks is not None, "robots start while the simulation runs"
+        graph = self._graphs[robot] = _RobotGraph(robot)
+        graph.task = self._tasks.create_task(graph.keep(self._enter_graph), name=f"robot {robot}")
+        await graph.started
+
+    async def _stop_graphs(self) -> None:
+        for graph in list(self._graphs.values()):
+            await graph.stop()
+        self._graphs.clear()
+
+    async def _enter_graph(self, robot: str, stack: AsyncExitStack) -> None:
+        """Start a robot's core and node; the stack ends them."""
         uri = self._cores.of(robot)
         if uri is None:
-            core = await graphs.enter_async_context(Core(port=0))
-            uri, name, namespace, prefix = core.uri, robot, "", ""
+            uri = await self._start_core(stack, self._next_port(), f"robot {robot}")
+            name, namespace, prefix = robot, "", ""
         else:
             name, namespace, prefix = ROBOT_NODE, robot, robot
-        node = await graphs.enter_async_context(
-            Node(name, namespace=namespace, argv=(), master_uri=uri, types=self._types, signals=False)
-        )
+        node = await stack.enter_async_context(self._node(name, uri, namespace))
         if prefix:
             await node.set_param(frames.PARAMETER, prefix)
-        driver = RobotDriver(node, self._world, robot, tf_prefix=prefix)
+        if self._options.clock:
+            await node.set_param(USE_SIM_TIME, value=True)
+        await self._runner.publish_clock(node)
+        stack.callback(self._runner.drop_clock, uri)
+        stand_ins = self._scene.stand_ins if self._options.stand_ins is None else self._options.stand_ins
+        driver = RobotDriver(
+            node, self._world, robot, tf_prefix=prefix, stand_in=stand_ins, now=self._runner.stamp
+        )
         await driver.start()
+        self._runner.drivers[robot] = driver
+        stack.callback(self._runner.drivers.pop, robot, None)
         self._say(f"robot {robot} ROS_MASTER_URI={uri}")
-        return driver
+
+    def _next_port(self) -> int:
+        """Return the port of the next robot's core."""
+        if not self._options.core_port:
+            return 0
+        self._ports += 1
+        return self._options.core_port + self._ports - 1
+
+    async def _start_core(self, stack: AsyncExitStack, port: int, whose: str) -> str:
+        core = Core(port=port)
+        try:
+            await stack.enter_async_context(core)
+        except OSError as error:
+            text = f"the core of {whose} cannot listen on port {port}: {error.strerror or error}"
+            raise PortTakenError(f"{text}; end the program that does, or choose other ports") from error
+        if self._options.clock:
+            core.set_param(USE_SIM_TIME, value=True)
+        return core.uri
+
+    def _node(self, name: str, uri: str, namespace: str = "") -> Node:
+        return Node(name, namespace=namespace, argv=(), master_uri=uri, types=self._types, signals=False)
+
+    async def _start_services(self, stack: AsyncExitStack) -> None:
+        port = self._options.world_port
+        if port is None:
+            return
+        uri = self._cores.default or await self._start_core(stack, port, "the world")
+        node = await stack.enter_async_context(self._node(WORLD_NODE, uri))
+        await self._runner.publish_clock(node)
+        await WorldServices(node, self._runner, self).start()
+        self._say(f"world ROS_MASTER_URI={uri}")
 
     async def _announce(self) -> None:
         if self._watch is not None:
             await self._watch.joined.wait()
         self._say(f"simulation ready: {len(self._scene.robots)} robots, {len(self._scene.boxes)} boxes")
 
-    def _after_update(self) -> None:
+    def _update_boxes(self) -> None:
         self._boxes.update()
+
+    def _report_speed(self, speed: float) -> None:
+        self._say(f"simulation: runs at {speed:.2f} of real time, not at {self._runner.factor:g}")
 
     async def _keep_report(self) -> None:
         while True:
@@ -148,31 +260,29 @@ class Simulation:
             write_report(look_at(self._world), self._report)
 
 
-async def run_world(
-    world: World,
-    drivers: Iterable[RobotDriver],
-    *,
-    after_update: Callable[[], None] | None = None,
-    pace: float = 1.0,
-) -> None:
-    """Run a world in real time until cancelled.
+class _RobotGraph:
+    """Keeps a robot's core and node in a task of their own, which starts and ends them."""
 
-    On a machine that is too slow the world runs slower; delays above MAX_LAG are not caught up.
+    def __init__(self, robot: str) -> None:
+        self.robot = robot
+        self.started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.task: asyncio.Task[None] | None = None
+        self._stop = asyncio.Event()
 
-    Args:
-        world: The world.
-        drivers: The robots in it.
-        after_update: Called after each update.
-        pace: Simulated seconds per second.
-    """
-    loop = asyncio.get_running_loop()
-    robots = list(drivers)
-    due = loop.time()
-    while True:
-        world.step(PERIOD)
-        for robot in robots:
-            robot.update()
-        if after_update is not None:
-            after_update()
-        due = max(due + PERIOD / pace, loop.time() - MAX_LAG)
-        await asyncio.sleep(max(0.0, due - loop.time()))
+    async def keep(self, enter: Callable[[str, AsyncExitStack], Awaitable[None]]) -> None:
+        """Start, wait until :meth:`stop` is called, end."""
+        try:
+            async with AsyncExitStack() as stack:
+                await enter(self.robot, stack)
+                self.started.set_result(None)
+                await self._stop.wait()
+        except Exception as error:
+            if self.started.done():
+                raise
+            self.started.set_exception(error)
+
+    async def stop(self) -> None:
+        """End core and node, and wait until they have ended."""
+        self._stop.set()
+        if self.task is not None:
+            await asyncio.wait([self.task])

@@ -21,6 +21,10 @@ class Contacts(BaseModel):
     robot_box: int
     robot_wall: int
     total: int
+    robot_door: int = 0
+    robot_walker: int = 0
+    own_motion: int = 0
+    """Those of the total in which a robot drove against the other thing."""
 
 
 class RobotTruth(BaseModel):
@@ -80,6 +84,9 @@ def look_at(world: World) -> WorldReport:
             robot_box=seen.robot_box,
             robot_wall=seen.robot_wall,
             total=seen.total,
+            robot_door=seen.robot_door,
+            robot_walker=seen.robot_walker,
+            own_motion=seen.own_motion,
         ),
         min_separation_m=round(apart, 4) if math.isfinite(apart) else None,
         boxes=list(world.boxes),

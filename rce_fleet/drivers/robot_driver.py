@@ -1,8 +1,9 @@
-"""A simulated robot as a ROS node: publishes sensors, accepts ``move_base`` goals.
+"""The hardware of a simulated robot as a ROS node: its sensors and wheels.
 
-Topics, relative to the node's namespace: publishes ``amcl_pose``, ``odom``, ``scan``, ``blockedCells``,
-``move_base/status`` and ``move_base/result``; subscribes to ``move_base/goal`` and ``move_base/cancel``. On
-``/tf`` it publishes the frames ``odom``, ``base_link`` and ``base_scan`` below ``map``.
+Topics, relative to the node's namespace: publishes ``scan``, ``odom``, ``battery_state``,
+``mobile_base/events/bumper`` and ``ground_truth/pose``; subscribes to ``cmd_vel`` and ``computing_load``. It
+publishes ``odom`` -> ``base_link`` on ``/tf``, the sensor's frame on ``/tf_static``, and ``/diagnostics``.
+Only judges of a run may read ``ground_truth/pose``.
 """
 
 from __future__ import annotations
@@ -11,56 +12,69 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from rce.ros.tf import StampedTransform, Transform, frames
-from rce.ros.tf.broadcaster import KIND, TF
+from rce.ros.tf.broadcaster import KIND, TF, TF_STATIC
 from rce.ros.types import Time
-from rce_fleet.geometry.angles import quaternion_z
-from rce_fleet.simulation.move_base import SimulatedMoveBase
-from rce_fleet.simulation.obstacles import hit_points
+from rce_fleet.drivers.fields import (
+    ERROR,
+    OK,
+    battery_diagnosis,
+    battery_fields,
+    pose_fields,
+    scan_fields,
+    transform_of,
+    twist_fields,
+)
+from rce_fleet.drivers.stand_in import StandIn
+from rce_fleet.geometry.poses import Twist
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rce.ros.node import Node, Publisher
     from rce.ros.types import Message
-    from rce_fleet.geometry.poses import Pose
     from rce_fleet.navigation.navigation import DriveLimits
     from rce_fleet.simulation.lidar import Floats
-    from rce_fleet.simulation.move_base import Goal
     from rce_fleet.simulation.world import World
 
-SENSE_EVERY = 0.1
-"""Seconds between two poses, and between two scans."""
-STATUS_EVERY = 0.2
-"""Seconds between two status lists."""
-RANGE_MIN = 0.05
-"""Smallest range that the lidar reports, metres."""
+REPORT_EVERY = 1.0
+"""Seconds between two messages about the battery, and between two diagnoses."""
+TRUTH_EVERY = 0.1
+"""Seconds between two true poses."""
+SIDE = math.radians(30)
+"""A contact farther to the side than this is at the left or right bumper, radians."""
+FRONT = math.radians(90)
+"""Bumpers reach so far to both sides of the front, radians."""
+LEFT, CENTER, RIGHT = 0, 1, 2
+_EPSILON = 1e-6
 
 
 @dataclass(slots=True)
 class _Topics:
     """The node's publishers."""
 
-    pose: Publisher
     odometry: Publisher
     scan: Publisher
-    blocked: Publisher
-    status: Publisher
-    result: Publisher
     frames: Publisher
+    battery: Publisher
+    bumper: Publisher
+    diagnostics: Publisher
+    truth: Publisher
 
 
 class RobotDriver:
     """Runs one robot of a world as a node.
 
-    The caller calls :meth:`update` after every step of the world, about 20 times a second.
+    The caller calls :meth:`update` after every step of the world.
 
     Args:
         node: Running node; its namespace is the robot's.
         world: The world.
         robot: Id of the robot in the world.
-        limits: Speeds and accelerations of the robot.
+        limits: Speeds and accelerations of the stand-in.
         tf_prefix: Prefix of the robot's frames, if several robots share a graph.
+        stand_in: Whether the node also stands for ``amcl`` and ``move_base``.
+        now: Returns the time for stamps; the machine's clock if None.
     """
 
     def __init__(
@@ -71,130 +85,188 @@ class RobotDriver:
         limits: DriveLimits | None = None,
         *,
         tf_prefix: str = "",
+        stand_in: bool = True,
+        now: Callable[[], Time] | None = None,
     ) -> None:
         self._node = node
         self._world = world
         self._robot = world.robots[robot]
-        self._base = SimulatedMoveBase(world.grid, self._robot.radius, limits)
-        self._odom, self._base_link, self._base_scan = (
-            frames.resolve(tf_prefix, frame) for frame in ("odom", "base_link", "base_scan")
+        self._now = now or Time.now
+        self._stand_in = StandIn(node, world.grid, self._robot, limits) if stand_in else None
+        self._sensor = self._robot.model.lidar
+        self._odom, self._base_link, self._sensor_frame = (
+            frames.resolve(tf_prefix, frame) for frame in ("odom", "base_link", self._sensor.frame)
         )
-        self._points: Floats = np.empty((0, 2))
         self._topics: _Topics | None = None
-        self._sensed_at = -math.inf
-        self._listed_at = -math.inf
+        self._due: dict[str, float] = {}
+        self._pressed: set[int] = set()
+        self._commanded_at = -math.inf
+
+    @property
+    def robot(self) -> str:
+        """Id of the robot."""
+        return self._robot.id
 
     async def start(self) -> None:
         """Create publishers and subscribers. They end with the node."""
         node = self._node
         self._topics = _Topics(
-            pose=await node.advertise("amcl_pose", "geometry_msgs/PoseWithCovarianceStamped"),
             odometry=await node.advertise("odom", "nav_msgs/Odometry"),
             scan=await node.advertise("scan", "sensor_msgs/LaserScan"),
-            blocked=await node.advertise("blockedCells", "std_msgs/Int32MultiArray"),
-            status=await node.advertise("move_base/status", "actionlib_msgs/GoalStatusArray"),
-            result=await node.advertise("move_base/result", "move_base_msgs/MoveBaseActionResult"),
             frames=await node.advertise(TF, KIND),
+            battery=await node.advertise("battery_state", "sensor_msgs/BatteryState"),
+            bumper=await node.advertise("mobile_base/events/bumper", "kobuki_msgs/BumperEvent"),
+            diagnostics=await node.advertise("/diagnostics", "diagnostic_msgs/DiagnosticArray"),
+            truth=await node.advertise("ground_truth/pose", "nav_msgs/Odometry"),
         )
-        await node.subscribe("move_base/goal", "move_base_msgs/MoveBaseActionGoal", self._take_goal)
-        await node.subscribe("move_base/cancel", "actionlib_msgs/GoalID", self._take_cancel)
+        static = await node.advertise(TF_STATIC, KIND, latch=True)
+        spec = self._sensor
+        mount = Transform.make(spec.x, spec.y, spec.z, yaw=spec.yaw)
+        edge = StampedTransform(self._base_link, self._sensor_frame, mount, self._now())
+        static.publish(transforms=[edge.fields])
+        await node.subscribe("cmd_vel", "geometry_msgs/Twist", self._take_command)
+        await node.subscribe("computing_load", "std_msgs/Float32", self._take_load)
+        if self._stand_in is not None:
+            await self._stand_in.start()
 
-    def update(self) -> None:
-        """Publish sensors and drive; call it after a step of the world."""
-        if self._topics is None:
+    def reset(self) -> None:
+        """Begin anew with the world's time."""
+        self._due.clear()
+        self._pressed.clear()
+        self._commanded_at = -math.inf
+        if self._stand_in is not None:
+            self._stand_in.reset(self._world.time)
+
+    @property
+    def wants_scan(self) -> bool:
+        """Whether the next :meth:`update` needs a scan."""
+        if self._stand_in is None and (self._topics is None or not self._topics.scan.connections):
+            return False
+        return self._world.time >= self._due.get("scan", -math.inf) - _EPSILON
+
+    def update(self, ranges: Floats | None = None) -> None:
+        """Publish sensors and drive; call it after a step of the world.
+
+        Args:
+            ranges: The robot's scan if :attr:`wants_scan`; it is made here if None.
+        """
+        topics = self._topics
+        if topics is None:
             return
-        now, stamp = self._world.time, Time.now()
-        if now - self._sensed_at >= SENSE_EVERY - 1e-6:
-            self._sensed_at = now
-            self._sense(self._topics, stamp)
-        found = self._base.blocked
-        self._robot.drive(self._base.update(now, self._robot.estimate, self._points))
-        for goal in self._base.take_ended():
-            self._topics.result.publish(header={"stamp": stamp}, status=_status_of(goal), result={})
-        fresh = self._base.blocked != found
-        if fresh or now - self._listed_at >= STATUS_EVERY - 1e-6:
-            self._listed_at = now
-            self._list(self._topics, stamp)
+        now, stamp = self._world.time, self._now()
+        if self.wants_scan:
+            self._is_due("scan", 1.0 / self._sensor.rate)
+            self._scan(topics, stamp, self._world.scan(self._robot.id) if ranges is None else ranges)
+        if self._is_due("odometry", 1.0 / self._robot.model.odometry.rate):
+            self._publish_odometry(topics, stamp)
+        if self._is_due("truth", TRUTH_EVERY) and topics.truth.connections:
+            self._publish_truth(topics, stamp)
+        self._publish_bumper(topics)
+        if self._is_due("report", REPORT_EVERY):
+            self._report(topics, stamp)
+        if self._stand_in is not None and self._is_due("control", _CONTROL_EVERY):
+            self._stand_in.update(now, stamp)
 
     # What comes in
 
-    def _take_goal(self, message: Message) -> None:
-        place = message.goal.target_pose.pose.position
-        goal_id = message.goal_id
-        self._base.accept(goal_id.id, goal_id.stamp.to_sec(), place.x, place.y)
+    def _take_command(self, message: Message) -> None:
+        speed, turn = message.linear.x, message.angular.z
+        if not (math.isfinite(speed) and math.isfinite(turn)):
+            self._node.log.error(
+                "cmd_vel: speeds must be finite numbers, not %s and %s; ignored", speed, turn
+            )
+            return
+        self._commanded_at = self._world.time
+        self._robot.drive(Twist(speed, turn))
 
-    def _take_cancel(self, message: Message) -> None:
-        self._base.cancel(message.id, message.stamp.to_sec())
+    def _take_load(self, message: Message) -> None:
+        load = message.data
+        if not 0 <= load <= 1:
+            self._node.log.error("computing_load: must be within 0 .. 1, not %s; ignored", load)
+            return
+        self._robot.battery.computing_load = load
 
     # What goes out
 
-    def _sense(self, topics: _Topics, stamp: Time) -> None:
-        robot, spec = self._robot, self._robot.model.lidar
-        ranges = self._world.scan(robot.id)
-        self._points = hit_points(spec, ranges, robot.estimate)
-        topics.pose.publish(
-            header={"stamp": stamp, "frame_id": "map"},
-            pose={"pose": _pose_fields(robot.estimate), "covariance": _covariance(robot.covariance)},
-        )
-        if topics.frames.connections:
-            topics.frames.publish(transforms=[edge.fields for edge in self._tree(stamp)])
-        twist = robot.twist
-        topics.odometry.publish(
-            header={"stamp": stamp, "frame_id": self._odom},
-            child_frame_id=self._base_link,
-            pose={"pose": _pose_fields(robot.odometry)},
-            twist={"twist": {"linear": {"x": twist.speed}, "angular": {"z": twist.turn_rate}}},
-        )
+    def _is_due(self, what: str, period: float) -> bool:
+        """Return whether something periodic is due; if so, note when it is due again."""
+        now = self._world.time
+        due = self._due.get(what, now)
+        if now < due - _EPSILON:
+            return False
+        self._due[what] = max(due + period, now)
+        return True
+
+    def _scan(self, topics: _Topics, stamp: Time, ranges: Floats) -> None:
         if topics.scan.connections:
             topics.scan.publish(
-                header={"stamp": stamp, "frame_id": self._base_scan},
-                angle_min=-math.pi,
-                angle_max=math.pi - spec.increment,
-                angle_increment=spec.increment,
-                scan_time=SENSE_EVERY,
-                range_min=RANGE_MIN,
-                range_max=spec.max_range,
-                ranges=np.where(ranges < spec.max_range, ranges, math.inf).tolist(),
+                header={"stamp": stamp, "frame_id": self._sensor_frame}, **scan_fields(self._sensor, ranges)
+            )
+        if self._stand_in is not None:
+            self._stand_in.sense(stamp, ranges)
+
+    def _publish_odometry(self, topics: _Topics, stamp: Time) -> None:
+        robot = self._robot
+        if topics.frames.connections:
+            edges = [StampedTransform(self._odom, self._base_link, transform_of(robot.odometry), stamp)]
+            if self._stand_in is not None:
+                edges.append(self._stand_in.map_from_odom(self._odom, stamp))
+            topics.frames.publish(transforms=[edge.fields for edge in edges])
+        if topics.odometry.connections:
+            topics.odometry.publish(
+                header={"stamp": stamp, "frame_id": self._odom},
+                child_frame_id=self._base_link,
+                pose={"pose": pose_fields(robot.odometry)},
+                twist={"twist": twist_fields(robot.wheels.wheels)},
             )
 
-    def _tree(self, stamp: Time) -> list[StampedTransform]:
-        """Return the robot's frames, from the map down; the lidar is in the robot's middle."""
-        map_from_base, odom_from_base = map(_transform, (self._robot.estimate, self._robot.odometry))
-        map_from_odom = map_from_base @ odom_from_base.inverse()
-        return [
-            StampedTransform("map", self._odom, map_from_odom, stamp),
-            StampedTransform(self._odom, self._base_link, odom_from_base, stamp),
-            StampedTransform(self._base_link, self._base_scan, Transform(), stamp),
-        ]
-
-    def _list(self, topics: _Topics, stamp: Time) -> None:
-        """Publish the status list, and the cells found blocked while they stop the robot."""
-        if self._base.blocked:
-            topics.blocked.publish(data=list(self._base.blocked))
-        topics.status.publish(
-            header={"stamp": stamp}, status_list=[_status_of(goal) for goal in self._base.goals]
+    def _publish_truth(self, topics: _Topics, stamp: Time) -> None:
+        topics.truth.publish(
+            header={"stamp": stamp, "frame_id": "map"},
+            child_frame_id=self._base_link,
+            pose={"pose": pose_fields(self._robot.pose)},
+            twist={"twist": twist_fields(self._robot.twist)},
         )
 
+    def _publish_bumper(self, topics: _Topics) -> None:
+        """Publish the bumpers that were pressed or released."""
+        pressed = set()
+        for bearing in self._world.touched(self._robot.id):
+            if abs(bearing) <= FRONT:
+                pressed.add(CENTER if abs(bearing) <= SIDE else LEFT if bearing > 0 else RIGHT)
+        for bumper in sorted(pressed ^ self._pressed):
+            topics.bumper.publish(bumper=bumper, state=int(bumper in pressed))
+        self._pressed = pressed
 
-def _transform(pose: Pose) -> Transform:
-    return Transform.make(pose.x, pose.y, yaw=pose.yaw)
+    def _report(self, topics: _Topics, stamp: Time) -> None:
+        battery = self._robot.battery
+        topics.battery.publish(header={"stamp": stamp}, **battery_fields(battery))
+        if topics.diagnostics.connections:
+            level, text = battery_diagnosis(battery)
+            bumped = (ERROR, "pressed") if self._pressed else (OK, "released")
+            status = [
+                self._status("battery", level, text),
+                self._status("bumper", *bumped),
+                self._drive_status(),
+            ]
+            topics.diagnostics.publish(header={"stamp": stamp}, status=status)
+
+    def _drive_status(self) -> dict[str, Any]:
+        age, limit = self._world.time - self._commanded_at, self._robot.model.drive.command_timeout
+        if self._robot.battery.empty:
+            return self._status("drive", ERROR, "off: the battery is empty")
+        if math.isfinite(age) and age > limit:
+            return self._status("drive", OK, f"stopped: no command for {age:.1f} s (limit {limit:g} s)")
+        return self._status("drive", OK, "on")
+
+    def _status(self, part: str, level: int, text: str) -> dict[str, Any]:
+        return {
+            "level": level,
+            "name": f"{self._robot.id}: {part}",
+            "message": text,
+            "hardware_id": "simulated",
+        }
 
 
-def _pose_fields(pose: Pose) -> dict[str, Any]:
-    z, w = quaternion_z(pose.yaw)
-    return {"position": {"x": pose.x, "y": pose.y}, "orientation": {"z": z, "w": w}}
-
-
-def _covariance(variances: tuple[float, float, float]) -> list[float]:
-    """Return the 6 x 6 matrix of ``geometry_msgs/PoseWithCovariance`` with x, y and yaw set."""
-    matrix = np.zeros((6, 6))
-    matrix[[0, 1, 5], [0, 1, 5]] = variances
-    return [float(value) for value in matrix.reshape(-1)]
-
-
-def _status_of(goal: Goal) -> dict[str, Any]:
-    return {
-        "goal_id": {"stamp": Time.from_sec(goal.stamp), "id": goal.id},
-        "status": goal.state.value,
-        "text": goal.state.name.lower(),
-    }
+_CONTROL_EVERY = 0.04
+"""Seconds between two commands of the stand-in."""

@@ -152,6 +152,12 @@ class World:
         """Return the directions in which something touches a robot, radians in its frame."""
         return self._contacts.bearings(robot)
 
+    def is_solid(self, x: float, y: float, radius: float) -> bool:
+        """Return whether a wall, box or door is within ``radius`` of a point, metres."""
+        solid = {Kind.WALL, Kind.BOX, Kind.DOOR}
+        found = self._space.point_query((x, y), radius, pymunk.ShapeFilter())
+        return any(hit.shape.collision_type in solid for hit in found)
+
     # Robots
 
     def add_robot(
