@@ -1,0 +1,1 @@
+"""Graph mapping: a pose graph of keyscans, loop closing, several robots, saved maps. Pure."""
