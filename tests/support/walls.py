@@ -47,7 +47,8 @@ def ranges_at(
         distance = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / cross
         share = (start[:, 0] * directions[:, None, 1] - start[:, 1] * directions[:, None, 0]) / cross
         seen = (distance > 0) & (share >= 0) & (share <= 1) & (distance <= farthest)
-    return np.where(seen, distance, inf).min(1)
+    ranges: NDArray[np.float64] = np.where(seen, distance, inf).min(1)
+    return ranges
 
 
 def scan_at(
@@ -64,7 +65,7 @@ def scan_at(
 ) -> LaserRecord:
     """Return a scan of walls from a pose."""
     increment = field_of_view / (beams - 1)
-    angles = -field_of_view / 2 + increment * np.arange(beams)
+    angles = np.asarray(-field_of_view / 2 + increment * np.arange(beams), np.float64)
     ranges = ranges_at(walls, np.asarray(pose, float), angles, farthest)
     if noise and rng is not None:
         ranges = ranges + rng.normal(0, noise, beams)

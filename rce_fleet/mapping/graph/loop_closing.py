@@ -137,12 +137,12 @@ class LoopMatcher:
         poses = self._graph.poses
         expected = relative(poses[earlier], poses[later])
         fit = self.fit(earlier, self._graph.scans[later], expected, self.window(length), PRIOR_WEIGHT)
-        return fit and Closure(earlier, later, fit.pose, fit.information, length, fit.score)
+        return None if fit is None else Closure(earlier, later, fit.pose, fit.information, length, fit.score)
 
     def match_anywhere(self, earlier: int, later: int) -> Closure | None:
         """Return the closure of two keyscans of different parts: any heading, up to a few metres apart."""
         fit = self.fit_anywhere(earlier, self._graph.scans[later])
-        return fit and Closure(earlier, later, fit.pose, fit.information, np.inf, fit.score)
+        return None if fit is None else Closure(earlier, later, fit.pose, fit.information, np.inf, fit.score)
 
     def fit_anywhere(self, key: int, scan: ScanPoints) -> Fit | None:
         """Return where a scan fits around a keyscan: any heading, up to a few metres away."""

@@ -59,7 +59,8 @@ def save_graph(graph: KeyGraph, path: Path) -> None:
     edges = [*graph.edges, *graph.refined]
     kinds = [int(edge.is_loop) for edge in graph.edges] + [REFINED] * len(graph.refined)
     scans = graph.scans
-    arrays: dict[str, NDArray[Any]] = {
+    arrays: dict[str, Any] = {
+        "header": np.array(json.dumps({"format": FORMAT, "version": VERSION})),
         "poses": graph.poses,
         "robots": np.array(graph.robots, np.int64),
         "ways": np.array(graph.ways, np.float64),
@@ -76,11 +77,10 @@ def save_graph(graph: KeyGraph, path: Path) -> None:
         "edge_lengths": np.array([edge.length for edge in edges]),
         "edge_kinds": np.array(kinds, np.int8),
     }
-    header = json.dumps({"format": FORMAT, "version": VERSION})
     partial = path.with_name(path.name + ".part")
     try:
         with partial.open("wb") as file:
-            np.savez_compressed(file, header=np.array(header), **arrays)
+            np.savez_compressed(file, allow_pickle=False, **arrays)
         partial.replace(path)
     except OSError as error:
         raise MapError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -116,6 +116,7 @@ def test_robot_is_localized_in_saved_map(saved: tuple[KeyGraph, Path, Poses], is
     localizer = GraphLocalizer(graph, start=start if is_known else None)
     poses = [localizer.add(record) for record in drive_log(RING, way, np.random.default_rng(5))]
     assert all(pose is not None for pose in poses[20:])
+    assert poses[-1] is not None
     error = relative(relative(origin, way[-1]), poses[-1])
     assert np.hypot(*error[:2]) < 0.05
     assert abs(error[2]) < 0.02

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 ROOM = [*box(-4, -3, 9, 7), *box(2, 1, 1, 1), *polyline((-4, 1), (-2.5, 1), (-2.5, 1.4))]
 
 
-def scan_points(pose: Sequence[float] | Poses, **options: float) -> ScanPoints:
-    return prepare_scan(scan_at(ROOM, pose, **options), farthest=30.0, cell=0.04)
+def scan_points(pose: Sequence[float] | Poses, beams: int = 181) -> ScanPoints:
+    return prepare_scan(scan_at(ROOM, pose, beams=beams), farthest=30.0, cell=0.04)
 
 
 @settings(max_examples=25, deadline=None)
