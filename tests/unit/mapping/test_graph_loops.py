@@ -67,7 +67,7 @@ def graph_along(walls: Walls, truth: Poses, believed: Poses | None = None) -> Ke
 
 
 def corridor_return() -> tuple[KeyGraph, int, int]:
-    """Return a graph there and back in a notched corridor; its last pose is wrong by one and a half niches."""
+    """Return a graph of a way in a notched corridor; the last pose is wrong by one and a half niches."""
     there = np.column_stack((np.arange(0, 20, 0.5), np.zeros(40), np.zeros(40)))
     truth = np.vstack((there, there[::-1][:30]))
     believed = truth.copy()
