@@ -81,6 +81,7 @@ class Amcl:
     def __init__(self, grid: OccupancyMap, parameters: AmclParameters, rng: np.random.Generator) -> None:
         self.parameters = parameters
         self._rng = rng
+        self._odometry: Pose | None = None
         self.set_map(grid)
         start = Pose(parameters.initial_pose_x, parameters.initial_pose_y, parameters.initial_pose_a)
         spread = (parameters.initial_cov_xx, parameters.initial_cov_yy, parameters.initial_cov_aa)
@@ -118,17 +119,19 @@ class Amcl:
         self._beams = BeamModel(grid, self.parameters) if uses_beams else None
         self._field = None if uses_beams else LikelihoodField(grid, self.parameters)
 
-    def set_pose(self, pose: Pose, covariance: ArrayLike) -> None:
+    def set_pose(self, pose: Pose, covariance: ArrayLike, odometry: Pose | None = None) -> None:
         """Draw the particles around a pose.
 
         Args:
             pose: Where the robot probably is on the map.
             covariance: shape (3, 3), of x, y (metres) and yaw (radians); must be symmetric.
+            odometry: Pose by odometry at the same time; None: it is that of the next scan.
         """
         values, axes = np.linalg.eigh(np.asarray(covariance, np.float64))
         normals = self._rng.standard_normal((3, self.parameters.max_particles))
         drawn = axes @ (np.sqrt(np.maximum(values, 0.0))[:, None] * normals) + pose.as_array()[:, None]
         self._start_with(drawn)
+        self._odometry = odometry
 
     def scatter(self) -> None:
         """Draw the particles evenly over all free cells: the robot may be anywhere."""
@@ -138,11 +141,15 @@ class Amcl:
         """Let the next scan update the filter, even if the robot stands."""
         self._forced = True
 
+    def forget_odometry(self) -> None:
+        """Keep the particles where they are at the next update: the odometry has jumped or begun anew."""
+        self._odometry = None
+
     def _start_with(self, particles: NDArray[np.float64]) -> None:
         self._particles = particles
         self._particles[2] = wrap_array(particles[2])
         self._weights = np.full(particles.shape[1], 1.0 / particles.shape[1])
-        self._odometry: Pose | None = None
+        self._odometry = None
         self._forced = True
         self._updates = 0
         self._slow = self._fast = 0.0
