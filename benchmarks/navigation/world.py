@@ -97,7 +97,7 @@ class World:
     def __post_init__(self) -> None:
         self._commands: list[tuple[float, Twist]] = []
         self._rectangles = np.array([*self.walls, *self.boxes], np.float64).reshape(-1, 4)
-        self._edges = edges_of([*self.walls, *self.boxes])
+        self.edges = edges_of([*self.walls, *self.boxes])
         self._touching = False
 
     def drive(self, twist: Twist) -> None:
@@ -107,7 +107,7 @@ class World:
     def scan(self) -> Floats:
         """Return a noisy scan of the lidar, shape (beams,); ``inf`` where nothing was hit."""
         circles = np.array([(one.x, one.y, WALKER_RADIUS) for one in self.walkers], np.float64).reshape(-1, 3)
-        ranges = cast(self.lidar, (self.pose.x, self.pose.y), self.pose.yaw, self._edges, circles)
+        ranges = cast(self.lidar, (self.pose.x, self.pose.y), self.pose.yaw, self.edges, circles)
         hit = ranges < self.lidar.max_range
         noisy = ranges + self.lidar.noise * self.rng.standard_normal(len(ranges))
         return np.where(hit, np.maximum(noisy, 0.01), inf)

@@ -1,0 +1,243 @@
+"""Reports cells of the fleet's grid that something on no map fills. Runs in a robot's namespace.
+
+It subscribes to ``scan``, ``/tf``, ``map`` (the localization map, if there is one), ``/fleet/map`` (one pixel
+is one cell) and, where it is there, ``/fleet/state`` and ``/fleet/poses/RobotN``, so that it does not report
+other robots. It publishes ``blockedCells`` and ``freedCells``. The work is done by
+:mod:`rce_fleet.navigation.obstacle_cells`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rce.ros.node import Node, run
+from rce.ros.tf import TransformListener
+from rce.ros.tf.exceptions import ExtrapolationError, TransformError
+from rce_fleet.geometry.poses import Pose
+from rce_fleet.maps.occupancy_map import OccupancyMap
+from rce_fleet.navigation.costmap.observation import observe_scan
+from rce_fleet.navigation.costmap.parameters import ObservationSource
+from rce_fleet.navigation.obstacle_cells.watch import CellWatch, Findings, WatchParameters
+from rce_fleet.navigation.scans import fault_of_scan, fault_of_stamp
+from rce_fleet.nodes.complaints import Complaints
+from rce_fleet.nodes.diagnostics import Diagnostics, Level
+from rce_fleet.nodes.parameters import read_parameters
+from rce_fleet.nodes.planar import pose_of, read_map, read_pose
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from rce.ros.node import Publisher
+    from rce.ros.types import Message
+
+CELLS = "std_msgs/Int32MultiArray"
+REPEAT_EVERY = 1.0
+"""Seconds after which cells are reported again while they are in sight: a message may be lost."""
+FREED_FOR = 3.0
+"""How long a freed cell is reported, seconds."""
+POSES_LAST = 2.0
+"""How long another robot's pose counts, seconds."""
+OLDEST = 2.0
+"""Scans older than this are of no use, seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObstacleCellsParameters(WatchParameters):
+    """Private parameters of the node.
+
+    Attributes:
+        map_frame: Frame of both maps.
+        robot: This robot's name in the fleet; empty: the node's namespace.
+        fleet_radius: Radius of the other robots, metres.
+    """
+
+    map_frame: str = "map"
+    robot: str = ""
+    fleet_radius: float = 0.22
+
+
+@dataclass(slots=True)
+class _Others:
+    """The other robots.
+
+    Attributes:
+        held: Cells that they hold.
+        blocked: Cells that are blocked, as far as the fleet knows.
+        poses: Their places by name, with the time of each.
+    """
+
+    held: frozenset[int] = frozenset()
+    blocked: frozenset[int] = frozenset()
+    poses: dict[str, tuple[float, Pose]] = field(default_factory=dict)
+
+
+class ObstacleCellsNode:
+    """Watches cells in a ROS graph.
+
+    Args:
+        node: Running node, in the robot's namespace.
+        parameters: Of the watch.
+    """
+
+    def __init__(self, node: Node, parameters: ObstacleCellsParameters) -> None:
+        self._node = node
+        self._parameters = parameters
+        self._robot = parameters.robot or node.namespace.strip("/")
+        self._complaints = Complaints(node)
+        self._watch: CellWatch | None = None
+        self._fleet: OccupancyMap | None = None
+        self._known: OccupancyMap | None = None
+        self._others = _Others()
+        self._reported: set[int] = set()
+        self._freed: dict[int, float] = {}
+        self._sent_at = float("-inf")
+        self._waiting: deque[Message] = deque(maxlen=5)
+        self._tf: TransformListener
+        self._blocked_out: Publisher
+        self._freed_out: Publisher
+
+    async def run(self) -> None:
+        """Watch until the node is stopped."""
+        node = self._node
+        self._blocked_out = await node.advertise("blockedCells", CELLS)
+        self._freed_out = await node.advertise("freedCells", CELLS)
+        diagnostics = await Diagnostics.start(node, "cells with obstacles")
+        async with TransformListener(node) as self._tf:
+            await node.subscribe("/fleet/map", "nav_msgs/OccupancyGrid", partial(self._take_map, fleet=True))
+            await node.subscribe("map", "nav_msgs/OccupancyGrid", partial(self._take_map, fleet=False))
+            await node.subscribe("/fleet/state", "fleet/FleetState", self._take_state)
+            await node.subscribe("scan", "sensor_msgs/LaserScan", self._take_scan)
+            while await node.sleep(1.0):
+                level = Level.OK if self._watch is not None else Level.WARN
+                text = "watching" if self._watch is not None else "waiting for /fleet/map"
+                cells = ", ".join(map(str, sorted(self._reported))) or "none"
+                diagnostics.publish(level, text, {"blocked cells": cells})
+
+    # What comes in
+
+    def _take_map(self, message: Message, *, fleet: bool) -> None:
+        try:
+            picture = read_map(message)
+        except ValueError as error:
+            self._complaints.warn("map", f"a map is ignored: {error}")
+            return
+        if not fleet:
+            self._known = picture
+        elif self._fleet is not None and _same_place(self._fleet, picture):
+            return  # Only cells were blocked or freed.
+        else:
+            self._fleet = picture
+        if self._fleet is not None:
+            self._watch = CellWatch(self._fleet, self._parameters, self._known)
+
+    async def _take_state(self, message: Message) -> None:
+        others = [robot for robot in message.robots if robot.id != self._robot]
+        held = {cell for robot in others for cell in (robot.cell, *robot.granted) if cell >= 0}
+        self._others.held = frozenset(held)
+        self._others.blocked = frozenset({*message.blocked} - {*message.walls})
+        for robot in others:
+            if robot.id not in self._others.poses:
+                self._others.poses[robot.id] = (float("-inf"), Pose(0.0, 0.0, 0.0))
+                take = partial(self._take_pose, robot.id)
+                topic = f"/fleet/poses/{robot.id}"
+                await self._node.subscribe(topic, "geometry_msgs/PoseWithCovarianceStamped", take)
+
+    def _take_pose(self, robot: str, message: Message) -> None:
+        try:
+            self._others.poses[robot] = (self._node.time(), read_pose(message.pose.pose))
+        except ValueError as error:
+            self._complaints.warn(f"pose of {robot}", f"the pose of {robot} is ignored: {error}")
+
+    def _take_scan(self, message: Message) -> None:
+        self._waiting.append(message)
+        while self._waiting and self._use(self._waiting[0]):
+            self._waiting.popleft()
+
+    def _use(self, message: Message) -> bool:
+        """Use a scan; return whether it need not wait for its transform any more."""
+        watch, now = self._watch, self._node.time()
+        if watch is None:
+            return True
+        angles = (message.angle_min, message.angle_max, message.angle_increment)
+        limits = (message.range_min, message.range_max)
+        stamp = message.header.stamp.to_sec()
+        fault = fault_of_scan(len(message.ranges), angles, limits) or fault_of_stamp(stamp, now, OLDEST)
+        if fault:
+            self._complaints.warn("scan", f"a scan is ignored: {fault}")
+            return True
+        frame, when = message.header.frame_id, message.header.stamp
+        try:
+            found = self._tf.lookup(self._parameters.map_frame, frame, when)
+        except ExtrapolationError as error:
+            return not error.is_future
+        except TransformError as error:
+            self._complaints.warn("tf", f"scans wait for their transform: {error}")
+            return True
+        reach = self._parameters.sight + 1.0
+        source = ObservationSource(
+            clearing=True, inf_is_valid=True, obstacle_range=reach, raytrace_range=reach
+        )
+        ranges = np.asarray(message.ranges, np.float64)
+        ranges = np.where(ranges >= limits[1], np.inf, ranges)
+        seen = observe_scan(ranges, angles[0], angles[2], limits, pose_of(found.transform), source, stamp)
+        others = self._others
+        suspects = others.blocked | self._reported
+        findings = watch.take(seen, now, robots=self._places(now), held=others.held, suspects=suspects)
+        self._report(findings, now)
+        return True
+
+    def _places(self, now: float) -> NDArray[np.float64]:
+        """Return the other robots' places and radii, shape (K, 3)."""
+        radius = self._parameters.fleet_radius
+        fresh = [
+            (pose.x, pose.y, radius)
+            for seen_at, pose in self._others.poses.values()
+            if now - seen_at <= POSES_LAST
+        ]
+        return np.array(fresh, np.float64).reshape(-1, 3)
+
+    # What goes out
+
+    def _report(self, findings: Findings, now: float) -> None:
+        """Publish what is new at once, and all that is in sight now and then."""
+        fresh = set(findings.blocked) - self._reported
+        freed = {cell for cell in findings.freed if cell not in self._freed}
+        for cell in sorted(fresh):
+            self._node.log.warning("cell %d is blocked by something that is on no map", cell)
+        for cell in sorted(freed):
+            self._node.log.info("cell %d is free again", cell)
+            self._freed[cell] = now
+        self._reported |= fresh
+        self._reported -= set(findings.freed)
+        repeats = not 0 <= now - self._sent_at < REPEAT_EVERY
+        if not (fresh or freed or repeats):
+            return
+        self._sent_at = now
+        for cell in findings.blocked:
+            self._freed.pop(cell, None)
+        if findings.blocked:
+            self._blocked_out.publish(data=list(findings.blocked))
+        if self._freed:
+            self._freed_out.publish(data=sorted(self._freed))
+        self._freed = {cell: at for cell, at in self._freed.items() if now - at < FREED_FOR}
+
+
+def _same_place(one: OccupancyMap, other: OccupancyMap) -> bool:
+    return (one.rows, one.columns, one.resolution, one.origin) == (
+        other.rows, other.columns, other.resolution, other.origin,
+    )  # fmt: skip
+
+
+async def main() -> None:
+    """Run the node until it is stopped."""
+    async with Node("obstacle_cells") as node:
+        await ObstacleCellsNode(node, await read_parameters(node, ObstacleCellsParameters)).run()
+
+
+if __name__ == "__main__":
+    run(main())
