@@ -1,0 +1,1 @@
+"""Grid mapping with a Rao-Blackwellized particle filter, with GMapping's parameters."""

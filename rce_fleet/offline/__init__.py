@@ -1,0 +1,1 @@
+"""``rce map`` and ``rce localize``: mapping and localization of recorded logs, without a robot."""

@@ -1,0 +1,99 @@
+"""``rce map LOG`` and ``rce localize LOG``."""
+
+from __future__ import annotations
+
+import sys
+import time
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rce_fleet.compiled import compile_kernels
+from rce_fleet.exceptions import FleetError
+from rce_fleet.mapping.trajectory import write_trajectory
+from rce_fleet.maps.ros_map import save_map
+from rce_fleet.offline.inputs import read_log
+from rce_fleet.offline.outputs import output_folder, print_faults, with_progress, write_report
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rce_fleet.mapping.mapper import Mapper
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as of shells."""
+
+Log = Annotated[
+    Path, typer.Argument(help="CARMEN log (also compressed with gzip) or ROS 1 bag.", show_default=False)
+]
+Output = Annotated[
+    Path, typer.Option(help="Folder for the results; made if it does not exist.", show_default=False)
+]
+ScanTopic = Annotated[str, typer.Option("--scan", help="In a bag: topic of the scans.")]
+OdometryTopic = Annotated[str, typer.Option("--odom", help="In a bag: topic of the odometry.")]
+Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same result.")]
+
+
+class Algorithm(StrEnum):
+    """How the map is made."""
+
+    GMAPPING = "gmapping"
+
+
+def map_log(
+    log: Log,
+    output: Output,
+    with_: Annotated[Algorithm, typer.Option("--with", help="How the map is made.")] = Algorithm.GMAPPING,
+    scan: ScanTopic = "/scan",
+    odom: OdometryTopic = "/odom",
+    seed: Seed = 0,
+) -> None:
+    """Make a map from a recorded log.
+
+    Writes map.pgm, map.yaml, trajectory.csv (a row for each scan) and report.json to the output folder.
+    """
+    with _errors(), output_folder(output) as folder:
+        mapper = _mapper(with_, seed)
+        compile_kernels()
+        begin = time.perf_counter()
+        found = read_log(log, scan=scan, odometry=odom)
+        print_faults(found.faults, sys.stderr)
+        for record in with_progress(found.records, sys.stderr):
+            mapper.add(record)
+        mapper.finish()
+        write_trajectory(
+            folder / "trajectory.csv", [each.time for each in found.records], mapper.trajectory()
+        )
+        save_map(mapper.occupancy_map(), folder / "map.yaml")
+        write_report(
+            folder / "report.json",
+            seconds=time.perf_counter() - begin,
+            log_seconds=found.seconds,
+            scans=len(found.records),
+            loop_closures=mapper.loop_closures,
+        )
+    typer.echo(f"{output}: map.pgm, map.yaml, trajectory.csv, report.json")
+
+
+def _mapper(algorithm: Algorithm, seed: int) -> Mapper:
+    match algorithm:
+        case Algorithm.GMAPPING:
+            from rce_fleet.mapping.gmapping.mapper import ParticleMapper
+
+            return ParticleMapper(seed=seed)
+
+
+@contextmanager
+def _errors() -> Iterator[None]:
+    """End the program with a message instead of a traceback."""
+    try:
+        yield
+    except FleetError as error:
+        typer.echo(f"rce: {error}", err=True)
+        raise typer.Exit(1) from error
+    except KeyboardInterrupt:
+        typer.echo("rce: interrupted; nothing was written", err=True)
+        raise typer.Exit(INTERRUPTED) from None

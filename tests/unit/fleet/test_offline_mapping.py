@@ -1,0 +1,149 @@
+"""``rce map``: logs in, files out."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from support.lidar_drive import FRONT, drive, write_bag, write_carmen
+from typer.testing import CliRunner, Result
+
+from rce_fleet import compiled
+from rce_fleet.exceptions import LogError
+from rce_fleet.mapping.gmapping.mapper import ParticleMapper
+from rce_fleet.mapping.gmapping.parameters import FilterParameters
+from rce_fleet.mapping.mapper import Mapper
+from rce_fleet.mapping.trajectory import read_trajectory
+from rce_fleet.maps.ros_map import load_map
+from rce_fleet.offline import commands
+from rce_fleet.offline.inputs import read_log
+
+FILES = ["map.pgm", "map.yaml", "report.json", "trajectory.csv"]
+
+
+@pytest.fixture(autouse=True)
+def few_particles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Map with few particles and without compiling: quick."""
+
+    def mapper(algorithm: commands.Algorithm, seed: int) -> Mapper:
+        return ParticleMapper(FilterParameters(particles=2, linear_update=0.2, angular_update=0.2), seed=seed)
+
+    monkeypatch.setattr(commands, "_mapper", mapper)
+    monkeypatch.setenv(compiled._SWITCH, "no")
+
+
+def run(*args: Path | str) -> Result:
+    app = typer.Typer()
+    app.command()(commands.map_log)
+    return CliRunner().invoke(app, [str(each) for each in args])
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(file.name for file in folder.iterdir())
+
+
+def test_a_log_becomes_a_map_and_a_trajectory(tmp_path: Path) -> None:
+    true, records = drive()
+    write_carmen(tmp_path / "run.log", records)
+    (tmp_path / "run.log").write_bytes(gzip.compress((tmp_path / "run.log").read_bytes()))
+    result = run(tmp_path / "run.log", "--output", tmp_path / "new" / "out", "--with", "gmapping")
+    assert result.exit_code == 0, result.output
+    assert "60 of 60 scans" in result.output
+    folder = tmp_path / "new" / "out"
+    assert names(folder) == FILES
+    times, poses = read_trajectory(folder / "trajectory.csv")
+    assert times.tolist() == [record.time for record in records]
+    assert np.hypot(*(poses - true)[:, :2].T).mean() < 0.12
+    assert (load_map(folder / "map.yaml").values_at(true[:, :2]) == 0).all()
+    report = json.loads((folder / "report.json").read_text())
+    assert sorted(report) == ["log_seconds", "loop_closures", "scans", "seconds"]
+    assert (report["scans"], report["log_seconds"]) == (60, 59)
+
+
+def test_a_bag_becomes_a_map(tmp_path: Path) -> None:
+    true, records = drive(laser=FRONT)
+    write_bag(tmp_path / "run.bag", records, scan="/front/scan")
+    result = run(tmp_path / "run.bag", "--output", tmp_path, "--with", "gmapping", "--scan", "/front/scan")
+    assert result.exit_code == 0, result.output
+    _, poses = read_trajectory(tmp_path / "trajectory.csv")
+    assert np.hypot(*(poses - true)[:, :2].T).mean() < 0.12
+
+
+def test_a_bag_has_the_records_that_were_written(tmp_path: Path) -> None:
+    _, records = drive(laser=FRONT)
+    write_bag(tmp_path / "run.bag", records)
+    found = read_log(tmp_path / "run.bag")
+    assert found.faults == []
+    for mine, other in zip(records, found.records, strict=True):
+        assert np.allclose(mine.ranges, other.ranges, atol=1e-5)
+        assert np.allclose(mine.odometry, other.odometry)
+        assert np.allclose(mine.laser, other.laser)
+        assert np.isclose(mine.time, other.time)
+
+
+def test_wrong_topics_of_a_bag_are_named(tmp_path: Path) -> None:
+    write_bag(tmp_path / "run.bag", drive()[1], scan="/laser", odometry="/wheels")
+    with pytest.raises(
+        LogError, match=r"no topic /scan; expected sensor_msgs/LaserScan.*: /laser; .* --scan"
+    ):
+        read_log(tmp_path / "run.bag")
+    with pytest.raises(
+        LogError, match="/laser has messages of type sensor_msgs/LaserScan; expected nav_msgs/Odom"
+    ):
+        read_log(tmp_path / "run.bag", scan="/laser", odometry="/laser")
+
+
+def test_a_truncated_bag_is_refused(tmp_path: Path) -> None:
+    write_bag(tmp_path / "run.bag", drive()[1])
+    content = (tmp_path / "run.bag").read_bytes()
+    (tmp_path / "run.bag").write_bytes(content[:3000])
+    with pytest.raises(LogError, match=r"run\.bag: cannot be read as a ROS 1 bag"):
+        read_log(tmp_path / "run.bag")
+
+
+@pytest.mark.parametrize("content", [None, "", "ODOM 0 0 0 0 0 0 1 host 1\n"])
+def test_unusable_logs_end_with_a_message(tmp_path: Path, content: str | None) -> None:
+    log = tmp_path / "bad.log"
+    if content is not None:
+        log.write_text(content)
+    result = run(log, "--output", tmp_path / "out", "--with", "gmapping")
+    assert result.exit_code == 1
+    assert "bad.log: " in result.output
+    assert "Traceback" not in result.output
+    assert names(tmp_path / "out") == []
+
+
+def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:
+    write_carmen(tmp_path / "run.log", drive(3)[1])
+    result = run(tmp_path / "run.log", "--output", tmp_path / "run.log", "--with", "gmapping")
+    assert result.exit_code == 1
+    assert "cannot be written to" in result.output
+
+
+def test_ctrl_c_leaves_the_former_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_carmen(tmp_path / "run.log", drive(3)[1])
+    (tmp_path / "map.yaml").write_text("former")
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "save_map", interrupted)
+    result = run(tmp_path / "run.log", "--output", tmp_path, "--with", "gmapping")
+    assert result.exit_code == 130
+    assert "nothing was written" in result.output
+    assert names(tmp_path) == ["map.yaml", "run.log"]
+    assert (tmp_path / "map.yaml").read_text() == "former"
+
+
+def test_faulty_lines_are_printed(tmp_path: Path) -> None:
+    write_carmen(tmp_path / "run.log", drive(3)[1])
+    with (tmp_path / "run.log").open("a") as stream:
+        stream.write("FLASER 7 1 2\n" * 12)
+    result = run(tmp_path / "run.log", "--output", tmp_path / "out", "--with", "gmapping")
+    assert result.exit_code == 0
+    assert "run.log:5: FLASER left out: expected 7 ranges" in result.output
+    assert "... and 2 more" in result.output
