@@ -16,7 +16,7 @@ SERVER, FLEET, ALL = "server", "fleet", "all"
 
 _MODULES = {
     SERVER: ("aiohttp", "aiosqlite", "argon2", "cryptography", "numpy", "PIL", "prometheus_client", "rich"),
-    FLEET: ("aiohttp", "numpy", "PIL", "pymunk", "scipy"),
+    FLEET: ("aiohttp", "numpy", "PIL", "pymunk", "rosbags", "scipy"),
 }
 _ROLES = {
     "rce.cli.certificate": SERVER,

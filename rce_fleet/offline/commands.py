@@ -6,15 +6,20 @@ import sys
 import time
 from contextlib import contextmanager
 from enum import StrEnum
+from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.exceptions import FleetError
+from rce_fleet.geometry.poses import Pose
+from rce_fleet.localization.replay import Recorded, replay
+from rce_fleet.localization.scan import LaserScan
 from rce_fleet.mapping.trajectory import write_trajectory
-from rce_fleet.maps.ros_map import save_map
+from rce_fleet.maps.ros_map import load_map, save_map
 from rce_fleet.offline.inputs import read_log
 from rce_fleet.offline.outputs import output_folder, print_faults, with_progress, write_report
 
@@ -22,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rce_fleet.mapping.mapper import Mapper
+    from rce_fleet.mapping.records import LaserRecord
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as of shells."""
@@ -76,6 +82,60 @@ def map_log(
             loop_closures=mapper.loop_closures,
         )
     typer.echo(f"{output}: map.pgm, map.yaml, trajectory.csv, report.json")
+
+
+def localize(
+    log: Log,
+    map_: Annotated[Path, typer.Option("--map", help="map.yaml of the map.", show_default=False)],
+    output: Output,
+    initial_pose: Annotated[
+        str, typer.Option(metavar="X,Y,THETA", help="Pose at the first scan: metres, radians.")
+    ] = "0,0,0",
+    global_: Annotated[
+        bool, typer.Option("--global", help="The pose at the first scan is unknown: search the whole map.")
+    ] = False,
+    scan: ScanTopic = "/scan",
+    odom: OdometryTopic = "/odom",
+    seed: Seed = 0,
+) -> None:
+    """Localize a robot in a recorded log with AMCL.
+
+    Writes trajectory.csv (a row for each scan) and report.json to the output folder.
+    """
+    start = None if global_ else _pose(initial_pose)
+    with _errors(), output_folder(output) as folder:
+        grid = load_map(map_)
+        compile_kernels()
+        begin = time.perf_counter()
+        found = read_log(log, scan=scan, odometry=odom)
+        print_faults(found.faults, sys.stderr)
+        scans = (_recorded(record) for record in with_progress(found.records, sys.stderr))
+        poses = [each.pose.as_array() for each in replay(scans, grid, seed=seed, start=start)]
+        write_trajectory(folder / "trajectory.csv", [each.time for each in found.records], np.array(poses))
+        write_report(
+            folder / "report.json",
+            seconds=time.perf_counter() - begin,
+            log_seconds=found.seconds,
+            scans=len(found.records),
+        )
+    typer.echo(f"{output}: trajectory.csv, report.json")
+
+
+def _pose(text: str) -> Pose:
+    try:
+        x, y, yaw = (float(each) for each in text.split(","))
+    except ValueError:
+        x = y = yaw = nan
+    if not all(map(isfinite, (x, y, yaw))):
+        raise typer.BadParameter(f"expected X,Y,THETA as three numbers, found {text!r}")
+    return Pose(x, y, yaw)
+
+
+def _recorded(record: LaserRecord) -> Recorded:
+    scan = LaserScan(
+        record.ranges, record.angle_min, record.angle_increment, 0.0, record.range_max, Pose(*record.laser)
+    )
+    return Recorded(Pose(*record.odometry), scan)
 
 
 def _mapper(algorithm: Algorithm, seed: int) -> Mapper:

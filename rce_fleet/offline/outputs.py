@@ -47,7 +47,7 @@ def output_folder(target: Path) -> Iterator[Path]:
 
 def write_report(path: Path, **values: float) -> None:
     """Write a ``report.json``; seconds are rounded to milliseconds."""
-    rounded = {name: round(value, 3) if isinstance(value, float) else value for name, value in values.items()}
+    rounded = {name: round(value, 3) for name, value in values.items()}
     path.write_text(json.dumps(rounded, indent=2) + "\n", encoding="utf-8")
 
 

@@ -18,6 +18,8 @@ from rce_fleet.maps.ray_casting import cast_rays
 from rce_fleet.offline.bags import typestore
 
 BEAMS = 90
+START = np.array((4.7, 3.2, -np.pi / 2))
+"""True pose at the first scan, in the map of the rooms."""
 FRONT = np.array((0.1, 0.0, 0.0))
 """Where the laser is on the base of a bag's robot."""
 
@@ -37,7 +39,8 @@ def drive(
 ) -> tuple[NDArray[np.float64], list[LaserRecord]]:
     """Return the true poses, seen from the first one, and what the robot records."""
     turns = np.linspace(0, 2 * np.pi, number)
-    true = np.column_stack((3 + 1.7 * np.cos(turns), 3.2 - 0.5 * np.sin(2 * turns), turns))
+    yaws = np.unwrap(np.arctan2(-np.cos(2 * turns), -1.7 * np.sin(turns)))
+    true = np.column_stack((3 + 1.7 * np.cos(turns), 3.2 - 0.5 * np.sin(2 * turns), yaws))
     draw = np.random.default_rng(4)
     place = np.zeros(3) if laser is None else laser
     odometry = [np.array((0.5, 0.2, 0.3))]

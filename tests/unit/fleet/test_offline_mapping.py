@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import gzip
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import typer
-from support.lidar_drive import FRONT, drive, write_bag, write_carmen
+from support.lidar_drive import FRONT, START, drive, rooms, write_bag, write_carmen
 from typer.testing import CliRunner, Result
 
 from rce_fleet import compiled
 from rce_fleet.exceptions import LogError
+from rce_fleet.geometry.poses import compose
 from rce_fleet.mapping.gmapping.mapper import ParticleMapper
 from rce_fleet.mapping.gmapping.parameters import FilterParameters
 from rce_fleet.mapping.mapper import Mapper
 from rce_fleet.mapping.trajectory import read_trajectory
-from rce_fleet.maps.ros_map import load_map
+from rce_fleet.maps.ros_map import load_map, save_map
 from rce_fleet.offline import commands
 from rce_fleet.offline.inputs import read_log
 
@@ -36,9 +38,9 @@ def few_particles(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(compiled._SWITCH, "no")
 
 
-def run(*args: Path | str) -> Result:
+def run(*args: Path | str, command: Callable[..., None] = commands.map_log) -> Result:
     app = typer.Typer()
-    app.command()(commands.map_log)
+    app.command()(command)
     return CliRunner().invoke(app, [str(each) for each in args])
 
 
@@ -137,6 +139,42 @@ def test_ctrl_c_leaves_the_former_result(tmp_path: Path, monkeypatch: pytest.Mon
     assert "nothing was written" in result.output
     assert names(tmp_path) == ["map.yaml", "run.log"]
     assert (tmp_path / "map.yaml").read_text() == "former"
+
+
+@pytest.mark.parametrize("start", [("--initial-pose", "4.7,3.2,-1.5708"), ("--global",)])
+def test_a_log_is_localized_on_a_map(tmp_path: Path, start: tuple[str, ...]) -> None:
+    true, records = drive()
+    write_carmen(tmp_path / "run.log", records)
+    save_map(rooms(), tmp_path / "rooms.yaml")
+    result = run(
+        tmp_path / "run.log", "--map", tmp_path / "rooms.yaml", "--output", tmp_path / "out", *start,
+        command=commands.localize,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert names(tmp_path / "out") == ["report.json", "trajectory.csv"]
+    _, poses = read_trajectory(tmp_path / "out" / "trajectory.csv")
+    wrong = poses[:, :2] - compose(START, true)[:, :2]
+    assert np.hypot(*wrong[-20:].T).mean() < 0.5
+
+
+@pytest.mark.parametrize("text", ["1,2", "1,2,x", "1,2,nan"])
+def test_a_faulty_initial_pose_is_refused(tmp_path: Path, text: str) -> None:
+    result = run(
+        tmp_path / "a", "--map", tmp_path / "b", "--output", tmp_path, "--initial-pose", text,
+        command=commands.localize,
+    )  # fmt: skip
+    assert result.exit_code == 2
+    assert "X,Y,THETA" in result.output
+
+
+def test_a_missing_map_ends_with_a_message(tmp_path: Path) -> None:
+    write_carmen(tmp_path / "run.log", drive(3)[1])
+    result = run(
+        tmp_path / "run.log", "--map", tmp_path / "no.yaml", "--output", tmp_path / "out",
+        command=commands.localize,
+    )  # fmt: skip
+    assert result.exit_code == 1
+    assert "no.yaml" in result.output
 
 
 def test_faulty_lines_are_printed(tmp_path: Path) -> None:
