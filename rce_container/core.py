@@ -82,7 +82,7 @@ class ManagerCore:
         self._out = []
         match event:
             case Put() | Patch() | Drop() | Sync() | StatusWanted():
-                self._hear(event)
+                self._handle_desired(event)
             case Adopted():
                 self._adopt(event)
             case Due(id=id_, ticket=ticket):
@@ -119,7 +119,7 @@ class ManagerCore:
 
     # Desired state from the master
 
-    def _hear(self, event: Put | Patch | Drop | Sync | StatusWanted) -> None:
+    def _handle_desired(self, event: Put | Patch | Drop | Sync | StatusWanted) -> None:
         match event:
             case Put(spec=spec):
                 self._put(spec)
@@ -284,7 +284,7 @@ class ManagerCore:
         container.address = LinkAddress()
         container.reported = None
         if container.phase is Phase.GONE:
-            self._revive_or_forget(container)
+            self._restart_or_forget(container)
         elif container.desired is None:  # adopted, and the master has not mentioned it yet
             del self.containers[container.id]
         else:
@@ -295,7 +295,7 @@ class ManagerCore:
         if container is None:
             return
         if container.course.advance(LifeEvent.NOT_STARTED) is Phase.GONE:
-            self._revive_or_forget(container)
+            self._restart_or_forget(container)
             return
         self._failed(container, f"cannot be started: {reason}")
         self._pause(container)
@@ -318,7 +318,7 @@ class ManagerCore:
         self._out.append(Wait(container.id, container.ticket, delay))
         self._tell(container)
 
-    def _revive_or_forget(self, container: Container) -> None:
+    def _restart_or_forget(self, container: Container) -> None:
         if container.desired is None or self._quitting:
             self._forget(container)
             return

@@ -56,7 +56,7 @@ _log = logging.getLogger(__name__)
 
 _SHIM_TIMEOUT_S = 5.0
 """Seconds that the shim has to remove the folders of a container that ended properly."""
-_LAST_WORDS_LENGTH = 300
+_LAST_OUTPUT_LENGTH = 300
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,15 +105,15 @@ class Incarnation:
         self._context = context
         self._channel: Channel | None = None
         self._links = ContainerLinks(context.acceptor, context.settings)
-        self._takes_errands = False
+        self._handles_links = False
         """Whether an environment runs for which links and limits are handled."""
         self._desired: DesiredState | None = None
         self._deadline: asyncio.Timeout | None = None
         self._features: frozenset[str] = frozenset()
         self._stopping = False
         self._stop_reason = ""
-        self._hurry = False
-        self._errands = BackgroundTasks()
+        self._kill_now = False
+        self._background = BackgroundTasks()
         self._supply = Supply(
             self.incarnation_id,
             EndpointId.parse(id).user,
@@ -145,9 +145,9 @@ class Incarnation:
         self._supply.want(spec.packages)
         if self._channel is not None:
             self._channel.send(m.encode(m.Apply(spec=spec)))
-        if self._takes_errands:
-            self._errands.spawn(self._links.assign(spec), name=f"links of {self.id}")
-            self._errands.spawn(self._resize(spec.resources), name=f"limits of {self.id}")
+        if self._handles_links:
+            self._background.spawn(self._links.assign(spec), name=f"links of {self.id}")
+            self._background.spawn(self._resize(spec.resources), name=f"limits of {self.id}")
 
     def apply_patch(self, patch: SpecPatch) -> None:
         """Give the environment a patch of its desired state, based on the revision that it has."""
@@ -159,12 +159,12 @@ class Incarnation:
         self._note_revision(patch.revision)
         if patch.contents is not None:
             self._supply.want(patch.contents.packages)
-            if self._takes_errands:
-                self._errands.spawn(self._resize(patch.contents.resources), name=f"limits of {self.id}")
+            if self._handles_links:
+                self._background.spawn(self._resize(patch.contents.resources), name=f"limits of {self.id}")
         if self._channel is not None:
             self._channel.send(m.encode(m.ApplyPatch(patch=patch)))
-        if self._takes_errands and (patch.links or patch.removed_links):
-            self._errands.spawn(self._links.change(patch), name=f"links of {self.id}")
+        if self._handles_links and (patch.links or patch.removed_links):
+            self._background.spawn(self._links.change(patch), name=f"links of {self.id}")
 
     def _note_revision(self, revision: int) -> None:
         try:
@@ -216,7 +216,7 @@ class Incarnation:
 
     def kill(self) -> None:
         """End at once."""
-        self._stopping = self._hurry = True
+        self._stopping = self._kill_now = True
         self._limit(0.0)
 
     async def run(self) -> None:
@@ -228,11 +228,11 @@ class Incarnation:
             reason = await self._live()
             if not self._stopping:
                 reason = self.enforcer.claim_all() or reason
-                reason += await asyncio.to_thread(self._last_words)
+                reason += await asyncio.to_thread(self._last_output)
                 _log.warning("container %s: %s", self.id, reason)
             self._context.feed(events.Lost(self.id, self.incarnation_id, reason))
             await asyncio.to_thread(self._note_end, reason)
-            await self._clean(_SHIM_TIMEOUT_S if self._stopping and not self._hurry else 0.0)
+            await self._clean(_SHIM_TIMEOUT_S if self._stopping and not self._kill_now else 0.0)
         except asyncio.CancelledError:
             self.handle.abandon()
             raise
@@ -252,7 +252,7 @@ class Incarnation:
                     self.apply(self._desired.whole)
                 await self._converse(self._channel)
         except TimeoutError:
-            self._hurry = True
+            self._kill_now = True
             return (
                 "its environment did not end in time" if self._stopping else "its environment does not answer"
             )
@@ -291,8 +291,8 @@ class Incarnation:
 
     async def _hang_up(self) -> None:
         self._deadline = None
-        self._takes_errands = False
-        await self._errands.close()
+        self._handles_links = False
+        await self._background.close()
         await self._supply.close()
         if self._channel is not None:
             self._channel.close()
@@ -303,11 +303,11 @@ class Incarnation:
         pace = intake.Pace()
         while (line := await channel.receive()) is not None:
             pace.pay(intake.PER_LINE + len(line))
-            self._hear(channel, intake.read(line), pace)
+            self._handle_message(channel, intake.read(line), pace)
             if pause := pace.pause:
                 await asyncio.sleep(pause)
 
-    def _hear(self, channel: Channel, said: m.ToManager | Unknown, pace: intake.Pace) -> None:
+    def _handle_message(self, channel: Channel, said: m.ToManager | Unknown, pace: intake.Pace) -> None:
         match said:
             case m.Report(status=status, features=features):
                 self._features = frozenset(features) & {EXEC, PATCHES}
@@ -324,7 +324,7 @@ class Incarnation:
             case m.Killed(request=number):
                 channel.send(m.encode(m.Cause(request=number, text=self.enforcer.claim())))
             case m.Dial() as request:
-                self._errands.spawn(self._dial(channel, request), name=f"dial for {self.id}")
+                self._background.spawn(self._dial(channel, request), name=f"dial for {self.id}")
             case Unknown(name=name):
                 _log.debug("%s: its environment sent a %s", self.id, intake.sanitize_text(name))
             case message:
@@ -371,7 +371,7 @@ class Incarnation:
     # Links
 
     def _open_handover(self, channel: Channel) -> None:
-        self._takes_errands = True
+        self._handles_links = True
         with self._links.open() as theirs:
             channel.send(m.encode(m.Handover(features=(PATCHES,))), theirs.fileno())
 
@@ -390,11 +390,11 @@ class Incarnation:
 
     def _note_end(self, reason: str) -> None:
         if self._stopping:
-            reason = "; ".join(filter(None, (self._stop_reason, reason if self._hurry else "")))
+            reason = "; ".join(filter(None, (self._stop_reason, reason if self._kill_now else "")))
         self._context.archive.end(self.id, self.incarnation_id, reason, time.time())
 
-    def _last_words(self) -> str:
-        words = last_line(self.folder.logs)[:_LAST_WORDS_LENGTH]
+    def _last_output(self) -> str:
+        words = last_line(self.folder.logs)[:_LAST_OUTPUT_LENGTH]
         return f"; its last output: {words}" if words else ""
 
     async def _clean(self, timeout: float) -> None:

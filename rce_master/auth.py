@@ -93,7 +93,7 @@ class Authenticator:
         self.checks = 0
         """Passwords that were hashed to check them."""
         # Checked for unknown users, so that the time does not reveal which users exist.
-        self._nobody = self._hasher.hash(secrets.token_hex())
+        self._unknown_user = self._hasher.hash(secrets.token_hex())
 
     async def verify(self, name: str, digest: str, address: str = "") -> User:
         """Check a password.
@@ -109,7 +109,7 @@ class Authenticator:
             TooManyLoginsError: Too many passwords wait to be checked.
         """
         user = self._tables.users.get(name)
-        stored = user.password if user else self._nobody
+        stored = user.password if user else self._unknown_user
         mark = self._mark(name, stored, digest)
         if not self._is_known(name, mark):
             right = await self._check(name, stored, digest, mark, address)

@@ -109,7 +109,9 @@ class App:
             elif for_robots is not None and not settings.public_url:
                 _warn(name_warning(for_robots, reach))
             info = MachineInfo(name=machine, cores=os.cpu_count() or 0, memory=machine_memory())
-            lobby = Lobby("robots", per_address=settings.strangers_per_address, in_all=settings.strangers)
+            lobby = Lobby(
+                "robots", per_address=settings.unauthenticated_per_address, in_all=settings.unauthenticated
+            )
             task_set = RobotTaskSet(
                 hub,
                 FormFactory(types),

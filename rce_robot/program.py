@@ -48,7 +48,7 @@ def run(engine: EngineSettings, *, verbose: bool = False) -> int:
         trusted_proxies=own.trusted_proxies,
         user_memory=own.user_memory,
         memory=own.memory,
-        strangers_per_address=own.strangers,
+        unauthenticated_per_address=own.strangers,
     )
     keep_large_blocks()
     raise_file_limit()

@@ -61,9 +61,9 @@ class RobotSettings:
     """Bytes of waiting or incomplete messages of all robots of one user; beyond it the oldest are dropped."""
     memory: int = 0
     """The same for all users; 0 is half of the machine's memory."""
-    strangers: int = 1024
+    unauthenticated: int = 1024
     """Connections whose robot has not logged in yet."""
-    strangers_per_address: int = 256
+    unauthenticated_per_address: int = 256
     """The same from one address."""
     conversion: ConversionSettings = field(default_factory=ConversionSettings)
     call_timeout: float = 30.0

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-STRANGERS_PER_ADDRESS = PER_ADDRESS
+UNAUTHENTICATED_PER_ADDRESS = PER_ADDRESS
 """Connections from one address that have not shown the secret yet."""
 
 PROOF_CHECK_S = 1.0
@@ -142,7 +142,7 @@ class ControlServer:
         return tuple(self._peers.values())
 
     async def __aenter__(self) -> Self:
-        lobby = Lobby("task sets", per_address=STRANGERS_PER_ADDRESS)
+        lobby = Lobby("task sets", per_address=UNAUTHENTICATED_PER_ADDRESS)
         connection = guarded(GuardedConnection, lobby)
         if self._tls is not None:
             self._gate = TlsGate("control channel", self._tls, lobby)

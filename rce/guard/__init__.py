@@ -1,1 +1,1 @@
-"""Limits on a process's resources for strangers and users: connections, memory, file descriptors."""
+"""Limits on a process's resources for unauthenticated connections and users."""

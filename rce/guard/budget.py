@@ -95,7 +95,7 @@ class Ledger:
 
     def _note(self, account: Account) -> None:
         self.growths += 1
-        self._look_at(account)
+        self._check(account)
         if self._settling:
             return
         self._settling = True
@@ -123,7 +123,7 @@ class Ledger:
             account = max(self._accounts[user], key=lambda account: account.held)
             before = account.held
             account.holder.shed(min(excess, before))
-            self._look_at(account)
+            self._check(account)
             self.shed += 1
             if account.held >= before:
                 self._end(account, f"{who} hold more memory of the engine than they may")
@@ -136,10 +136,10 @@ class Ledger:
 
     def _refresh(self, user: str) -> int:
         for account in self._accounts[user]:
-            self._look_at(account)
+            self._check(account)
         return self._sums[user]
 
-    def _look_at(self, account: Account) -> None:
+    def _check(self, account: Account) -> None:
         if account in self._accounts.get(account.user, {}):
             self._add(account, account.holder.held - account.held)
 

@@ -23,7 +23,7 @@ _RECOVERY = 0.5
 class Workload(Protocol):
     """A user's object that has work to do."""
 
-    def go_on(self) -> bool:
+    def continue_work(self) -> bool:
         """Do a small part of it; return whether there is more."""
 
 
@@ -49,7 +49,7 @@ class LoopShare:
         """Have work done now, as far as the user's share allows, and the rest in later turns.
 
         Returns:
-            Whether all is done. If not, do not call this again before ``go_on`` has returned False.
+            Whether all is done. If not, do not call this again before ``continue_work`` has returned False.
         """
         if user not in self._waiting:
             now = self._clock()
@@ -77,7 +77,7 @@ class LoopShare:
         """Work until the user's slice is used up; return whether all was done."""
         more = True
         while more and used < self._slice:
-            more = workload.go_on()
+            more = workload.continue_work()
             end = self._clock()
             used += end - now
             now = end

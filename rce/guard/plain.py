@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from rce.guard.lobby import address_of
-from rce.guard.rates import Complaints
+from rce.guard.rates import LogThrottle
 
 if TYPE_CHECKING:
     import asyncio
@@ -31,7 +31,7 @@ class PlainPort:
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._complaints = Complaints()
+        self._throttle = LogThrottle()
 
     def refuses(self, transport: asyncio.Transport, data: bytes, now: float) -> bool:
         """Return whether a connection is refused for its first bytes; if so, it is answered and closed.
@@ -44,7 +44,7 @@ class PlainPort:
         if data[:1] != bytes([_HANDSHAKE_RECORD]):
             return False
         address = address_of(transport.get_extra_info("peername"))
-        if self._complaints.is_due(address, now):
+        if self._throttle.is_due(address, now):
             _log.warning(
                 "%s: a client at %s was not taken: it speaks TLS at a port without TLS; let it use http:// or"
                 " ws://, or start this program with --tls",

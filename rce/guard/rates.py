@@ -11,7 +11,7 @@ MOST_KEYS = 16_384
 
 
 EVERY_S = 10.0
-"""Seconds between two complaints about an address."""
+"""Seconds between two log lines about an address."""
 _MOST = 1024
 """Addresses that are remembered."""
 
@@ -89,14 +89,14 @@ class Rates:
             self._buckets.popitem(last=False)
 
 
-class Complaints:
-    """Decides which complaints are logged."""
+class LogThrottle:
+    """Limits how often a warning about an address is logged."""
 
     def __init__(self) -> None:
         self._last: dict[str, float] = {}
 
     def is_due(self, address: str, now: float) -> bool:
-        """Return whether to log a complaint about an address; if so, it counts as logged.
+        """Return whether to log a warning about an address; if so, it counts as logged.
 
         Args:
             address: The peer's address.

@@ -155,7 +155,7 @@ class Endpoint:
             if self._closed:
                 raise RuntimeError(f"endpoint {self.id} is closed")
             self._due.include(self._desired.replace(spec))
-            await self._make_up()
+            await self._reconcile()
 
     async def patch(self, patch: SpecPatch) -> None:
         """Do what :meth:`apply` does, with what changed since the spec or patch before.
@@ -167,7 +167,7 @@ class Endpoint:
             if self._closed:
                 raise RuntimeError(f"endpoint {self.id} is closed")
             self._due.include(self._desired.patch(patch))
-            await self._make_up()
+            await self._reconcile()
 
     async def close(self) -> None:
         """End everything; returns when nothing is left."""
@@ -185,7 +185,7 @@ class Endpoint:
 
     # What is due
 
-    async def _make_up(self) -> None:
+    async def _reconcile(self) -> None:
         """Do what is due. If this is cancelled, it is due again the next time."""
         due, desired = self._due, self._desired
         if due.contents:

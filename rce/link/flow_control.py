@@ -37,7 +37,7 @@ class Stream(Protocol):
     def control(self, frame: Frame) -> None:
         """Send a frame of the link itself."""
 
-    def go_on(self) -> None:
+    def resume_sending(self) -> None:
         """Send what waits."""
 
     def pause_reading(self) -> None:
@@ -82,7 +82,7 @@ class FlowControl:
             self._extend()
         else:
             self._send_grant(_NO_LIMIT)
-        self._stream.go_on()
+        self._stream.resume_sending()
 
     def allow(self, payload: bytes | memoryview) -> None:
         """Take the peer's GRANT.
@@ -93,7 +93,7 @@ class FlowControl:
         if len(payload) != _OFFSET.size:
             raise ProtocolError("bad GRANT")
         (self._allowed,) = _OFFSET.unpack(payload)
-        self._stream.go_on()
+        self._stream.resume_sending()
 
     def room(self, *, urgent: bool) -> int:
         """Return how many bytes of payload the next frame may have; for 0, the stream continues later."""
@@ -104,7 +104,7 @@ class FlowControl:
                 return 0
             limit = min(limit, max(left, SMALL_MESSAGE))
         if self._pacer is not None:
-            if not self._pacer.ask(self._stream.go_on, urgent=urgent):
+            if not self._pacer.ask(self._stream.resume_sending, urgent=urgent):
                 return 0
             limit = min(limit, self._pacer.part)
         return limit
@@ -136,7 +136,7 @@ class FlowControl:
     def close(self) -> None:
         """Stop waiting for the limit."""
         if self._pacer is not None:
-            for go in (self._extend, self._read_on, self._stream.go_on):
+            for go in (self._extend, self._read_on, self._stream.resume_sending):
                 self._pacer.forget(go)
         self._read_on()
 

@@ -185,8 +185,8 @@ class LinkAcceptor:
         self._limits = limits or LinkLimits()
         self.lobby = Lobby(
             "links to hand over",
-            per_address=self._limits.strangers_per_address,
-            in_all=self._limits.strangers,
+            per_address=self._limits.unauthenticated_per_address,
+            in_all=self._limits.unauthenticated,
         )
         self._routes: dict[str, HandoverSender] = {}
         self._assigned = asyncio.Condition()

@@ -68,7 +68,7 @@ class LinkHub:
         self.timeouts = timeouts or LinkTimeouts()
         self.limits = limits or LinkLimits()
         self.lobby = Lobby(
-            "links", per_address=self.limits.strangers_per_address, in_all=self.limits.strangers
+            "links", per_address=self.limits.unauthenticated_per_address, in_all=self.limits.unauthenticated
         )
         self._dial = dial
         self._accepting: dict[str, Link] = {}
@@ -290,7 +290,7 @@ class LinkHub:
                 self.limits,
                 self.timeouts,
                 received=received,
-                on_open=self._let_in,
+                on_open=self._admit,
                 on_closed=self._carriers.discard,
             )
         )
@@ -299,7 +299,7 @@ class LinkHub:
         self._carriers.add(carrier)
         return carrier
 
-    def _let_in(self, carrier: SocketCarrier) -> None:
+    def _admit(self, carrier: SocketCarrier) -> None:
         """Wait for the HELLO of an accepted connection, if there is room."""
         crowded = LinkLostError("too many connections come at once")
         guest = self.lobby.enter(address_of(carrier.peer), lambda: carrier.abort(crowded))

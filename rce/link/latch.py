@@ -93,7 +93,7 @@ class HeardSources:
     def __init__(self) -> None:
         self._heard: dict[int, dict[int, None]] = {}
 
-    def hear(self, channel: int, source: int) -> tuple[str, list[str]]:
+    def note_source(self, channel: int, source: int) -> tuple[str, list[str]]:
         """Note a latched message.
 
         Returns:

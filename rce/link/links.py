@@ -99,7 +99,7 @@ class EndpointLinks:
             link = self._links[spec.id] = Link(spec, self._hub.limits, self._on_growth)
             link.pace(self._pacer)
             if spec.peer == str(self._id):
-                self._far_ends[spec.id] = _bend_back(link)
+                self._far_ends[spec.id] = _loop_back(link)
             elif spec.dial:
                 self._dial(link)
             else:
@@ -154,7 +154,7 @@ async def _keep_dialed(link: Link, hub: LinkHub) -> None:
         await hub.wait_registered(link.spec.id, pauses.next())
 
 
-def _bend_back(link: Link) -> Link:
+def _loop_back(link: Link) -> Link:
     """Make the other end of the link of an endpoint with itself, and join the two for good."""
     far = Link(link.spec, link.limits)
     one, other = LocalCarrier.pair()

@@ -54,7 +54,7 @@ class LinkLimits:
     """Requests that one interface serves at the same time."""
     waiting: int = 1024
     """Requests that wait until one interface can serve them."""
-    strangers: int = 1024
+    unauthenticated: int = 1024
     """Accepted connections that have not named their link yet."""
-    strangers_per_address: int = 256
+    unauthenticated_per_address: int = 256
     """The same from one address."""

@@ -164,7 +164,7 @@ class InterfaceSlot:
             if source is None:
                 self._interface.receive(payload, latched=False)
             else:
-                name, ended = self._heard.hear(channel.number, source)
+                name, ended = self._heard.note_source(channel.number, source)
                 self._unlatch(ended)
                 self._interface.receive_latched(payload, name)
         except Exception as error:  # noqa: BLE001 - logged
@@ -176,7 +176,7 @@ class InterfaceSlot:
         self.counters.dropped += 1
         self._fault_once("memory is short; a message was dropped while it came in")
         if source is not None:
-            name, ended = self._heard.hear(channel.number, source)
+            name, ended = self._heard.note_source(channel.number, source)
             self._unlatch([*ended, name])
 
     def keep_sources(self, channel: Channel, sources: Collection[int]) -> None:

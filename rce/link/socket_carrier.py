@@ -131,7 +131,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         """Limit what passes."""
         if not self._ending and (pacer is not None or self._flow is not None):
             self._use_flow_control().pace(pacer)
-            self._look_at_flow()
+            self._check_flow()
 
     @property
     def traffic(self) -> tuple[int, int]:
@@ -159,7 +159,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         except ProtocolError as error:
             self.abort(error)
         else:
-            self.go_on()
+            self.resume_sending()
 
     def send(self, queue: OutgoingQueue, frame: Frame) -> None:
         """Send a message: at once where nothing waits, else in its lane."""
@@ -172,7 +172,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
             self._write(frame_chunk(frame))
             return
         self._lanes.add(queue, frame)
-        self.go_on()
+        self.resume_sending()
 
     def withdraw(self, queue: OutgoingQueue, call_id: int) -> bool:
         """Take a call back that has not begun to be sent."""
@@ -181,7 +181,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
     def clear(self, queue: OutgoingQueue) -> None:
         """Throw away what waits on a channel."""
         self._lanes.clear(queue)
-        self.go_on()
+        self.resume_sending()
 
     def close(self) -> None:
         """Hang up after what lies in the socket's buffer was sent, or after the flush time."""
@@ -240,7 +240,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         """Continue handing bytes to the transport."""
         self._writable = True
         self._straight = self._flow is None
-        self.go_on()
+        self.resume_sending()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Give everything up."""
@@ -254,7 +254,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
 
     # rce.link.flow_control.Stream
 
-    def go_on(self) -> None:
+    def resume_sending(self) -> None:
         """Send waiting frames, as far as the socket and the limits allow."""
         if self._writable and self._turn is None:
             self._pump()
@@ -277,7 +277,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
             self._straight = False
         return self._flow
 
-    def _look_at_flow(self) -> None:
+    def _check_flow(self) -> None:
         """Remove the flow control when neither end has a limit any more."""
         if self._flow is not None and self._flow.open:
             self._flow = None
@@ -318,7 +318,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         except ProtocolError as error:
             self.abort(error)
         else:
-            self._look_at_flow()
+            self._check_flow()
 
     def _keep(self, frame: Frame) -> None:
         if len(self._early) > self._limits.max_channels:

@@ -1,4 +1,4 @@
-"""Makes texts of strangers safe to print on a terminal.
+"""Makes texts of other users safe to print on a terminal.
 
 A terminal interprets control codes in its output: it moves its cursor, renames its window, writes to its
 user's clipboard. The output of other users' nodes must not contain them.

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, cast
 
 from rce.aio.tasks import BackgroundTasks
 from rce.guard.lobby import address_of
-from rce.guard.rates import Complaints
+from rce.guard.rates import LogThrottle
 from rce.tls.alerts import alert_of
 from rce.tls.faults import CertificateError, explain_to_server
 
@@ -53,7 +53,7 @@ class TlsGate:
         self._context = context
         self._lobby = lobby
         self._handshakes = BackgroundTasks()
-        self._complaints = Complaints()
+        self._throttle = LogThrottle()
 
     def guard(self, protocol: asyncio.Protocol) -> asyncio.Protocol:
         """Return a protocol factory for ``loop.create_server``, in place of ``protocol``."""
@@ -116,7 +116,7 @@ class TlsGate:
 
     def _complain(self, address: str, why: str) -> None:
         # Limited for each reason: a logged one must not hide another.
-        if self._complaints.is_due(f"{address} {why}", asyncio.get_running_loop().time()):
+        if self._throttle.is_due(f"{address} {why}", asyncio.get_running_loop().time()):
             _log.warning("%s: a client at %s was not taken: %s", self._name, address or "this machine", why)
 
 

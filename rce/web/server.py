@@ -32,8 +32,8 @@ _SWEEP_EVERY = 32
 class HttpServer:
     """Serves an application. Use it as an asynchronous context manager.
 
-    A connection without an answer counts as a stranger, also between requests; one with an accepted stream
-    does not. When there are too many strangers, those without a request are closed first.
+    A connection without an answer counts as unauthenticated, also between requests; one with an accepted
+    stream does not. When there are too many, those without a request are closed first.
 
     Args:
         app: The application.
@@ -41,11 +41,11 @@ class HttpServer:
         port: 0 takes a free one.
         tls: Gives the TLS context for each connection; none serves plain HTTP.
         idle_timeout: Seconds without a request after which a connection is closed.
-        lobby: Where strangers are counted; one of its own if none.
+        lobby: Counts unauthenticated connections; one of its own if none.
 
     Attributes:
         url: The URL of the server, once it listens.
-        lobby: The strangers.
+        lobby: The unauthenticated connections.
     """
 
     def __init__(
@@ -107,10 +107,10 @@ class HttpServer:
     # Connections
 
     def _make_arrival(self) -> asyncio.Protocol:
-        arrival = _Arrival(self._let_in)
+        arrival = _Arrival(self._admit)
         return arrival if self._gate is None else self._gate.guard(arrival)
 
-    def _let_in(self, transport: asyncio.Transport) -> None:
+    def _admit(self, transport: asyncio.Transport) -> None:
         """Serve a new connection, if there is room for it."""
         self._arrivals += 1
         if self._arrivals % _SWEEP_EVERY == 0:
@@ -147,7 +147,7 @@ class HttpServer:
             guest.rest()
 
     async def _grant(self, request: web.Request, response: web.StreamResponse) -> None:
-        """Take note that a handler began to stream: the connection no longer counts as a stranger."""
+        """Take note that a handler began to stream: the connection no longer counts as unauthenticated."""
         guest = None if request.transport is None else self._guests.get(request.transport)
         if guest in self._handled and response.status < _FIRST_ERROR:
             guest.leave()
@@ -156,11 +156,11 @@ class HttpServer:
 class _Arrival(asyncio.Protocol):
     """A connection's protocol until it is let in."""
 
-    def __init__(self, let_in: Callable[[asyncio.Transport], None]) -> None:
-        self._let_in = let_in
+    def __init__(self, admit: Callable[[asyncio.Transport], None]) -> None:
+        self._admit = admit
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._let_in(cast("asyncio.Transport", transport))
+        self._admit(cast("asyncio.Transport", transport))
 
 
 class _FirstWords(asyncio.Protocol):

@@ -127,7 +127,7 @@ class Environment:
                     on_fault=self._fault,
                 )
                 self._reporter = Reporter(self._endpoint)
-                applying = tasks.create_task(self._apply_for_ever(), name="endpoint")
+                applying = tasks.create_task(self._apply_changes(), name="endpoint")
                 serving = tasks.create_task(self._accept_managers(), name="control socket")
                 watching = tasks.create_task(graph.watch_nodes(self), name="graph")
                 self._wait_for_manager()
@@ -244,7 +244,7 @@ class Environment:
             self._fault(text)
         self._faulty = texts
 
-    async def _apply_for_ever(self) -> None:
+    async def _apply_changes(self) -> None:
         while True:
             await self._news.wait()
             self._news.clear()

@@ -66,7 +66,7 @@ class ForkServer:
                 ours.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
                 self._order(request, descriptors._replace(answer=theirs.fileno()))
                 theirs.close()
-                answer, pid = await _hear(ours)
+                answer, pid = await _receive_answer(ours)
             if answer is None:
                 _log.warning("a container's environment died as it was made; it is tried again")
                 continue
@@ -157,7 +157,7 @@ async def hear_credentials(sock: socket.socket, size: int) -> tuple[bytes, int]:
         return data, 0
 
 
-async def _hear(sock: socket.socket) -> tuple[Answer | None, int]:
+async def _receive_answer(sock: socket.socket) -> tuple[Answer | None, int]:
     data, pid = await hear_credentials(sock, MAX_PACKET)
     if not data:
         return None, 0

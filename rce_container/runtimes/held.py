@@ -36,7 +36,7 @@ class HeldHandle(Handle):
         fork_server: ForkServer,
     ) -> None:
         super().__init__(process, "", popen)
-        self.complaint = "its namespaces cannot be made"
+        self.failure = "its namespaces cannot be made"
         """The error text without a holder."""
         self._request = request
         self._fork_server = fork_server
@@ -101,7 +101,7 @@ class HeldHandle(Handle):
         with socket.socket(fileno=os.dup(self._fds["lifeline"])) as lifeline:
             said, pid = await hear_credentials(lifeline, 1)
         if not said or not pid:
-            raise StartError(self.complaint)
+            raise StartError(self.failure)
         return pid
 
     def _open_holder(self, pid: int) -> int:

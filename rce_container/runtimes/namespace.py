@@ -162,7 +162,7 @@ class NamespaceRuntime(Runtime):
             if lock >= 0:
                 os.close(lock)
         if not self._root:
-            handle.complaint += _NO_USER_NAMESPACES
+            handle.failure += _NO_USER_NAMESPACES
         return handle
 
     def _try(self, failures: list[Exception]) -> None:

@@ -148,7 +148,7 @@ class PodmanRuntime(NamespaceRuntime):
         """Make the container's namespaces; the environment comes to life by the handle's ``launch``."""
         handle = super().start(order)
         if order.image:
-            handle.complaint = (
+            handle.failure = (
                 f"podman cannot start the image {order.image} (if it is not there, the machine's operator "
                 "can fetch it: podman pull)"
             )

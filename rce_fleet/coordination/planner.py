@@ -226,10 +226,10 @@ class FleetPlanner:
     def _take_tick(self, _event: Tick) -> None:
         for robot in self._deadlines.take_due(self._now):
             record = self.state.robots[robot]
-            self._look_at(record)
+            self._check_timeouts(record)
             self._deadlines.set(robot, self._due(record))
 
-    def _look_at(self, record: RobotRecord) -> None:
+    def _check_timeouts(self, record: RobotRecord) -> None:
         """Handle timeouts of one robot."""
         heard = record.heard(self._now, self.settings)
         if record.phase is Phase.SILENT:

@@ -43,7 +43,7 @@ def admit(route: Route, user: User | None) -> None:
         raise WrongCredentialsError("a bearer token is needed; get one at /api/v1/login")
     if route.admin and (user is None or user.role is not UserRole.ADMIN):
         raise ForbiddenError("only an administrator may do this")
-    looks = (route.method == "GET" and not route.acts) or route.everybody or route.open
+    looks = (route.method == "GET" and not route.acts) or route.any_role or route.open
     if user is not None and not user.role.changes and not looks:
         raise ForbiddenError(
             f"the role {user.role.value} changes nothing; ask an administrator for another one"

@@ -34,7 +34,7 @@ async def log_in(call: Call) -> models.TokenOut:
     )
 
 
-@routes.route("DELETE", "/login", "Forget the token that this request carries", status=204, everybody=True)
+@routes.route("DELETE", "/login", "Forget the token that this request carries", status=204, any_role=True)
 async def log_out(call: Call) -> None:
     """Forget the token."""
     await call.services.state_service.submit(commands.RemoveToken(digest=token_digest(call.token)))
@@ -84,7 +84,7 @@ async def remove_user(call: Call) -> None:
     "Change a password (your own, or anybody's as administrator); ends the user's tokens and sessions",
     body=models.PasswordIn,
     status=204,
-    everybody=True,
+    any_role=True,
 )
 async def set_password(call: Call) -> None:
     """Change a password."""

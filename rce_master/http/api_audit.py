@@ -43,7 +43,7 @@ async def read_audit(call: Call) -> models.AuditOut:
     "Note what the caller did at a station of this engine",
     body=models.AuditIn,
     status=204,
-    everybody=True,
+    any_role=True,
 )
 async def note_action(call: Call) -> None:
     """Record a control action; a station sends it with the token of the acting user."""

@@ -41,7 +41,7 @@ async def add_token(call: Call) -> models.TokenOut:
     "/tokens/{id}",
     "Revoke a token; ends what was opened by it",
     status=204,
-    everybody=True,
+    any_role=True,
     query=(OF_USER,),
 )
 async def revoke_token(call: Call) -> None:

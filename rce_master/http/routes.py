@@ -184,7 +184,7 @@ class Route(routes.Route[Handler]):
     """A method of a path, and its permissions."""
 
     admin: bool = False
-    everybody: bool = False
+    any_role: bool = False
     """Whether read-only users may use it too."""
     acts: bool = False
     """Whether it makes a change although it is a GET."""

@@ -102,7 +102,7 @@ class ConversionPool:
             raise ConversionFailedError(f"{len(orders)} large messages wait to be converted already")
         order = _Order(user, job, parts, asyncio.get_running_loop().create_future())
         orders.append(order)
-        self._go_on()
+        self._start_next()
         try:
             return await order.answer
         finally:
@@ -130,7 +130,7 @@ class ConversionPool:
         if orders is not None and not orders:
             del self._waiting[order.user]
 
-    def _go_on(self) -> None:
+    def _start_next(self) -> None:
         """Begin as many jobs as possible."""
         while not self._closed and (order := self._next()) is not None:
             if self._idle:
@@ -178,7 +178,7 @@ class ConversionPool:
             else:
                 self._count -= 1
                 await self._end(worker)
-            self._go_on()
+            self._start_next()
 
     async def _do(self, worker: WorkerProcess, order: _Order) -> tuple[Result, list[memoryview]]:
         if not worker.pid:

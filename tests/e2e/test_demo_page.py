@@ -42,22 +42,22 @@ def artifact(name: str) -> Path:
 @contextlib.asynccontextmanager
 async def opened(demo: Demo, viewport: ViewportSize = DESKTOP, *, expected: str = "") -> AsyncIterator[Page]:
     """The page in a browser; what the browser complains of and is not ``expected`` fails the test."""
-    complaints: list[str] = []
+    messages: list[str] = []
     async with async_playwright() as playwright:
         browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=list(BROWSER))
         try:
             page = await browser.new_page(
                 viewport=viewport, color_scheme="light", has_touch=viewport is PHONE
             )
-            page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
-            page.on("pageerror", lambda error: complaints.append(str(error)))
+            page.on("console", lambda said: messages.append(said.text) if said.type == "error" else None)
+            page.on("pageerror", lambda error: messages.append(str(error)))
             page.set_default_timeout(WAIT_MS)
             await page.goto(demo.page)
             await page.wait_for_function("document.querySelector('#link').textContent === 'live'")
             yield page
         finally:
             await browser.close()
-    assert [text for text in complaints if not (expected and expected in text)] == []
+    assert [text for text in messages if not (expected and expected in text)] == []
 
 
 async def robots_placed(page: Page, count: int) -> None:

@@ -86,7 +86,7 @@ class RobotOptions(TypedDict, total=False):
     login_timeout: float
     user_memory: int
     memory: int
-    strangers_per_address: int
+    unauthenticated_per_address: int
     conversion: ConversionSettings
 
 

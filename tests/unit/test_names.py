@@ -115,13 +115,21 @@ BANS = (
         "sanitize_*",
     ),
     Ban("neighbourhood", "the table of peers", "PeerTable"),
-    Ban(
-        "patience",
-        "how long to wait",
-        "timeout; LivenessSettings for the rules of a peer table",
-        # ActionClient's keyword, which nodes of users pass, and what it is made of.
-        (*TREES, "!rce/ros/actions", "!tests/unit/ros_actions", "!tests/integration/ros_actions"),
-    ),
+    Ban("patience", "how long to wait", "timeout; LivenessSettings for the rules of a peer table"),
+    Ban("complaint complaints", "a text about a fault, or a limit on its log lines", "failure, LogThrottle"),
+    Ban("stranger strangers", "a peer that has not authenticated", "unauthenticated", ENGINE),
+    Ban("everybody somebody anybody", "who may do it", "any_role, none", ENGINE),
+    Ban("anew", "once more", "again, restart; note_time_jump for a clock that jumped", ENGINE),
+    Ban("errand errands", "work beside the main task", "background", ENGINE),
+    Ban("=hurry", "to end at once", "kill_now", ("rce_container",)),
+    Ban("=go_on", "to continue after a pause", "continue_work, resume_sending", ENGINE),
+    Ban("=make_up", "to bring the actual state to the desired one", "reconcile", ENGINE),
+    Ban("=let_in", "to accept a connection", "admit", ENGINE),
+    Ban("=hear", "to take a message", "handle_message, receive", ENGINE),
+    Ban("=last_words", "the last output of a process", "last_output", PACKAGES),
+    Ban("=look_at", "to check something", "check, update", ENGINE),
+    Ban("=bend_back", "a link of an endpoint with itself", "loop_back", ENGINE),
+    Ban("=for_ever", "a loop without an end", "the work that it does", PACKAGES),
     Ban("=Play =Stage =Setting", "the demo and its config", "DemoConfig, RunningDemo, Mode", ("rce_fleet",)),
     Ban("roam roamer roaming", "goals at random", "RandomGoals", ("rce_fleet", "tests/unit/demo")),
     Ban("=FleetBooks books", "the planner's state", "FleetState", ("rce_fleet",)),
@@ -131,6 +139,7 @@ BANS = (
     Ban("bundle bundles", "nodes and message types of a user", "package", (*TREES, "!tests")),
 )
 KEPT = {
+    ("rce/config/task_set_settings.py", "strangers"): "a key of settings files",
     ("rce/config/task_set_settings.py", "bundle_space"): "a key of settings files",
     ("rce_container/settings.py", "bundle_space"): "a key of settings files",
     ("rce_container/settings.py", "BUNDLE_SPACE"): "the default of a key of settings files",
@@ -227,6 +236,8 @@ def test_every_kept_name_is_still_defined() -> None:
         ("rce_fleet/demo/a.py", "def roam(): ...", "use: RandomGoals"),
         ("rce_fleet/station/door.py", "", "door.py:1: module 'door'"),
         ("rce_master/a.py", "def bundle_of(x): ...", "use: package"),
+        ("rce/ros/actions/a.py", "patience = 10.0", "use: timeout"),
+        ("rce/link/a.py", "self._max_strangers = 1", "use: unauthenticated"),
     ],
 )
 def test_planted_name_is_reported(path: str, text: str, expected: str) -> None:
@@ -242,7 +253,6 @@ def test_planted_name_is_reported(path: str, text: str, expected: str) -> None:
         ("rce_fleet/a.py", "class Operator: ..."),
         ("rce_container/a.py", "operator = 1\nrocket = 2\nbearing = 3\nunited = 4"),
         ("rce_container/a.py", "seats_left = 'nursery'  # the nursery"),
-        ("rce/ros/actions/client.py", "patience = 10.0"),
         ("tests/unit/master/a.py", "class Door: ..."),
     ],
 )

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-PATIENCE = 10.0
+SILENCE_TIMEOUT = 10.0
 """Seconds without a status of the server, which should send five a second, after which its goals are lost."""
 
 TICK = 0.25
@@ -49,7 +49,7 @@ class ActionClient:
         name: str,
         kind: str,
         *,
-        patience: float = PATIENCE,
+        silence_timeout: float = SILENCE_TIMEOUT,
     ) -> None:
         """Prepare a client.
 
@@ -57,13 +57,14 @@ class ActionClient:
             node: The node that it is part of; it must be running while the client is.
             name: The action's name: the namespace of its topics.
             kind: Its type, such as ``actionlib_tutorials/FibonacciAction``; ``Action`` may be left out.
-            patience: Seconds of silence of the server after which its goals are lost; ``math.inf``: never.
+            silence_timeout: Seconds without a message of the server after which its goals are lost;
+                ``math.inf``: never.
                 Time does not count while simulated time stands still.
         """
         self.name = node.resolve(name)
         self._node = node
         self._types = topics.ActionTypes.named(kind)
-        self._patience = patience
+        self._silence_timeout = silence_timeout
         self._goals: dict[str, ClientGoal] = {}
         self._payloads: dict[str, bytes] = {}
         self._heard_at = 0.0
@@ -217,7 +218,7 @@ class ActionClient:
                 self._lose_all("the node stops")
             now = self._clock.now()
             for goal in self.goals:
-                self._update(goal, goal.tracker.check(now, self._heard_at, self._patience))
+                self._update(goal, goal.tracker.check(now, self._heard_at, self._silence_timeout))
                 if goal.tracker.must_repeat(now):
                     self._repeat(goal)
             if not self._goals:

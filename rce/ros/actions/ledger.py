@@ -124,7 +124,7 @@ class GoalLedger:
         self._cancelled_up_to = max(self._cancelled_up_to, request.stamp)
         return asked
 
-    def begin_anew(self) -> None:
+    def note_time_jump(self) -> None:
         """Take note that time jumped back: cancellations of all goals up to a time are void."""
         self._cancelled_up_to = 0
 

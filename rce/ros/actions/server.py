@@ -171,7 +171,7 @@ class ActionServer:
         now = self._node.now()
         nanoseconds = now.to_nsec()
         if nanoseconds < self._latest:
-            self._ledger.begin_anew()
+            self._ledger.note_time_jump()
         self._latest = nanoseconds
         return now
 

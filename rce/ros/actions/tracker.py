@@ -92,19 +92,19 @@ class GoalTracker:
         self.sent_at = now
         return self._pass((CommState.WAITING_FOR_CANCEL_ACK,), now)
 
-    def check(self, now: float, heard_at: float, patience: float) -> tuple[CommState, ...]:
+    def check(self, now: float, heard_at: float, silence_timeout: float) -> tuple[CommState, ...]:
         """Lose the goal if its server is silent, or if the result does not come.
 
         Args:
             now: The time.
             heard_at: When the server was heard last.
-            patience: Seconds to wait.
+            silence_timeout: Seconds to wait.
         """
         if self.is_done:
             return ()
-        if now - max(heard_at, self.since) > patience:
+        if now - max(heard_at, self.since) > silence_timeout:
             return self._lose(_SILENT, now)
-        if self.comm is CommState.WAITING_FOR_RESULT and now - self.since > patience:
+        if self.comm is CommState.WAITING_FOR_RESULT and now - self.since > silence_timeout:
             return self._lose(_NO_RESULT, now)
         return ()
 

@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 JUMP = 1.0
 """Seconds that time must jump back for the buffer to forget: a simulation or a bag began anew."""
 
-MAX_COMPLAINTS = 100
+MAX_WARNINGS = 100
 """For how many different frames warnings are logged."""
 
 _A_LONG_TIME = 3600.0
@@ -65,7 +65,7 @@ class TransformListener:
         self._changed = asyncio.Event()
         self._stopped = False
         self._latest = 0.0
-        self._complaints: set[str] = set()
+        self._warned_of: set[str] = set()
 
     # Life
 
@@ -185,6 +185,6 @@ class TransformListener:
         return self.buffer
 
     def _complain(self, child: str, error: BadTransformError) -> None:
-        if child not in self._complaints and len(self._complaints) < MAX_COMPLAINTS:
-            self._complaints.add(child)
+        if child not in self._warned_of and len(self._warned_of) < MAX_WARNINGS:
+            self._warned_of.add(child)
             _log.warning("ignored: %s", error)

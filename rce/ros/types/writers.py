@@ -47,7 +47,7 @@ class WriteDialect(Protocol):
 class WriterBuilder:
     """Generates the writer of one message type.
 
-    The writer takes the message and a list, in which the dialect may note its findings.
+    The writer takes the message and a list, in which the dialect may note what it has to report.
     """
 
     def __init__(self, dialect: WriteDialect, writer_of: Callable[[MessageType], Any]) -> None:

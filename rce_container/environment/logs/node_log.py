@@ -73,7 +73,7 @@ class NodeLog:
         self._writer.write(streams.fragments(streams.ENGINE, f"-- {text} --\n".encode(errors="replace")))
 
     @property
-    def last_words(self) -> str:
+    def last_output(self) -> str:
         """Return the newest life's last line of standard error; of standard output if that is empty."""
         return str(self._words[streams.STDERR]) or str(self._words[streams.STDOUT])
 

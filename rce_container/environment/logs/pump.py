@@ -46,9 +46,9 @@ class Pump:
             self._window_bytes = 0
         elif self._window_bytes > _RATE_BYTES:
             self._loop.remove_reader(self._pipe)
-            self._resume = self._loop.call_at(self._window_end, self._go_on)
+            self._resume = self._loop.call_at(self._window_end, self._read_on)
 
-    def _go_on(self) -> None:
+    def _read_on(self) -> None:
         self._resume = None
         self._loop.add_reader(self._pipe, self._read)
 

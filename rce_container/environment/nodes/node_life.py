@@ -102,7 +102,7 @@ class NodeLife:
             finally:
                 child.signal_group(signal.SIGKILL)
                 await kill_marked(launch.env[NODE_MARK], variable=NODE_MARK)
-        if code and not self._halted.done() and (words := self._log.last_words):
+        if code and not self._halted.done() and (words := self._log.last_output):
             reason += f"; its last output: {words}"
         return Ended(self._spec.tag, self.life, code, reason)
 

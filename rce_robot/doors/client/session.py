@@ -210,7 +210,7 @@ class Session:
         """Handle a large message again when its binary values have arrived."""
         for event in self._stream.await_binaries(large, ids, self._now()):
             self._handle(event)
-        self._look_at_pending()
+        self._check_pending()
 
     def send_urgent(self, message: Queued) -> bool:
         """Send in the control lane; False if that is full or the connection ended."""
@@ -280,7 +280,7 @@ class Session:
     def _handle_events(self, events: Sequence[Event], size: int) -> None:
         for event in events:
             self._handle(event, size)
-        self._look_at_pending()
+        self._check_pending()
 
     def _refuse_text(self) -> None:
         self._socket.fail(CloseCode.INVALID_DATA, "a text frame is not UTF-8")
@@ -289,7 +289,7 @@ class Session:
         """Handle a binary frame."""
         for event in self._stream.feed_binary(data, self._now()):
             self._handle(event)
-        self._look_at_pending()
+        self._check_pending()
 
     def on_part(self) -> None:
         """Count a large message that is still being received."""
@@ -321,7 +321,7 @@ class Session:
             self.ended.set()
             self._owner.left(self, self._reason)
 
-    def _look_at_pending(self) -> None:
+    def _check_pending(self) -> None:
         pending = self._stream.pending_bytes
         if pending > self._pending_bytes:
             self._owner.grew()

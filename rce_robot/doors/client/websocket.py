@@ -142,7 +142,7 @@ class RobotSocket(GuardedConnection):
         self._share = share
         self._user = user
 
-    def go_on(self) -> bool:
+    def continue_work(self) -> bool:
         """Handle a few received frames, or a part of a large one; return whether there is more."""
         if self._work:
             self._work_on()

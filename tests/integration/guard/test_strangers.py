@@ -65,7 +65,7 @@ async def ended(sock: socket.socket) -> bool:
 
 @pytest.mark.parametrize("first", [b"", b"GET /?userID=testUser HTTP/1.1\r\nHost: h\r\n"])
 async def test_robots_come_in(first: bytes) -> None:
-    async with running_cloud(strangers_per_address=FEW) as cloud:
+    async with running_cloud(unauthenticated_per_address=FEW) as cloud:
         port = int(cloud.ws_url.rstrip("/").rpartition(":")[2])
         async with held_open(port, first) as crowd:
             url = f"{cloud.ws_url}?userID=testUser&robotID=r&password={DIGEST}"
@@ -76,7 +76,7 @@ async def test_robots_come_in(first: bytes) -> None:
 
 
 async def test_robots_that_are_known_are_not_counted() -> None:
-    async with running_cloud(strangers_per_address=2) as cloud, AsyncExitStack() as stack:
+    async with running_cloud(unauthenticated_per_address=2) as cloud, AsyncExitStack() as stack:
         robots = [
             await stack.enter_async_context(
                 connect(f"{cloud.ws_url}?userID=testUser&robotID=r{n}&password={DIGEST}", proxy=None)
@@ -158,7 +158,7 @@ async def test_http_streams_go_on() -> None:
 
 
 async def test_task_sets_come_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rce.control.server.STRANGERS_PER_ADDRESS", FEW)
+    monkeypatch.setattr("rce.control.server.UNAUTHENTICATED_PER_ADDRESS", FEW)
 
     async def nothing(*_: object) -> None:
         pass
@@ -177,7 +177,7 @@ async def test_task_sets_come_in(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("first", [b"", encode_hello("unheard of", "t")])
 @pytest.mark.parametrize("way", ["hub", "link acceptor"])
 async def test_links_are_answered(way: str, first: bytes) -> None:
-    limits = LinkLimits(strangers_per_address=FEW)
+    limits = LinkLimits(unauthenticated_per_address=FEW)
     async with AsyncExitStack() as stack:
         hub = LinkHub("here", QUICK, limits)
         stack.push_async_callback(hub.close)

@@ -17,7 +17,7 @@ from support.multimaster import STRING, DiscoveryNetwork, node
 from rce.ros.core import Core, Graph
 from rce.ros.errors import ServiceFaultError
 from rce.ros.multimaster.filters import SyncLists
-from rce.ros.multimaster.relay.link import STRANGERS_PER_ADDRESS
+from rce.ros.multimaster.relay.link import UNAUTHENTICATED_PER_ADDRESS
 from rce.ros.multimaster.relay.throttle import MessageThrottle
 from rce.ros.multimaster.relay.topic import TopicRelay
 from rce.ros.multimaster.sync import MasterSync, SyncSettings
@@ -328,9 +328,9 @@ async def test_strangers_are_bounded_in_number() -> None:
                 await asyncio.sleep(0.02)
         connections = [await asyncio.open_connection("127.0.0.1", one.relay_port) for _ in range(60)]
         async with asyncio.timeout(20):
-            while one._links._lobby.turned_away < 60 - STRANGERS_PER_ADDRESS:
+            while one._links._lobby.turned_away < 60 - UNAUTHENTICATED_PER_ADDRESS:
                 await asyncio.sleep(0.02)
-        assert len(one._links._lobby) <= STRANGERS_PER_ADDRESS
+        assert len(one._links._lobby) <= UNAUTHENTICATED_PER_ADDRESS
         assert one._links.connected == {"robot"}, "who is known continues"
         for _, writer in connections:
             writer.close()

@@ -60,7 +60,7 @@ async def pair(
         make_node("server") as a,
         make_node("client") as b,
         server(a, "job", FIBONACCI, handler, **options) as provider,
-        ActionClient(b, "job", FIBONACCI, patience=20) as client,
+        ActionClient(b, "job", FIBONACCI, silence_timeout=20) as client,
     ):
         async with asyncio.timeout(30):
             yield provider, client
@@ -263,7 +263,7 @@ async def test_a_silent_server_loses_the_goal(make_node: MakeNode) -> None:
         make_node("server") as a,
         make_node("client") as b,
         ActionServer(a, "job", FIBONACCI, until_cancelled),
-        ActionClient(b, "job", FIBONACCI, patience=0.01) as client,
+        ActionClient(b, "job", FIBONACCI, silence_timeout=0.01) as client,
     ):
         goal = await client.send(order=1)
         with pytest.raises(GoalFailedError, match="the server is silent"):

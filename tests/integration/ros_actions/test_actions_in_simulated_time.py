@@ -77,7 +77,7 @@ async def test_a_server_is_not_missed_while_time_stands_still(core: Core, make_n
     async with (
         simulation(core, make_node) as (world, a, b),
         ActionServer(a, "job", FIBONACCI, handler),
-        ActionClient(b, "job", FIBONACCI, patience=0.3) as client,
+        ActionClient(b, "job", FIBONACCI, silence_timeout=0.3) as client,
         asyncio.timeout(30),
     ):
         goal = await client.send(order=1)
@@ -111,7 +111,7 @@ async def test_goals_after_a_jump_back_are_new_ones(core: Core, make_node: MakeN
         assert list((await again.result()).sequence) == [2]
 
 
-def test_patience_counts_what_passed_for_both() -> None:
+def test_silence_counts_what_passed_for_both() -> None:
     machine, graph = 10.0, 1000.0
     clock = SilenceClock(lambda: machine, lambda: graph)
     seen = [clock.now()]

@@ -209,7 +209,7 @@ async def test_our_client_at_a_simple_server(node: Node, peer: Peer) -> None:
     async with (
         peer("servers"),
         node,
-        ActionClient(node, "simple", TEST, patience=30) as client,
+        ActionClient(node, "simple", TEST, silence_timeout=30) as client,
         asyncio.timeout(200),
     ):
         await until_results_come(client)
@@ -238,7 +238,7 @@ async def test_our_client_at_a_full_server(node: Node, peer: Peer) -> None:
     async with (
         peer("servers") as process,
         node,
-        ActionClient(node, "full", TEST, patience=30) as client,
+        ActionClient(node, "full", TEST, silence_timeout=30) as client,
         asyncio.timeout(200),
     ):
         await until_results_come(client)

@@ -94,10 +94,10 @@ def test_a_line_is_seen_before_it_ends(tmp_path: Path, log: NodeLog) -> None:
 def test_last_words_are_of_the_errors_first_and_of_one_life(log: NodeLog) -> None:
     log.stderr(b"Traceback\nValueError: bad\n\n")
     log.stdout(b"bye\n")
-    assert log.last_words == "ValueError: bad"
+    assert log.last_output == "ValueError: bad"
     log.begin()
     log.stdout(b"bye\n")
-    assert log.last_words == "bye"
+    assert log.last_output == "bye"
 
 
 @given(

@@ -27,7 +27,7 @@ class Load:
         self._clock = clock
         self._note = note
 
-    def go_on(self) -> bool:
+    def continue_work(self) -> bool:
         self._clock.now += 0.001
         self._note()
         self.left -= 1

@@ -170,7 +170,7 @@ class Wire:
         assert frame.type is FrameType.GRANT
         self.grants.append(int.from_bytes(frame.payload))
 
-    def go_on(self) -> None:
+    def resume_sending(self) -> None:
         self.goes += 1
 
     def pause_reading(self) -> None:

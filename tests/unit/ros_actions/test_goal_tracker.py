@@ -68,17 +68,17 @@ def test_goal_with_result_under_way_may_be_unlisted() -> None:
     goal = tracker()
     goal.listed(GoalState.SUCCEEDED, "", 1)
     assert goal.not_listed(2) == ()
-    assert goal.check(10, heard_at=10, patience=10) == ()
-    assert goal.check(12, heard_at=12, patience=10) == (CommState.DONE,)
+    assert goal.check(10, heard_at=10, silence_timeout=10) == ()
+    assert goal.check(12, heard_at=12, silence_timeout=10) == (CommState.DONE,)
     assert goal.state is GoalState.LOST
 
 
 def test_a_silent_server_loses_the_goal() -> None:
     goal = tracker()
     goal.listed(GoalState.ACTIVE, "", 1)
-    assert goal.check(100, heard_at=95, patience=10) == ()
-    assert goal.check(100, heard_at=1, patience=math.inf) == ()
-    assert goal.check(100, heard_at=89, patience=10) == (CommState.DONE,)
+    assert goal.check(100, heard_at=95, silence_timeout=10) == ()
+    assert goal.check(100, heard_at=1, silence_timeout=math.inf) == ()
+    assert goal.check(100, heard_at=89, silence_timeout=10) == (CommState.DONE,)
     assert goal.text == "the server is silent"
 
 

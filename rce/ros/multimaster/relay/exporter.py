@@ -114,8 +114,8 @@ class Exporter:
     async def _look(self) -> None:
         snapshot = await self._source.read()
         foreign = {self._node.name, *self._foreign()}
-        await self._look_at_topics(snapshot, foreign)
-        await self._look_at_services(snapshot, foreign)
+        await self._update_topics(snapshot, foreign)
+        await self._update_services(snapshot, foreign)
         offer = Offer(
             {key: (self._offered_name(name), kind) for name, (key, kind) in self._topics.items()},
             {key: (self._offered_name(name), kind) for name, (key, kind) in self._services.items()},
@@ -124,7 +124,7 @@ class Exporter:
             self._offered = offer
             self._send(offer)
 
-    async def _look_at_topics(self, snapshot: Snapshot, foreign: set[str]) -> None:
+    async def _update_topics(self, snapshot: Snapshot, foreign: set[str]) -> None:
         found: dict[str, list[str]] = {}
         for topic, nodes in snapshot.publishers.items():
             name, kind = self._rename(topic), snapshot.topic_types.get(topic, "")
@@ -147,7 +147,7 @@ class Exporter:
                 continue
             self._topics[topic] = (self._number(topic), learned)
 
-    async def _look_at_services(self, snapshot: Snapshot, foreign: set[str]) -> None:
+    async def _update_services(self, snapshot: Snapshot, foreign: set[str]) -> None:
         found: dict[str, str] = {}
         for service, nodes in snapshot.services.items():
             name, address = self._rename(service), snapshot.service_uris.get(service)

@@ -1,6 +1,6 @@
 """The handshake in which both sides of a relay prove that they have the same token. Sans-I/O.
 
-The token itself is never sent. The dialing side proves first, so that a stranger who connects learns only a
+The token itself is never sent. The dialing side proves first, so that an unauthenticated peer learns only a
 random number::
 
     dialing side                                  listening side

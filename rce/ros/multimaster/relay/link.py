@@ -11,7 +11,7 @@ from rce.aio.backoff import Backoff
 from rce.aio.tasks import TaskScope
 from rce.dialing import open_socket
 from rce.guard.lobby import Lobby
-from rce.guard.rates import Complaints
+from rce.guard.rates import LogThrottle
 from rce.ros.multimaster.errors import LinkBrokenError, MultimasterError
 from rce.ros.multimaster.relay.connection import RelayConnection
 from rce.ros.multimaster.relay.exporter import Exporter
@@ -28,10 +28,10 @@ CONNECT_TIMEOUT = 10.0
 RETRY = Backoff(first=0.2, longest=5.0, jitter=0.5)
 WORKED_AFTER = 5.0
 """After a link that lasted for so many seconds, the next pause is short again."""
-MAX_NEW = STRANGERS = 64
+MAX_NEW = UNAUTHENTICATED = 64
 """How many links may wait to be taken, or have not shown yet that they have the token."""
 
-STRANGERS_PER_ADDRESS = 16
+UNAUTHENTICATED_PER_ADDRESS = 16
 """The same from one address."""
 
 
@@ -75,8 +75,8 @@ class RelayLinks:
         self._make_ends = make_ends
         self._running: set[RelayConnection] = set()
         self._guests: asyncio.Queue[RelayConnection] = asyncio.Queue(MAX_NEW)
-        self._lobby = Lobby("relay links", per_address=STRANGERS_PER_ADDRESS, in_all=STRANGERS)
-        self._complaints = Complaints()
+        self._lobby = Lobby("relay links", per_address=UNAUTHENTICATED_PER_ADDRESS, in_all=UNAUTHENTICATED)
+        self._throttle = LogThrottle()
         self._dialing: set[str] = set()
         """Nonces of the attempts to dial that are not over."""
 
@@ -129,7 +129,7 @@ class RelayLinks:
         try:
             await self._serve(link, self._greet_as_listener)
         except LinkBrokenError as error:
-            if self._complaints.is_due(link.address, asyncio.get_running_loop().time()):
+            if self._throttle.is_due(link.address, asyncio.get_running_loop().time()):
                 _log.warning("relay link from %s: %s", link.address, error)
 
     async def _serve(self, link: RelayConnection, greet: Callable[[RelayConnection], Awaitable[str]]) -> None:
