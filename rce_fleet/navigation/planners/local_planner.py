@@ -202,22 +202,23 @@ class LocalPlanner:
         return off if self._turning else None
 
     def _turn(self, pose: Pose, now: Twist, off: float, near: Floats, dt: float) -> ControlStep:
-        """Turn on the spot; a footprint that is not round must have room."""
+        """Turn on the spot; a footprint that is not round must have room, or turn the other way round."""
         limits = self.parameters
+        poses = _turned(pose, off)
+        if not self.footprint.is_round and not self._has_room(pose, poses, near):
+            off -= copysign(2 * pi, off)
+            poses = _turned(pose, off)
+            if not self._has_room(pose, poses, near):
+                return self._towards(now, Twist(), dt, Following.BLOCKED, poses[:1])
         rate = sqrt(2 * _BRAKING_SHARE * limits.acc_lim_theta * abs(off))
         rate = min(max(rate, limits.min_vel_theta), limits.max_vel_theta, abs(off) / dt)
-        count = max(2, ceil(abs(off) / (pi / 36)))
-        yaws = pose.yaw + off * np.arange(1, count + 1) / count
-        poses = np.stack((np.full(count, pose.x), np.full(count, pose.y), yaws), axis=1)
-        if not self.footprint.is_round:
-            here = float(self.footprint.clearance(np.array(((pose.x, pose.y, pose.yaw),)), near)[0])
-            clear = self.footprint.clearance(poses, near)[None, :]
-            if free_steps(clear, 0.0, here)[0] < min(
-                count, 2 + ceil(now.turn_rate**2 / limits.acc_lim_theta * 6)
-            ):
-                return self._towards(now, Twist(), dt, Following.BLOCKED, poses[:1])
         wanted = Twist(0.0, copysign(rate, off) if abs(now.speed) < limits.trans_stopped_vel else 0.0)
         return self._towards(now, wanted, dt, Following.DRIVING, poses)
+
+    def _has_room(self, pose: Pose, poses: Floats, near: Floats) -> bool:
+        here = float(self.footprint.clearance(pose.as_array()[None, :], near)[0])
+        clear = self.footprint.clearance(poses, near)[None, :]
+        return bool(free_steps(clear, self.parameters.clearance, here)[0] == len(poses))
 
     def _drive(self, pose: Pose, now: Twist, near: Floats, dt: float) -> ControlStep:
         """Choose the best of the trajectories that keep clear of obstacles."""
@@ -296,6 +297,13 @@ def _window(now: Twist, highest: float, limits: LocalPlannerParameters, dt: floa
     )
     turns = np.append(turns, 0.0)
     return np.repeat(speeds, len(turns)), np.tile(turns, len(speeds))
+
+
+def _turned(pose: Pose, off: float) -> Floats:
+    """Return the poses of a turn on the spot, 5 degrees apart, shape (T, 3)."""
+    count = max(2, ceil(abs(off) / (pi / 36)))
+    yaws = pose.yaw + off * np.arange(1, count + 1) / count
+    return np.stack((np.full(count, pose.x), np.full(count, pose.y), yaws), axis=1)
 
 
 def _approach(value: float, wanted: float, step: float) -> float:
