@@ -44,6 +44,9 @@ class Robot:
         self.plan: Plan | None = None
         self.plans = 0
 
+    def state(self) -> State:
+        return self.core.state
+
     def step(self) -> Decision:
         situation = Situation(self.now, 0.1, self.pose, self.twist, self.obstacles, problem=self.problem)
         decision = self.core.step(situation, self.costs)
@@ -73,10 +76,10 @@ def test_a_goal_is_planned_driven_and_reached() -> None:
     robot = Robot(MoveBaseParameters())
     assert robot.run(1.0) == Decision()
     robot.core.start(robot.now)
-    assert robot.core.state is State.PLANNING
+    assert robot.state() is State.PLANNING
     decision = robot.run(30.0)
     assert decision.ending is Ending.SUCCEEDED
-    assert robot.core.state is State.IDLE
+    assert robot.state() is State.IDLE
     assert np.hypot(robot.pose.x - GOAL.x, robot.pose.y - GOAL.y) <= LIMITS.xy_goal_tolerance
     assert robot.plans == 1
 
@@ -106,7 +109,7 @@ def test_cancelling_stops_with_the_next_command() -> None:
     robot.run(2.0)
     assert robot.twist.speed > 0
     robot.core.cancel()
-    assert robot.core.state is State.IDLE
+    assert robot.state() is State.IDLE
     assert robot.step().twist == Twist()
     robot.core.cancel()  # without a goal: nothing
 
@@ -116,7 +119,7 @@ def test_a_new_goal_replaces_the_present_one() -> None:
     robot.core.start(robot.now)
     robot.run(2.0)
     robot.core.start(robot.now)
-    assert robot.core.state is State.PLANNING
+    assert robot.state() is State.PLANNING
     assert robot.run(30.0).ending is Ending.SUCCEEDED
     assert robot.plans == 2
 
@@ -124,7 +127,7 @@ def test_a_new_goal_replaces_the_present_one() -> None:
 def test_a_plan_that_comes_too_late_is_ignored() -> None:
     robot = Robot(MoveBaseParameters())
     robot.core.take_plan(make_plan(robot.costs, HERE, GOAL), 1.0)
-    assert robot.core.state is State.IDLE
+    assert robot.state() is State.IDLE
 
 
 def test_a_problem_stops_the_robot_until_it_is_gone() -> None:
