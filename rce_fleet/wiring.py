@@ -106,7 +106,7 @@ def _bridges(container: str, namespace: str) -> Iterator[dict[str, Any]]:
     }
     yield _topic(f"/{namespace}/goalNodesList", _CELLS, planner, container)
     yield _topic(f"/{namespace}/cancelGoal", "std_msgs/Bool", planner, container)
-    yield _topic("/map", "nav_msgs/OccupancyGrid", planner, container)
+    yield _topic("/fleet/map", "nav_msgs/OccupancyGrid", planner, container)
     yield _topic(f"/{namespace}/moveClient/status", "fleet/MoveStatus", container, planner)
 
 

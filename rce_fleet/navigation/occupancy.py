@@ -27,6 +27,7 @@ class Occupancy:
         width: Pixels along x.
         height: Pixels along y.
         origin: Outer corner of pixel (0, 0), ``(x, y)`` in metres.
+        yaw: Direction of the rows of pixels, radians counter-clockwise from x.
         data: shape (height * width,), int8, row by row: 0 free, 100 occupied.
     """
 
@@ -35,6 +36,7 @@ class Occupancy:
     height: int
     origin: tuple[float, float]
     data: NDArray[np.int8]
+    yaw: float = 0.0
 
 
 def occupancy(grid: GridMap, blocked: Iterable[int] = (), *, pixels_per_cell: int = 1) -> Occupancy:
@@ -54,4 +56,5 @@ def occupancy(grid: GridMap, blocked: Iterable[int] = (), *, pixels_per_cell: in
         height=picture.shape[0],
         origin=grid.origin,
         data=picture.reshape(-1),
+        yaw=grid.yaw,
     )

@@ -42,7 +42,7 @@ from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.geometry.angles import yaw_of
-from rce_fleet.navigation.occupancy import occupancy
+from rce_fleet.nodes.grid_messages import GRID_TOPIC, OLD_TOPIC, grid_fields, wants_old_topic
 from rce_fleet.nodes.grid_parameters import make_grid
 from rce_fleet.nodes.plan_worker import PlanWorker
 from rce_fleet.nodes.state_publisher import StatePublisher
@@ -58,7 +58,8 @@ LOOK_AROUND = 0.5
 """Seconds between two searches for new robots."""
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 ROBOT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/amcl_pose")
-MAP_FRAME = "map"
+OLD_TOPIC_LOOKS = 3
+"""So many looks in a row must find only robot files from before on the old topic of the grid."""
 
 
 class PlannerNode:
@@ -80,6 +81,9 @@ class PlannerNode:
         self._state = StatePublisher(node, planner)
         self._blocked: Publisher
         self._map: Publisher
+        self._old_map: Publisher | None = None
+        self._shown_blocked: tuple[int, ...] = ()
+        self._looks_for_old = 0
 
     async def run(self, blocked: list[int]) -> None:
         """Run until the node is stopped.
@@ -89,7 +93,7 @@ class PlannerNode:
         """
         node = self._node
         self._blocked = await node.advertise("/fleet/blockedCells", "std_msgs/Int32MultiArray", latch=True)
-        self._map = await node.advertise("/map", "nav_msgs/OccupancyGrid", latch=True)
+        self._map = await node.advertise(GRID_TOPIC, "nav_msgs/OccupancyGrid", latch=True)
         self._publish_blocked(())
         for cell in blocked:
             self._handle(CellBlocked(cell))
@@ -115,10 +119,26 @@ class PlannerNode:
                         found = ROBOT_TOPIC.fullmatch(topic)
                         if found is not None and found[1] not in self._cells:
                             await self._join(found[1])
+                    await self._serve_old_topic(await master.call("getSystemState"))
                 except MasterError as error:
                     self._node.log.warning("cannot search for robots: %s", error)
                 if not await self._node.sleep(LOOK_AROUND):
                     return
+
+    async def _serve_old_topic(self, state: list[Any]) -> None:
+        """Publish the grid on the topic that robot files from before connect, while it has no other use."""
+        publishers, subscribers = (dict(topics) for topics in state[:2])
+        wanted = wants_old_topic(publishers, subscribers, self._node.name)
+        self._looks_for_old = self._looks_for_old + 1 if wanted else 0
+        if self._old_map is None and self._looks_for_old >= OLD_TOPIC_LOOKS:
+            self._node.log.warning(
+                "a robot file connects %s; the grid is now %s: change the file", OLD_TOPIC, GRID_TOPIC
+            )
+            self._old_map = await self._node.advertise(OLD_TOPIC, "nav_msgs/OccupancyGrid", latch=True)
+            self._publish_blocked(self._shown_blocked)
+        elif self._old_map is not None and set(publishers.get(OLD_TOPIC, ())) - {self._node.name}:
+            old, self._old_map = self._old_map, None
+            await old.close()
 
     async def _join(self, robot: str) -> None:
         node = self._node
@@ -228,20 +248,11 @@ class PlannerNode:
 
     def _publish_blocked(self, cells: tuple[int, ...]) -> None:
         self._blocked.publish(data=list(cells))
-        picture = occupancy(self._planner.state.grid, cells)
-        x, y = picture.origin
-        stamp = Time.now()
-        self._map.publish(
-            header={"stamp": stamp, "frame_id": MAP_FRAME},
-            info={
-                "map_load_time": stamp,
-                "resolution": picture.resolution,
-                "width": picture.width,
-                "height": picture.height,
-                "origin": {"position": {"x": x, "y": y}, "orientation": {"w": 1.0}},
-            },
-            data=picture.data.tolist(),
-        )
+        fields = grid_fields(self._planner.state.grid, cells, Time.now())
+        for grids in (self._map, self._old_map):
+            if grids is not None:
+                grids.publish(fields)
+        self._shown_blocked = cells
 
 
 def _pose(robot: str, message: Message) -> PoseSeen:

@@ -9,8 +9,11 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, assert_never
 
+from rce.ros.errors import MasterError
 from rce.ros.node import Node, run
+from rce.ros.node.master import MasterClient
 from rce.ros.types import Time
+from rce.ros.xmlrpc import RpcClient
 from rce_fleet.coordination.answers import Answer, answer_array, is_answer, revision_of
 from rce_fleet.coordination.move_client import (
     ClientReport,
@@ -21,6 +24,7 @@ from rce_fleet.coordination.move_client import (
     SendStop,
 )
 from rce_fleet.geometry.angles import quaternion_z
+from rce_fleet.nodes.grid_messages import GRID_TOPIC, LEAST_CELL, MAP_FRAME, OLD_TOPIC, read_grid
 from rce_fleet.nodes.grid_parameters import make_grid
 from rce_fleet.planning.grid import GridMap
 
@@ -32,7 +36,8 @@ TICK = 0.25
 """Seconds between two timer events."""
 REPORT_EVERY = 0.5
 """Seconds after which the progress is published again."""
-MAP_FRAME = "map"
+OLD_MAP_AFTER = 5.0
+"""Seconds without the grid after which a move client looks for it on its old topic."""
 
 
 class MoveClientNode:
@@ -50,6 +55,7 @@ class MoveClientNode:
         self._stops: Publisher
         self._reports: Publisher
         self._answers = False
+        self._hears_old = False
 
     async def run(self) -> None:
         """Send the robot along until the node is stopped."""
@@ -58,10 +64,10 @@ class MoveClientNode:
         self._stops = await node.advertise("move_base/cancel", "actionlib_msgs/GoalID")
         values = await node.get_param("~", {})
         self._answers = bool(values.get("answers", False))
-        if "rows" in values or "map" in values:
+        if {"rows", "map", "map_yaml"} & values.keys():
             self._take_grid(make_grid(values))
         else:
-            await node.subscribe("/map", "nav_msgs/OccupancyGrid", self._take_map)
+            await node.subscribe(GRID_TOPIC, "nav_msgs/OccupancyGrid", self._take_map)
         if self._answers:
             self._reports = await node.advertise("goalNodesList", "std_msgs/Int32MultiArray")
             await node.subscribe("blockedCells", "std_msgs/Int32MultiArray", self._take_blocked)
@@ -72,8 +78,12 @@ class MoveClientNode:
         await node.subscribe("cancelGoal", "std_msgs/Bool", self._take_cancel)
         await node.subscribe("move_base/status", "actionlib_msgs/GoalStatusArray", self._take_states)
         await node.subscribe("move_base/result", "move_base_msgs/MoveBaseActionResult", self._take_result)
+        look_at = time.monotonic() + OLD_MAP_AFTER
         while await node.sleep(TICK):
             if self._client is None:
+                if not self._hears_old and time.monotonic() >= look_at:
+                    await self._look_for_old_map()
+                    look_at = time.monotonic() + OLD_MAP_AFTER
                 continue
             now = time.time()
             self._do(self._client.tick(now))
@@ -83,15 +93,31 @@ class MoveClientNode:
     # What comes in
 
     def _take_map(self, message: Message) -> None:
-        """Set size and position of the cells: one pixel of the map is one cell."""
-        info = message.info
-        grid = GridMap(
-            rows=info.height,
-            columns=info.width,
-            cell_size=info.resolution,
-            origin=(info.origin.position.x, info.origin.position.y),
-        )
-        self._take_grid(grid)
+        try:
+            self._take_grid(read_grid(message))
+        except ValueError as error:
+            self._node.log.warning("the grid on %s cannot be used: %s", GRID_TOPIC, error)
+
+    def _take_old_map(self, message: Message) -> None:
+        """Take the grid from a planner or a robot file of before, if it is one."""
+        if message.info.resolution >= LEAST_CELL:
+            self._take_map(message)
+
+    async def _look_for_old_map(self) -> None:
+        """Listen to the grid's old topic, if only that one is published here."""
+        try:
+            async with RpcClient() as rpc:
+                master = MasterClient(self._node.master_uri, self._node.name, self._node.uri, rpc)
+                topics = {topic for topic, _ in await master.call("getPublishedTopics", "")}
+        except MasterError as error:
+            self._node.log.warning("cannot look for the grid: %s", error)
+            return
+        if OLD_TOPIC in topics and GRID_TOPIC not in topics:
+            self._node.log.warning(
+                "no %s here, only %s: connect %s in the robot's file", GRID_TOPIC, OLD_TOPIC, GRID_TOPIC
+            )
+            self._hears_old = True
+            await self._node.subscribe(OLD_TOPIC, "nav_msgs/OccupancyGrid", self._take_old_map)
 
     def _take_grid(self, grid: GridMap) -> None:
         if self._client is None:

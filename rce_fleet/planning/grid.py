@@ -12,7 +12,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from math import floor
+from math import cos, floor, isfinite, sin
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ class GridMap:
         cell_size: Edge of a cell, metres.
         origin: Outer corner of cell 0, ``(x, y)`` in metres.
         blocked: Cells that cannot be entered.
+        yaw: Direction of the columns in the world, radians counter-clockwise from x.
     """
 
     rows: int = 8
@@ -36,12 +37,15 @@ class GridMap:
     cell_size: float = 1.0
     origin: tuple[float, float] = (0.0, 0.0)
     blocked: frozenset[int] = frozenset()
+    yaw: float = 0.0
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
             raise ValueError(f"a map needs at least one row and one column, not {self.rows} x {self.columns}")
         if not self.cell_size > 0:
             raise ValueError(f"cell_size must be positive, not {self.cell_size}")
+        if not isfinite(self.yaw):
+            raise ValueError(f"yaw must be a finite number, not {self.yaw}")
         outside = [cell for cell in self.blocked if cell not in self]
         if outside:
             raise ValueError(f"blocked cells {sorted(outside)} are outside the map")
@@ -74,35 +78,43 @@ class GridMap:
     def centre(self, cell: int) -> tuple[float, float]:
         """Return the centre of a cell, ``(x, y)`` in metres."""
         row, column = self.place(cell)
-        return (
-            self.origin[0] + (column + 0.5) * self.cell_size,
-            self.origin[1] + (row + 0.5) * self.cell_size,
-        )
+        along, up = (column + 0.5) * self.cell_size, (row + 0.5) * self.cell_size
+        c, s = self._turn
+        return self.origin[0] + c * along - s * up, self.origin[1] + s * along + c * up
 
     def cell_at(self, x: float, y: float) -> int | None:
         """Return the cell of a point in metres; ``None`` outside the map."""
-        column = floor((x - self.origin[0]) / self.cell_size)
-        row = floor((y - self.origin[1]) / self.cell_size)
+        along, up = self._from_corner(x, y)
+        column, row = floor(along / self.cell_size), floor(up / self.cell_size)
         if 0 <= row < self.rows and 0 <= column < self.columns:
             return self.cell(row, column)
         return None
 
     def cells_touched(self, x: float, y: float, radius: float) -> set[int]:
         """Return the cells of the map that a disc overlaps; all in metres."""
-        left = floor((x - radius - self.origin[0]) / self.cell_size)
-        right = floor((x + radius - self.origin[0]) / self.cell_size)
-        low = floor((y - radius - self.origin[1]) / self.cell_size)
-        high = floor((y + radius - self.origin[1]) / self.cell_size)
+        size = self.cell_size
+        along, up = self._from_corner(x, y)
+        left, right = floor((along - radius) / size), floor((along + radius) / size)
+        low, high = floor((up - radius) / size), floor((up + radius) / size)
         touched = set()
         for row in range(max(low, 0), min(high, self.rows - 1) + 1):
             for column in range(max(left, 0), min(right, self.columns - 1) + 1):
-                cell = self.cell(row, column)
-                cx, cy = self.centre(cell)
-                dx = max(abs(x - cx) - self.cell_size / 2, 0.0)
-                dy = max(abs(y - cy) - self.cell_size / 2, 0.0)
+                dx = max(abs(along - (column + 0.5) * size) - size / 2, 0.0)
+                dy = max(abs(up - (row + 0.5) * size) - size / 2, 0.0)
                 if dx * dx + dy * dy < radius * radius:
-                    touched.add(cell)
+                    touched.add(self.cell(row, column))
         return touched
+
+    @cached_property
+    def _turn(self) -> tuple[float, float]:
+        """Cosine and sine of the direction of the columns."""
+        return cos(self.yaw), sin(self.yaw)
+
+    def _from_corner(self, x: float, y: float) -> tuple[float, float]:
+        """Return how far a point is from the outer corner of cell 0, along columns and rows, metres."""
+        dx, dy = x - self.origin[0], y - self.origin[1]
+        c, s = self._turn
+        return c * dx + s * dy, c * dy - s * dx
 
     # Neighbours
 

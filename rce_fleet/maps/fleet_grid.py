@@ -1,0 +1,94 @@
+"""A fleet's grid of cells, laid over an occupancy map (``map.yaml``, from ``map_saver`` or ``rce map``)."""
+
+from __future__ import annotations
+
+from math import ceil, floor
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rce_fleet.exceptions import MapError
+from rce_fleet.geometry.poses import Pose, transform_points
+from rce_fleet.planning.grid import GridMap
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from rce_fleet.maps.occupancy_map import OccupancyMap
+
+MAX_CELLS = 4_000_000
+"""Maximum number of cells, so that a wrong cell size does not fill the memory."""
+BLOCKED_SHARE = 0.1
+"""A cell is blocked if a greater share of its area is occupied or unknown."""
+
+
+def fleet_grid(
+    drawn: OccupancyMap,
+    cell_size: float = 1.0,
+    *,
+    origin: Pose | None = None,
+    rows: int | None = None,
+    columns: int | None = None,
+    blocked_share: float = BLOCKED_SHARE,
+) -> GridMap:
+    """Return the grid of cells over a map.
+
+    Args:
+        drawn: The map.
+        cell_size: Edge of a cell, metres.
+        origin: Outer corner of cell 0 and direction of the columns, in the world; by default those of the
+            map.
+        rows: Number of rows; by default as many as the map needs above the origin.
+        columns: Number of columns, likewise.
+        blocked_share: A cell is blocked if more than this share of it is occupied, unknown or outside of the
+            map, 0 .. 1.
+
+    Raises:
+        MapError: The grid would have no free cell, or more than ``MAX_CELLS``; or a number is out of range.
+    """
+    if not cell_size > 0:
+        raise MapError(f"the cell size must be a positive number of metres, not {cell_size}")
+    if not 0 <= blocked_share <= 1:
+        raise MapError(f"the share that blocks a cell must be within 0 .. 1, not {blocked_share}")
+    place = drawn.origin if origin is None else origin
+    needed_rows, needed_columns = _size(drawn, place, cell_size)
+    rows = needed_rows if rows is None else rows
+    columns = needed_columns if columns is None else columns
+    if not 0 < rows * columns <= MAX_CELLS or rows < 0:
+        raise MapError(
+            f"a grid of {columns} x {rows} cells is not within 1 .. {MAX_CELLS} cells; check cell size and"
+            " origin"
+        )
+    shares = np.concatenate([_taken(drawn, place, cell_size, row, columns) for row in range(rows)])
+    blocked = np.flatnonzero(shares > blocked_share)
+    if len(blocked) == rows * columns:
+        raise MapError(
+            f"all {rows * columns} cells of {cell_size} m are blocked; check the origin, choose smaller"
+            f" cells, or let more than {blocked_share:.0%} of a cell be occupied"
+        )
+    return GridMap(rows, columns, cell_size, (place.x, place.y), frozenset(map(int, blocked)), yaw=place.yaw)
+
+
+def _size(drawn: OccupancyMap, place: Pose, cell_size: float) -> tuple[int, int]:
+    """Return rows and columns that reach the farthest corner of the map."""
+    width, height = drawn.size
+    corners = transform_points(
+        drawn.origin.as_array(), [(0.0, 0.0), (width, 0.0), (0.0, height), (width, height)]
+    )
+    far = transform_points(place.inverse().as_array(), corners).max(axis=0) / cell_size
+    columns, rows = (max(ceil(value - 1e-6), 0) for value in far)
+    return rows, columns
+
+
+def _taken(drawn: OccupancyMap, place: Pose, cell_size: float, row: int, columns: int) -> NDArray[np.float64]:
+    """Return the shares of a row's cells that are not free, shape (columns,), from evenly spaced points."""
+    points = max(floor(cell_size / drawn.resolution + 1e-6), 1)
+    inside = (np.arange(points) + 0.5) / points
+    along = (np.arange(columns)[:, None] + inside).reshape(-1) * cell_size
+    up = (row + inside) * cell_size
+    grid = np.stack(np.broadcast_arrays(along[None, :], up[:, None]), axis=-1)
+    cells = drawn.world_to_cell(transform_points(place.as_array(), grid))
+    on_map = drawn.inside(cells)
+    safe = np.where(on_map[..., None], cells, 0)
+    free = on_map & drawn.free[safe[..., 0], safe[..., 1]]
+    return np.asarray(1.0 - free.reshape(points, columns, points).mean(axis=(0, 2)), np.float64)

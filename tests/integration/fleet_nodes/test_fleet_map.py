@@ -1,0 +1,81 @@
+"""The grid of a fleet on ``/fleet/map``, and on ``/map`` for robot files from before."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+
+from rce.ros.core import Core
+from rce.ros.node import Node
+from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.nodes import move_client
+from rce_fleet.nodes.fleet_planner import PlannerNode
+from rce_fleet.nodes.grid_messages import grid_fields
+from rce_fleet.nodes.move_client import MoveClientNode
+from rce_fleet.planning.grid import GridMap
+
+PATIENCE = 60.0
+GRID = GridMap(3, 4, 0.5, (1.0, 2.0), frozenset({5}), yaw=0.5)
+TYPE = "nav_msgs/OccupancyGrid"
+
+
+@asynccontextmanager
+async def planning(uri: str) -> AsyncIterator[Node]:
+    async with Node("fleet_planner", argv=[], master_uri=uri) as node:
+        task = asyncio.create_task(PlannerNode(node, FleetPlanner(GRID)).run([2]))
+        yield node
+        node.shutdown("the test is over")
+        await task
+
+
+async def test_the_planner_publishes_its_grid() -> None:
+    async with Core() as core, planning(core.uri), Node("judge", argv=[], master_uri=core.uri) as judge:
+        grids = await judge.subscribe("/fleet/map", TYPE)
+        async with asyncio.timeout(PATIENCE):
+            async for message in grids:
+                if message.data[2]:
+                    break
+        info = message.info
+        assert (info.height, info.width, info.resolution) == (3, 4, 0.5)
+        assert (info.origin.position.x, info.origin.position.y) == (1.0, 2.0)
+        assert info.origin.orientation.z == pytest.approx(0.2474, abs=1e-4)
+        assert [cell for cell, value in enumerate(message.data) if value] == [2, 5]
+
+
+async def test_an_old_robot_file_gets_the_grid_on_map() -> None:
+    async with Core() as core, planning(core.uri):
+        async with Node("rce_environment", argv=[], master_uri=core.uri) as environment:
+            grids = await environment.subscribe("/map", TYPE)
+            async with asyncio.timeout(PATIENCE):
+                message = await anext(aiter(grids))
+        assert [cell for cell, value in enumerate(message.data) if value] == [2, 5]
+
+
+@pytest.mark.parametrize("resolution", [0.5, 0.05])
+async def test_a_move_client_takes_an_old_grid(resolution: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(move_client, "OLD_MAP_AFTER", 0.2)
+    async with Core() as core, Node("rce_environment", argv=[], master_uri=core.uri) as environment:
+        grids = await environment.advertise("/map", TYPE, latch=True)
+        fields = grid_fields(GRID, (), environment.now())
+        grids.publish(fields | {"info": fields["info"] | {"resolution": resolution}})
+        async with Node("move_client", namespace="Robot1", argv=[], master_uri=core.uri) as node:
+            client = MoveClientNode(node)
+            task = asyncio.create_task(client.run())
+            async with asyncio.timeout(PATIENCE):
+                while not grids.connections:
+                    await asyncio.sleep(0.05)
+                reports = await environment.subscribe("/Robot1/moveClient/status", "fleet/MoveStatus")
+                if resolution == 0.5:
+                    assert (await anext(aiter(reports))).target == -1
+                else:  # it is a map that robots localize on
+                    await asyncio.sleep(1.0)
+                    new = await environment.advertise("/fleet/map", TYPE, latch=True)
+                    new.publish(grid_fields(GRID, (), environment.now()))
+                    assert (await anext(aiter(reports))).target == -1
+            assert client._client is not None
+            assert client._client.grid == GridMap(3, 4, 0.5, (1.0, 2.0), yaw=client._client.grid.yaw)
+            node.shutdown("the test is over")
+            await task

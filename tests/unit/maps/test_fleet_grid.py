@@ -1,0 +1,101 @@
+"""A fleet's grid over an occupancy map."""
+
+from __future__ import annotations
+
+from math import cos, pi, sin
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rce_fleet.exceptions import MapError
+from rce_fleet.geometry.poses import Pose
+from rce_fleet.maps.fleet_grid import fleet_grid
+from rce_fleet.maps.occupancy_map import OccupancyMap
+from rce_fleet.maps.ros_map import save_map
+from rce_fleet.navigation.occupancy import occupancy
+from rce_fleet.nodes.grid_messages import wants_old_topic
+from rce_fleet.nodes.grid_parameters import make_grid
+from rce_fleet.planning.grid import GridMap
+
+
+def drawn(origin: Pose | None = None) -> OccupancyMap:
+    """Return a map of 3 x 2 m: a wall fills the second square metre, a corner is unknown."""
+    data = np.zeros((40, 60), np.int8)
+    data[:20, 20:40] = 100
+    data[36:, 56:] = -1  # 4 % of the last square metre
+    return OccupancyMap(data, 0.05, origin or Pose(-1.0, 2.0, 0.0))
+
+
+def test_cells_are_blocked_by_their_share() -> None:
+    grid = fleet_grid(drawn())
+    assert (grid.rows, grid.columns, grid.origin, grid.yaw) == (2, 3, (-1.0, 2.0), 0.0)
+    assert grid.blocked == {1}
+    assert fleet_grid(drawn(), blocked_share=0.03).blocked == {1, 5}
+    assert fleet_grid(drawn(), blocked_share=0.05).blocked == {1}
+    assert fleet_grid(drawn(), 0.5).blocked == {2, 3, 8, 9, 23}
+
+
+def test_cells_beyond_the_map_are_blocked() -> None:
+    grid = fleet_grid(drawn(), origin=Pose(-2.0, 2.0, 0.0), rows=3, columns=5)
+    assert grid.blocked == {0, 2, 4, 5, 9, 10, 11, 12, 13, 14}
+
+
+@pytest.mark.parametrize("yaw", [pi / 2, 0.5, -2.0])
+def test_a_turned_map_gives_a_turned_grid(yaw: float) -> None:
+    grid = fleet_grid(drawn(Pose(4.0, -3.0, yaw)))
+    assert (grid.rows, grid.columns, grid.yaw) == (2, 3, yaw)
+    assert grid.blocked == {1}
+    x, y = grid.centre(4)
+    assert (x, y) == pytest.approx(
+        (4.0 + 1.5 * cos(yaw) - 1.5 * sin(yaw), -3.0 + 1.5 * sin(yaw) + 1.5 * cos(yaw))
+    )
+
+
+@given(st.integers(0, 14), st.floats(-4, 4), st.floats(-0.49, 0.49), st.floats(-0.49, 0.49))
+def test_cells_of_a_turned_grid_are_found(cell: int, yaw: float, along: float, up: float) -> None:
+    grid = GridMap(3, 5, 2.0, (1.0, -2.0), yaw=yaw)
+    x, y = grid.centre(cell)
+    c, s = 2 * cos(yaw), 2 * sin(yaw)
+    inside = x + c * along - s * up, y + s * along + c * up
+    assert grid.cell_at(*inside) == cell
+    assert grid.cells_touched(*inside, 0.001) == {cell}
+    straight = GridMap(3, 5, 2.0)
+    assert len(grid.cells_touched(x, y, 1.2)) == len(straight.cells_touched(*straight.centre(cell), 1.2))
+    assert occupancy(grid).yaw == yaw
+
+
+@pytest.mark.parametrize(
+    ("options", "fault"),
+    [
+        ({"cell_size": 0.0}, "must be a positive number of metres"),
+        ({"cell_size": 0.001}, "is not within 1"),
+        ({"blocked_share": 1.5}, r"within 0 \.\. 1"),
+        ({"origin": Pose(50.0, 0.0, 0.0)}, "is not within 1"),
+        ({"rows": -2}, "is not within 1"),
+        ({"origin": Pose(9.0, 9.0, 0.0), "rows": 2, "columns": 2}, "all 4 cells of 1.0 m are blocked"),
+    ],
+)
+def test_a_grid_that_cannot_be_is_refused(options: dict[str, float], fault: str) -> None:
+    with pytest.raises(MapError, match=fault):
+        fleet_grid(drawn(), **options)  # type: ignore[arg-type]
+
+
+def test_the_planner_reads_a_map_by_its_parameters(tmp_path: Path) -> None:
+    file = str(save_map(drawn(), tmp_path / "hall"))
+    assert make_grid({"map_yaml": file}).blocked == {1}
+    grid = make_grid({"map_yaml": file, "cell_size": 0.5, "columns": 2, "origin_yaw": 0.1, "walls": [0]})
+    assert (grid.columns, grid.rows, grid.yaw) == (2, 4, 0.1)
+    assert 0 in grid.blocked
+    assert make_grid({"rows": 2, "columns": 2, "origin_yaw": 0.2}).yaw == 0.2
+
+
+def test_the_old_topic_is_for_robot_files_only() -> None:
+    environment, planner = "/rce_environment", "/fleet_planner"
+    assert wants_old_topic({}, {"/map": [environment]}, planner)
+    assert wants_old_topic({"/map": [planner]}, {"/map": [environment]}, planner)
+    assert not wants_old_topic({"/map": ["/map_server"]}, {"/map": [environment]}, planner)
+    assert not wants_old_topic({}, {"/map": [environment, "/amcl"]}, planner)
+    assert not wants_old_topic({}, {}, planner)
