@@ -46,7 +46,7 @@ def test_any_number_of_robots(number: int) -> None:
     assert config.robot == f"testRobot_{number}"
     assert config.nodes[0].node.namespace == f"Robot{number}"
     assert {item.interface.addr for item in config.interfaces if item.endpoint == "cTag_fleet"} == {
-        "/map",
+        "/fleet/map",
         *(
             f"/Robot{number}/{topic}"
             for topic in ("amcl_pose", "blockedCells", "goalNodesList", "cancelGoal", "moveClient/status")
