@@ -97,10 +97,10 @@ class PlannerNode:
         self._publish_blocked(())
         for cell in blocked:
             self._handle(CellBlocked(cell))
-        await self._state.start()
         await node.advertise_service("/fleet/set_goal", "fleet/SetGoal", self._set_goal)
         await node.advertise_service("/fleet/block_cell", "fleet/BlockCell", self._block_cell)
         await node.advertise_service("/fleet/remove_robot", "fleet/RemoveRobot", self._remove_robot)
+        await self._state.start()  # last: who sees the state may call the services
         async with PlanWorker(node.log) as worker, asyncio.TaskGroup() as tasks:
             planning = tasks.create_task(self._make_plans(worker))
             tasks.create_task(self._look_around())

@@ -52,9 +52,9 @@ class StatePublisher:
     async def start(self) -> None:
         """Advertise topics and service, and publish the current state."""
         node = self._node
+        await node.advertise_service(GET_STATE_SERVICE, GET_STATE, self._get_state)
         self._state = await node.advertise(STATE_TOPIC, STATE, latch=True)
         self._changes = await node.advertise(CHANGES_TOPIC, CHANGES)
-        await node.advertise_service(GET_STATE_SERVICE, GET_STATE, self._get_state)
         self._publish_whole()
 
     def update(self, now: float) -> None:
