@@ -16,6 +16,7 @@ from support.engine import Program, running_engine, until
 from support.ports import free_ports
 from support.stranger import ask_for_echo, stranger
 
+from rce_container.environment.logs.streams import letters_of, text_of
 from tools.leaks import Traces, sweep_cgroups
 
 pytestmark = [pytest.mark.e2e]
@@ -122,7 +123,8 @@ async def _code(program: Program) -> int:
 
 
 def _text(logs: Path) -> bytes:
-    return b"".join(path.read_bytes() for path in logs.glob("*/node.*.log"))
+    raw = b"".join(path.read_bytes() for path in logs.glob("*/node.*.log"))
+    return text_of(raw, letters_of(()))  # an unbuffered print comes in pieces
 
 
 @pytest.mark.parametrize("moment", [MASTER_RUNS, "rce-master ready", "rce-container ready", "RCE ready"])
