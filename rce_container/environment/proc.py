@@ -38,15 +38,20 @@ class Process(NamedTuple):
     """Bytes."""
 
 
-def read(pid: int) -> Process | None:
-    """Read one process; None if it does not exist or is a zombie."""
+def read(pid: int, *, zombies: bool = False) -> Process | None:
+    """Read one process; None if it does not exist or is a zombie.
+
+    Args:
+        pid: The process.
+        zombies: Read zombies too, such as a child that ended and was not waited for.
+    """
     try:
         with open(f"{_PROC}/{pid}/stat", "rb") as file:  # noqa: PTH123 - pathlib doubles the cost of a scan
             text = file.read()
     except OSError:
         return None
     fields = text[text.rindex(b")") + 2 :].split()
-    if fields[0] in (b"Z", b"X"):
+    if fields[0] in (b"Z", b"X") and not zombies:
         return None
     return Process(
         pid=pid,

@@ -97,7 +97,9 @@ def spawn_shim(
             )
     except OSError as error:
         raise StartError(f"cannot start {SHELL}: {error}") from error
-    process = proc.read(popen.pid)
+    process = proc.read(
+        popen.pid, zombies=True
+    )  # one that ended at once is reported like one that ends later
     if process is None:
         raise StartError(f"{SHELL} ended at once with code {popen.wait()}")
     return popen, process

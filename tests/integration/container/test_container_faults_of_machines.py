@@ -126,3 +126,15 @@ async def test_what_a_crash_left_is_removed_and_nobody_else_is_harmed(
     assert await container.stop() == 0
     assert not run.exists()
     assert proc.same(me, proc.read(os.getpid()))
+
+
+def test_a_child_that_ended_at_once_is_identified() -> None:
+    """The kernel keeps its entry until it is waited for; a manager takes it for one that ended later."""
+    child = subprocess.Popen(["/bin/true"])
+    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+    assert proc.read(child.pid) is None
+    found = proc.read(child.pid, zombies=True)
+    assert found is not None
+    assert (found.pid, found.parent) == (child.pid, os.getpid())
+    assert child.wait() == 0
+    assert proc.read(child.pid, zombies=True) is None
