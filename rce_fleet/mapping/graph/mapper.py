@@ -12,6 +12,7 @@ from rce_fleet.mapping.graph.agreement import Agreement
 from rce_fleet.mapping.graph.joining import PlaceList
 from rce_fleet.mapping.graph.key_graph import Edge, KeyGraph
 from rce_fleet.mapping.graph.loop_closing import Closure, LoopMatcher
+from rce_fleet.mapping.graph.occupancy import draw_graph
 from rce_fleet.mapping.graph.parameters import GraphParameters
 from rce_fleet.mapping.graph.refinement import refine
 from rce_fleet.mapping.graph.tracker import Tracker
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rce_fleet.mapping.records import LaserRecord
+    from rce_fleet.maps.occupancy_map import OccupancyMap
 
 LOOP_LENGTH = 0.1
 """A loop counts as this much way, metres."""
@@ -179,6 +181,17 @@ class GraphMapper:
             return np.zeros((0, 3))
         keys = [key for key, _ in tracker.entries]
         return compose(self.graph.poses[keys], np.array([offset for _, offset in tracker.entries]))
+
+    def occupancy_map(self, resolution: float = 0.05) -> OccupancyMap:
+        """Return the map, in the frame of the first robot's first scan: -1 unknown, 0 free, 100 occupied.
+
+        Args:
+            resolution: Cell size, metres.
+
+        Raises:
+            MapError: If the map would become larger than any floor.
+        """
+        return draw_graph(self.graph, resolution=resolution, farthest=self.parameters.usable_range)
 
     def statistics(self, robot: str = "") -> dict[str, int]:
         """Return counts of a robot's scans and of the graph, by name."""
