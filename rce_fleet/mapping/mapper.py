@@ -9,11 +9,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rce_fleet.mapping.records import LaserRecord
-    from rce_fleet.maps.occupancy_map import OccupancyMap
 
 
 class Mapper(Protocol):
-    """Makes a map from scans, one after the other. The map's frame is the base at the first scan."""
+    """Finds the robot's way from scans, one after the other; the frame is the base at the first scan."""
 
     @property
     def loop_closures(self) -> int:
@@ -27,6 +26,3 @@ class Mapper(Protocol):
 
     def trajectory(self) -> NDArray[np.float64]:
         """Return the estimated pose of the base at each scan that was added, shape (N, 3)."""
-
-    def occupancy_map(self) -> OccupancyMap:
-        """Return the map."""

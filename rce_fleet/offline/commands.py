@@ -18,6 +18,7 @@ from rce_fleet.exceptions import FleetError
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.localization.replay import Recorded, replay
 from rce_fleet.localization.scan import LaserScan
+from rce_fleet.mapping.occupancy_mapping import draw_map
 from rce_fleet.mapping.trajectory import write_trajectory
 from rce_fleet.maps.ros_map import load_map, save_map
 from rce_fleet.offline.inputs import read_log
@@ -47,12 +48,13 @@ class Algorithm(StrEnum):
     """How the map is made."""
 
     GMAPPING = "gmapping"
+    GRAPH = "graph"
 
 
 def map_log(
     log: Log,
     output: Output,
-    with_: Annotated[Algorithm, typer.Option("--with", help="How the map is made.")] = Algorithm.GMAPPING,
+    with_: Annotated[Algorithm, typer.Option("--with", help="How the map is made.")] = Algorithm.GRAPH,
     scan: ScanTopic = "/scan",
     odom: OdometryTopic = "/odom",
     seed: Seed = 0,
@@ -70,10 +72,9 @@ def map_log(
         for record in with_progress(found.records, sys.stderr):
             mapper.add(record)
         mapper.finish()
-        write_trajectory(
-            folder / "trajectory.csv", [each.time for each in found.records], mapper.trajectory()
-        )
-        save_map(mapper.occupancy_map(), folder / "map.yaml")
+        poses = mapper.trajectory()
+        write_trajectory(folder / "trajectory.csv", [each.time for each in found.records], poses)
+        save_map(draw_map(found.records, poses), folder / "map.yaml")
         write_report(
             folder / "report.json",
             seconds=time.perf_counter() - begin,
@@ -144,6 +145,10 @@ def _mapper(algorithm: Algorithm, seed: int) -> Mapper:
             from rce_fleet.mapping.gmapping.mapper import ParticleMapper
 
             return ParticleMapper(seed=seed)
+        case Algorithm.GRAPH:
+            from rce_fleet.mapping.graph.mapper import GraphMapper
+
+            return GraphMapper()
 
 
 @contextmanager

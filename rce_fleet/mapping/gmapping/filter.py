@@ -101,6 +101,7 @@ class GridFilter:
         self._log_weights = np.zeros(number)
         self._rng = rng
         self._odometry: Reals | None = None
+        self._jumped = False
         self._base = np.zeros(3)
         self._motion = np.zeros(3)
         self._driven = np.zeros(3)
@@ -147,7 +148,8 @@ class GridFilter:
         odometry = np.array(record.odometry)
         scan = self._prepare(record)
         if self._odometry is not None:
-            step = relative(self._odometry, odometry)
+            step = np.zeros(3) if self._jumped else relative(self._odometry, odometry)
+            self._jumped = False
             self._driven = compose(self._driven, step)
             self._motion = self._track(scan, compose(self._motion, step), motion_std(step, self.parameters))
             self._odometry = odometry
@@ -172,6 +174,10 @@ class GridFilter:
             or abs(self._motion[2]) >= p.angular_update
             or 0 <= p.temporal_update <= record.time - self._time
         )
+
+    def forget_odometry(self) -> None:
+        """Take the next scan's odometry as that of the last one: it jumped, and does not tell the way."""
+        self._jumped = True
 
     def path(self) -> Reals:
         """Return the poses of the best particle at the scans that were used, shape (K, 3)."""

@@ -8,7 +8,7 @@ _POSITIVE = {"above": 0}
 _NOT_NEGATIVE = {"minimum": 0}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class FilterParameters:
     """Parameters of the filter. Names of ROS that Python's conventions do not allow stand in the metadata.
 
@@ -36,10 +36,6 @@ class FilterParameters:
         temporal_update: ``temporalUpdate``: or after this time, seconds; below 0 never.
         resample_threshold: ``resampleThreshold``: particles are drawn anew if their effective number is below
             this share.
-        xmin: Map at the beginning, metres; it grows.
-        ymin: See xmin.
-        xmax: See xmin.
-        ymax: See xmin.
         delta: Edge of a cell, metres.
         ll_sample_range: ``llsamplerange``: poses up to so far around a match are compared for its likelihood,
             metres.
@@ -71,10 +67,6 @@ class FilterParameters:
     resample_threshold: float = field(
         default=0.5, metadata={"name": "resampleThreshold", "minimum": 0, "maximum": 1}
     )
-    xmin: float = -100.0
-    ymin: float = -100.0
-    xmax: float = 100.0
-    ymax: float = 100.0
     delta: float = field(default=0.05, metadata=_POSITIVE)
     ll_sample_range: float = field(default=0.01, metadata={"name": "llsamplerange", **_NOT_NEGATIVE})
     ll_sample_step: float = field(default=0.01, metadata={"name": "llsamplestep", **_POSITIVE})
