@@ -1,0 +1,107 @@
+"""The files of a TurtleBot: launch file, parameters, map and world fit each other and the nodes."""
+
+from __future__ import annotations
+
+from math import hypot
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rce.ros.launch import LaunchPlan, MachineInputs, load_launch_files
+from rce.ros.packages import PackageIndex
+from rce_fleet.drivers.scene import load_scene
+from rce_fleet.maps.ros_map import load_map
+from rce_fleet.navigation.safety.parameters import SafetyParameters
+from rce_fleet.nodes.move_base_parameters import read_settings
+from rce_fleet.nodes.parameter_values import read_values
+
+FOLDER = Path(__file__).parents[3] / "configs" / "turtlebot"
+
+
+def plan(**arguments: str) -> LaunchPlan:
+    found = load_launch_files([FOLDER / "botmotion.launch"], arguments, inputs=MachineInputs())
+    assert found.warnings == []
+    return found
+
+
+def names(found: LaunchPlan) -> list[str]:
+    return [node.name for node in found.nodes]
+
+
+def parameters(found: LaunchPlan, node: str) -> dict[str, Any]:
+    """The private parameters of a node as a tree."""
+    tree: dict[str, Any] = {}
+    for name, value in found.parameters.items():
+        if name.startswith(f"{node}/"):
+            inner = tree
+            *spaces, last = name.removeprefix(f"{node}/").split("/")
+            for space in spaces:
+                inner = inner.setdefault(space, {})
+            inner[last] = value
+    return tree
+
+
+def test_a_robot_of_its_own_master_has_no_namespace() -> None:
+    found = plan(robot="Robot1")
+    assert names(found) == ["/map_server", "/velocity_limiter", "/amcl", "/move_base", "/pose_relay"]
+    assert found.nodes[-1].arguments == ("/amcl_pose", "/Robot1/amcl_pose")
+    assert found.parameters["/amcl/odom_frame_id"] == "odom"
+    assert "/tf_prefix" not in found.parameters
+
+
+def test_robots_at_one_master_have_namespaces() -> None:
+    first, second = plan(tf_prefix="Robot1"), plan(tf_prefix="Robot2", map_server="false")
+    assert names(first) == ["/map_server", "/Robot1/velocity_limiter", "/Robot1/amcl", "/Robot1/move_base"]
+    assert not set(names(first)) & set(names(second))
+    assert second.parameters["/Robot2/amcl/base_frame_id"] == "Robot2/base_link"
+    assert second.parameters["/Robot2/move_base/local_costmap/global_frame"] == "Robot2/odom"
+    assert dict(second.nodes[1].remappings)["static_map"] == "/static_map"
+
+
+def test_an_offloaded_robot_keeps_safety_only() -> None:
+    assert names(plan(offload="true")) == ["/velocity_limiter"]
+
+
+@pytest.mark.parametrize("tf_prefix", ["", "Robot1"])
+def test_the_nodes_take_all_parameters(tf_prefix: str) -> None:
+    found = plan(tf_prefix=tf_prefix)
+    space = f"/{tf_prefix}".rstrip("/")
+    settings, problems = read_settings(parameters(found, f"{space}/move_base"))
+    assert problems == []
+    assert settings.local_costmap.global_frame == (f"{tf_prefix}/odom" if tf_prefix else "odom")
+    _, problems = read_values(SafetyParameters, parameters(found, f"{space}/velocity_limiter"))
+    assert problems == []
+
+
+def test_the_nodes_are_there() -> None:
+    packages = PackageIndex([])
+    for node in plan(robot="Robot1").nodes:
+        assert packages.find(node.package).executable(node.type)
+
+
+def test_the_map_is_that_of_the_world() -> None:
+    drawn, saved = load_scene(FOLDER / "scene.yaml").draw(), load_map(FOLDER / "floor.yaml")
+    assert np.array_equal(drawn.data, saved.data)
+    assert hypot(drawn.origin.x - saved.origin.x, drawn.origin.y - saved.origin.y) < 1e-6
+
+
+def test_the_floor_has_no_symmetry() -> None:
+    """A turned or mirrored floor differs: a robot can tell where it is."""
+    walls = load_map(FOLDER / "floor.yaml").data >= 65
+    turned = [np.rot90(walls, times) for times in (1, 2, 3)]
+    mirrored = [np.rot90(walls[:, ::-1], times) for times in range(4)]
+    same = [np.mean(walls == other, where=walls | other) for other in turned + mirrored]
+    assert max(same) < 0.93
+
+
+def test_all_cells_can_be_entered() -> None:
+    scene = load_scene(FOLDER / "scene.yaml")
+    drawn = load_map(FOLDER / "floor.yaml")
+    rows, columns = np.nonzero(drawn.data >= 65)
+    x = drawn.origin.x + (columns + 0.5) * drawn.resolution
+    y = drawn.origin.y + (rows + 0.5) * drawn.resolution
+    grid = scene.grid
+    nearest = [np.min(np.hypot(x - one[0], y - one[1])) for one in map(grid.centre, range(len(grid)))]
+    assert min(nearest) > 0.177 + 0.05
