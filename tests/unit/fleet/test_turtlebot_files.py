@@ -14,6 +14,7 @@ from rce.ros.packages import PackageIndex
 from rce_fleet.drivers.scene import load_scene
 from rce_fleet.maps.ros_map import load_map
 from rce_fleet.navigation.safety.parameters import SafetyParameters
+from rce_fleet.nodes.amcl_parameters import AmclNodeParameters
 from rce_fleet.nodes.move_base_parameters import read_settings
 from rce_fleet.nodes.parameter_values import read_values
 
@@ -71,6 +72,8 @@ def test_the_nodes_take_all_parameters(tf_prefix: str) -> None:
     settings, problems = read_settings(parameters(found, f"{space}/move_base"))
     assert problems == []
     assert settings.local_costmap.global_frame == (f"{tf_prefix}/odom" if tf_prefix else "odom")
+    _, problems = read_values(AmclNodeParameters, parameters(found, f"{space}/amcl"))
+    assert problems == []
     _, problems = read_values(SafetyParameters, parameters(found, f"{space}/velocity_limiter"))
     assert problems == []
 
