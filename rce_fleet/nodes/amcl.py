@@ -90,7 +90,7 @@ class AmclNode:
         self._clouds = await node.advertise("particlecloud", "geometry_msgs/PoseArray", latch=True)
         self._diagnostics = await Diagnostics.start(node, "localization")
         async with AsyncExitStack() as stack:
-            listener = await stack.enter_async_context(TransformListener(node))
+            listener = await stack.enter_async_context(TransformListener(node, prefix=""))
             broadcaster = await stack.enter_async_context(TransformBroadcaster(node, prefix=listener.prefix))
             self._frames = RobotFrames(parameters, listener, broadcaster)
             await node.advertise_service("global_localization", "std_srvs/Empty", self._scatter)

@@ -89,7 +89,7 @@ class MoveBaseNode:
         ]
         for publisher in publishers:
             await publisher.start()
-        async with TransformListener(node) as transforms:
+        async with TransformListener(node, prefix="") as transforms:
             costmaps = (stack.global_costmap, stack.local_costmap)
             world, local = (one.parameters for one in costmaps)
             self._place = RobotPlace(

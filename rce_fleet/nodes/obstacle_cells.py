@@ -107,7 +107,7 @@ class ObstacleCellsNode:
         self._blocked_out = await node.advertise("blockedCells", CELLS)
         self._freed_out = await node.advertise("freedCells", CELLS)
         diagnostics = await Diagnostics.start(node, "cells with obstacles")
-        async with TransformListener(node) as self._tf:
+        async with TransformListener(node, prefix="") as self._tf:
             await node.subscribe("/fleet/map", "nav_msgs/OccupancyGrid", partial(self._take_map, fleet=True))
             await node.subscribe("map", "nav_msgs/OccupancyGrid", partial(self._take_map, fleet=False))
             await node.subscribe("/fleet/state", "fleet/FleetState", self._take_state)

@@ -64,7 +64,7 @@ class VelocityLimiterNode:
         self._stopped = await node.advertise("~emergency_stopped", "std_msgs/Bool", latch=True)
         self._stopped.publish(data=False)
         diagnostics = await Diagnostics.start(node, "velocity_limiter: safety")
-        async with TransformListener(node) as self._tf:
+        async with TransformListener(node, prefix="") as self._tf:
             await node.subscribe("odom", "nav_msgs/Odometry", self._take_odometry)
             await node.subscribe("scan", "sensor_msgs/LaserScan", self._take_scan)
             await node.subscribe("raw_cmd_vel", "geometry_msgs/Twist", self._take_command)

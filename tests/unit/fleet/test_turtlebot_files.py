@@ -16,6 +16,7 @@ from rce_fleet.maps.ros_map import load_map
 from rce_fleet.navigation.safety.parameters import SafetyParameters
 from rce_fleet.nodes.amcl_parameters import AmclNodeParameters
 from rce_fleet.nodes.move_base_parameters import read_settings
+from rce_fleet.nodes.obstacle_cells import ObstacleCellsParameters
 from rce_fleet.nodes.parameter_values import read_values
 
 FOLDER = Path(__file__).parents[3] / "configs" / "turtlebot"
@@ -46,7 +47,8 @@ def parameters(found: LaunchPlan, node: str) -> dict[str, Any]:
 
 def test_a_robot_of_its_own_master_has_no_namespace() -> None:
     found = plan(robot="Robot1")
-    assert names(found) == ["/map_server", "/velocity_limiter", "/amcl", "/move_base", "/pose_relay"]
+    nodes = ["map_server", "velocity_limiter", "amcl", "move_base", "obstacle_cells", "pose_relay"]
+    assert names(found) == [f"/{name}" for name in nodes]
     assert found.nodes[-1].arguments == ("/amcl_pose", "/Robot1/amcl_pose")
     assert found.parameters["/amcl/odom_frame_id"] == "odom"
     assert "/tf_prefix" not in found.parameters
@@ -54,7 +56,8 @@ def test_a_robot_of_its_own_master_has_no_namespace() -> None:
 
 def test_robots_at_one_master_have_namespaces() -> None:
     first, second = plan(tf_prefix="Robot1"), plan(tf_prefix="Robot2", map_server="false")
-    assert names(first) == ["/map_server", "/Robot1/velocity_limiter", "/Robot1/amcl", "/Robot1/move_base"]
+    nodes = ["velocity_limiter", "amcl", "move_base", "obstacle_cells"]
+    assert names(first) == ["/map_server", *(f"/Robot1/{name}" for name in nodes)]
     assert not set(names(first)) & set(names(second))
     assert second.parameters["/Robot2/amcl/base_frame_id"] == "Robot2/base_link"
     assert second.parameters["/Robot2/move_base/local_costmap/global_frame"] == "Robot2/odom"
@@ -73,6 +76,8 @@ def test_the_nodes_take_all_parameters(tf_prefix: str) -> None:
     assert problems == []
     assert settings.local_costmap.global_frame == (f"{tf_prefix}/odom" if tf_prefix else "odom")
     _, problems = read_values(AmclNodeParameters, parameters(found, f"{space}/amcl"))
+    assert problems == []
+    _, problems = read_values(ObstacleCellsParameters, parameters(found, f"{space}/obstacle_cells"))
     assert problems == []
     _, problems = read_values(SafetyParameters, parameters(found, f"{space}/velocity_limiter"))
     assert problems == []
