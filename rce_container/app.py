@@ -49,7 +49,7 @@ _log = logging.getLogger(__name__)
 AUTO = "auto"
 RUNTIMES = (NamespaceRuntime.name, PodmanRuntime.name, ProcessRuntime.name)
 
-_NOT_ISOLATED = "containers are NOT isolated: nodes may do all that this user may"
+_NOT_ISOLATED = "containers are NOT isolated: nodes have all permissions of this user"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,41 +11,41 @@ from rce.lifecycle import LifeCycle
 
 
 class Phase(Enum):
-    """Where a container is in its life."""
+    """The phases of a container."""
 
     STARTING = "starting"
     """Its processes are being made, or its environment has not reported yet."""
     RUNNING = "running"
-    """Its environment reports that all is well."""
+    """Its environment reports no fault."""
     DEGRADED = "degraded"
     """Its environment reports a node that failed, is stuck, or pauses after a failure."""
     STOPPING = "stopping"
-    """It was told to end, because it is not desired any more; nothing of it may be left."""
+    """It is ending, because it is not desired any more; it is removed completely."""
     CLEANING = "cleaning"
-    """It ended although it is desired; what is left of it is being removed."""
+    """It ended although it is desired; its remains are being removed."""
     WAITING = "waiting"
-    """Nothing of it is there; it is made again after a while."""
+    """It is removed, and created again after a pause."""
     GONE = "gone"
-    """Nothing of it is there, and it is not desired. The manager forgets it."""
+    """It is removed and not desired. The manager forgets it."""
 
 
 class LifeEvent(Enum):
     """What can happen to a container."""
 
     REPORT = "report"
-    """Its environment reported that all is well."""
+    """Its environment reported no fault."""
     ILLNESS = "illness"
-    """Its environment reported that not all is well."""
+    """Its environment reported a fault of a node."""
     LOSS = "loss"
     """Its environment is gone."""
     NOT_STARTED = "not started"
-    """It could not be started; nothing of it is there."""
+    """It could not be started, and is removed."""
     REMOVED = "removed"
     """No process and no folder of it is left."""
     RELEASE = "release"
     """It is not desired any more."""
     DESIRE = "desire"
-    """It is desired, with whatever specification."""
+    """It is desired, with the same or another specification."""
     DUE = "due"
     """It waited long enough."""
 

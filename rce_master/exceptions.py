@@ -3,7 +3,7 @@
 ::
 
     MasterError
-    +-- RefusedError               a request was not done; the text says what was wrong and how to mend it
+    +-- RefusedError               a request was refused; the text says why and what to do
     |   +-- InvalidRequestError    it can never be done like this
     |   +-- NotFoundError          it names something that is not there
     |   +-- ConflictError          it contradicts what is there

@@ -162,7 +162,7 @@ class UsageBook:
 
 
 def _continued(history: History | None, sample: Sample) -> History:
-    # Less processor time than before: it was made anew, and counts from the beginning.
+    # Less processor time than before: it was made again, and counts from the beginning.
     if history is None or sample.usage.cpu_s < history.now.usage.cpu_s:
         return History.begin(sample)
     history.note(sample)

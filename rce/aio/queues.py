@@ -16,7 +16,7 @@ class OverflowPolicy(Enum):
     DROP_OLDEST = "drop oldest"
     """Drop the oldest items, and count them. For topics, where the newest is worth most."""
     REFUSE = "refuse"
-    """Take no more; the sender is told. For services, where nothing may be lost."""
+    """Refuse new items, and tell the sender. For services, where nothing may be lost."""
 
 
 class BoundedQueue(Generic[T]):

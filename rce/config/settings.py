@@ -40,7 +40,7 @@ PROGRAM_SECTIONS = ("core", "demo", "discovery", "relay", "sync", "ui")
 
 
 class LogLevel(Enum):
-    """What a program tells in its log."""
+    """How much a program writes to its log."""
 
     DEBUG = "debug"
     INFO = "info"

@@ -13,7 +13,7 @@ from rce.config.master_settings import ANYWHERE
 
 
 class Runtime(Enum):
-    """How containers are kept apart."""
+    """How containers are isolated."""
 
     AUTO = "auto"
     """The strongest isolation that this machine supports."""

@@ -39,14 +39,14 @@ class Difference:
 
 
 class Fit(Enum):
-    """How a patch relates to what is there."""
+    """How a patch relates to the present state."""
 
     OLD = "old"
-    """Its changes are known already."""
+    """It is already applied."""
     NEXT = "next"
     """It can be applied."""
     GAP = "gap"
-    """Something between the two is missing: only a whole spec helps."""
+    """Patches before it are missing: the whole spec is needed."""
 
 
 class DesiredState:

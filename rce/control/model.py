@@ -132,9 +132,9 @@ class NodeState(Enum):
     STUCK = "stuck"
     """Runs, but sends no heartbeat."""
     STOPPING = "stopping"
-    """Told to end."""
+    """Ordered to end."""
     EXITED = "exited"
-    """Ended by itself with exit code 0."""
+    """Ended with exit code 0."""
     FAILED = "failed"
     """Could not be started, or ended by a signal or with another exit code."""
 
@@ -174,7 +174,7 @@ class EndpointStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The newest spec revision that was applied."""
     state: EndpointState
     incarnation: str = ""
-    """Changes whenever the endpoint is made anew (a restarted container)."""
+    """Changes whenever the endpoint is made again (a restarted container)."""
     detail: str = ""
     nodes: tuple[NodeStatus, ...] = ()
     interfaces: dict[str, bool] = {}

@@ -35,4 +35,4 @@ authenticated; the master limits how much a user may ask for."""
 MAX_TEXT = MAX_FRAME // 4
 """Most characters that surely fit."""
 MAX_QUEUED = 8192
-"""How many messages may wait for a peer; one that is further behind is disconnected and starts anew."""
+"""How many messages may wait for a peer; one that is further behind is disconnected and starts again."""

@@ -55,7 +55,7 @@ class FrameType(IntEnum):
     WELCOME = 2
     """Accepting end's answer; the link is up."""
     REFUSE = 3
-    """Accepting end's answer: a text why not; it hangs up."""
+    """Accepting end's refusal, with the reason as text; it closes the connection."""
     PING = 4
     PONG = 5
     SECURE = 7
@@ -74,7 +74,7 @@ class FrameType(IntEnum):
     FAULT = 19
     """A text in place of a REPLY."""
     CANCEL = 20
-    """The caller no longer waits for the answer to the CALL with this id."""
+    """The caller does not wait for the answer to the CALL with this id any more."""
     SOURCES = 21
     """Ids of the sources whose latched messages are in force, 4 bytes each; only to peers with ``latch``."""
     FRAGMENT = 24

@@ -191,7 +191,7 @@ class LinkHub:
             del self._accepting[link.spec.id]
 
     async def wait_registered(self, link_id: str, timeout: float | None) -> None:
-        """Wait until a link's accepting end is registered anew, or ``timeout`` seconds (None: no limit)."""
+        """Wait until a link's accepting end is registered again, or ``timeout`` seconds (None: no limit)."""
         waiter = self.loop.create_future()
         self._waiters.setdefault(link_id, set()).add(waiter)
         try:

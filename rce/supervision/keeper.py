@@ -1,4 +1,10 @@
-"""One child program that is kept running: its output is read, and it is started again when it ends."""
+"""One child program that is kept running: its output is read, and it is started again when it ends.
+
+For programs that run on their own: those of ``rce up`` and of the demo. A process that answers requests is
+started by the next request, and has an owner that knows its protocol: converters
+(``rce_robot.conversion.pool``), the fork server (``rce_container.forkserver.process``) and the plan worker
+(``rce_fleet.nodes.plan_worker``). pip runs once for each package, within a time and a size.
+"""
 
 from __future__ import annotations
 

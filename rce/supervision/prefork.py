@@ -119,7 +119,7 @@ def _become(program: Program, parent: int, wait: int, print_: int) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(line_buffering=True, write_through=True)  # type: ignore[union-attr]  # as they are
     sys.argv = [program.module, *program.arguments]
-    sys.orig_argv = list(program.argv)  # with these a program executes itself anew
+    sys.orig_argv = list(program.argv)  # with these a program executes itself again
     import_module(f"{program.module}.__main__").main()
     raise SystemExit(0)
 

@@ -34,7 +34,7 @@ class TlsFiles:
 
 
 class TlsIdentity:
-    """Makes contexts from files, and makes them anew when the files have changed.
+    """Makes contexts from files, and makes them again when the files have changed.
 
     The files are checked when a connection begins. If new ones cannot be used, that is logged once, and the
     last valid ones stay in use.

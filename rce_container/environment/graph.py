@@ -27,7 +27,7 @@ class Subscription(Protocol):
 
 
 class NodeListener(Protocol):
-    """What is told of nodes that appear in the graph."""
+    """Listens to nodes that appear in the graph."""
 
     def node_appeared(self, name: str) -> bool:
         """Take note of a node; return whether its name says which process it is."""

@@ -74,7 +74,7 @@ class ForkServer:
                 raise StartError(f"its environment cannot be confined: {answer.error}")
             return pid
         raise StartError(
-            "its environment, or the fork server that makes it, dies each time; this program's log tells why"
+            "its environment, or the fork server that makes it, ends each time; this program's log says why"
         )
 
     def start(self) -> None:
@@ -134,7 +134,7 @@ class ForkServer:
         raise StartError("the fork server of environments dies at once; its reason is in this program's log")
 
 
-async def hear_credentials(sock: socket.socket, size: int) -> tuple[bytes, int]:
+async def receive_credentials(sock: socket.socket, size: int) -> tuple[bytes, int]:
     """Wait for data on a socket with ``SO_PASSCRED``; return it and its sender's pid, as seen from here.
 
     At the end of the stream both are empty.
@@ -158,7 +158,7 @@ async def hear_credentials(sock: socket.socket, size: int) -> tuple[bytes, int]:
 
 
 async def _receive_answer(sock: socket.socket) -> tuple[Answer | None, int]:
-    data, pid = await hear_credentials(sock, MAX_PACKET)
+    data, pid = await receive_credentials(sock, MAX_PACKET)
     if not data:
         return None, 0
     with contextlib.suppress(msgspec.DecodeError):

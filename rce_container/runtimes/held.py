@@ -14,7 +14,7 @@ from rce_container.environment import proc
 from rce_container.environment.logs.files import ENVIRONMENT_LOG, segment_path
 from rce_container.exceptions import StartError
 from rce_container.forkserver.messages import FAREWELL, Descriptors, SpawnRequest
-from rce_container.forkserver.process import ForkServer, hear_credentials
+from rce_container.forkserver.process import ForkServer, receive_credentials
 from rce_container.runtimes.base import Handle, Order, Prepare
 from rce_container.runtimes.shim import SHELL, spawn_shim
 
@@ -99,7 +99,7 @@ class HeldHandle(Handle):
 
     async def _holder(self) -> int:
         with socket.socket(fileno=os.dup(self._fds["lifeline"])) as lifeline:
-            said, pid = await hear_credentials(lifeline, 1)
+            said, pid = await receive_credentials(lifeline, 1)
         if not said or not pid:
             raise StartError(self.failure)
         return pid

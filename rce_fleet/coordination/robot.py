@@ -30,9 +30,9 @@ class Cause(Enum):
     """Causes of a change of phase."""
 
     SETTLED = "settled"
-    """It stands still, and a cell is its own."""
+    """It stands still, and has a cell."""
     HELD = "held"
-    """It is told to stand still."""
+    """It is ordered to stop."""
     LOST = "lost"
     """The robot or its move client sends no messages any more."""
     HEARD = "heard"

@@ -34,7 +34,7 @@ class CoreProgram(StrEnum):
 
 
 class MachineBackend(StrEnum):
-    """What stands for the machines of the mode ``multi``."""
+    """How the machines of the mode ``multi`` are represented."""
 
     AUTO = "auto"
     """Namespaces if they can be created, else ports."""
@@ -57,7 +57,7 @@ class DemoConfig:
         mode: What carries the fleet's messages.
         core: The program that is the core of the mode ``single``.
         core_uri: A running ROS master to use instead of that program; none if empty.
-        machines: What stands for the machines of the mode ``multi``.
+        machines: How the machines of the mode ``multi`` are represented.
         blocked_cells: Cells that a headless run blocks while robots drive.
     """
 

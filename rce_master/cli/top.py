@@ -24,7 +24,7 @@ Usage = dict[str, Any]
 
 
 class Order(Enum):
-    """What containers are sorted by; the most first."""
+    """The value by which containers are sorted, largest first."""
 
     CPU = "cpu"
     MEMORY = "memory"

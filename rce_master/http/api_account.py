@@ -81,7 +81,7 @@ async def remove_user(call: Call) -> None:
 @routes.route(
     "PUT",
     "/users/{name}/password",
-    "Change a password (your own, or anybody's as administrator); ends the user's tokens and sessions",
+    "Change a password (your own, or as administrator any user's); ends the user's tokens and sessions",
     body=models.PasswordIn,
     status=204,
     any_role=True,

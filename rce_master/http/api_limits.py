@@ -15,7 +15,7 @@ routes = route_table("account")
 @routes.route(
     "GET",
     "/users/{name}",
-    "Show a user (yourself, or anybody as administrator), what they may have and what they have",
+    "Show a user (yourself, or as administrator any user) with limits and usage",
     reply=models.UserLimitsOut,
 )
 async def show_user(call: Call) -> models.UserLimitsOut:

@@ -23,38 +23,38 @@ class Error(Model):
 
 
 class LoginIn(Body):
-    """Who wants a token."""
+    """A login: the user, and the token to make."""
 
     userID: str  # noqa: N815 - its name everywhere in the protocol
     password: Annotated[str, Field(repr=False)]
     """The password itself, not its hash."""
     label: Annotated[str, Field(max_length=128)] = ""
     lifetime: Annotated[float, Field(ge=0)] = 0.0
-    """Seconds for which the token is to be good, at most as long as the master gives; 0: so long."""
+    """Seconds until the token expires; 0, or more than the master allows: the longest time that it allows."""
 
 
 class RobotTokenIn(Body):
-    """A robot that is to have a token of its own."""
+    """A token to make, for one robot."""
 
     robot: Annotated[str, Field(max_length=256)]
     label: Annotated[str, Field(max_length=128)] = ""
     days: Annotated[float, Field(ge=0, le=36500)] = 0.0
-    """For how long it is good; 0: until it is revoked."""
+    """Days until it expires; 0: it is valid until it is revoked."""
     replace: bool = False
-    """Take the place of the token that the robot has."""
+    """Replace the token that the robot has."""
 
 
 class ScopedTokenIn(Body):
-    """A token for a program that may do one thing."""
+    """A token to make, for a program that may do one thing only."""
 
     scope: Annotated[str, Field(pattern="^metrics$")]
     label: Annotated[str, Field(max_length=128)] = ""
     days: Annotated[float, Field(ge=0, le=36500)] = 0.0
-    """For how long it is good; 0: until it is revoked."""
+    """Days until it expires; 0: it is valid until it is revoked."""
 
 
 class UserIn(Body):
-    """A user to make."""
+    """A user to create."""
 
     name: str
     password: Annotated[str, Field(repr=False, min_length=1)]
@@ -62,7 +62,7 @@ class UserIn(Body):
 
 
 class RoleIn(Body):
-    """What a user may do from now on."""
+    """The new role of a user."""
 
     role: Annotated[str, Field(pattern=ROLES)]
 
@@ -74,7 +74,7 @@ class AuditIn(Body):
     subject: Annotated[str, Field(max_length=300)] = ""
     detail: Annotated[str, Field(max_length=300)] = ""
     address: Annotated[str, Field(max_length=64)] = ""
-    """Where it came from."""
+    """The address of the client."""
     outcome: Annotated[str, Field(pattern="^(done|refused)$")] = "done"
 
 
@@ -83,11 +83,11 @@ class PasswordIn(Body):
 
     password: Annotated[str, Field(repr=False, min_length=1)]
     old_password: Annotated[str, Field(repr=False)] = ""
-    """The password until now; needed to change one's own."""
+    """The present password; required to change your own."""
 
 
 class LimitsIn(Body):
-    """What a user may have from now on; left out: as before. 0: no limit; ``default``: as all users."""
+    """New limits of a user. A limit left out stays; 0: no limit; ``default``: the limit of all users."""
 
     containers: Amount | None = None
     slots: Amount | None = None
@@ -96,9 +96,9 @@ class LimitsIn(Body):
     memory: Amount | None = None
     """MB, or a text such as ``8G``."""
     packages: Amount | None = None
-    """Versions."""
+    """Number of versions."""
     disk: Amount | None = None
-    """Of the packages' files; MB, or a text such as ``2G``."""
+    """Size of the packages' files: MB, or a text such as ``2G``."""
 
 
 # Out
@@ -113,21 +113,21 @@ class TokenOut(Model):
     expires: float
     """Seconds since 1970; 0: never."""
     id: str = ""
-    """By which it is listed and revoked; no secret."""
+    """Names it in lists, and to revoke it; not secret."""
     scope: str = ""
-    """What it is good for: all that the user may do (empty), ``robot:ID`` or ``metrics``."""
+    """What it permits: everything that the user may do (empty), ``robot:ID`` or ``metrics``."""
 
 
 class TokenListed(Model):
-    """A token, without the text that it is used by."""
+    """A token, without its secret text."""
 
     id: str
     user: str
     label: str
     scope: str
-    """What it is good for: all that the user may do (empty), ``robot:ID`` or ``metrics``."""
+    """What it permits: everything that the user may do (empty), ``robot:ID`` or ``metrics``."""
     robot: str
-    """The only robot that it is good for; else empty."""
+    """The only robot that may use it; empty if any may."""
     created: float
     """Seconds since 1970."""
     expires: float
@@ -153,9 +153,9 @@ class AuditRecord(Model):
     detail: str
     address: str
     via: str
-    """What passed it on: a robot or a station; else empty."""
+    """The robot or station that passed the action on; empty if none did."""
     times: int
-    """How often, for refusals that repeat."""
+    """Number of times, for repeated refusals."""
 
 
 class AuditOut(Model):
@@ -181,17 +181,17 @@ class UserOut(Model):
 
 
 class LimitOut(Model):
-    """How much of something a user may have, and has. Memory and disk in bytes."""
+    """A limit of a user, and how much of it is used. Memory and disk are in bytes."""
 
     limit: float
     """0: no limit."""
     used: float
     source: str
-    """``user``: set for this one; ``all``: for all users; ``machines``: a share of what the machines have."""
+    """``user``: of this user; ``all``: of all users; ``machines``: a share of the machines' resources."""
 
 
 class UserLimitsOut(UserOut):
-    """A user with what they may have."""
+    """A user with their limits."""
 
     limits: dict[str, LimitOut]
     """``containers``, ``slots``, ``cpu``, ``memory``, ``packages``, ``disk``."""
@@ -238,17 +238,17 @@ class MachineOut(Model):
     memory_used: int
     """Resident bytes of the task set."""
     slots: int
-    """0 if it is not counted."""
+    """0 if slots are not counted."""
     limits: str
     networks: list[str]
     runtimes: list[str]
     promised_slots: int
-    """What its containers were promised: of slots, cores and bytes."""
+    """Slots, cores and bytes that are reserved for its containers."""
     promised_cores: float
     promised_memory: int
     draining: bool
     staying: list[StayingOut]
-    """Of a draining machine: the containers that it still has."""
+    """While the machine is drained: the containers that it still has."""
 
 
 class UsersOut(Model):
@@ -276,8 +276,8 @@ class LogOut(Model):
     offset: int
     """Where the next read continues."""
     incarnation: str = Field(default="", alias="life")
-    """The container's incarnation of which this is the log; reads of the same log name it."""
+    """The incarnation of the container that wrote this log; name it to read the same log again."""
     ended: float | None = None
-    """When that incarnation ended, in seconds since 1970; null if it continues."""
+    """When that incarnation ended, in seconds since 1970; null while it runs."""
     reason: str = ""
     """Why it ended."""

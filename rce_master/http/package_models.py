@@ -1,4 +1,4 @@
-"""What the REST API takes and gives of packages."""
+"""Packages in requests and answers of the REST API."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class PackageOut(Model):
     """Whether nodes that name no version get this one."""
     description: str
     executables: list[str]
-    """What nodes can name as ``exe``."""
+    """Values of ``exe`` for nodes of this package."""
     requirements: bool
     """Whether it has a ``requirements.txt``."""
     files: int
@@ -54,17 +54,17 @@ class PackageOut(Model):
     packed: int
     """Bytes of the archive."""
     sha256: str
-    """Of the archive."""
+    """SHA-256 of the archive."""
     digest: str
-    """SHA-256 of what the archive unpacks to."""
+    """SHA-256 of the unpacked files."""
     key: str
     """Id of the key that signed it."""
     created: float
     """Seconds since 1970."""
     nodes: list[str]
-    """Nodes that need it, each ``CONTAINER/NODE``."""
+    """Nodes that use it, each ``CONTAINER/NODE``."""
     warnings: list[str] = Field(default=[])
-    """What its owner should know; in the answer to a push only."""
+    """Warnings for its owner; only in the answer to a push."""
 
 
 class PackagesOut(Model):

@@ -121,12 +121,12 @@ def _plain(value: Any) -> Any:
 
 @takes(CreateContainer)
 class ContainerIn(Body):
-    """A container to make. Zero or empty: not requested."""
+    """A container to create. Zero and empty values are not requested."""
 
 
 @takes(ResizeContainer, "container")
 class ResizeIn(Body):
-    """What a container may use from now on; null or left out: as before. Zero withdraws a request."""
+    """New resources of a container. Null or left out: unchanged; zero: not requested any more."""
 
 
 @takes(AddNode, "container")
@@ -141,12 +141,12 @@ class ParameterIn(Body):
 
 @takes(AddInterface, "endpoint")
 class InterfaceIn(Body):
-    """An interface to make."""
+    """An interface to create."""
 
 
 @takes(Connection)
 class ConnectionIn(Body):
-    """Two interfaces to join, each ``ENDPOINT/INTERFACE``."""
+    """Two interfaces to connect, each ``ENDPOINT/INTERFACE``."""
 
 
 # Out
@@ -154,7 +154,7 @@ class ConnectionIn(Body):
 
 @gives(Resources)
 class RequestedOut(Model):
-    """What a container asked for; zero or empty: nothing."""
+    """The resources that a container requested; zero or empty: not requested."""
 
 
 class ContainerOut(Model):
@@ -179,7 +179,7 @@ class ContainerOut(Model):
     """Bytes in use."""
     requested: RequestedOut = Option(alias="wish")
     moving_to: str
-    """Task set where its copy is being made, while its machine is drained; else empty."""
+    """While its machine is drained: the task set that starts its copy; else empty."""
 
 
 @gives(NodeSpec)
@@ -195,7 +195,7 @@ class NodeOut(Model):
     exit_code: int | None
     detail: str
     restarts: int
-    """How often it was started again by itself."""
+    """Number of automatic restarts."""
 
 
 class ParameterOut(Model):

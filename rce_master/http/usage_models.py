@@ -1,4 +1,4 @@
-"""What the REST API tells of consumption. Bytes, bytes per second, and processor cores."""
+"""The resource usage in answers of the REST API. Bytes, bytes per second, and processor cores."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from rce_master.http.model import Model
 
 
 class AdviceOut(Model):
-    """What could be better, and the command that mends it."""
+    """A possible improvement, and the command for it."""
 
     about: str
     """``too small``, ``too large`` or ``too full``."""
@@ -15,7 +15,7 @@ class AdviceOut(Model):
 
 
 class NodeUsageOut(Model):
-    """What a node consumes, with all processes that it started."""
+    """The resource usage of a node, with all processes that it started."""
 
     tag: str
     state: str
@@ -28,7 +28,7 @@ class NodeUsageOut(Model):
 
 
 class ContainerUsageOut(Model):
-    """What a container consumes."""
+    """The resource usage of a container."""
 
     id: str
     user: str
@@ -40,7 +40,7 @@ class ContainerUsageOut(Model):
     cpu_limit: float
     """0: no limit."""
     throttled: float
-    """Share of the time in which it is held back by its CPU limit now."""
+    """Share of the time in which its CPU limit stops it now."""
     cpu_s: float
     throttled_s: float
     memory: int
@@ -58,13 +58,13 @@ class ContainerUsageOut(Model):
     link_out_rate: float
     processes: int
     restarts: int
-    """Of its nodes, by themselves."""
+    """Automatic restarts of its nodes."""
     nodes: list[NodeUsageOut]
     advice: list[AdviceOut]
 
 
 class MachineUsageOut(Model):
-    """What a container machine has, what is promised of it, and what its containers use."""
+    """A container machine: its resources, how much of them is reserved, and how much its containers use."""
 
     process: str
     machine: str
@@ -72,21 +72,21 @@ class MachineUsageOut(Model):
     draining: bool
     containers: int
     slots: int
-    """0 if it is not counted."""
+    """0 if slots are not counted."""
     promised_slots: int
     cores: int
     promised_cores: float
     cpu: float
-    """Cores in use by its containers now."""
+    """Cores that its containers use now."""
     memory: int
     promised_memory: int
     memory_used: int
-    """By its containers."""
+    """Bytes that its containers use."""
     advice: list[AdviceOut]
 
 
 class UsageOut(Model):
-    """What is consumed now."""
+    """The present resource usage."""
 
     time: float
     """Seconds since 1970."""

@@ -9,7 +9,7 @@ from rce_master.exceptions import TransitionError
 
 
 class RobotSession(Enum):
-    """Where a robot is in its life."""
+    """The states of a robot."""
 
     OFFLINE = "offline"
     """The robot is unknown; it has no endpoint."""
@@ -31,16 +31,16 @@ class RobotEvent(Enum):
 
 
 class ContainerPhase(Enum):
-    """Where a container is in its life."""
+    """The states of a container."""
 
     REQUESTED = "requested"
     """Desired, and placed nowhere yet."""
     PLACED = "placed"
-    """A task set was told to make it, and has not reported it since."""
+    """A task set was ordered to create it, and has not reported it yet."""
     STARTING = "starting"
     """Its task set is making it."""
     RUNNING = "running"
-    """Its task set reports that all is well."""
+    """Its task set reports no fault."""
     DEGRADED = "degraded"
     """It runs, but a node of it failed, is stuck, or pauses after a failure."""
     FAILED = "failed"
@@ -48,10 +48,10 @@ class ContainerPhase(Enum):
     STOPPING = "stopping"
     """Its task set is ending it."""
     STOPPED = "stopped"
-    """Its task set ended it, as when that is shut down; placed anew as soon as there is a machine."""
+    """Its task set ended it, as when that is shut down; it is placed again when there is a machine."""
     LOST = "lost"
-    """Its task set stayed away beyond the grace time; placed anew as soon as there is a machine, or
-    bound again if the task set comes back with it first."""
+    """Its task set was away for longer than the grace time. It is placed again when there is a machine; if
+    its task set returns with it first, it stays there."""
 
     @property
     def is_placed(self) -> bool:
@@ -63,13 +63,13 @@ class ContainerEvent(Enum):
     """What can happen to a container."""
 
     PLACE = "place"
-    """A task set is told to make it."""
+    """A task set is ordered to create it."""
     STARTING = "starting"
     """Its task set reports that it starts."""
     RUNNING = "running"
     """Its task set reports that it runs."""
     DEGRADED = "degraded"
-    """Its task set reports that not all of its nodes are well."""
+    """Its task set reports a fault of a node."""
     FAILED = "failed"
     """Its task set reports that it ended, or could not be made."""
     STOPPING = "stopping"
@@ -77,7 +77,7 @@ class ContainerEvent(Enum):
     WITHDRAW = "withdraw"
     """Its task set ended it though it is desired."""
     LOSE = "lose"
-    """Its task set stayed away beyond the grace time."""
+    """Its task set was away for longer than the grace time."""
 
 
 ROBOT_LIFE: LifeCycle[RobotSession, RobotEvent] = LifeCycle(

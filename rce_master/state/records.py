@@ -1,6 +1,6 @@
 """The records of the state. All are immutable: a change replaces a record.
 
-Persistent records go to the store; the others (what is observed now) are made anew after a restart.
+Persistent records go to the store; the others (what is observed now) are made again after a restart.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ class UserRole(Enum):
 
     @property
     def sees_all(self) -> bool:
-        """Whether what belongs to others may be looked at."""
+        """Whether the role sees the objects of all users."""
         return self is not UserRole.USER
 
     @property
     def changes(self) -> bool:
-        """Whether there is anything that may be changed."""
+        """Whether the role may change anything."""
         return self is not UserRole.VIEWER
 
 

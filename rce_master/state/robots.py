@@ -106,7 +106,7 @@ def leave(tx: Transaction, robot: Robot, reason: str) -> None:
 
 
 def send_away(tx: Transaction, robot: Robot, reason: str) -> None:
-    """End a robot's session. It is absent then, and finds everything again if it can log in anew in time."""
+    """End a robot's session. It is absent then, and finds everything again if it can log in again in time."""
     leave(tx, robot, reason)
     if robot.task_set:
         endpoints.withdraw(tx, robot, reason)

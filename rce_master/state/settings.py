@@ -61,7 +61,7 @@ class StateSettings:
     """All files of one user's packages together, on the machines where they are unpacked."""
     max_endpoint_bytes: int = 2 * 2**20
     """What the nodes, parameters and interfaces of one endpoint take when they are written down. All are sent
-    when a task set or a container starts anew; a change of a node or a parameter is stored and sent with all
+    when a task set or a container starts again; a change of a node or a parameter is stored and sent with all
     other nodes and parameters."""
     max_user_bytes: int = 32 * 2**20
     """The same of all of a user's endpoints together."""

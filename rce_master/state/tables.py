@@ -140,7 +140,7 @@ class Table(Generic[R]):
         return {value: list(keys) for value, keys in self._found[index].items()}
 
     def computed_entries(self, index: str) -> dict[str, list[str]]:
-        """Compute anew what :meth:`index_entries` must hold, up to the order."""
+        """Compute again what :meth:`index_entries` must hold, up to the order."""
         entries: dict[str, list[str]] = {}
         for key, record in self._rows.items():
             for value in self._indexes[index](record):
@@ -159,7 +159,7 @@ class Table(Generic[R]):
 
     @property
     def computed_totals(self) -> dict[str, int]:
-        """Compute anew what :attr:`totals` must hold."""
+        """Compute again what :attr:`totals` must hold."""
         totals: dict[str, int] = {}
         for record in self._rows.values():
             if self._amount is not None:

@@ -51,7 +51,7 @@ class Arrival(Enum):
     """How a server classifies an incoming goal."""
 
     NEW = auto()
-    """It is to be worked on."""
+    """It is new: the server works on it."""
     REPEATED = auto()
     """It is in the list already."""
     CANCELLED = auto()

@@ -167,7 +167,7 @@ class ActionServer:
             self._publish_status()
 
     def _see_time(self) -> Time:
-        """Return ROS time, and notice if it jumped back: a simulation or a bag began anew."""
+        """Return ROS time, and notice if it jumped back: a simulation or a bag began again."""
         now = self._node.now()
         nanoseconds = now.to_nsec()
         if nanoseconds < self._latest:

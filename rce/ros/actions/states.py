@@ -30,9 +30,9 @@ class GoalState(IntEnum):
     REJECTED = 5
     """Ended: the server did not accept it."""
     PREEMPTING = 6
-    """Worked on, and asked to end."""
+    """Active, and asked to end."""
     RECALLING = 7
-    """Not accepted yet, and asked to end."""
+    """Pending, and asked to end."""
     RECALLED = 8
     """Ended: cancelled before it was worked on."""
     LOST = 9

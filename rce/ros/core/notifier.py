@@ -87,7 +87,7 @@ class Notifier:
             answer = await self._client.send(call.uri, call.method, document, timeout=CALL_TIMEOUT)
         except RpcUnreachableError as error:
             _log.info("%s is not delivered: %s", call.method, error)
-            queue.clear()  # the node is gone; a new node at this address registers and learns the state anew
+            queue.clear()  # the node is gone; a new node at this address registers and learns the state again
         except XmlRpcError as error:
             _log.warning("%s to %s: %s", call.method, call.uri, error)
         else:

@@ -1,7 +1,7 @@
 """ROS time: the machine's clock or, if the parameter ``/use_sim_time`` is true, the topic ``/clock``.
 
 Simulated time is zero until the first tick, may run at any speed, stand still, and jump back when a
-simulation or a bag begins anew.
+simulation or a bag begins again.
 """
 
 from __future__ import annotations

@@ -263,7 +263,7 @@ class Node(GraphMember):
         Args:
             name: The service.
             service_type: Its type.
-            persistent: Keep connections for later calls; else every call looks the provider up anew.
+            persistent: Keep connections for later calls; else every call looks the provider up again.
 
         Raises:
             UnknownTypeError: The type does not exist.

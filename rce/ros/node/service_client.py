@@ -35,7 +35,7 @@ class ServiceClient:
     """Calls one service. Made by :meth:`rce.ros.node.Node.service_client`.
 
     Any number of calls may run at once. A connection carries one call at a time and is kept for later ones
-    while it lasts; when it is lost, the provider is looked up anew.
+    while it lasts; when it is lost, the provider is looked up again.
     """
 
     def __init__(self, runtime: Runtime, name: str, service_type: ServiceType, *, persistent: bool) -> None:

@@ -1,6 +1,6 @@
 """Keeps the memory of large messages in the process instead of giving it back after each.
 
-glibc returns freed blocks at the end of the heap to the kernel and maps really large ones anew each time.
+glibc returns freed blocks at the end of the heap to the kernel and maps really large ones again each time.
 A process that passes on 10 MB messages then spends most of its time in page faults: five of six milliseconds
 per copy. Imported and used only by processes that see such messages.
 """

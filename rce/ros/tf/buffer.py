@@ -82,7 +82,7 @@ class Buffer:
         return edge.insert(Sample(stamped.stamp.to_nsec(), parent, transform))
 
     def clear(self) -> None:
-        """Remove all transforms except static ones; for a time that begins anew."""
+        """Remove all transforms except static ones; for a time that begins again."""
         self._edges = {child: edge for child, edge in self._edges.items() if isinstance(edge, StaticEdge)}
         self._frames = {}
         for child, edge in self._edges.items():

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 JUMP = 1.0
-"""Seconds that time must jump back for the buffer to forget: a simulation or a bag began anew."""
+"""Seconds that time must jump back for the buffer to forget: a simulation or a bag began again."""
 
 MAX_WARNINGS = 100
 """For how many different frames warnings are logged."""

@@ -32,7 +32,7 @@ class MessageThrottle:
         self._last = float("-inf")
 
     def passes(self, now: float, size: int) -> bool:
-        """Decide; a clock that is set back starts anew."""
+        """Decide; a clock that is set back starts again."""
         del size
         if self._last <= now < self._last + self._period:
             return False
