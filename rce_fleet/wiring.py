@@ -22,6 +22,13 @@ if TYPE_CHECKING:
 
 FLEET_CONTAINER = "cTag_fleet"
 OPERATOR = "fleetOperator"
+FLOOR_PARAMETERS: dict[str, bool | int | float | str | list[Any]] = {
+    "rows": 8,
+    "columns": 8,
+    "cell_size": 1.0,
+    "walls": [9, 20, 21, 23, 37, 41, 42, 45, 50],
+}
+"""The planner's parameters for the floor of ``configs/scene.yaml``."""
 
 _POSE = "geometry_msgs/PoseWithCovarianceStamped"
 _CELLS = "std_msgs/Int32MultiArray"
@@ -73,10 +80,11 @@ def fleet_config(
 
     Args:
         account: Engine and user; None for those of a development engine.
-        parameters: The planner's parameters by name, such as ``rows``; those of an 8 x 8 floor if None.
+        parameters: The planner's parameters by name, such as ``rows``; those of the floor of
+            ``configs/scene.yaml`` if None.
     """
     account = account or FleetAccount()
-    given = {"rows": 8, "columns": 8, "cell_size": 1.0} if parameters is None else parameters
+    given = FLOOR_PARAMETERS if parameters is None else parameters
     return {
         "url": account.url,
         "userID": account.user,

@@ -8,14 +8,13 @@ from pathlib import Path
 from random import Random
 
 from rce_fleet.demo.exceptions import DemoError
+from rce_fleet.demo.floor import FLOOR
 from rce_fleet.exceptions import FleetError
 from rce_fleet.planning.dijkstra import shortest_path
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map, read_scenario
 from rce_fleet.planning.scenario import Scenario, given_scenario, make_scenario
 
-FLOOR = GridMap(rows=8, columns=8, cell_size=1.0, blocked=frozenset({26, 34, 29, 37}))
-"""8 x 8 cells with two short walls in the middle."""
 MIN_LONGEST_PATH = 6
 """Cells on the longest path, at least, so that a cell in its middle can be blocked on the way."""
 _MAX_DRAWS = 1000

@@ -22,6 +22,8 @@ from rce_fleet.drivers.cell_watch import CellWatch, GraphCellWatch
 from rce_fleet.drivers.engine_cell_watch import EngineCellWatch, WorldAccount
 from rce_fleet.drivers.program import Cores, PortTakenError, RunOptions, Simulation
 from rce_fleet.drivers.scene import load_scene
+from rce_fleet.exceptions import FleetError
+from rce_fleet.maps.ros_map import save_map
 
 BAD_SCENE = 2
 FAILED = 1
@@ -107,6 +109,13 @@ def sim(
     report: Annotated[
         Path | None, typer.Option(help="Write the state of the world to this file (JSON).")
     ] = None,
+    write_map: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.yaml",
+            help="Write the map of the scene's walls for map_server (YAML and PGM) and exit.",
+        ),
+    ] = None,
     headless: Annotated[bool, typer.Option(help="Accepted for scripts; the program has no window.")] = True,
 ) -> None:
     """Simulate a world; each robot has its own ROS core."""
@@ -124,12 +133,19 @@ def sim(
     try:
         read = load_scene(scene)
         read = read if seed is None else read.model_copy(update={"seed": seed})
+        if write_map is not None:
+            save_map(read.draw(), write_map.with_suffix(""))
+            typer.echo(f"wrote {write_map.with_suffix('.yaml')} and {write_map.with_suffix('.pgm')}")
+            return
         simulation = Simulation(
             read, TypeRegistry(), typer.echo, report=report, cores=Cores.read(core or ()), options=options
         )
     except ConfigError as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(BAD_SCENE) from None
+    except (FleetError, OSError) as error:
+        typer.echo(f"rce sim: {error}", err=True)
+        raise typer.Exit(FAILED) from None
     try:
         uvloop.run(_until_signal(simulation))
     except* PortTakenError as group:

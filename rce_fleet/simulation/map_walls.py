@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 TILE = 32
 """Cells of a side of the squares that are vectorised one by one: those without a wall are left out."""
+_DIGITS = 9
+"""Digits of a map's origin: without the noise of binary fractions."""
 TOLERANCE = 0.5
 """Cells that a simplified line may be away from the cells' edge."""
 
@@ -96,7 +98,8 @@ def draw_map(
     rooms = np.unique(free[cells[on_map, 1], cells[on_map, 0]])
     data = np.where(np.isin(free, rooms[rooms > 0]), FREE, UNKNOWN)
     data[solid] = OCCUPIED
-    origin = Pose((first_column - 0.5) * resolution, (first_row - 0.5) * resolution, 0.0)
+    left, low = ((first - 0.5) * resolution for first in (first_column, first_row))
+    origin = Pose(round(left, _DIGITS), round(low, _DIGITS), 0.0)
     return OccupancyMap(data.astype(np.int8), resolution, origin)
 
 

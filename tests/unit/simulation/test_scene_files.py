@@ -10,13 +10,17 @@ import pytest
 import yaml
 
 from rce.config.exceptions import ConfigError
+from rce_fleet.demo.floor import FLOOR
 from rce_fleet.drivers.robot_models import load_model, shipped_models
 from rce_fleet.drivers.scene import load_scene
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.maps.occupancy_map import OccupancyMap
-from rce_fleet.maps.ros_map import save_map
+from rce_fleet.maps.ros_map import load_map, save_map
 from rce_fleet.simulation.map_walls import draw_map, walls_of_map
 from rce_fleet.simulation.world import World
+from rce_fleet.wiring import FLOOR_PARAMETERS
+
+CONFIGS = Path(__file__).parents[3] / "configs"
 
 FULL = """
 rows: 6
@@ -73,9 +77,14 @@ def test_shipped_models_are_as_their_data_sheets_say() -> None:
 
 
 def test_the_shipped_scene_is_that_of_the_shipped_configs() -> None:
-    scene = load_scene(Path(__file__).parents[3] / "configs" / "scene.yaml")
+    scene = load_scene(CONFIGS / "scene.yaml")
     assert (scene.rows, scene.columns, scene.cell_size) == (8, 8, 1.0)
     assert list(scene.build().robots) == ["Robot1", "Robot2", "Robot3"]
+    assert scene.floor().grid == FLOOR
+    assert sorted(FLOOR.blocked) == FLOOR_PARAMETERS["walls"]
+    drawn, shipped = scene.draw(), load_map(CONFIGS / "map.yaml")
+    np.testing.assert_array_equal(drawn.data, shipped.data)
+    assert (drawn.resolution, drawn.origin) == (shipped.resolution, shipped.origin)
 
 
 @pytest.mark.parametrize(
