@@ -126,6 +126,25 @@ TARGETS = [
         )
         for robots in (50, 2000)
     ),
+    *(
+        Target(
+            f"simulated world, 100 robots with {sensor}s, one core",
+            "simulation.world",
+            _column("x real time", robots=100, sensor=sensor),
+            1,
+            "x real time",
+            at_least=True,
+        )
+        for sensor in ("lidar", "camera")
+    ),
+    Target(
+        "simulated world with ROS nodes, 100 robots with lidars, one core",
+        "simulation.nodes",
+        _column("x real time", robots=100),
+        1,
+        "x real time",
+        at_least=True,
+    ),
     Target("container start to first message, p50", "start", _column("p50_ms"), 250, "ms"),
     Target("100 containers at once", "many", _column("all at once", containers=100), 20, "s"),
     Target("idle container, PSS", "many", _column("idle container PSS MB"), 15, "MB"),

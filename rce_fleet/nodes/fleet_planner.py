@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, assert_never
 from rce.ros.errors import MasterError
 from rce.ros.node import Node, run
 from rce.ros.node.master import MasterClient
-from rce.ros.types import Time
 from rce.ros.xmlrpc import RpcClient
 from rce_fleet.coordination.answers import is_answer, numbered_array, read_answer
 from rce_fleet.coordination.events import (
@@ -248,7 +247,7 @@ class PlannerNode:
 
     def _publish_blocked(self, cells: tuple[int, ...]) -> None:
         self._blocked.publish(data=list(cells))
-        fields = grid_fields(self._planner.state.grid, cells, Time.now())
+        fields = grid_fields(self._planner.state.grid, cells, self._node.now())
         for grids in (self._map, self._old_map):
             if grids is not None:
                 grids.publish(fields)

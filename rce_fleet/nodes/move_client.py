@@ -6,7 +6,6 @@ The work is done by :mod:`rce_fleet.coordination.move_client`; this node passes 
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING, assert_never
 
 from rce.ros.errors import MasterError
@@ -85,9 +84,9 @@ class MoveClientNode:
                     await self._look_for_old_map()
                     look_at = time.monotonic() + OLD_MAP_AFTER
                 continue
-            now = time.time()
+            now = self._node.time()
             self._do(self._client.tick(now))
-            if now - self._reported_at >= REPORT_EVERY:
+            if not 0 <= now - self._reported_at < REPORT_EVERY:  # simulated time may jump back
                 self._do([self._client.report])
 
     # What comes in
@@ -121,7 +120,7 @@ class MoveClientNode:
 
     def _take_grid(self, grid: GridMap) -> None:
         if self._client is None:
-            self._client = MoveClient(grid, self._node.namespace.strip("/"), time.time())
+            self._client = MoveClient(grid, self._node.namespace.strip("/"), self._node.time())
 
     def _take_blocked(self, message: Message) -> None:
         if self._client is not None:
@@ -137,23 +136,23 @@ class MoveClientNode:
             return
         revision = revision_of(labels)
         try:
-            self._do(self._client.take_cells(revision, list(message.data), time.time()))
+            self._do(self._client.take_cells(revision, list(message.data), self._node.time()))
         except ValueError as error:
             self._node.log.warning("the list of cells was refused: %s", error)
 
     def _take_cancel(self, message: Message) -> None:
         if self._client is not None and message.data:
-            self._do(self._client.cancel(time.time()))
+            self._do(self._client.cancel(self._node.time()))
 
     def _take_states(self, message: Message) -> None:
         if self._client is not None:
             states = {entry.goal_id.id: GoalState(entry.status) for entry in message.status_list}
-            self._do(self._client.take_goal_states(states, time.time()))
+            self._do(self._client.take_goal_states(states, self._node.time()))
 
     def _take_result(self, message: Message) -> None:
         if self._client is not None:
             status = message.status
-            self._do(self._client.take_result(status.goal_id.id, GoalState(status.status), time.time()))
+            self._do(self._client.take_result(status.goal_id.id, GoalState(status.status), self._node.time()))
 
     # What goes out
 
@@ -189,7 +188,7 @@ class MoveClientNode:
     def _report(
         self, report: ClientReport, blocked: tuple[int, ...] = (), freed: tuple[int, ...] = ()
     ) -> None:
-        self._reported_at = time.time()
+        self._reported_at = self._node.time()
         if self._answers:
             self._reports.publish(answer_array(Answer(report, blocked, freed)))
             return

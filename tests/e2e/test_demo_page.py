@@ -12,7 +12,7 @@ import pytest
 from playwright.async_api import Page, ViewportSize, async_playwright
 from support.demo import Demo, running_demo
 
-from rce_fleet.demo.scenario import FLOOR
+from rce_fleet.demo.floor import FLOOR
 from rce_fleet.drivers.report import read_report
 from rce_fleet.planning.scenario import midway_cell
 

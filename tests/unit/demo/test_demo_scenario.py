@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from rce_fleet.demo.exceptions import DemoError
-from rce_fleet.demo.scenario import FLOOR, MIN_LONGEST_PATH, choose_scenario
+from rce_fleet.demo.floor import FLOOR
+from rce_fleet.demo.scenario import MIN_LONGEST_PATH, choose_scenario
 from rce_fleet.planning.dijkstra import shortest_path
 
 MAP = "type octile\nheight 2\nwidth 3\nmap\n...\n.@.\n"
