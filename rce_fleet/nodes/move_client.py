@@ -6,6 +6,7 @@ The work is done by :mod:`rce_fleet.coordination.move_client`; this node passes 
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, assert_never
 
 from rce.ros.errors import MasterError
