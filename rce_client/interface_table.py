@@ -88,8 +88,9 @@ class InterfaceTable:
     def set_active(self, tag: str, active: bool) -> None:
         """Note whether an interface is joined with a peer."""
         self.active[tag] = active
-        if active and tag in self._interfaces:
-            self._interfaces[tag].on_active()
+        interface = self._interfaces.get(tag)
+        if interface is not None:
+            (interface.on_active if active else interface.on_inactive)()
 
     def keep_latched(self, tag: str, sources: Sequence[str]) -> None:
         """Tell an interface which sources are still there."""

@@ -160,6 +160,9 @@ class ClientInterface(ABC):
     def on_active(self) -> None:  # noqa: B027 - few interfaces act on it
         """Learn that the interface is joined with a peer, or again."""
 
+    def on_inactive(self) -> None:  # noqa: B027 - few interfaces act on it
+        """Learn that the interface is not joined with a peer any more."""
+
     def on_lost(self) -> None:  # noqa: B027 - few interfaces act on it
         """Learn that the connection ended."""
 

@@ -37,6 +37,26 @@ class Publisher(ClientInterface, Generic[M]):
     def __init__(self, owner: InterfaceOwner, tag: str, message_type: str, *, raw: bool) -> None:
         super().__init__(owner, tag, message_type, raw=raw)
         self._latched: dict[str, M] = {}
+        self._on_demand: Callable[[bool], None] | None = None
+
+    def watch_demand(self, callback: Callable[[bool], None]) -> None:
+        """Call a function whenever it changes whether the interface is connected to a peer.
+
+        A program can make messages only while they are needed. Without a connection to the engine they are
+        not needed.
+
+        Args:
+            callback: Called with whether messages are needed; must not block.
+
+        Example:
+            ```python
+            picture = await robot.publisher("picture", "sensor_msgs/Image")
+            picture.watch_demand(lambda needed: print("camera on" if needed else "camera off"))
+            ```
+        """
+        self._on_demand = callback
+        if self._owner.is_active(self.tag):
+            callback(True)
 
     def publish(self, message: M, *, latch: str = "") -> bool:
         """Send a message. It never waits.
@@ -90,6 +110,19 @@ class Publisher(ClientInterface, Generic[M]):
         for source, message in self._latched.items():
             self._post(message, source)
         self.keep_latched(tuple(self._latched))
+        self._tell_demand(needed=True)
+
+    def on_inactive(self) -> None:
+        """Report that messages are not needed."""
+        self._tell_demand(needed=False)
+
+    def on_lost(self) -> None:
+        """Report that messages are not needed without a connection."""
+        self._tell_demand(needed=False)
+
+    def _tell_demand(self, *, needed: bool) -> None:
+        if self._on_demand is not None:
+            self._on_demand(needed)
 
     def _post(self, message: M, latch: str) -> bool:
         source = latch if self._owner.knows_sources else ""

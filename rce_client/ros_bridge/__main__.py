@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 import uvloop
 
+from rce.aio.tasks import TaskScope
 from rce.cli.options import Authority
 from rce.config.documents import read_file
 from rce.config.exceptions import ConfigError, ShippedFileError
@@ -140,10 +141,11 @@ def _connection(config: ClientConfig, tls: Context | None) -> Connection:
 
 async def _serve(config: ClientConfig, plan: Plan, conn: Connection, node: Node) -> None:
     try:
-        await build(plan, conn, node)
-        await wait_ready(plan, conn, say)
-        print(f"rce-ros ready: robot {config.robot} connected", flush=True)  # noqa: T201
-        await conn.wait_refused()
+        async with TaskScope() as tasks:
+            await build(plan, conn, node, tasks)
+            await wait_ready(plan, conn, say)
+            print(f"rce-ros ready: robot {config.robot} connected", flush=True)  # noqa: T201
+            await conn.wait_refused()
     except asyncio.CancelledError:
         current = asyncio.current_task()
         assert current is not None

@@ -5,21 +5,26 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import logging
 from typing import TYPE_CHECKING, assert_never
 
 from rce.model import Role
-from rce.ros.errors import MasterError
+from rce.ros.closing import release
+from rce.ros.errors import MasterError, RosError
 from rce.ros.node import Node
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Sequence
 
+    from rce.aio.tasks import TaskScope
     from rce.ros.node import Publisher as RosPublisher
     from rce.ros.types import TypeRegistry
     from rce_client.connection import Connection
     from rce_client.own_interfaces import Serialized
     from rce_client.ros_bridge.plan import Plan, Span
     from rce_client.topics import Publisher
+
+_log = logging.getLogger(__name__)
 
 MASTER_TIMEOUT = 2.0
 """Seconds between two attempts to reach the robot's ROS master."""
@@ -54,8 +59,8 @@ async def joined_graph(
         yield node
 
 
-async def build(plan: Plan, conn: Connection, node: Node) -> None:
-    """Send all requests to the engine and create all spans.
+async def build(plan: Plan, conn: Connection, node: Node, tasks: TaskScope) -> None:
+    """Send all requests to the engine and create all spans; ``tasks`` runs what belongs to them.
 
     Raises:
         rce.ros.errors.RosError: The robot's graph refuses a registration.
@@ -64,17 +69,20 @@ async def build(plan: Plan, conn: Connection, node: Node) -> None:
     for request in plan.requests[: plan.first]:
         await conn.request(request)
     for span in plan.spans:
-        await lay(span, conn, node)
+        await lay(span, conn, node, tasks)
     for request in plan.requests[plan.first :]:
         await conn.request(request)
 
 
-async def lay(span: Span, conn: Connection, node: Node) -> None:
+async def lay(span: Span, conn: Connection, node: Node, tasks: TaskScope) -> None:
     """Connect one interface with its topic or service. Messages are passed on unchanged."""
     match span.role:
         case Role.SUBSCRIBER:
             uplink = Uplink(conn, await conn.publisher(span.tag, span.message_type, raw=True))
-            await node.listen(span.addr, span.message_type, uplink)
+            if span.on_demand:
+                tasks.spawn(uplink.listen_on_demand(node, span), name=f"uplink {span.tag}")
+            else:
+                await node.listen(span.addr, span.message_type, uplink)
         case Role.PUBLISHER:
             publisher = await node.advertise(span.addr, span.message_type)
             downlink = Downlink(publisher)
@@ -116,6 +124,39 @@ class Uplink:
         self._names: dict[str, str] = {}
         """By publisher of the robot's graph: what the engine is told of who it is."""
         self._numbers = itertools.count(1)
+
+    async def listen_on_demand(self, node: Node, span: Span) -> None:
+        """Subscribe to the topic whenever the interface is connected, until it is not, until cancelled.
+
+        So a topic that the config offers, and that no other program uses now, costs nothing.
+        """
+        changed = asyncio.Event()
+        needed = False
+
+        def take_demand(now: bool) -> None:  # noqa: FBT001 - the callback's form
+            nonlocal needed
+            needed = now
+            changed.set()
+
+        self._publisher.watch_demand(take_demand)
+        while True:
+            await changed.wait()
+            changed.clear()
+            if not needed:
+                continue
+            try:
+                subscriber = await node.listen(span.addr, span.message_type, self)
+            except RosError as error:
+                _log.warning("topic %s cannot be subscribed to: %s", span.addr, error)
+                continue
+            try:
+                while needed:
+                    await changed.wait()
+                    changed.clear()
+            finally:
+                await release(subscriber)
+                self._names.clear()
+                self._publisher.keep_latched(())
 
     def received(self, payload: bytes) -> None:
         """Send a message of the robot's graph."""

@@ -31,6 +31,8 @@ class Span:
     message_type: str
     addr: str
     """Topic or service in the robot's graph."""
+    on_demand: bool = False
+    """Subscribe to the topic only while the interface is connected: no connection of the file names it."""
 
     @property
     def type(self) -> str:
@@ -66,15 +68,21 @@ class Plan:
 
 def make_plan(config: ClientConfig) -> Plan:
     """Return what is to be done for a robot's config."""
+    ends = {end for link in config.connections for end in (link.tag_a, link.tag_b)}
     spans = tuple(
-        Span(own.tag, own.kind.role, own.message_type, own.addr)
+        Span(
+            own.tag,
+            own.kind.role,
+            own.message_type,
+            own.addr,
+            on_demand=own.kind.role is Role.SUBSCRIBER and f"{config.robot}/{own.tag}" not in ends,
+        )
         for own in config.robot_interfaces
         if own.addr
     )
     bridged = {span.tag for span in spans}
     requests = [_without(request, config.robot, bridged) for request in config.setup()]
     first = sum(1 for _ in config.containers)
-    ends = {end for link in config.connections for end in (link.tag_a, link.tag_b)}
     return Plan(
         robot=config.robot,
         spans=spans,

@@ -36,6 +36,10 @@ from rce_fleet.station.engine_watch import EngineWatch
 from rce_fleet.station.feed import Feed
 from rce_fleet.station.fleet_link import FleetLink, PlannerClient
 from rce_fleet.station.graph_watch import GraphWatch
+from rce_fleet.station.layers.engine_source import EngineLayerSource
+from rce_fleet.station.layers.hub import LayerHub
+from rce_fleet.station.layers.ros_source import RosLayerSource
+from rce_fleet.station.layers.sources import LayerSource
 from rce_fleet.station.ros_planner_client import RosPlannerClient
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
@@ -161,6 +165,10 @@ class Backend(Protocol):
     def client(self) -> PlannerClient:
         """The client of the planner."""
 
+    @property
+    def layers(self) -> LayerSource:
+        """Where layers come from."""
+
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
         """Call ``on_state`` with the state of engine or graph until cancelled."""
 
@@ -175,25 +183,35 @@ class EngineBackend:
             raise ConfigError(
                 "station", [Fault("token", "a token is for robots; the station needs the user's password")]
             )
-        self.account = StationAccount(config.url, config.user, password, self._tls)
+        self.account = account = StationAccount(config.url, config.user, password, self._tls)
         self.client = EnginePlannerClient(config, self._tls)
+        self._on_state: Callable[[dict[str, Any]], None] = _ignore
+        self._watch = EngineWatch(
+            account.url, account.user, account.password, tls=self._tls, on_state=self._take
+        )
+        self.layers = EngineLayerSource(lambda: self.client.connection, self._watch.read_items)
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
         """Call ``on_state`` with the engine's state until cancelled; restart nodes that ended."""
+        self._on_state = on_state
+        await self._watch.run()
 
-        def take(state: dict[str, Any]) -> None:
-            on_state(state)
-            self.client.on_engine(state)
+    def _take(self, state: dict[str, Any]) -> None:
+        self._on_state(state)
+        self.client.on_engine(state)
 
-        account = self.account
-        await EngineWatch(account.url, account.user, account.password, tls=self._tls, on_state=take).run()
+
+def _ignore(state: dict[str, Any]) -> None:
+    del state
 
 
 class RosBackend:
     """The planner runs in a ROS graph without the engine."""
 
     def __init__(self, master_uri: str) -> None:
-        self.client = RosPlannerClient(master_uri, TypeRegistry(PackageIndex.from_environ()))
+        types = TypeRegistry(PackageIndex.from_environ())
+        self.client = RosPlannerClient(master_uri, types)
+        self.layers = RosLayerSource(master_uri, types)
         self._master_uri = master_uri
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
@@ -218,8 +236,10 @@ async def serve(
     stop = asyncio.Event()
     for number in end_signals():
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    station = Station(view, fleet, feed.pages, authenticator=authenticator, names=names)
+    layers = LayerHub(backend.layers, view, TypeRegistry(PackageIndex.from_environ()))
+    station = Station(view, fleet, feed.pages, authenticator=authenticator, names=names, layers=layers)
     async with AsyncExitStack() as stack:
+        stack.push_async_callback(layers.close)
         if isinstance(authenticator, EngineAuthenticator):
             await stack.enter_async_context(authenticator)
         server = await stack.enter_async_context(HttpServer(station.make_app(), bind, port, tls))

@@ -24,6 +24,15 @@ class CellRequest(_Model):
     blocked: bool
 
 
+class LayersRequest(_Model):
+    """The layers that a page shows; sent on the live socket, it replaces the last one."""
+
+    robot: str = Field(description="The robot whose layers are shown.", max_length=128)
+    layers: list[str] = Field(
+        description="map, scan, particles, plan, local_costmap, global_costmap.", max_length=32
+    )
+
+
 class LoginRequest(_Model):
     """Name and password of a user of the engine."""
 

@@ -49,6 +49,8 @@ class EnginePlannerClient(PlannerClient):
         self._config = config
         self._tls = tls
         self._container = config.containers[0].tag
+        self.connection: Connection | None = None
+        """The connection to the engine, while there is one."""
         self._node_requests: asyncio.Queue[Request] = asyncio.Queue()
         self._listener: PlannerListener
         self._states: Subscriber[dict[str, Any]]
@@ -70,6 +72,7 @@ class EnginePlannerClient(PlannerClient):
                 for request in config.setup():
                     await connection.request(request)
                 await self._join_planner(connection)
+                self.connection = connection
                 await ready()
                 async with asyncio.TaskGroup() as group:
                     group.create_task(self._follow_robots(connection))
@@ -77,6 +80,7 @@ class EnginePlannerClient(PlannerClient):
                     group.create_task(self._follow_changes(connection))
                     group.create_task(self._follow_states(connection))
             finally:
+                self.connection = None
                 await connection.remove_all()
 
     def on_engine(self, state: dict[str, Any]) -> None:

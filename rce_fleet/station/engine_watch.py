@@ -15,6 +15,7 @@ from rce.masters import Masters
 from rce.tls.faults import explain_to_client
 from rce.web.client import session_connector
 from rce_fleet.station.engine_authenticator import RequestOptions
+from rce_fleet.station.layers.frames import LayerError
 
 if TYPE_CHECKING:
     from rce.tls.identity import Context
@@ -51,6 +52,21 @@ class EngineWatch:
         self._on_state = on_state
         self._token = ""
         self._last: dict[str, Any] = {}
+        self._session: aiohttp.ClientSession | None = None
+
+    async def read_items(self, kind: str) -> list[dict[str, Any]]:
+        """Return the user's items of a kind from the REST API, such as ``interfaces``.
+
+        Raises:
+            LayerError: They cannot be read now.
+        """
+        if self._session is None or not self._token:
+            raise LayerError("the engine's state is not known yet")
+        try:
+            items: list[dict[str, Any]] = (await self._get(self._session, kind))[kind]
+        except (aiohttp.ClientError, TimeoutError) as error:
+            raise LayerError(f"the master cannot be asked for {kind}: {error}") from error
+        return items
 
     @property
     def _api(self) -> URL:
@@ -66,9 +82,11 @@ class EngineWatch:
         async with aiohttp.ClientSession(
             timeout=TIMEOUT, raise_for_status=True, connector=connector
         ) as session:
+            self._session = session
             try:
                 await self._watch(session)
             finally:
+                self._session = None
                 await self._log_out(session)
 
     async def _watch(self, session: aiohttp.ClientSession) -> None:

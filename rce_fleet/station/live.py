@@ -11,10 +11,14 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable, Iterator
+from typing import TypeAlias
 
 MAX_CHANGES = 50
 """Maximum number of changes that wait for one page."""
 MAX_EVENTS = 100
+
+Message: TypeAlias = str | bytes
+"""A text, or a frame of a layer (:mod:`rce_fleet.station.layers.frames`)."""
 
 
 class Page:
@@ -30,7 +34,7 @@ class Page:
         self._takes_changes = takes_changes
         self._is_behind = True
         self._changes: deque[str] = deque()
-        self._newest: dict[str, str] = {}
+        self._newest: dict[str, Message] = {}
         self._events: deque[str] = deque(maxlen=MAX_EVENTS)
         self._wake = asyncio.Event()
         self._wake.set()
@@ -44,33 +48,37 @@ class Page:
             self._changes.append(text)
         self._wake.set()
 
-    def put(self, topic: str, text: str) -> None:
+    def put(self, topic: str, message: Message) -> None:
         """Queue a message; it replaces an older one of its topic."""
-        self._newest[topic] = text
+        self._newest[topic] = message
         self._wake.set()
+
+    def drop(self, topic: str) -> None:
+        """Remove a queued message of a topic."""
+        self._newest.pop(topic, None)
 
     def put_event(self, text: str) -> None:
         """Queue an event."""
         self._events.append(text)
         self._wake.set()
 
-    async def take(self) -> list[str]:
+    async def take(self) -> list[Message]:
         """Wait for messages, and return them."""
         while True:
             await self._wake.wait()
             self._wake.clear()
-            texts = self._take_now()
-            if texts:
-                return texts
+            messages = self._take_now()
+            if messages:
+                return messages
 
-    def _take_now(self) -> list[str]:
+    def _take_now(self) -> list[Message]:
         state = self._whole() if self._is_behind else list(self._changes)
         self._is_behind = self._is_behind and not state
-        texts = [*state, *self._newest.values(), *self._events]
+        messages = [*state, *self._newest.values(), *self._events]
         self._changes.clear()
         self._newest.clear()
         self._events.clear()
-        return texts
+        return messages
 
 
 class Broadcast:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
@@ -23,6 +24,7 @@ from rce_fleet.station.api import (
     CellRequest,
     FleetModel,
     GoalRequest,
+    LayersRequest,
     LoginRequest,
     MapModel,
     Problem,
@@ -31,6 +33,7 @@ from rce_fleet.station.api import (
 )
 from rce_fleet.station.authentication import AuthenticationError, Authenticator, TokenAuthenticator
 from rce_fleet.station.fleet_link import FleetLink, PlannerError, PlannerUnavailableError
+from rce_fleet.station.layers.hub import LayerHub
 from rce_fleet.station.live import Broadcast, Page
 from rce_fleet.station.view import FleetView
 
@@ -67,6 +70,7 @@ class Station:
         pages: The open pages.
         authenticator: Finds the user of a token; if None, every request may do everything.
         names: Host names under which the station may be requested.
+        layers: Sends layers to the pages that ask for them; if None, there are none.
     """
 
     def __init__(
@@ -77,7 +81,9 @@ class Station:
         *,
         authenticator: Authenticator | None = None,
         names: ServerNames | None = None,
+        layers: LayerHub | None = None,
     ) -> None:
+        self._layers = layers
         self._view = view
         self._fleet = fleet
         self._pages = pages
@@ -236,19 +242,31 @@ class Station:
 
         Without ``?changes=1`` it gets everything whenever something changes, as pages of 0.1 expect.
         """
-        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, compress=False)
+        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, compress=False, max_msg_size=MAX_BODY)
         await socket.prepare(request)
         page = self._pages.open(takes_changes=request.query.get("changes") == "1")
         writer = asyncio.create_task(_write(socket, page))
         watcher = asyncio.create_task(self._close_when_logged_out(socket, request))
         try:
             async for message in socket:
-                if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
-                    continue
+                if message.type is WSMsgType.TEXT and self._layers is not None:
+                    self._show_layers(self._layers, page, message.data)
         finally:
             self._pages.close(page)
+            if self._layers is not None:
+                self._layers.leave(page)
             await cancel_and_wait(writer, watcher)
         return socket
+
+    def _show_layers(self, layers: LayerHub, page: Page, text: str) -> None:
+        """Set the layers that a page shows; tell the page if it cannot be read."""
+        try:
+            wanted = LayersRequest.model_validate_json(text)
+        except ValidationError as error:
+            fault = f"a page asked for something else than layers: {error.errors()[0]['msg']}"
+            page.put_event(json.dumps({"type": "event", "text": fault, "tone": "bad"}))
+            return
+        layers.show(page, wanted.robot, wanted.layers)
 
     async def _close_when_logged_out(self, socket: web.WebSocketResponse, request: web.Request) -> None:
         """Close a page's socket when its user may not see the fleet any more."""
@@ -262,8 +280,11 @@ class Station:
 async def _write(socket: web.WebSocketResponse, page: Page) -> None:
     with contextlib.suppress(ConnectionError):
         while True:
-            for text in await page.take():
-                await socket.send_str(text)
+            for message in await page.take():
+                if isinstance(message, bytes):
+                    await socket.send_bytes(message)
+                else:
+                    await socket.send_str(message)
             await asyncio.sleep(MIN_FRAME_S)
 
 

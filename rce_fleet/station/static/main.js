@@ -1,13 +1,18 @@
 // Connects model, view and panel to the station: a WebSocket for changes, HTTP for the operator's requests.
 
 import { Fleet } from "./model.js";
+import { LayerPanel } from "./layer_panel.js";
+import { Layers } from "./layers.js";
 import { Panel } from "./panel.js";
 import { View } from "./view.js";
 
+let socket = null;
 const fleet = new Fleet();
+const layers = new Layers((request) => { if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(request)); });
 const canvas = document.querySelector("#map");
-const view = new View(canvas, fleet);
+const view = new View(canvas, fleet, layers);
 const panel = new Panel(fleet);
+new LayerPanel(fleet, layers);
 const badge = document.querySelector("#link");
 const message = document.querySelector("#message");
 const toolBlock = document.querySelector("#tool-block");
@@ -84,6 +89,9 @@ fleet.addEventListener("selected", () => {
 
 fleet.addEventListener("news", ({ detail }) => panel.addEvent(detail.text, detail.tone));
 
+// A station that was restarted does not know which layers are shown, and refuses them until it knows the robots.
+fleet.addEventListener("state", () => layers.request());
+
 fleet.addEventListener("map", () => {
   canvas.style.aspectRatio = `${fleet.map.columns} / ${fleet.map.rows}`;
 });
@@ -109,20 +117,25 @@ document.querySelector("#logout").addEventListener("click", async () => {
 const LOGIN_ENDED = 1008;
 
 function connect(delay = 500) {
-  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/live?changes=1`);
+  const opening = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/live?changes=1`);
+  opening.binaryType = "arraybuffer";
+  socket = opening;
   let opened = false;
-  socket.addEventListener("open", () => {
+  opening.addEventListener("open", () => {
     opened = true;
     badge.textContent = "live";
     badge.classList.add("live");
+    layers.request();
   });
-  socket.addEventListener("message", (event) => {
+  opening.addEventListener("message", (event) => {
+    if (event.data instanceof ArrayBuffer) return layers.takeFrame(event.data);
     const received = JSON.parse(event.data);
+    if (received.type === "layer") return layers.take(received);
     fleet.apply(received);
     // A change is missing; the next connection begins with the complete state.
-    if (received.type === "changes" && fleet.isBehind) socket.close();
+    if (received.type === "changes" && fleet.isBehind) opening.close();
   });
-  socket.addEventListener("close", ({ code }) => {
+  opening.addEventListener("close", ({ code }) => {
     if (code === LOGIN_ENDED) return location.replace("/login");
     badge.textContent = "connecting";
     badge.classList.remove("live");
@@ -134,4 +147,4 @@ identify();
 connect();
 
 // For automated tests of the page.
-window.rceFleet = { fleet, view };
+window.rceFleet = { fleet, layers, view };

@@ -1,5 +1,6 @@
 // Draws the world on a canvas: cells, boxes, plans, trails, robots. World metres, y up; the screen's y points down.
 
+import { LayerView } from "./layer_view.js";
 import { colourOf } from "./model.js";
 
 const MARGIN = 0.15;    // of a cell, around the map
@@ -9,9 +10,10 @@ const SMOOTHING = 0.25; // share of the way to the newest pose that a robot is m
 export class View {
   cursor = null; // cell under the pointer or the keyboard
 
-  constructor(canvas, fleet) {
+  constructor(canvas, fleet, layers) {
     this.canvas = canvas;
     this.fleet = fleet;
+    this.layers = new LayerView(layers);
     this.context = canvas.getContext("2d");
     new ResizeObserver(() => this.#resize()).observe(canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#readColours());
@@ -42,6 +44,7 @@ export class View {
     this.colour = Object.fromEntries(
       ["cell", "line", "wall", "box", "boxedge", "shut", "pending", "ink", "quiet", "accent", "bad"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]),
     );
+    this.layers.readColours(style);
   }
 
   #resize() {
@@ -69,14 +72,18 @@ export class View {
     context.clearRect(0, 0, canvas.width, canvas.height);
     if (!fleet.map) return;
     this.#fit();
-    this.#drawCells();
+    this.layers.drawBelow(this);
+    if (this.layers.layers.grid) this.#drawCells();
+    this.#drawCursor();
     for (const robot of fleet.robots.values()) this.#drawTrail(robot);
     for (const robot of fleet.robots.values()) this.#drawPlan(robot);
     for (const robot of fleet.robots.values()) this.#drawRobot(robot);
+    this.layers.drawAbove(this);
   }
 
   #drawCells() {
     const { context, fleet, colour } = this;
+    const overMap = this.layers.hasMap;
     const side = fleet.map.cell_size * this.scale;
     const small = side < 24;
     const gap = small ? 0 : Math.max(1, side * 0.02);
@@ -90,7 +97,15 @@ export class View {
       const wall = fleet.walls.has(cell);
       const boxed = !wall && fleet.blocked.has(cell);
       context.fillStyle = wall ? colour.wall : boxed ? colour.shut : fleet.pending.has(cell) ? colour.pending : colour.cell;
-      if (wall) context.fillRect(left - gap - 0.5, top - gap - 0.5, side + 1, side + 1);
+      // Over the map, cells are outlined, so that it can be seen through them.
+      if (overMap) {
+        context.globalAlpha = 0.35;
+        if (wall || boxed || fleet.pending.has(cell)) context.fillRect(left, top, side - 2 * gap, side - 2 * gap);
+        context.globalAlpha = 1;
+        context.strokeStyle = colour.line;
+        context.lineWidth = 1;
+        context.strokeRect(left, top, side - 2 * gap, side - 2 * gap);
+      } else if (wall) context.fillRect(left - gap - 0.5, top - gap - 0.5, side + 1, side + 1);
       else context.fillRect(left, top, side - 2 * gap, side - 2 * gap);
       if (boxed) this.#drawBox(this.#x(x), this.#y(y), BOX * side);
       if (!small && !wall) {
@@ -98,12 +113,17 @@ export class View {
         context.fillText(cell, left + side * 0.05, top + side * 0.05);
       }
     }
-    if (this.cursor !== null) {
-      const [x, y] = fleet.centre(this.cursor);
-      context.strokeStyle = colour.accent;
-      context.lineWidth = Math.max(2, side * 0.04);
-      context.strokeRect(this.#x(x) - side / 2 + gap, this.#y(y) - side / 2 + gap, side - 2 * gap, side - 2 * gap);
-    }
+  }
+
+  #drawCursor() {
+    if (this.cursor === null) return;
+    const { context, fleet } = this;
+    const side = fleet.map.cell_size * this.scale;
+    const gap = side < 24 ? 0 : Math.max(1, side * 0.02);
+    const [x, y] = fleet.centre(this.cursor);
+    context.strokeStyle = this.colour.accent;
+    context.lineWidth = Math.max(2, side * 0.04);
+    context.strokeRect(this.#x(x) - side / 2 + gap, this.#y(y) - side / 2 + gap, side - 2 * gap, side - 2 * gap);
   }
 
   #drawBox(x, y, side) {

@@ -1,0 +1,1 @@
+"""Layers of the page: a robot's scan, particle cloud, costmaps, path and map."""

@@ -1,0 +1,79 @@
+"""Robots' topics in ROS graphs: the planner's, or each robot's own."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import TYPE_CHECKING
+
+from rce.ros.closing import release
+from rce.ros.errors import RosError
+from rce.ros.multimaster.listing import list_masters
+from rce.ros.node import Node
+from rce_fleet.station.layers.sources import LayerSource
+
+if TYPE_CHECKING:
+    from rce.ros.types import TypeRegistry
+    from rce_fleet.station.layers.kinds import LayerTopic
+    from rce_fleet.station.layers.sources import Take, Tell
+
+_log = logging.getLogger(__name__)
+
+NODE = "operator_station_layers"
+
+
+class RosLayerSource(LayerSource):
+    """Subscribes in the planner's graph, or in the robot's own if discovery knows a master of its name.
+
+    In the planner's graph, a robot's topics are in its namespace. In its own graph they may also be outside
+    of it.
+
+    Args:
+        master_uri: The ROS master of the planner's graph.
+        types: Knows the message types.
+    """
+
+    def __init__(self, master_uri: str, types: TypeRegistry) -> None:
+        self._master_uri = master_uri
+        self._types = types
+        self._masters: dict[str, str] = {}
+        """The robots' own masters by robot ID; found once."""
+
+    @asynccontextmanager
+    async def open(self, robot: str, topic: LayerTopic, take: Take, tell: Tell) -> AsyncIterator[None]:
+        """Receive a topic of a robot while the block runs."""
+        own = await self._find_master(robot)
+        outside = own is not None or topic.is_global
+        names = [f"/{robot}/{name}" for name in topic.names]
+        names += [f"/{name}" for name in topic.names if outside]
+        node = Node(
+            NODE,
+            anonymous=True,
+            argv=(),
+            master_uri=own or self._master_uri,
+            types=self._types,
+            signals=False,
+            master_timeout=0,
+            rosout=False,
+        )
+        async with AsyncExitStack() as stack:
+            await stack.enter_async_context(node)
+            for name in names:
+                subscriber = await node.subscribe_serialized(
+                    name, topic.type_name, lambda payload, _: take(payload)
+                )
+                stack.push_async_callback(release, subscriber)
+            tell("")
+            yield
+
+    async def _find_master(self, robot: str) -> str | None:
+        """Return the URI of the robot's own master; None if it is in the planner's graph."""
+        if robot not in self._masters:
+            try:
+                found = await list_masters(self._master_uri)
+            except RosError as error:
+                _log.debug("no robots with masters of their own: %s", error)
+                return None
+            self._masters |= {master.name: master.uri for master in found if master.online}
+        return self._masters.get(robot)
