@@ -8,6 +8,8 @@ three groups of connections:
 * robot - planner: poses, and cells that the robot found blocked;
 * own container - planner: granted cells, cancellations and the map; back, the move client's reports.
 
+The robot also offers the topics of the page's layers, which the station connects while a page shows them.
+
 This module made ``fleet.config`` and ``robot1.config`` to ``robot3.config`` in ``configs``.
 ``robot1-long.config`` is the same as ``robot1.config`` without bridges, with the paper's names.
 """
@@ -16,6 +18,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+
+from rce_fleet.station.layers.kinds import TOPICS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -68,6 +72,7 @@ def robot_config(number: int, account: FleetAccount | None = None) -> dict[str, 
                 "namespace": namespace,
             }
         ],
+        "interfaces": list(_layers(robot, namespace)),
         "bridges": list(_bridges(container, namespace)),
     }
 
@@ -99,6 +104,19 @@ def fleet_config(
             {"cTag": FLEET_CONTAINER, "nTag": "fleetPlanner", "pkg": "fleet", "exe": "fleet_planner.py"}
         ],
     }
+
+
+def _layers(robot: str, namespace: str) -> Iterator[dict[str, Any]]:
+    """Offer the topics of layers to the station, which connects them while a page shows them."""
+    for topic in TOPICS:
+        tag, name = topic.interface_tag(namespace), f"/{topic.names[0]}"
+        yield {
+            "eTag": robot,
+            "iTag": tag,
+            "iType": "SubscriberForwarder",
+            "iCls": topic.type_name,
+            "addr": name,
+        }
 
 
 def _bridges(container: str, namespace: str) -> Iterator[dict[str, Any]]:

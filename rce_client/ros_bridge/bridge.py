@@ -133,7 +133,7 @@ class Uplink:
         changed = asyncio.Event()
         needed = False
 
-        def take_demand(now: bool) -> None:  # noqa: FBT001 - the callback's form
+        def take_demand(now: bool) -> None:
             nonlocal needed
             needed = now
             changed.set()

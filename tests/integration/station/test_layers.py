@@ -175,15 +175,15 @@ async def test_the_page_draws_layers_that_are_checked() -> None:
     from playwright.async_api import async_playwright
 
     args = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
-    complaints: list[str] = []
+    problems: list[str] = []
     async with world() as made, async_playwright() as playwright:
         browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=args)
         try:
             page = await browser.new_page(
                 viewport={"width": 1280, "height": 1000}, color_scheme="light", reduced_motion="reduce"
             )
-            page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
-            page.on("pageerror", lambda error: complaints.append(str(error)))
+            page.on("console", lambda said: problems.append(said.text) if said.type == "error" else None)
+            page.on("pageerror", lambda error: problems.append(str(error)))
             page.set_default_timeout(LIMIT_S * 1000)
             await page.goto(str(made.client.make_url("/")))
             await page.get_by_label("of robot").select_option("Robot1")
@@ -205,7 +205,7 @@ async def test_the_page_draws_layers_that_are_checked() -> None:
                 "document.querySelector('#layer-note-scan').textContent.includes('not a number')"
             )
             ARTIFACTS.mkdir(exist_ok=True)
-            await page.screenshot(path=ARTIFACTS / "layers.png")
+            await page.locator("main").screenshot(path=ARTIFACTS / "layers.png")
             drawn = await page.evaluate(_PIXEL, [0.05, 4.0])
             assert drawn[:3] != await page.evaluate(_PIXEL, [1.5, 6.5]), "a wall differs from the floor"
             await page.emulate_media(color_scheme="dark")
@@ -218,7 +218,7 @@ async def test_the_page_draws_layers_that_are_checked() -> None:
             await made.until_subscribed(lambda topics: "/Robot1/scan" not in topics)
         finally:
             await browser.close()
-    assert complaints == []
+    assert problems == []
 
 
 _PIXEL = """([x, y]) => {
