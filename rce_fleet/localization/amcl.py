@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rce_fleet.maps.occupancy_map import OccupancyMap
 
 CONVERGED_M = 0.5
-"""Beams are skipped only while all particles are this near to their mean, in x and in y (ROS's constant)."""
+"""Beams are skipped only while all particles are this near to their middle, in x and in y."""
 
 
 APART = 0.3
@@ -233,8 +233,8 @@ class Amcl:
         return min(average, 1.0)
 
     def _has_converged(self) -> bool:
-        off = np.abs(self._particles[:2] - self._particles[:2].mean(axis=1, keepdims=True))
-        return bool((off <= CONVERGED_M).all())
+        places = self._particles[:2]
+        return bool((places.max(axis=1) - places.min(axis=1) <= 2 * CONVERGED_M).all())
 
     # Resampling
 

@@ -7,16 +7,15 @@ headings of -180 and 180 degrees touch too.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import atan2
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from rce_fleet.geometry.angles import wrap_array
+from rce_fleet.compiled import kernel
 from rce_fleet.geometry.poses import Pose
-from rce_fleet.localization.resampling import HEADINGS, bin_numbers, split_bins
+from rce_fleet.localization.resampling import HEADINGS, bin_numbers, distinct, split_bins
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -50,7 +49,7 @@ def find_hypotheses(
         weights: shape (N,), normalized.
         most: So many clusters at most.
     """
-    numbers, members = np.unique(bin_numbers(particles), return_inverse=True)
+    numbers, members = distinct(bin_numbers(particles))
     if len(numbers) == 1:
         return [_hypothesis(particles, weights)]
     count, labels = _connected(split_bins(numbers))
@@ -67,31 +66,105 @@ def find_hypotheses(
 
 
 def _hypothesis(particles: NDArray[np.float64], weights: NDArray[np.float64]) -> Hypothesis:
-    total = float(weights.sum())
+    found = moments(np.ascontiguousarray(particles), weights)
+    pose = Pose(float(found[1]), float(found[2]), float(found[3]))
+    return Hypothesis(pose, found[4:].reshape(3, 3), float(found[0]))
+
+
+def _moments_numpy(particles: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    total = weights.sum()
     share = weights / total
     x, y = particles[0] @ share, particles[1] @ share
-    yaw = atan2(float(np.sin(particles[2]) @ share), float(np.cos(particles[2]) @ share))
-    off = np.stack((particles[0] - x, particles[1] - y, wrap_array(particles[2] - yaw)))
-    return Hypothesis(Pose(float(x), float(y), yaw), (off * share) @ off.T, total)
+    yaw = np.arctan2(np.sin(particles[2]) @ share, np.cos(particles[2]) @ share)
+    off = np.empty_like(particles)
+    off[0], off[1] = particles[0] - x, particles[1] - y
+    off[2] = (particles[2] - yaw + np.pi) % (2 * np.pi) - np.pi
+    return np.concatenate(((total, x, y, yaw), ((off * share) @ off.T).reshape(-1)))
+
+
+@kernel("float64[::1](float64[:,::1], float64[::1])", numpy=_moments_numpy)
+def moments(particles: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return total weight, mean x, y and yaw, and the covariance row by row of particles: shape (13,).
+
+    Args:
+        particles: shape (3, N).
+        weights: shape (N,).
+    """
+    count = particles.shape[1]
+    total = x = y = c = s = 0.0
+    for i in range(count):
+        total += weights[i]
+        x += weights[i] * particles[0, i]
+        y += weights[i] * particles[1, i]
+        c += weights[i] * np.cos(particles[2, i])
+        s += weights[i] * np.sin(particles[2, i])
+    found = np.zeros(13)
+    found[0], found[1], found[2], found[3] = total, x / total, y / total, np.arctan2(s, c)
+    off = np.empty(3)
+    for i in range(count):
+        off[0], off[1] = particles[0, i] - found[1], particles[1, i] - found[2]
+        off[2] = (particles[2, i] - found[3] + np.pi) % (2 * np.pi) - np.pi
+        for row in range(3):
+            for column in range(3):
+                found[4 + 3 * row + column] += weights[i] / total * off[row] * off[column]
+    return found
 
 
 def _connected(bins: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
     """Return the number of clusters of bins, shape (3, B), and the cluster of each."""
     if bins.shape[1] <= _FEW:
-        apart = np.abs(bins[:, :, None] - bins[:, None, :])
-        apart[2] = np.minimum(apart[2], HEADINGS - apart[2])
-        touching = (apart <= 1).all(axis=0)
-        labels = np.arange(len(touching))
-        while True:  # each bin takes the least label among those it touches
-            least = np.where(touching, labels, len(labels)).min(axis=1)
-            if (least == labels).all():
-                break
-            labels = least
-        kept, labels = np.unique(labels, return_inverse=True)
-        return len(kept), labels
+        labels = label_few(np.ascontiguousarray(bins))
+        return int(labels.max()) + 1, labels
     graph = _graph(bins)
     count, labels = csgraph.connected_components(graph, directed=False)
     return int(count), np.asarray(labels, np.int64)
+
+
+def _label_numpy(bins: NDArray[np.int64]) -> NDArray[np.int64]:
+    apart = np.abs(bins[:, :, None] - bins[:, None, :])
+    apart[2] = np.minimum(apart[2], HEADINGS - apart[2])
+    touching = (apart <= 1).all(axis=0)
+    labels = np.arange(len(touching))
+    while True:  # each bin takes the least label among those it touches
+        least = np.where(touching, labels, len(labels)).min(axis=1)
+        if (least == labels).all():
+            return np.asarray(np.unique(labels, return_inverse=True)[1], np.int64)
+        labels = least
+
+
+@kernel("int64[::1](int64[:,::1])", numpy=_label_numpy)
+def label_few(bins: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the cluster of each of a few bins, shape (B,): 0, 1, ... in the order of their first bins.
+
+    Args:
+        bins: shape (3, B): column, row, heading.
+    """
+    count = bins.shape[1]
+    labels = np.full(count, -1, np.int64)
+    waiting = np.empty(count, np.int64)
+    clusters = 0
+    for first in range(count):
+        if labels[first] >= 0:
+            continue
+        labels[first] = clusters
+        waiting[0] = first
+        size = 1
+        while size:
+            size -= 1
+            here = waiting[size]
+            for other in range(count):
+                turn = abs(bins[2, here] - bins[2, other])
+                if (
+                    labels[other] < 0
+                    and abs(bins[0, here] - bins[0, other]) <= 1
+                    and abs(bins[1, here] - bins[1, other]) <= 1
+                    and min(turn, HEADINGS - turn) <= 1
+                ):
+                    labels[other] = clusters
+                    waiting[size] = other
+                    size += 1
+        clusters += 1
+    return labels
 
 
 def _graph(bins: NDArray[np.int64]) -> sparse.coo_array:

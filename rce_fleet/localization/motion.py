@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rce_fleet.compiled import kernel
 from rce_fleet.geometry.angles import wrap
 from rce_fleet.localization.parameters import AmclParameters, OdometryModel
 
@@ -70,13 +71,55 @@ def _move_differential(
         a1 * second2 + a2 * way * way,
     )
     sigma = _sigma(spread, corrected=parameters.odom_model_type is OdometryModel.DIFF_CORRECTED)
-    noise = rng.standard_normal((3, particles.shape[1])) * sigma
-    heading = particles[2] + (noise[0] + first)
-    length = noise[1] + way
+    noise = rng.standard_normal((3, particles.shape[1]))
+    return turn_drive_turn(
+        np.ascontiguousarray(particles), noise, sigma[:, 0], np.array((first, way, second))
+    )
+
+
+def _turn_drive_turn_numpy(
+    particles: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    motion: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    drawn = noise * sigma[:, None] + motion[:, None]
+    heading = particles[2] + drawn[0]
     moved = np.empty_like(particles)
-    moved[0] = particles[0] + length * np.cos(heading)
-    moved[1] = particles[1] + length * np.sin(heading)
-    moved[2] = heading + (noise[2] + second)
+    moved[0] = particles[0] + drawn[1] * np.cos(heading)
+    moved[1] = particles[1] + drawn[1] * np.sin(heading)
+    moved[2] = heading + drawn[2]
+    return moved
+
+
+@kernel(
+    "float64[:,::1](float64[:,::1], float64[:,::1], float64[::1], float64[::1])",
+    numpy=_turn_drive_turn_numpy,
+)
+def turn_drive_turn(
+    particles: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    motion: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return particles that turned, drove and turned again.
+
+    Args:
+        particles: shape (3, N).
+        noise: shape (3, N), of standard deviation 1.
+        sigma: shape (3,): standard deviations of turn, way and turn.
+        motion: shape (3,): turn, way and turn by odometry.
+
+    Returns:
+        shape (3, N).
+    """
+    moved = np.empty_like(particles)
+    for i in range(particles.shape[1]):
+        heading = particles[2, i] + (noise[0, i] * sigma[0] + motion[0])
+        length = noise[1, i] * sigma[1] + motion[1]
+        moved[0, i] = particles[0, i] + length * np.cos(heading)
+        moved[1, i] = particles[1, i] + length * np.sin(heading)
+        moved[2, i] = heading + (noise[2, i] * sigma[2] + motion[2])
     return moved
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,7 +39,7 @@ class LaserScan:
     laser: Pose = ON_BASE
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Beams:
     """The beams of a scan that the filter uses.
 
@@ -59,8 +60,9 @@ class Beams:
         """Which beams hit something, shape (K,)."""
         return self.ranges < self.range_max
 
+    @cached_property
     def ends(self) -> NDArray[np.float64]:
-        """Return where the beams that hit something end, in the frame of the base: shape (2, M), metres."""
+        """Where the beams that hit something end, in the frame of the base: shape (2, M), metres."""
         hit = self.returned
         ranges, angles = self.ranges[hit], self.angles[hit]
         return np.stack((self.laser.x + ranges * np.cos(angles), self.laser.y + ranges * np.sin(angles)))

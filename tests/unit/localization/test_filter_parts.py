@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rce_fleet.geometry.poses import Pose
-from rce_fleet.localization import likelihood
+from rce_fleet.localization import clusters, likelihood, motion, resampling
 from rce_fleet.localization.beam_model import BeamModel
 from rce_fleet.localization.clusters import find_hypotheses
 from rce_fleet.localization.likelihood import LikelihoodField
@@ -20,7 +20,6 @@ from rce_fleet.localization.parameters import AmclParameters, OdometryModel
 from rce_fleet.localization.resampling import (
     HEADINGS,
     bin_numbers,
-    count_for,
     effective_count,
     particles_needed,
     resample,
@@ -112,7 +111,7 @@ def test_beams_are_evenly_chosen_and_checked() -> None:
 
 
 def test_a_laser_off_the_centre() -> None:
-    ends = Beams(np.array([1.0]), np.array([pi / 2]), 6.0, Pose(0.2, 0.1, pi / 2)).ends()
+    ends = Beams(np.array([1.0]), np.array([pi / 2]), 6.0, Pose(0.2, 0.1, pi / 2)).ends
     assert ends[:, 0] == pytest.approx((0.2, 1.1))
 
 
@@ -153,11 +152,50 @@ def test_skipped_beams_do_not_count() -> None:
 def test_compiled_likelihoods_equal_those_of_numpy() -> None:
     pytest.importorskip("numba")
     draw = rng(3)
-    table = draw.random((30, 40))
-    local = np.stack((draw.uniform(-10, 50, 200), draw.uniform(-10, 40, 200), *draw.uniform(-1, 1, (2, 200))))
-    ends = np.ascontiguousarray(draw.uniform(-20, 20, (2, 33)))
-    kernel = likelihood._sum_loop
-    assert kernel.compile()(table, local, ends) == pytest.approx(kernel.numpy(table, local, ends), rel=1e-12)
+    table, ends = draw.random((30, 40)), draw.uniform(-2, 2, (2, 33))
+    particles, frame = draw.uniform(-1, 4, (3, 200)), np.array((0.3, -0.5, 0.7))
+    loop, plain = likelihood.sum_at_ends.compile(), likelihood.sum_at_ends.numpy
+    expected = plain(table, particles, ends, frame, 0.1)
+    assert loop(table, particles, ends, frame, 0.1) == pytest.approx(expected, rel=1e-12)
+
+
+def test_compiled_motion_equals_that_of_numpy() -> None:
+    pytest.importorskip("numba")
+    given = rng(1).normal(size=(3, 50)), rng(2).normal(size=(3, 50)), np.array((0.1, 0.2, 0.3)), np.ones(3)
+    assert motion.turn_drive_turn.compile()(*given) == pytest.approx(motion.turn_drive_turn.numpy(*given))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_compiled_resampling_equals_that_of_numpy(seed: int) -> None:
+    pytest.importorskip("numba")
+    draw = rng(seed)
+    particles = draw.uniform((-3, -3, -7), (3, 3, 7), (300, 3)).T.copy()
+    bins = resampling._bins_loop.numpy(particles)
+    assert (resampling._bins_loop.compile()(particles) == bins).all()
+    for some in (bins, bins[:5], bins % 7):
+        expected = resampling.distinct.numpy(some)
+        found = resampling.distinct.compile()(some)
+        assert (found[0] == expected[0]).all()
+        assert (found[1] == expected[1]).all()
+    _, members = resampling.distinct.numpy(bins)
+    sums = np.cumsum(draw.random(300))
+    needed = resampling._needed_table(AmclParameters(min_particles=20, max_particles=900, kld_err=0.3))
+    for draws in (draw.random(10), draw.random(400), draw.random(900)):
+        stop = resampling.stop_of_draws.numpy(members, sums, draws, needed)
+        assert resampling.stop_of_draws.compile()(members, sums, draws, needed) == stop
+    chosen = resampling._systematic_loop.numpy(sums, 77, 0.4)
+    assert (resampling._systematic_loop.compile()(sums, 77, 0.4) == chosen).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_compiled_clusters_equal_those_of_numpy(seed: int) -> None:
+    pytest.importorskip("numba")
+    draw = rng(seed)
+    particles, weights = draw.uniform(-4, 4, (3, 80)), draw.random(80)
+    expected = clusters.moments.numpy(particles, weights)
+    assert clusters.moments.compile()(particles, weights) == pytest.approx(expected)
+    bins = split_bins(np.unique(bin_numbers(particles)))
+    assert clusters.label_few.compile()(bins).tolist() == clusters.label_few.numpy(bins).tolist()
 
 
 # Resampling
@@ -193,7 +231,11 @@ def test_kld_sampling_stops_as_one_by_one(drawn: list[int], least: int) -> None:
         if count >= particles_needed(len(seen), chosen):
             expected = count
             break
-    assert count_for(np.array(drawn), chosen) == expected
+    bins = np.array(drawn)
+    even = (np.arange(len(bins)) + 1.0) / len(bins)
+    draws = (np.arange(len(bins)) + 0.5) / len(bins)  # each particle once, in this order
+    needed = resampling._needed_table(chosen)
+    assert resampling.stop_of_draws(bins, even, draws, needed) == (expected or -1)
 
 
 def test_systematic_sampling_keeps_proportions() -> None:
