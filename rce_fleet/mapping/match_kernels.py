@@ -76,7 +76,8 @@ def _evaluate(
                 along = found[2] * found[1] - found[3] * found[0]
                 square = across * across + ALONG * along * along
             square *= resolution * resolution
-            result[number, 0] += exp(-square / sigma)
+            if sigma > 0:
+                result[number, 0] += exp(-square / sigma)
             result[number, 1] += max(-square / lsigma, NULL_LIKELIHOOD)
 
 

@@ -100,7 +100,7 @@ def _evaluate_one(
     flat = (nx != 0) | (ny != 0)
     square = np.where(flat, across * across + ALONG * along * along, ex * ex + ey * ey) * resolution**2
     likelihoods = np.where(known, np.maximum(-square / lsigma, NULL_LIKELIHOOD), NULL_LIKELIHOOD)
-    values = np.where(known, np.exp(-square / sigma), 0.0)
+    values = np.where(known, np.exp(-square / sigma), 0.0) if sigma > 0 else np.zeros_like(square)
     return np.column_stack((values.sum(axis=1), likelihoods.sum(axis=1)))
 
 

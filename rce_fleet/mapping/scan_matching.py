@@ -39,7 +39,7 @@ class Matches:
 
 
 def scores(
-    store: TileStore, maps: slice, beams: Reals, poses: Reals, *, sigma: float, lsigma: float
+    store: TileStore, maps: slice, beams: Reals, poses: Reals, *, sigma: float = 0.0, lsigma: float = 1.0
 ) -> Reals:
     """Return how well a scan fits at poses in maps.
 
@@ -49,6 +49,7 @@ def scores(
         beams: shape (N, 2): ends of the beams in the base's frame, metres.
         poses: shape (maps, M, 3).
         sigma: Width of the score, square metres: a beam counts ``exp(-d * d / sigma)``, as in GMapping.
+            With 0 the score is not computed, and is 0.
         lsigma: The same for the log-likelihood, at least -0.5 a beam.
 
     Returns:

@@ -10,7 +10,8 @@ is occupied if it was hit in at least one of :data:`VISITS_PER_HIT` visits, so w
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+import mmap
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from rce_fleet.exceptions import MapError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-Value = TypeVar("Value", bound=np.generic)
 SHIFT = 5
 TILE = 1 << SHIFT
 """Cells along the edge of a tile."""
@@ -55,11 +55,27 @@ def _ranks() -> NDArray[np.int32]:
 RANKS = _ranks()
 
 
-def _grown(values: NDArray[Value], more: int) -> NDArray[Value]:
-    """Return a longer array with the same values; what is new takes memory only when it is written."""
-    result = np.zeros((len(values) + more, *values.shape[1:]), values.dtype)
-    result[: len(values)] = values
-    return result
+class _Memory:
+    """Memory of an array that grows without being copied; what is new is 0 and takes space when written."""
+
+    def __init__(self, *shape: int, dtype: type[np.generic]) -> None:
+        self._shape = shape
+        self._dtype = np.dtype(dtype)
+        self._row = int(np.prod(shape)) * self._dtype.itemsize
+        self._space = mmap.mmap(-1, self._row, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+
+    def array(self, rows: int) -> NDArray[Any]:
+        """Return an array of shape (rows, ...).
+
+        Raises:
+            BufferError: It has to grow, and an array that was returned before still exists.
+        """
+        if rows * self._row > len(self._space):
+            self._space.resize(rows * self._row)
+        if not rows:
+            return np.empty((0, *self._shape), self._dtype)
+        values = np.frombuffer(self._space, self._dtype, rows * int(np.prod(self._shape)))
+        return values.reshape(rows, *self._shape)
 
 
 class TileStore:
@@ -82,9 +98,12 @@ class TileStore:
         self.resolution = resolution
         self.origin = (-TILE, -TILE)
         self.tables = np.full((maps, 2, 2), -1, np.int32)
-        self.counts = np.zeros((0, AREA, 2), np.int32)
-        self.points = np.zeros((0, AREA, 4), np.float32)
-        self.owner = np.zeros((0, AREA), np.uint8)
+        self._memory = (
+            _Memory(AREA, 2, dtype=np.int32),
+            _Memory(AREA, 4, dtype=np.float32),
+            _Memory(AREA, dtype=np.uint8),
+        )
+        self.counts, self.points, self.owner = (each.array(0) for each in self._memory)
         self.references = np.zeros(0, np.int32)
         self.free = np.zeros(0, np.int32)
         self.state = np.zeros(1, np.int64)
@@ -139,10 +158,9 @@ class TileStore:
             return
         old = len(self.references)
         more = max(missing, old, 64)
-        self.counts = _grown(self.counts, more)
-        self.points = _grown(self.points, more)
-        self.owner = _grown(self.owner, more)
-        self.references = _grown(self.references, more)
+        del self.counts, self.points, self.owner  # memory that is in use cannot grow
+        self.counts, self.points, self.owner = (each.array(old + more) for each in self._memory)
+        self.references = np.concatenate((self.references, np.zeros(more, np.int32)))
         unused = int(self.state[0])
         free = np.empty(old + more, np.int32)
         free[:unused] = self.free[:unused]
@@ -170,8 +188,9 @@ class TileStore:
         made.origin = self.origin
         made.tables = np.full((1, *table.shape), -1, np.int32)
         made.tables[0][places] = np.arange(len(picked))
-        made.counts, made.points = self.counts[picked], self.points[picked]
-        made.owner = self.owner[picked]
+        made.counts, made.points, made.owner = (each.array(len(picked)) for each in made._memory)
+        made.counts[:], made.points[:] = self.counts[picked], self.points[picked]
+        made.owner[:] = self.owner[picked]
         made.references = np.ones(len(picked), np.int32)
         made.free = np.zeros(len(picked), np.int32)
         return made

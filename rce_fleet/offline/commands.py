@@ -18,6 +18,8 @@ from rce_fleet.exceptions import FleetError
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.localization.replay import Recorded, replay
 from rce_fleet.localization.scan import LaserScan
+from rce_fleet.mapping.gmapping.filter import GridFilter
+from rce_fleet.mapping.gmapping.parameters import FilterParameters
 from rce_fleet.mapping.occupancy_mapping import draw_map
 from rce_fleet.mapping.trajectory import write_trajectory
 from rce_fleet.maps.ros_map import load_map, save_map
@@ -25,7 +27,7 @@ from rce_fleet.offline.inputs import read_log
 from rce_fleet.offline.outputs import output_folder, print_faults, with_progress, write_report
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from rce_fleet.mapping.mapper import Mapper
     from rce_fleet.mapping.records import LaserRecord
@@ -110,7 +112,7 @@ def localize(
         begin = time.perf_counter()
         found = read_log(log, scan=scan, odometry=odom)
         print_faults(found.faults, sys.stderr)
-        scans = (_recorded(record) for record in with_progress(found.records, sys.stderr))
+        scans = _recorded(with_progress(found.records, sys.stderr))
         poses = [each.pose.as_array() for each in replay(scans, grid, seed=seed, start=start)]
         write_trajectory(folder / "trajectory.csv", [each.time for each in found.records], np.array(poses))
         write_report(
@@ -132,11 +134,23 @@ def _pose(text: str) -> Pose:
     return Pose(x, y, yaw)
 
 
-def _recorded(record: LaserRecord) -> Recorded:
-    scan = LaserScan(
-        record.ranges, record.angle_min, record.angle_increment, 0.0, record.range_max, Pose(*record.laser)
-    )
-    return Recorded(Pose(*record.odometry), scan)
+def _recorded(records: Iterable[LaserRecord]) -> Iterator[Recorded]:
+    """Yield scans with odometry that was corrected by matching each scan with those before.
+
+    Wheels slip, and some robots record backward motion as forward; AMCL's model of odometry has neither.
+    """
+    tracker = GridFilter(FilterParameters(particles=1), np.random.default_rng(0))
+    for record in records:
+        tracker.add(record)
+        scan = LaserScan(
+            record.ranges,
+            record.angle_min,
+            record.angle_increment,
+            0.0,
+            record.range_max,
+            Pose(*record.laser),
+        )
+        yield Recorded(Pose.from_array(tracker.tracked), scan)
 
 
 def _mapper(algorithm: Algorithm, seed: int) -> Mapper:

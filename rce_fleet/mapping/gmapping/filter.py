@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
     Reals = NDArray[np.float64]
 
-STEPS_PER_ITERATION = 4
-COARSE_BEAMS = 90
+STEPS_PER_ITERATION = 2
+COARSE_BEAMS = 60
 """Beams of the coarse search."""
 COARSE_SHARP = 2.0
 """How much narrower than ``lsigma`` says the likelihood of the coarse search is."""
@@ -186,7 +186,7 @@ class GridFilter:
     def _prepare(self, record: LaserRecord) -> _Scan:
         _, ends, hit = beams_of(record, self.farthest(record))
         beams = np.ascontiguousarray(ends[hit])
-        coarse = np.ascontiguousarray(beams[:: max(len(beams) // COARSE_BEAMS, 1)])
+        coarse = np.ascontiguousarray(beams[:: max(-(-len(beams) // COARSE_BEAMS), 1)])
         return _Scan(record, beams, coarse, np.ascontiguousarray(beams[:: self.parameters.skip + 1]))
 
     def _track(self, scan: _Scan, motion: Reals, std: Reals) -> Reals:
@@ -211,7 +211,7 @@ class GridFilter:
             expected = compose(pose, motion + start)
             found, accepted = self._match(maps, scan, expected, prior_information(expected[:, 2], std))
             moved = relative(pose[0], found.poses[0])
-            value = TEMPER * self._scores(maps, scan.beams, found.poses[:, None], SHARP)[0, 0, 1]
+            value = TEMPER * self._likelihoods(maps, scan.beams, found.poses[:, None], SHARP)[0, 0]
             value += float(_doubtful(moved - motion, std))
             if accepted[0] and value > best_value:
                 best, best_value = moved, value
@@ -226,7 +226,7 @@ class GridFilter:
         found = match(
             self.store, maps, scan.beams, expected, expected, information, sigma=p.sigma, iterations=steps
         )
-        values = self._scores(maps, scan.beams, found.poses[:, None])[:, 0, 0]
+        values = scores(self.store, maps, scan.beams, found.poses[:, None], sigma=p.sigma)[:, 0, 0]
         return found, (values > p.minimum_score) & (values >= LEAST_MATCHED * len(scan.beams))
 
     def _move(self, scan: _Scan, motion: Reals, std: Reals) -> None:
@@ -246,9 +246,8 @@ class GridFilter:
         self.poses[:, 2] = wrap_array(self.poses[:, 2])
         self._log_weights += self._log_likelihoods(scan.likely)
 
-    def _scores(self, maps: slice, beams: Reals, poses: Reals, sharpness: float = 1.0) -> Reals:
-        p = self.parameters
-        return scores(self.store, maps, beams, poses, sigma=p.sigma, lsigma=p.lsigma / sharpness)
+    def _likelihoods(self, maps: slice, beams: Reals, poses: Reals, sharpness: float = 1.0) -> Reals:
+        return scores(self.store, maps, beams, poses, lsigma=self.parameters.lsigma / sharpness)[:, :, 1]
 
     def _log_likelihoods(self, beams: Reals) -> Reals:
         """Return the mean likelihoods of a scan at the poses around each particle's, as logarithms."""
@@ -260,7 +259,8 @@ class GridFilter:
             line = np.zeros((len(_samples(reach[axis], steps[axis])), 3))
             line[:, axis] = _samples(reach[axis], steps[axis])
             around.append(line[line[:, axis] != 0])
-        values = self._scores(slice(None), beams, self.poses[:, None] + np.vstack(around))[:, :, 1]
+        poses = self.poses[:, None] + np.vstack(around)
+        values = self._likelihoods(slice(None), beams, poses)
         most = values.max(axis=1)
         return np.asarray(most + np.log(np.exp(values - most[:, None]).mean(axis=1)))
 
@@ -268,7 +268,7 @@ class GridFilter:
         """Return how wrong odometry's motion is, from a grid of motions in the best particle's map."""
         best = self.best
         candidates = compose(self.poses[best], motion + OFFSETS)
-        found = self._scores(slice(best, best + 1), scan.coarse, candidates[None], COARSE_SHARP)[0, :, 1]
+        found = self._likelihoods(slice(best, best + 1), scan.coarse, candidates[None], COARSE_SHARP)[0]
         share = TEMPER * len(scan.beams) / len(scan.coarse)
         return np.asarray(OFFSETS[int((found * share + _doubtful(OFFSETS, std)).argmax())])
 

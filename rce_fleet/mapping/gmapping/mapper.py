@@ -105,7 +105,5 @@ class ParticleMapper:
             sigma=p.sigma,
             iterations=REFINE_STEPS,
         )
-        score = scores(store, slice(None), beams, found.poses[:, None], sigma=p.sigma, lsigma=p.lsigma)[
-            0, 0, 0
-        ]
+        score = scores(store, slice(None), beams, found.poses[:, None], sigma=p.sigma)[0, 0, 0]
         return found.poses[0] if score > p.minimum_score else pose

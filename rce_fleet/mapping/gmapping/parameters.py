@@ -22,7 +22,7 @@ class FilterParameters:
             always found within 6 cells, and greater values are refused.
         linear_step: ``lstep``: step of the coarse search, metres.
         angular_step: ``astep``: step of the coarse search, radians.
-        iterations: Rounds of the matcher, four Gauss-Newton steps each.
+        iterations: Rounds of the matcher, two Gauss-Newton steps each.
         lsigma: Width of the likelihood of a beam.
         gain: ``ogain``: how much the likelihood is smoothed before particles are compared.
         skip: ``lskip``: beams that are left out between two used ones for the likelihood.
