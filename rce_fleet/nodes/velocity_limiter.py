@@ -149,6 +149,8 @@ class VelocityLimiterNode:
     # What goes out
 
     def _pass_on(self) -> None:
+        if self._node.is_shutdown:
+            return
         verdict = self._limiter.limit(self._node.time())
         if verdict.stopped and not self._last.stopped and "no command" not in verdict.reason:
             self._complaints.warn("stop", f"the robot stands: {verdict.reason}")
