@@ -145,6 +145,15 @@ TARGETS = [
         "x real time",
         at_least=True,
     ),
+    *(
+        Target(f"navigation, {what}", "navigation.drive", _column(column), limit, unit, at_least=at_least)
+        for what, column, limit, unit, at_least in (
+            ("contacts by the robot's own motion in 200 runs", "contacts", 0, "contacts", False),
+            ("goals with a way that are reached", "reached %", 99, "%", True),
+            ("median path by the shortest", "path / shortest", 1.15, "x", False),
+            ("control step at 10 Hz, CPU, p99", "step p99 ms", 10, "ms", False),
+        )
+    ),
     Target("container start to first message, p50", "start", _column("p50_ms"), 250, "ms"),
     Target("100 containers at once", "many", _column("all at once", containers=100), 20, "s"),
     Target("idle container, PSS", "many", _column("idle container PSS MB"), 15, "MB"),

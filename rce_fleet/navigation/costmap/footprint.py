@@ -101,6 +101,16 @@ class Footprint:
         turn = np.array(((cos(yaw), sin(yaw)), (-sin(yaw), cos(yaw))))
         return np.asarray(self.polygon @ turn + (x, y))
 
+    def distances(self, points: Floats) -> Floats:
+        """Return the distance of points from the outline, shape (M,), metres; negative inside.
+
+        Args:
+            points: Shape (M, 2), metres in the robot's frame.
+        """
+        if self.is_round:
+            return np.asarray(np.hypot(points[:, 0], points[:, 1]) - self.radius)
+        return np.where(self._inside(points), -1.0, 1.0) * self._edge_distance(points)
+
     def clearance(self, poses: Floats, points: Floats, *, enough: float = 0.5) -> Floats:
         """Return the distance from the outline to the nearest obstacle for each pose, shape (T,), metres.
 
@@ -125,7 +135,7 @@ class Footprint:
         c, s = np.cos(poses[pose, 2]), np.sin(poses[pose, 2])
         px, py = dx[pose, point], dy[pose, point]
         local = np.stack((c * px + s * py, c * py - s * px), axis=1)
-        signed = np.where(self._inside(local), -1.0, 1.0) * self._edge_distance(local)
+        signed = self.distances(local)
         exact = np.full(len(poses), np.inf)
         np.minimum.at(exact, pose, signed)
         return np.where(np.isfinite(exact), exact, np.maximum(nearest, enough))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rce_fleet.geometry.poses import transform_points
 from rce_fleet.navigation.costmap.cost_grid import NOWHERE, Area, CostGrid, shifted
 from rce_fleet.navigation.costmap.costs import FREE, LETHAL
 from rce_fleet.navigation.costmap.layer import fill_of, write_known, write_larger
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
     from rce_fleet.navigation.costmap.parameters import ObservationSource, ObstacleLayerParameters
 
     Floats = NDArray[np.float64]
+
+
+JUMP = 1.0
+"""A message that is older than the one before by more than this came after a jump of time, seconds."""
 
 
 class ObstacleLayer:
@@ -56,6 +61,8 @@ class ObstacleLayer:
     def take(self, source: str, observation: Observation) -> None:
         """Take an observation of a source; it is used at the next update."""
         kept = self._kept[source]
+        if kept and kept[-1].stamp - observation.stamp > JUMP:
+            kept.clear()  # Time jumped back: a simulation or a bag began anew.
         kept.append(observation)
         self._drop_old(kept, observation.stamp - self.sources[source].observation_persistence)
 
@@ -146,9 +153,8 @@ class ObstacleLayer:
         if not len(rows):
             return NOWHERE
         cells = np.stack((rows + area.low, columns + area.left), axis=1)
-        centres = grid.centres_of(cells)
-        pose = np.array(((robot.x, robot.y, robot.yaw),))
-        under = np.array([self._footprint.clearance(pose, one[None])[0] < 0 for one in centres])
+        local = transform_points(robot.inverse().as_array(), grid.centres_of(cells))
+        under = self._footprint.distances(local) < 0
         if not under.any():
             return NOWHERE
         rows, columns = cells[under].T

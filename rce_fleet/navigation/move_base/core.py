@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from rce_fleet.navigation.planners.local_planner import LocalPlanner
 
 STANDING = Twist()
+TIME_JUMP = 1.0
+"""Time that goes back by more than this began anew, with a simulation or a bag, seconds."""
 REPLAN_EVERY = 0.5
 """Least time between two plans while the path or the robot is blocked, seconds."""
 
@@ -142,7 +144,7 @@ class MoveBase:
         self._asked_at = self._planned_at = self._valid_plan_at = self._valid_control_at = float("-inf")
         self._retries = 0
         self._waits_for_plan = False
-        self._moved_at = 0.0
+        self._moved_at = self._now = 0.0
         self._moved_from: Pose | None = None
 
     @property
@@ -164,8 +166,7 @@ class MoveBase:
         self._recovery = None
         self._waits_for_plan = False
         self._moved_from = None
-        self._plan_anew(now)
-        self._valid_control_at = now
+        self._begin_times_anew(now)
 
     def cancel(self) -> None:
         """Drop the goal; the robot stops with the next command. Do nothing without a goal."""
@@ -197,6 +198,9 @@ class MoveBase:
             situation: What is known.
             costs: The global costmap.
         """
+        if situation.now < self._now - TIME_JUMP:
+            self._begin_times_anew(situation.now)
+        self._now = situation.now
         if self._ending is not None:
             ending, text = self._ending
             self._ending = None
@@ -205,8 +209,7 @@ class MoveBase:
             return Decision()
         if situation.problem:
             # Patience begins anew: the robot stands because it must not drive, not because it cannot.
-            self._plan_anew(situation.now)
-            self._valid_control_at = self._moved_at = situation.now
+            self._begin_times_anew(situation.now)
             self._local.reset()
             return Decision(text=situation.problem)
         self._watch_motion(situation)
@@ -294,12 +297,13 @@ class MoveBase:
         name = self._recovery.name
         self._machine.advance(Event.RECOVERED)
         self._local.reset()
-        self._plan_anew(situation.now)
-        self._valid_control_at = self._moved_at = situation.now
+        self._begin_times_anew(situation.now)
         return Decision(text=f"{self._cause}; recovery '{name}' {step.text}")
 
-    def _plan_anew(self, now: float) -> None:
-        self._valid_plan_at, self._retries = now, 0
+    def _begin_times_anew(self, now: float) -> None:
+        """Let all limits of time begin now, and want a plan at once."""
+        self._valid_plan_at = self._valid_control_at = self._moved_at = now
+        self._retries = 0
         self._asked_at = float("-inf")
 
     def _end(self, ending: Ending | None = None, text: str = "") -> None:

@@ -37,6 +37,8 @@ _ANGLE_STEP = pi / 180
 """Angle of the steps of a turn on the spot, radians."""
 _STILL = 1e-3
 """A forward speed below this is a turn on the spot, m/s."""
+_OWN_BODY = 0.05
+"""Points deeper inside the outline than this are the robot itself, such as a mast, metres."""
 _JUMP = 1.0
 """Odometry that moves by more than this between two poses has jumped, metres."""
 
@@ -124,6 +126,7 @@ class VelocityLimiter:
         assert scan is not None
         delay = limits.delay + max(now - scan.stamp, 0.0)
         points = in_frame(self._pose, self.seen.points)
+        points = points[self.footprint.distances(points) > -_OWN_BODY]
         if abs(twist.speed) < _STILL:
             share, reason = self._limit_turn(twist, points, delay)
         else:

@@ -23,6 +23,8 @@ _MOVED_SHARE = 0.03
 """What is added to it, as a share of the distance: the error of the heading between the scans."""
 _EARLIER = 0.25
 """Age of the scan that the newest is compared with, seconds."""
+_TIME_JUMP = 1.0
+"""A scan that is older than the one before by more than this came after a jump of time, seconds."""
 _KEEP_WITHIN = 2.0
 """Points farther away than this are not remembered, metres."""
 
@@ -119,6 +121,9 @@ class SeenPoints:
     def take(self, scan: Scan) -> None:
         """Take a scan; one that is older than the newest is ignored."""
         before = self.newest
+        if before is not None and before.stamp - scan.stamp > _TIME_JUMP:
+            self.forget()
+            before = None
         if before is not None and scan.stamp < before.stamp:
             return
         self._remember(scan, before)

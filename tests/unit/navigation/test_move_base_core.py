@@ -374,3 +374,14 @@ def test_wrong_parameters_are_named() -> None:
     assert "my::Layer" in texts
     assert "dance/Dance" in texts
     assert "~TrajectoryPlannerROS/max_vel_x is 'fast', must be a number" in texts
+
+
+def test_time_that_jumps_back_does_not_stop_planning() -> None:
+    robot = Robot(MoveBaseParameters())
+    robot.core.start(robot.now)
+    robot.run(1.0)
+    robot.now = 5.0
+    robot.costs.values[8:12, 20:22] = LETHAL
+    robot.run(1.0)
+    assert robot.plans >= 2
+    assert robot.run(30.0).ending is Ending.SUCCEEDED

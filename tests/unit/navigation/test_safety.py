@@ -212,3 +212,20 @@ def test_a_polygon_needs_room_to_turn() -> None:
     assert stage.limit(0.0).twist.turn_rate < 0.8
     stage.take_command(Twist(0.0, -1.0), 0.0)
     assert stage.limit(0.0).twist.turn_rate == -1.0
+
+
+def test_the_robots_own_body_is_no_obstacle() -> None:
+    """A mast before the lidar is inside the outline; a box at the hull is not."""
+    stage = limiter(seen=circles((0.1, 0.0, 0.02)))
+    stage.take_command(Twist(0.5, 0.0), 0.0)
+    assert stage.limit(0.0).twist == Twist(0.5, 0.0)
+
+
+def test_time_that_jumps_back_begins_anew() -> None:
+    stage = VelocityLimiter(PARAMETERS, DISC)
+    stage.take_pose(HERE, 100.0)
+    stage.take_scan(circles((0.4, 0.0, 0.1), stamp=100.0))
+    stage.take_pose(HERE, 1.0)
+    stage.take_scan(scan(stamp=1.0))
+    stage.take_command(Twist(0.5, 0.0), 1.0)
+    assert stage.limit(1.0).twist == Twist(0.5, 0.0)
