@@ -8,7 +8,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING
 
 from rce.ros.closing import release
-from rce.ros.errors import RosError
+from rce.ros.errors import MasterError, RosError
 from rce.ros.multimaster.listing import list_masters
 from rce.ros.node import Node
 from rce_fleet.station.layers.sources import LayerSource
@@ -38,7 +38,7 @@ class RosLayerSource(LayerSource):
         self._master_uri = master_uri
         self._types = types
         self._masters: dict[str, str] = {}
-        """The robots' own masters by robot ID; found once."""
+        """The robots' own masters by robot ID, as they were found last."""
 
     @asynccontextmanager
     async def open(self, robot: str, topic: LayerTopic, take: Take, tell: Tell) -> AsyncIterator[None]:
@@ -58,7 +58,11 @@ class RosLayerSource(LayerSource):
             rosout=False,
         )
         async with AsyncExitStack() as stack:
-            await stack.enter_async_context(node)
+            try:
+                await stack.enter_async_context(node)
+            except MasterError:
+                self._masters.pop(robot, None)  # The robot may come back elsewhere.
+                raise
             for name in names:
                 subscriber = await node.subscribe_serialized(
                     name, topic.type_name, lambda payload, _: take(payload)

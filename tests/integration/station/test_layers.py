@@ -14,8 +14,11 @@ import pytest
 from aiohttp import ClientWebSocketResponse, WSMsgType, web
 from aiohttp.test_utils import TestClient, TestServer
 from support.layers import ROBOT, STATE, RobotTopics, scan
+from support.multimaster import DiscoveryNetwork
 
 from rce.ros.core import Core
+from rce.ros.multimaster.discovery import Discovery
+from rce.ros.multimaster.listing import list_masters
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
 from rce.ros.packages import PackageIndex
@@ -168,6 +171,29 @@ async def test_a_page_that_asks_nonsense_stays_connected() -> None:
         await page.send_json({"robot": "Robot1", "layers": ["scan", "sonar"]})
         await receive(page, is_frame("scan"))
         assert made.hub.streams == {("Robot1", "scan")}
+
+
+async def test_layers_come_from_a_robots_own_graph() -> None:
+    """With discovery, topics of a robot's master are subscribed to there, without a namespace."""
+    network = DiscoveryNetwork()
+    async with (
+        Core(port=0) as planner,
+        Core(port=0) as robot,
+        Discovery(network.settings(planner.uri, name="planner")),
+        Discovery(network.settings(robot.uri, name="Robot1")),
+        Node("nodes", argv=[], master_uri=robot.uri, types=TYPES) as node,
+    ):
+        topics = RobotTopics(node)
+        await topics.start()
+        async with asyncio.timeout(LIMIT_S):
+            while "Robot1" not in {master.name for master in await list_masters(planner.uri)}:
+                await asyncio.sleep(0.1)
+        made = World(planner)
+        async with TestClient(TestServer(made.app)) as client, client.ws_connect("/api/v1/live") as page:
+            await page.send_json({"robot": "Robot1", "layers": ["map"]})
+            header, _ = await receive(page, is_frame("map"))
+            assert header["rows"] == 160
+        await made.hub.close()
 
 
 @pytest.mark.needs("chromium")
