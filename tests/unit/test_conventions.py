@@ -35,19 +35,18 @@ TINY = {
     "rce_robot/command.py": TYPER,
 }
 """Modules under 40 lines, and why they are not merged with another one."""
-BEING_BUILT = tuple(
-    f"rce_fleet/{room}/"
-    for room in [
-        "geometry",
-        "maps",
-        "localization",
-        "mapping",
-        "navigation",
-        "simulation",
-        "nodes",
-        "drivers",
-    ]
+_ROOMS = (
+    "geometry",
+    "maps",
+    "localization",
+    "mapping",
+    "navigation",
+    "simulation",
+    "nodes",
+    "drivers",
+    "offline",
 )
+BEING_BUILT = tuple(f"rce_fleet/{room}/" for room in _ROOMS)
 """Packages that are being built; they are not looked at yet."""
 _RULER = re.compile(r"^\s*#\s*[-=~]{2,}|^\s*#.*[-=~]{4,}\s*$", re.MULTILINE)
 

@@ -3,36 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-import struct
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from support.cloud import PASSWORD
+from support.client_types import ECHO, STRING, ros_string
 
 from rce.link import PeerFaultError
 from rce.protocol import codec
 from rce_client import Serialized
-from rce_client.connection import Connection, State
 from rce_client.exceptions import (
     CallError,
     CallTimeoutError,
     InterfaceError,
-    NotConnectedError,
-    RefusedError,
 )
-from rce_client.reminder import Reminder
 
 if TYPE_CHECKING:
-    from integration.client.conftest import Door, Engine
-
-STRING = "std_msgs/String"
-ECHO = "Test/StringEcho"
-ROBOT = "testUser/testRobot"
-
-
-def ros_string(text: str) -> bytes:
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
+    from integration.client.conftest import Engine
 
 
 # Messages
@@ -225,209 +211,7 @@ async def test_errors_reach_the_program(engine: Engine) -> None:
 # Coming in
 
 
-async def test_the_password_itself_is_not_sent(engine: Engine) -> None:
-    async with engine.connection():
-        pass
-    assert engine.door.targets == ["/?userID=testUser&version=20130902&auth=bearer"]
-
-
-@pytest.mark.parametrize("status", [400, 401, 410, 501])
-async def test_a_refusal_for_good_is_raised(door: Door, status: int) -> None:
-    door.status, door.body = status, "go away"
-    with pytest.raises(RefusedError, match="go away") as caught:
-        async with Connection(door.url, "testUser", "x", "testRobot"):
-            pass
-    assert caught.value.status == status
-
-
-async def test_a_wrong_password_is_raised(engine: Engine) -> None:
-    with pytest.raises(RefusedError, match="Wrong user or password") as caught:
-        async with Connection(engine.door.url, "testUser", "wrong", "testRobot"):
-            pass
-    assert caught.value.status == 401
-
-
-async def test_a_robot_id_in_use_is_told_at_once_and_again(
-    engine: Engine, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Who has it is told, and the second client comes in when the first is gone."""
-    defaults = Reminder.__init__.__defaults__
-    assert defaults is not None
-    monkeypatch.setattr(Reminder.__init__, "__defaults__", (0.1, *defaults[1:]))
-
-    def told() -> list[str]:
-        return [record.message for record in caplog.records if "until it is free" in record.message]
-
-    async with asyncio.timeout(30):
-        async with engine.connection():
-            second = asyncio.create_task(engine.connection().__aenter__())
-            while len(told()) < 3:
-                await asyncio.sleep(0.02)
-            assert not second.done()
-        conn = await second
-        await conn.__aexit__(None, None, None)
-    assert "already" in told()[0]
-
-
-async def test_waits_for_an_engine_that_is_not_there_yet(engine: Engine) -> None:
-    engine.door.status = 503
-    states: list[tuple[State, str]] = []
-
-    def watch(state: State, words: str) -> None:
-        states.append((state, words))
-        if len(states) == 4:
-            engine.door.status = 200
-
-    async with engine.connection(on_state=watch):
-        pass
-    assert any("503" in words for _, words in states)
-    assert [state for state, _ in states if state is not State.CONNECTING] == [State.CONNECTED, State.CLOSED]
-
-
-async def test_a_time_limit_ends_the_waiting(door: Door) -> None:
-    door.status = 503
-    with pytest.raises(TimeoutError):
-        async with asyncio.timeout(0.2), Connection(door.url, "testUser", "x", "testRobot"):
-            pass
-
-
-async def test_what_the_program_raises_is_raised_as_it_is(engine: Engine) -> None:
-    with pytest.raises(KeyError):
-        async with engine.connection():
-            raise KeyError("mine")
-
-
 # Losing it
 
 
-async def test_comes_back_and_restores(engine: Engine) -> None:
-    states: list[State] = []
-    changed = asyncio.Event()
-
-    def watch(state: State, words: str) -> None:
-        states.append(state)
-        changed.set()
-
-    async with engine.connection(on_state=watch) as conn:
-        await conn.create_container("c1")
-        publisher = await conn.publisher("say", STRING)
-        client = await conn.service_client("ask", ECHO)
-        await client.wait_active(10)
-        await publisher.wait_active(10)
-        asked = asyncio.Event()
-
-        async def hang(payload: bytes) -> bytes:
-            asked.set()
-            await asyncio.Event().wait()
-            return payload
-
-        engine.end("ask").answer = hang
-        call = asyncio.create_task(client({"data": "x"}))
-        await asked.wait()
-        engine.master.requests.clear()
-        await engine.kick()
-        with pytest.raises(CallError, match="connection broke"):
-            await call
-        assert not conn.active["say"]
-        while State.RESTORED not in states:
-            changed.clear()
-            await changed.wait()
-        await publisher.wait_active(10)
-        publisher.publish({"data": "again"})
-        assert await engine.end("say").received.get() == ros_string("again")
-    assert [type_ for _, type_, _ in engine.master.requests] == ["CC", "CN"]
-    interfaces = engine.master.requests[1][2]["addInterfaces"]
-    assert [item["interfaceTag"] for item in interfaces] == ["say", "ask"]
-    assert states.index(State.LOST) < states.index(State.RESTORED)
-
-
-async def test_what_is_removed_while_away_is_removed_on_return(engine: Engine) -> None:
-    async with engine.connection() as conn:
-        await conn.create_container("c1")
-        await conn.create_container("c2")
-        await engine.master.changed.until(lambda: len(engine.master.requests) == 2)
-        engine.door.status = 503
-        await engine.kick()
-        await conn.destroy_container("c1")
-        publisher = await conn.publisher("say", STRING)
-        assert not publisher.publish({"data": "into the void"})
-        client = await conn.service_client("ask", ECHO)
-        with pytest.raises(NotConnectedError):
-            await client({"data": "x"})
-        engine.master.requests.clear()
-        engine.door.status = 200
-        await publisher.wait_active(10)
-    made = [(type_, data.get("containerTag")) for _, type_, data in engine.master.requests]
-    assert made[0] == ("DC", "c1")
-    assert ("CC", "c2") in made
-    assert ("CC", "c1") not in made
-
-
-async def test_a_refusal_on_the_way_back_closes_the_connection(engine: Engine) -> None:
-    async with engine.connection() as conn:
-        subscriber = await conn.subscriber("hear", STRING)
-        engine.door.status, engine.door.body = 410, "too old"
-        await engine.kick()
-        assert [message async for message in subscriber] == []
-        with pytest.raises(RefusedError):
-            await conn.create_container("c1")
-        assert conn.state is State.CLOSED
-
-
 # Cancelling
-
-
-async def stall(engine: Engine, conn: Connection) -> None:
-    """Fill what the network takes: what is sent from now on waits in the queue of the connection."""
-    say = await conn.publisher("stalled", STRING, raw=True)
-    await say.wait_active(10)
-    engine.stop_reading()
-    say.publish(bytes(32 << 20))
-    while conn._session.transport._queue:  # until it is in the socket, as far as it goes
-        await asyncio.sleep(0)
-
-
-async def test_a_cancelled_request_is_sent_after_the_reconnect(engine: Engine) -> None:
-    async with engine.connection() as conn:
-        await conn.create_container("c1")
-        await stall(engine, conn)
-        with pytest.raises(TimeoutError):
-            async with asyncio.timeout(0.1):
-                await conn.destroy_container("c1")
-        await engine.kick()
-        requests = engine.master.requests
-        await engine.master.changed.until(lambda: any(type_ == "DC" for _, type_, _ in requests))
-        assert conn.connected
-
-
-async def test_an_interface_whose_making_was_cancelled_can_be_made(engine: Engine) -> None:
-    async with engine.connection() as conn:
-        making = asyncio.create_task(conn.publisher("say", STRING))
-        await asyncio.sleep(0)
-        making.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await making
-        await conn.wait_active("say", 10)
-        publisher = await conn.publisher("say", STRING)
-        assert publisher.publish({"data": "up"})
-        assert await engine.end("say").received.get() == ros_string("up")
-
-
-async def test_leaving_can_be_cancelled_while_messages_wait(engine: Engine) -> None:
-    conn = await engine.connection().__aenter__()
-    await stall(engine, conn)
-    with pytest.raises(TimeoutError):
-        async with asyncio.timeout(0.1):
-            await conn.__aexit__(None, None, None)
-    assert conn.state is State.CLOSED
-    with pytest.raises(NotConnectedError):
-        await conn.create_container("c1")
-
-
-async def test_of_several_masters_the_first_that_answers_is_used(engine: Engine) -> None:
-    nowhere = "http://127.0.0.1:1/"
-    for masters in ([nowhere, engine.door.url], f"{nowhere},{engine.door.url}"):
-        connection = Connection(masters, "testUser", PASSWORD, "testRobot")
-        async with asyncio.timeout(30), connection:
-            assert connection.connected
-        await engine.cloud.master.changed.until(lambda: not engine.cloud.master.inside)

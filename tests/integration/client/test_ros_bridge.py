@@ -7,11 +7,11 @@ import contextlib
 import json
 import os
 import signal
-import struct
 import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.client_types import ros_string
 from support.processes import finish
 
 from rce.ros.core import Core
@@ -27,11 +27,6 @@ if TYPE_CHECKING:
 
 STRING = "std_msgs/String"
 EMPTY = "std_srvs/SetBool"
-
-
-def ros_string(text: str) -> bytes:
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
 
 
 def config(url: str) -> dict[str, Any]:

@@ -6,7 +6,8 @@ import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
-from integration.client.test_ros_bridge import EMPTY, STRING, config, program, ros_string, write
+from integration.client.test_ros_bridge import EMPTY, STRING, config, program, write
+from support.client_types import ros_string
 from support.ports import free_port
 from support.ros_real import GRAPHS
 

@@ -9,27 +9,24 @@ from typing import TYPE_CHECKING
 
 import pytest
 from msgspec.structs import replace
+from support.link_frames import hello, read_on
+from support.link_kinds import SERVICE_OUT, TOPIC_OUT
 
 from rce.control.model import ConnectionSpec, LinkAddress, LinkSpec
 from rce.link import (
     CallTimeoutError,
     LinkLimits,
     LinkLostError,
-    LinkRefusedError,
     MessageTooLargeError,
     OverloadedError,
     PeerLostError,
 )
 from rce.link.frame_reader import FrameReader
-from rce.link.frames import HEADER, Frame, FrameType, encode
-from rce.link.handshake import check_answer, encode_hello, encode_welcome
+from rce.link.frames import Frame, FrameType, encode
+from rce.link.handshake import encode_hello, encode_welcome
 
 if TYPE_CHECKING:
     from .conftest import Party, Rig
-
-TOPIC_OUT = ("SubscriberConverter", "PublisherInterface")
-TOPIC_IN = ("PublisherConverter", "SubscriberInterface")
-SERVICE_OUT = ("ServiceProviderForwarder", "ServiceClientInterface")
 
 
 def kill_link(party: Party) -> None:
@@ -126,138 +123,6 @@ async def test_peer_may_come_first_or_last_to_the_same_process(rig: Rig) -> None
     await a.connected(1)
     assert a.endpoint._links["L"].carrier is not None
     assert a.endpoint._links["L"].carrier.kind == "local"
-
-
-async def hello(address: LinkAddress, data: bytes) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    if address.unix:
-        reader, writer = await asyncio.open_unix_connection(address.unix)
-    else:
-        reader, writer = await asyncio.open_connection(address.host, address.port)
-    writer.write(data)
-    return reader, writer
-
-
-async def answer(reader: asyncio.StreamReader) -> Frame:
-    frames = FrameReader(LinkLimits()).feed(await reader.read(100))
-    return frames[0]
-
-
-@pytest.mark.parametrize("way", ["unix", "tcp", "handed-over"])
-async def test_wrong_token_and_unknown_link_are_refused(rig: Rig, way: str) -> None:
-    a, b = await rig.pair(way, unknown_link=0.05)
-    await rig.join(a, b, [TOPIC_OUT])
-    await a.connected(1)
-    for link, token in (("L", "wrong"), ("L", ""), ("M", "secret")):
-        reader, writer = await hello(b.address, encode_hello(link, token))
-        with pytest.raises(LinkRefusedError, match="unknown link or wrong token"):
-            check_answer(await answer(reader))
-        assert await reader.read() == b""
-        writer.close()
-        await writer.wait_closed()
-    assert a.endpoint.connections == (1,)
-    assert a.fakes["i1"].active == [True]
-
-
-@pytest.mark.parametrize("way", ["local", "unix"])
-async def test_endpoint_with_a_wrong_token_does_not_connect(rig: Rig, way: str) -> None:
-    a, b = await rig.pair(way)
-    await rig.join(a, b, [TOPIC_OUT])
-    await a.connected(1)
-    await a.apply(links=[])
-    await a.apply(links=[LinkSpec(id="L", peer="user/b", token="wrong", dial=True, address=b.address)])
-    with pytest.raises(LinkRefusedError):
-        await a.hub.connect(a.spec.links[0])
-    assert a.endpoint.connections == ()
-
-
-@pytest.mark.parametrize("way", ["unix", "tcp", "handed-over"])
-async def test_link_may_be_asked_for_before_its_spec_came(
-    rig: Rig, way: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _, b = await rig.pair(way, unknown_link=5.0)
-    asked = asyncio.Event()
-    wait = b.hub.wait_registered
-
-    async def note_and_wait(link_id: str, timeout: float | None) -> None:
-        asked.set()
-        await wait(link_id, timeout)
-
-    monkeypatch.setattr(b.hub, "wait_registered", note_and_wait)
-    reader, writer = await hello(b.address, encode_hello("L", "secret"))
-    await asked.wait()
-    await b.apply(links=[LinkSpec(id="L", peer="user/a", token="secret", dial=False)])
-    check_answer(await answer(reader))
-    writer.close()
-    await writer.wait_closed()
-
-
-@pytest.mark.parametrize("way", ["unix", "tcp", "handed-over"])
-@pytest.mark.parametrize(
-    "garbage",
-    [
-        b"GET / HTTP/1.1\r\nHost: x\r\n\r\n",
-        b"\0" * 24,
-        encode(Frame(FrameType.PING)),
-        encode_hello("x" * 5_000, ""),
-    ],
-    ids=["http", "zeros", "ping", "long hello"],
-)
-async def test_garbage_ends_its_own_connection_only(rig: Rig, way: str, garbage: bytes) -> None:
-    a, b = await rig.pair(way)
-    await rig.join(a, b, [TOPIC_OUT])
-    await a.connected(1)
-    reader, writer = await hello(b.address, garbage)
-    try:
-        rest = await reader.read()
-    except ConnectionResetError:
-        rest = b""
-    assert rest == b""
-    writer.close()
-    a.fakes["i1"].port.send(b"unhurt")
-    assert await b.fakes["i1"].received.get() == (b"unhurt", False)
-
-
-async def test_silent_connection_is_dropped(rig: Rig) -> None:
-    _, b = await rig.pair("tcp", handshake=0.05)
-    reader, writer = await hello(b.address, b"")
-    assert await _read_on(reader) == b""
-    writer.close()
-
-
-@pytest.mark.parametrize(
-    "rule_breaker",
-    [
-        HEADER.pack(200, 0, 0, 0, 0, 0, 0),
-        encode(Frame(FrameType.HELLO)),
-        encode(Frame(FrameType.OPEN, 1)) + encode(Frame(FrameType.HELLO, 1)),
-        b"".join(encode(Frame(FrameType.OPEN, n)) for n in range(1, 40)),
-        encode(Frame(FrameType.OPEN, 2)) + 2 * encode(Frame(FrameType.CALL, 2, 7)),
-    ],
-    ids=["unknown type", "second hello", "hello on a channel", "too many channels", "same call twice"],
-)
-async def test_rule_breaking_peer_loses_its_link(rig: Rig, rule_breaker: bytes) -> None:
-    hub = await rig.hub(limits=LinkLimits(max_channels=30))
-    b = rig.party("b", hub)
-    await rig.listen(b, "unix")
-    await b.apply(
-        {"i1": "PublisherInterface", "i2": "ServiceClientInterface"},
-        [LinkSpec(id="L", peer="user/a", token="secret", dial=False)],
-        [ConnectionSpec(id=n, link="L", interface=f"i{n}", peer_interface="x") for n in (1, 2)],
-    )
-    reader, writer = await hello(b.address, encode_hello("L", "secret"))
-    check_answer(await answer(reader))
-    writer.write(rule_breaker)
-    while await _read_on(reader):
-        pass
-    writer.close()
-    await b.connected()
-
-
-async def _read_on(reader: asyncio.StreamReader) -> bytes:
-    try:
-        return await reader.read(1_000)
-    except ConnectionResetError:
-        return b""
 
 
 async def test_call_times_out_and_is_cancelled_at_the_peer(rig: Rig, way: str) -> None:
@@ -433,7 +298,7 @@ async def test_dead_machine_is_noticed_on_tcp(rig: Rig) -> None:
     reader, writer = await hello(b.address, encode_hello("L", "secret") + encode(Frame(FrameType.OPEN, 1)))
     await b.connected(1)
     await b.connected()
-    assert encode(Frame(FrameType.PING)) in await _read_on(reader)
+    assert encode(Frame(FrameType.PING)) in await read_on(reader)
     writer.close()
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import struct
 from typing import TYPE_CHECKING
 
 import pytest
+from support.client_types import ros_string
 
 from rce.link import PeerFaultError
 
@@ -16,11 +16,6 @@ if TYPE_CHECKING:
 
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"
-
-
-def ros_string(text: str) -> bytes:
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
 
 
 async def test_robot_to_container_as_json(cloud: Cloud, robot: Robot) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import pytest
+from support.client_types import ros_string
 from support.cloud import DIGEST, running_cloud
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -26,11 +27,6 @@ if TYPE_CHECKING:
 
 STRING = "std_msgs/String"
 ROBOT = "testUser/testRobot"
-
-
-def ros_string(text: str) -> bytes:
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
 
 
 async def refused(attempt: connect) -> tuple[int, str]:

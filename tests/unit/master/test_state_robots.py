@@ -1,0 +1,130 @@
+"""Robots that connect, move between task sets and come back."""
+
+from __future__ import annotations
+
+import pytest
+from support.master_world import World
+from support.state_reports import kinds, status
+
+from rce.control.model import (
+    EndpointState,
+    LinkAddress,
+)
+from rce_master.exceptions import ConflictError
+from rce_master.state import commands
+
+
+def test_robot_within_grace_time_finds_everything(world: World) -> None:
+    """A robot is kept for its grace time and finds everything again."""
+    world.wired()
+    before = world.spec("rob")
+    world.do(commands.RobotLeft(process="r1", id="anna/rob"))
+    assert world.session() == "absent"
+    world.tick(59)
+    changes = world.login()
+    assert world.spec("rob") == before
+    assert changes.answered == "anna/rob"
+    assert world.session() == "connected"
+    world.do(commands.RobotLeft(process="r1", id="anna/rob"))
+    changes = world.tick(60)
+    assert kinds(changes) == ["robot_gone"]
+    assert [(w.process, w.id) for w in changes.withdrawals] == [("r1", "anna/rob")]
+    assert world.spec("c").connections == ()
+    assert world.phase() == "placed"
+
+
+def test_a_robot_connects_once(world: World) -> None:
+    world.wired()
+    world.robot_set("r2")
+    with pytest.raises(ConflictError, match="connected already"):
+        world.login(process="r2")
+    with pytest.raises(ConflictError, match="is not a connected robot task set"):
+        world.login("other", process="c1")
+
+
+def test_a_robot_moves_to_another_task_set(world: World) -> None:
+    world.wired()
+    world.login("abel")
+    world.interface("abel/in", "PublisherConverter")
+    world.connect("abel/in", "rob/out")
+    world.robot_set("r2", port=2)
+    world.do(commands.RobotLeft(process="r1", id="anna/rob"))
+    changes = world.login(process="r2")
+    assert [(w.process, w.id) for w in changes.withdrawals] == [("r1", "anna/rob")]
+    assert "anna/abel" in changes.touched
+    (link,) = world.spec("abel").links
+    assert (link.dial, link.address.port) == (True, 2)
+
+
+def test_robots_of_a_killed_task_set_come_back_at_another(world: World) -> None:
+    world.wired()
+    before = world.spec("rob")
+    world.leave("r1")
+    assert world.session() == "absent"
+    world.robot_set("r2")
+    changes = world.login(process="r2")
+    assert changes.withdrawals == []
+    assert world.spec("rob").connections == before.connections
+    world.tick(60)
+    assert "r1" not in world.state.tables.task_sets
+    assert world.session() == "connected"
+
+
+def test_a_channel_that_dropped_for_a_while_changes_nothing(world: World) -> None:
+    world.wired()
+    world.run()
+    before = world.spec("rob"), world.spec("c")
+    world.leave("r1")
+    world.leave("c1")
+    world.tick(29)
+    world.robot_set(endpoints=(status("rob", revision=before[0].revision),))
+    world.container_set(
+        endpoints=(status("c", revision=before[1].revision, address=LinkAddress(machine="m", unix="/run/c")),)
+    )
+    assert (world.spec("rob"), world.spec("c")) == before
+    assert (world.session(), world.phase()) == ("connected", "running")
+
+
+def test_a_robot_that_its_task_set_lost_meanwhile_is_absent(world: World) -> None:
+    world.wired()
+    world.leave("r1")
+    world.robot_set()
+    assert world.session() == "absent"
+    world.login(arrives=False)
+    world.report("r1", status("rob", EndpointState.ABSENT))
+    assert world.session() == "connected", "its task set has not heard of it yet"
+    world.report("r1", status("rob"))
+    world.tick(60)
+    assert world.session() == "connected"
+    world.report("r1", status("rob", EndpointState.ABSENT))
+    assert world.session() == "absent"
+    world.report("r1", status("rob"))
+    assert world.session() == "connected"
+
+
+def test_a_robot_that_was_let_in_and_never_came_can_log_in_again(world: World) -> None:
+    world.robot_set()
+    world.login(arrives=False)
+    world.tick(14)
+    with pytest.raises(ConflictError):
+        world.login()
+    world.tick(1)
+    assert world.session() == "absent"
+    world.login()
+
+
+def test_a_new_password_ends_the_sessions_of_the_users_robots(world: World) -> None:
+    world.wired()
+    before = world.spec("rob")
+    changes = world.do(commands.SetPassword(name="anna", password="new"))
+    assert [(w.process, w.id) for w in changes.withdrawals] == [("r1", "anna/rob")]
+    assert world.session() == "absent"
+    world.report("r1", status("rob"))
+    assert world.session() == "absent"
+    world.do(commands.RobotLeft(process="r1", id="anna/rob"))
+    world.do(commands.EndpointGone(process="r1", id="anna/rob"))
+    world.login()
+    after = world.spec("rob")
+    assert after.revision > changes.withdrawals[0].revision
+    assert (after.interfaces, after.connections) == (before.interfaces, before.connections)
+    assert world.session() == "connected"

@@ -1,0 +1,91 @@
+"""Large messages of a robot, which are converted elsewhere."""
+
+from __future__ import annotations
+
+import asyncio
+
+from support.robot_interfaces import SERVICE, STRING, Setup, ros_string, shown
+
+from rce.protocol.stream import LargeData
+from rce.protocol.weight import Address
+
+
+def large(msg: str, tag: str = "tag", cls: str = STRING, msg_id: str = "nil") -> LargeData:
+    text = f'{{"type":"DM","data":{{"iTag":"{tag}","type":"{cls}","msgID":"{msg_id}","msg":{msg}}}}}'
+    return LargeData(Address(tag, cls, msg_id), text.encode())
+
+
+async def test_a_large_message_is_converted_elsewhere_and_in_order() -> None:
+    setup = Setup("SubscriberConverter")
+    setup.interface.take_large(large('{"data":"first"}'))
+    setup.take({"data": "second"})
+    assert setup.port.sent == []
+    assert setup.robot.holdings.bytes > 0
+    await asyncio.gather(*setup.robot.work)
+    assert setup.port.sent == [ros_string("first"), ros_string("second")]
+    assert setup.robot.holdings.bytes == 0
+    setup.take({"data": "third"})
+    assert setup.port.sent[2:] == [ros_string("third")]
+
+
+async def test_wrong_large_message_harms_no_other() -> None:
+    """A large message that is wrong is told and harms no other."""
+    setup = Setup("SubscriberConverter")
+    setup.interface.take_large(large('{"data":5}'))
+    setup.interface.take_large(large("[" * 100 + "]" * 100))
+    setup.interface.take_large(large("[" + "[]," * 200_000 + "[]]"))
+    setup.take({"data": "good"})
+    await asyncio.gather(*setup.robot.work)
+    assert setup.port.sent == [ros_string("good")]
+    wrong, deep, many = setup.robot.reports
+    assert wrong == "tag: data: 5 is not a string"
+    assert deep == "tag: nested deeper than 64 levels"
+    assert many.startswith("tag: a message of 200010 objects, lists and members is over the limit of 200000")
+
+
+async def test_large_message_waits_for_its_binary_values() -> None:
+    """A large message that refers to binary values waits for them."""
+    setup = Setup("SubscriberConverter", "sensor_msgs/CompressedImage")
+    id_ = "ab" * 16
+    message = large(f'{{"format":"jpeg","data*":"{id_}"}}', cls="sensor_msgs/CompressedImage")
+    setup.interface.take_large(message)
+    await asyncio.gather(*setup.robot.work)
+    assert setup.robot.awaited == [(message, [id_])]
+    setup.interface.take_large(LargeData(message.address, message.text, {id_: memoryview(b"pixels")}))
+    await asyncio.gather(*setup.robot.work)
+    assert setup.port.sent[0].endswith(b"\x06\0\0\0pixels")
+
+
+async def test_a_large_answer_of_the_robot_completes_its_call() -> None:
+    setup = Setup("ServiceClientConverter", SERVICE)
+    call = asyncio.ensure_future(setup.interface.serve(b"\x01"))
+    await asyncio.sleep(0)
+    msg_id = shown(setup.robot.urgent[0])["msgID"]
+    setup.interface.take_large(large('{"success":true,"message":"big"}', cls=SERVICE, msg_id=msg_id))
+    assert bytes(await call) == b"\x01" + ros_string("big")
+
+
+async def test_a_call_is_given_up_when_memory_is_short() -> None:
+    setup = Setup("ServiceProviderConverter", SERVICE)
+    setup.port.answer = asyncio.get_running_loop().create_future()
+    setup.take({"data": True}, "id1")
+    await asyncio.sleep(0)
+    assert setup.robot.holdings.bytes == 1
+    setup.robot.holdings.shed(1)
+    await asyncio.gather(*setup.robot.work, return_exceptions=True)
+    assert setup.robot.holdings.bytes == 0
+    assert setup.robot.reports == ["tag, msgID id1: memory is short; the call was given up"]
+
+
+def test_a_latched_message_is_held_until_another_takes_its_place() -> None:
+    setup = Setup("PublisherConverter")
+    setup.interface.receive(ros_string("x" * 100), latched=True)
+    assert setup.robot.holdings.bytes == 104
+    setup.interface.receive(ros_string("x" * 50), latched=True)
+    assert setup.robot.holdings.bytes == 54
+    setup.robot.holdings.shed(1)
+    assert setup.robot.holdings.bytes == 0
+    assert setup.robot.latched_dropped == 1
+    setup.robot.data.clear()
+    setup.interface.robot_joined()
+    assert setup.robot.data == []

@@ -1,0 +1,99 @@
+"""Service calls from and to a robot."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+from support.robot_interfaces import SERVICE, Setup, ros_string, shown
+
+from rce.aio.queues import OverflowPolicy
+from rce.link import (
+    CallTimeoutError,
+    NotConnectedError,
+    OverloadedError,
+    PeerFaultError,
+    PeerLostError,
+)
+from rce_robot.exceptions import BusyError, MisdirectedError
+from rce_robot.services import AnsweredByRobot
+
+
+async def test_the_robot_asks() -> None:
+    setup = Setup("ServiceProviderConverter", SERVICE)
+    setup.port.answer = b"\x01" + ros_string("done")
+    setup.take({"data": True}, "id1")
+    await asyncio.gather(*setup.robot.work)
+    assert setup.port.sent == [b"\x01"]
+    (message,) = setup.robot.urgent
+    assert shown(message)["msgID"] == "id1"
+    assert shown(message)["msg"] == {"success": True, "message": "done"}
+
+
+@pytest.mark.parametrize("error", [NotConnectedError(), PeerFaultError("no"), CallTimeoutError("late")])
+async def test_a_call_that_fails_is_told(error: Exception) -> None:
+    setup = Setup("ServiceProviderConverter", SERVICE)
+    setup.port.answer = error
+    setup.take({"data": True}, "id1")
+    await asyncio.gather(*setup.robot.work)
+    assert setup.robot.reports == [f"tag, msgID id1: {error}"]
+
+
+def test_too_many_calls_are_refused() -> None:
+    setup = Setup("ServiceProviderConverter", SERVICE)
+    setup.robot.room = False
+    with pytest.raises(BusyError, match="id1"):
+        setup.take({"data": True}, "id1")
+
+
+async def test_a_large_answer_takes_the_data_lane_and_is_not_dropped() -> None:
+    setup = Setup("ServiceProviderForwarder", SERVICE)
+    setup.port.answer = bytes(1 << 20)
+    setup.take(b"\x01", "id1")
+    await asyncio.gather(*setup.robot.work)
+    ((message, overflow),) = setup.robot.data
+    assert overflow is OverflowPolicy.REFUSE
+    assert message.size > 1 << 20
+
+
+async def test_the_robot_answers() -> None:
+    setup = Setup("ServiceClientConverter", SERVICE)
+    calls = [asyncio.ensure_future(setup.interface.serve(bytes([number]))) for number in (0, 1)]
+    await asyncio.sleep(0)
+    for message in reversed(setup.robot.urgent):
+        request = shown(message)
+        setup.take({"success": request["msg"]["data"]}, request["msgID"])
+    answers = await asyncio.gather(*calls)
+    assert [bytes(answer) for answer in answers] == [b"\x00" + ros_string(""), b"\x01" + ros_string("")]
+
+
+async def test_the_ways_in_which_the_robot_does_not_answer() -> None:
+    setup = Setup("ServiceClientConverter", SERVICE, call_timeout=0.01)
+    with pytest.raises(CallTimeoutError):
+        await setup.interface.serve(b"\x01")
+    setup.robot.room = False
+    with pytest.raises(OverloadedError):
+        await setup.interface.serve(b"\x01")
+    setup.robot.connected = False
+    with pytest.raises(PeerLostError):
+        await setup.interface.serve(b"\x01")
+    with pytest.raises(MisdirectedError, match="no call"):
+        setup.take({}, "unknown")
+
+
+async def test_a_bad_request_of_a_peer_is_the_peers_to_know() -> None:
+    setup = Setup("ServiceClientConverter", SERVICE)
+    with pytest.raises(PeerFaultError):
+        await setup.interface.serve(b"far too long for a bool")
+    assert not setup.robot.reports
+
+
+async def test_a_closed_interface_fails_its_callers() -> None:
+    setup = Setup("ServiceClientConverter", SERVICE)
+    assert isinstance(setup.interface, AnsweredByRobot)
+    call = asyncio.ensure_future(setup.interface.serve(b"\x01"))
+    await asyncio.sleep(0)
+    await setup.interface.close()
+    with pytest.raises(PeerLostError):
+        await call
+    assert setup.robot.gone == [setup.interface]
