@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from rce.config.exceptions import ShippedFileError
-from rce.config.folders import default_state_dir, examples_dir, run_dir
+from rce.config.folders import configs_dir, default_state_dir, examples_dir, run_dir
 from rce.config.secret import Secret
 from rce.control.channel import TaskSetChannel
 from rce.control.contents import ContentClient
@@ -229,10 +229,11 @@ def choose_runtime(requested: str, runtimes: dict[str, Runtime]) -> tuple[Runtim
 
 
 def package_path(given: Sequence[Path]) -> tuple[Path, ...]:
-    """All folders with packages: given, of the environment variables, the examples, the machine's ROS."""
+    """All folders with packages: given, of the environment variables, shipped ones, the machine's ROS."""
     paths = [*given, *PackageIndex.from_environ().path]
-    with contextlib.suppress(ShippedFileError):
-        paths.append(examples_dir())
+    for shipped in (examples_dir, configs_dir):
+        with contextlib.suppress(ShippedFileError):
+            paths.append(shipped())
     paths += installed_shares()
     return tuple(dict.fromkeys(path.absolute() for path in paths))
 

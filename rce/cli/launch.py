@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -53,7 +54,7 @@ def launch(
     from rce.launching import StopTimeouts
     from rce.ros.launch import MachineInputs
 
-    inputs = MachineInputs()
+    inputs = MachineInputs(_packages())
     uri = _master_uri(port)
     try:
         plan = _load(what, inputs)
@@ -85,11 +86,10 @@ def run(
     import shlex
 
     from rce.ros.errors import PackageError
-    from rce.ros.packages import PackageIndex
     from rce.ros.system import system_environ
 
     try:
-        program = PackageIndex.of_machine().find(package).program(executable)
+        program = _packages().find(package).program(executable)
         words = [*shlex.split(prefix), *program.command, *(arguments or [])]
     except (PackageError, ValueError) as error:
         typer.echo(f"rce run: {error}", err=True)
@@ -107,6 +107,18 @@ def run(
 
 
 run_command = Plugged(run, {"allow_interspersed_args": False, "ignore_unknown_options": True})
+
+
+def _packages() -> PackageIndex:
+    """Return the machine's packages, and those of the shipped configs."""
+    from rce.config.exceptions import ShippedFileError
+    from rce.config.folders import configs_dir
+    from rce.ros.packages import PackageIndex
+
+    path = PackageIndex.of_machine().path
+    with contextlib.suppress(ShippedFileError):
+        path = (*path, configs_dir())
+    return PackageIndex(path)
 
 
 def _master_uri(port: int) -> str:

@@ -1,0 +1,138 @@
+"""The client configs of a fleet of TurtleBots, wired twice from the same launch file.
+
+``configs/turtlebot/botmotion.launch`` names a robot's nodes and their parameters. They run on the robot, with
+the planner in the cloud (:func:`onboard_config`); or in the robot's container, so that only sensors and the
+safety stage stay on the robot (:func:`offloaded_config`): scans and odometry go up, velocities come down.
+
+This module made ``robot1.config``, ``robot1-offload.config`` and those of robot 2 in ``configs/turtlebot``.
+"""
+
+from __future__ import annotations
+
+import shlex
+from typing import TYPE_CHECKING, Any
+
+from rce.config.folders import configs_dir
+from rce.ros.launch import MachineInputs, load_launch_files
+from rce.ros.packages import PackageIndex
+from rce_fleet.wiring import FLEET_CONTAINER, FleetAccount, robot_config
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rce.ros.launch import LaunchPlan, NodePlan
+
+LAUNCH_FILE = "turtlebot/botmotion.launch"
+_MAP = "/map.yaml"
+"""Stands for the map's file while the launch file is read."""
+_MAP_IN_CONTAINER = "$(find turtlebot)/floor.yaml"
+
+UP = (
+    ("/scan", "sensor_msgs/LaserScan"),
+    ("/odom", "nav_msgs/Odometry"),
+    ("/tf", "tf2_msgs/TFMessage"),
+    ("/tf_static", "tf2_msgs/TFMessage"),
+    ("/initialpose", "geometry_msgs/PoseWithCovarianceStamped"),
+)
+"""What an off-loaded robot sends to its container."""
+DOWN = (("/raw_cmd_vel", "geometry_msgs/Twist"),)
+"""What it gets: velocities, for the safety stage before the wheels."""
+_CELLS = "std_msgs/Int32MultiArray"
+_STATE = ("/fleet/state", "fleet/FleetState")
+_GRID = ("/fleet/map", "nav_msgs/OccupancyGrid")
+
+
+def onboard_config(number: int, account: FleetAccount | None = None) -> dict[str, Any]:
+    """Return the config of robot ``number`` that runs all nodes of its launch file itself.
+
+    Args:
+        number: Names robot, container and namespace, as for :func:`rce_fleet.wiring.robot_config`.
+        account: Engine and user; None for those of a development engine.
+    """
+    config = robot_config(number, account)
+    planner, namespace = FLEET_CONTAINER, f"Robot{number}"
+    config["bridges"] += [
+        _topic("/freedCells", _CELLS, "robot", f"{planner}:/{namespace}/freedCells"),
+        *(_topic(name, kind, planner, "robot") for name, kind in (_GRID, _STATE)),
+    ]
+    return config
+
+
+def offloaded_config(
+    number: int,
+    account: FleetAccount | None = None,
+    *,
+    initial_pose: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> dict[str, Any]:
+    """Return the config of robot ``number`` whose container runs all its nodes but the safety stage.
+
+    The robot itself runs ``botmotion.launch offload:=true``.
+
+    Args:
+        number: Names robot, container and namespace, as for :func:`rce_fleet.wiring.robot_config`.
+        account: Engine and user; None for those of a development engine.
+        initial_pose: Where the robot starts, (x, y, yaw) in metres and radians.
+
+    Raises:
+        LaunchFileError: The shipped launch file cannot be read.
+    """
+    config = robot_config(number, account)
+    container, namespace = config["containers"][0]["cTag"], f"Robot{number}"
+    x, y, yaw = initial_pose
+    pose = {"initial_pose_x": f"{x}", "initial_pose_y": f"{y}", "initial_pose_a": f"{yaw}"}
+    everything = _launch_plan({"map": _MAP, "robot": namespace, **pose})
+    stays = {node.name for node in _launch_plan({"offload": "true"}).nodes}
+    # The planner hears the pose from the container itself.
+    moved = [node for node in everything.nodes if node.name not in stays and node.type != "relay"]
+    names = [f"{node.name}/" for node in moved]
+    config["parameters"] = [
+        {"cTag": container, "name": name, "value": value}
+        for name, value in everything.parameters.items()
+        if name.startswith(tuple(names))
+    ]
+    client = config["nodes"][0]
+    client["args"] = " ".join(
+        f"move_base/{topic}:=/move_base/{topic}" for topic in ("goal", "cancel", "status", "result")
+    )
+    config["nodes"] = [*(_node(container, node) for node in moved), client]
+    config["bridges"] = list(_offload_bridges(container, namespace))
+    return config
+
+
+def _launch_plan(arguments: dict[str, str]) -> LaunchPlan:
+    folder = configs_dir()
+    inputs = MachineInputs(PackageIndex([folder]), {})
+    return load_launch_files([folder / LAUNCH_FILE], arguments, inputs=inputs)
+
+
+def _node(container: str, node: NodePlan) -> dict[str, Any]:
+    """Return a node of the launch file as a node of a container."""
+    name = node.name.removeprefix("/")
+    remappings = (f"{source}:={target}" for source, target in node.remappings)
+    args = shlex.join([*node.arguments, *remappings]).replace(_MAP, _MAP_IN_CONTAINER)
+    made = {"cTag": container, "nTag": name, "pkg": node.package, "exe": node.type, "name": name}
+    if args:
+        made["args"] = args
+    if node.respawn:
+        made["restart"] = "always"
+    return made
+
+
+def _offload_bridges(container: str, namespace: str) -> Iterator[dict[str, Any]]:
+    planner = FLEET_CONTAINER
+    for name, kind in UP:
+        yield _topic(name, kind, "robot", container)
+    for name, kind in DOWN:
+        yield _topic(name, kind, container, "robot")
+    pose = "geometry_msgs/PoseWithCovarianceStamped"
+    for name, kind in (("amcl_pose", pose), ("blockedCells", _CELLS), ("freedCells", _CELLS)):
+        yield _topic(f"/{name}", kind, container, f"{planner}:/{namespace}/{name}")
+    yield _topic(f"/{namespace}/moveClient/status", "fleet/MoveStatus", container, planner)
+    yield _topic(f"/{namespace}/goalNodesList", _CELLS, planner, container)
+    yield _topic(f"/{namespace}/cancelGoal", "std_msgs/Bool", planner, container)
+    for name, kind in (_GRID, _STATE):
+        yield _topic(name, kind, planner, container)
+
+
+def _topic(name: str, kind: str, source: str, target: str) -> dict[str, Any]:
+    return {"topic": name, "type": kind, "from": source, "to": target}
