@@ -4,7 +4,8 @@
 the planner in the cloud (:func:`onboard_config`); or in the robot's container, so that only sensors and the
 safety stage stay on the robot (:func:`offloaded_config`): scans and odometry go up, velocities come down.
 
-This module made ``robot1.config``, ``robot1-offload.config`` and those of robot 2 in ``configs/turtlebot``.
+This module made ``robot1.config``, ``robot1-offload.config`` and those of robots 2 and 3 in
+``configs/turtlebot``.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 LAUNCH_FILE = "turtlebot/botmotion.launch"
 _MAP = "/map.yaml"
 """Stands for the map's file while the launch file is read."""
-_MAP_IN_CONTAINER = "$(find turtlebot)/floor.yaml"
+_MAP_IN_CONTAINER = "$(find turtlebot)/../map.yaml"
 
 UP = (
     ("/scan", "sensor_msgs/LaserScan"),

@@ -24,8 +24,8 @@ pytestmark = pytest.mark.needs("pymunk")
 TURTLEBOT = Path(__file__).parents[3] / "configs" / "turtlebot"
 RCE = str(Path(sys.executable).with_name("rce"))
 WAIT_S = 120.0
-START = (1.5, 1.5)
-GOAL = (3.5, 2.5)
+START = (0.5, 0.5)
+GOAL = (2.5, 0.5)
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 
 
@@ -77,7 +77,15 @@ async def check_drive(judge: Node, namespace: str = "") -> None:
 async def test_a_robot_with_its_own_master_drives(tmp_path: Path) -> None:
     port = free_port()
     uri = f"http://127.0.0.1:{port}/"
-    scene = ("sim", str(TURTLEBOT / "scene.yaml"), "--core-port", str(port), "--world-port", "0")
+    scene = (
+        "sim",
+        str(TURTLEBOT.parent / "scene.yaml"),
+        "--no-stand-ins",
+        "--core-port",
+        str(port),
+        "--world-port",
+        "0",
+    )
     launch = ("launch", str(TURTLEBOT / "botmotion.launch"), "robot:=Robot1")
     place = (f"initial_pose_x:={START[0]}", f"initial_pose_y:={START[1]}")
     async with (
@@ -93,7 +101,7 @@ async def test_a_robot_with_its_own_master_drives(tmp_path: Path) -> None:
 
 async def test_a_robot_at_a_shared_master_drives(tmp_path: Path) -> None:
     async with Core(port=0) as core:
-        scene = ("sim", str(TURTLEBOT / "scene.yaml"), "--core", core.uri)
+        scene = ("sim", str(TURTLEBOT.parent / "scene.yaml"), "--no-stand-ins", "--core", core.uri)
         launch = ("launch", str(TURTLEBOT / "botmotion.launch"), "tf_prefix:=Robot1")
         place = (f"initial_pose_x:={START[0]}", f"initial_pose_y:={START[1]}")
         async with (

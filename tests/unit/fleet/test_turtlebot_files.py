@@ -1,17 +1,14 @@
-"""The files of a TurtleBot: launch file, parameters, map and world fit each other and the nodes."""
+"""The files of a TurtleBot: launch file and parameters fit each other and the nodes."""
 
 from __future__ import annotations
 
-from math import hypot
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from rce.ros.launch import LaunchPlan, MachineInputs, load_launch_files
 from rce.ros.packages import PackageIndex
-from rce_fleet.drivers.scene import load_scene
 from rce_fleet.maps.ros_map import load_map
 from rce_fleet.navigation.safety.parameters import SafetyParameters
 from rce_fleet.nodes.amcl_parameters import AmclNodeParameters
@@ -89,27 +86,7 @@ def test_the_nodes_are_there() -> None:
         assert packages.find(node.package).executable(node.type)
 
 
-def test_the_map_is_that_of_the_world() -> None:
-    drawn, saved = load_scene(FOLDER / "scene.yaml").draw(), load_map(FOLDER / "floor.yaml")
-    assert np.array_equal(drawn.data, saved.data)
-    assert hypot(drawn.origin.x - saved.origin.x, drawn.origin.y - saved.origin.y) < 1e-6
-
-
-def test_the_floor_has_no_symmetry() -> None:
-    """A turned or mirrored floor differs: a robot can tell where it is."""
-    walls = load_map(FOLDER / "floor.yaml").data >= 65
-    turned = [np.rot90(walls, times) for times in (1, 2, 3)]
-    mirrored = [np.rot90(walls[:, ::-1], times) for times in range(4)]
-    same = [np.mean(walls == other, where=walls | other) for other in turned + mirrored]
-    assert max(same) < 0.93
-
-
-def test_all_cells_can_be_entered() -> None:
-    scene = load_scene(FOLDER / "scene.yaml")
-    drawn = load_map(FOLDER / "floor.yaml")
-    rows, columns = np.nonzero(drawn.data >= 65)
-    x = drawn.origin.x + (columns + 0.5) * drawn.resolution
-    y = drawn.origin.y + (rows + 0.5) * drawn.resolution
-    grid = scene.grid
-    nearest = [np.min(np.hypot(x - one[0], y - one[1])) for one in map(grid.centre, range(len(grid)))]
-    assert min(nearest) > 0.177 + 0.05
+def test_the_default_map_is_there() -> None:
+    server = plan().nodes[0]
+    assert Path(server.arguments[0]).resolve() == FOLDER.parent / "map.yaml"
+    assert load_map(server.arguments[0]).data.size
