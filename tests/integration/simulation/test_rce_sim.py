@@ -13,6 +13,7 @@ from xmlrpc.client import ServerProxy
 
 import pytest
 from support.engine import Program, until
+from support.ports import free_port
 
 from rce.ros.node import Node
 from rce.ros.tf import TransformListener
@@ -166,6 +167,33 @@ async def test_real_rosservice_pauses_the_world(tmp_path: Path) -> None:
         step = node.service_client("/simulation/step", "fleet/StepWorld")
         first = (await step(seconds=0.5)).time
         assert (await step(seconds=0.5)).time == pytest.approx(first + 0.5), "it stands between the two"
+
+
+async def test_a_killed_world_comes_back_for_its_listeners(tmp_path: Path) -> None:
+    """A world that was killed starts again on its ports; nodes of the robot's graph find it again."""
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    ports = ("--core-port", str(free_port()), "--world-port", "0")
+    argv = [*RCE, "sim", str(tmp_path / "scene.yaml"), *ports]
+    first = Program("first", argv, dict(os.environ), tmp_path)
+    await first.start(ready="simulation ready:")
+    second = Program("second", argv, dict(os.environ), tmp_path)
+    try:
+        async with RunningSim(first).node("robot Robot1") as node:
+            scans = await node.subscribe("/scan", "sensor_msgs/LaserScan")
+            async with asyncio.timeout(60):
+                await anext(aiter(scans))
+            await first.kill()
+            await second.start(ready="simulation ready:")
+            begun = node.now()
+            async with asyncio.timeout(90):
+                async for scan in scans:
+                    if scan.header.stamp > begun:
+                        break
+        assert await second.stop() == 0
+    finally:
+        for program in (first, second):
+            if program.running:
+                await program.kill()
 
 
 @pytest.mark.parametrize(
