@@ -92,6 +92,7 @@ class MapModel(_Model):
     columns: int
     cell_size: float = Field(description="Metres.")
     origin: tuple[float, float] = Field(description="Outer corner of cell 0, metres.")
+    yaw: float = Field(default=0.0, description="Direction of the columns, radians counter-clockwise from x.")
     robot_radius: float = Field(description="Metres.")
     walls: list[int] = Field(description="Blocked cells that belong to the map and cannot be freed.")
 

@@ -20,6 +20,8 @@ from rce_fleet.station.fleet_link import (
     CHANGES,
     CHANGES_TOPIC,
     GET_STATE,
+    GRID,
+    GRID_TOPIC,
     POSE,
     SET_GOAL,
     STATE,
@@ -79,6 +81,7 @@ class EnginePlannerClient(PlannerClient):
                     group.create_task(self._restart_nodes(connection))
                     group.create_task(self._follow_changes(connection))
                     group.create_task(self._follow_states(connection))
+                    group.create_task(self._read_grid(connection))
             finally:
                 self.connection = None
                 await connection.remove_all()
@@ -104,6 +107,20 @@ class EnginePlannerClient(PlannerClient):
         await connection.subscriber("fleetChanges", CHANGES, self._listener.take_changes)
         await self._join(connection, "fleetChanges", "SubscriberInterface", CHANGES, CHANGES_TOPIC)
         self._listener.may_have_missed()
+
+    async def _read_grid(self, connection: Connection) -> None:
+        """Receive the grid once: its rotation does not change, but each blocked cell publishes it anew."""
+        came = asyncio.Event()
+
+        def take(message: dict[str, Any]) -> None:
+            self._listener.take_grid(message)
+            came.set()
+
+        grid = await connection.subscriber("fleetMap", GRID, take)
+        await self._join(connection, "fleetMap", "SubscriberInterface", GRID, GRID_TOPIC)
+        await came.wait()
+        await grid.close()
+        await connection.remove_interface(self._container, "fleetMap")
 
     async def _follow_states(self, connection: Connection) -> None:
         """Receive whole states while changes are not followed."""

@@ -17,6 +17,8 @@ STATE = "fleet/FleetState"
 STATE_TOPIC = "/fleet/state"
 CHANGES = "fleet/FleetChanges"
 CHANGES_TOPIC = "/fleet/changes"
+GRID = "nav_msgs/OccupancyGrid"
+GRID_TOPIC = "/fleet/map"
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 CALL_TIMEOUT_S = 10.0
 RESEND_FOR_S = 20.0
@@ -68,6 +70,9 @@ class PlannerListener(Protocol):
 
     def take_pose(self, robot: str, message: dict[str, Any]) -> None:
         """Handle a robot's pose message."""
+
+    def take_grid(self, message: dict[str, Any]) -> None:
+        """Handle the grid, a ``nav_msgs/OccupancyGrid``."""
 
     def take_event(self, text: str, tone: str) -> None:
         """Handle an event; the tone is ``good``, ``warn`` or ``bad``."""
@@ -301,6 +306,10 @@ class FleetLink:
         """Handle a robot's pose message."""
         self._view.on_pose(robot, message)
         self._on_pose(robot)
+
+    def take_grid(self, message: dict[str, Any]) -> None:
+        """Handle the grid, a ``nav_msgs/OccupancyGrid``: it has the rotation."""
+        self._on_change(self._view.on_grid(message))
 
     def take_event(self, text: str, tone: str) -> None:
         """Handle an event."""

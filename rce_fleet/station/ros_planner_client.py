@@ -16,6 +16,8 @@ from rce_fleet.station.fleet_link import (
     CHANGES,
     CHANGES_TOPIC,
     GET_STATE,
+    GRID,
+    GRID_TOPIC,
     POSE,
     SET_GOAL,
     STATE,
@@ -64,11 +66,24 @@ class RosPlannerClient(PlannerClient):
             listener.may_have_missed()
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._follow_robots(listener))
+                group.create_task(self._read_grid(listener))
                 while True:
                     await self._changes_followed.wait()
                     await states.close()
                     await self._states_needed.wait()
                     states = await node.subscribe(STATE_TOPIC, STATE, take_state)
+
+    async def _read_grid(self, listener: PlannerListener) -> None:
+        """Receive the grid once: its rotation does not change, but each blocked cell publishes it anew."""
+        came = asyncio.Event()
+
+        def take(message: Message) -> None:
+            listener.take_grid(plain(message))
+            came.set()
+
+        grid = await self._node.subscribe(GRID_TOPIC, GRID, take)
+        await came.wait()
+        await grid.close()
 
     async def _follow_robots(self, listener: PlannerListener) -> None:
         while True:

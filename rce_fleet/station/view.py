@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from math import atan2
+from math import atan2, isfinite
 from typing import Any
 
 ROBOT_RADIUS = 0.22
@@ -26,11 +26,7 @@ class Pose:
         """Read a geometry_msgs/PoseWithCovarianceStamped in its JSON form."""
         pose = message["pose"]["pose"]
         position, turn = pose["position"], pose["orientation"]
-        yaw = atan2(
-            2.0 * (turn["w"] * turn["z"] + turn["x"] * turn["y"]),
-            1.0 - 2.0 * (turn["y"] ** 2 + turn["z"] ** 2),
-        )
-        return cls(position["x"], position["y"], yaw)
+        return cls(position["x"], position["y"], _yaw_of(turn))
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +61,8 @@ class FleetView:
     """The newest state of the fleet and the newest pose of each robot."""
 
     poses: dict[str, Pose] = field(default_factory=dict)
+    _yaw: float = 0.0
+    """Direction of the grid's columns, radians; it is in no ``fleet/FleetState``."""
     _map: dict[str, Any] | None = None
     _robots: dict[str, dict[str, Any]] = field(default_factory=dict)
     _blocked: set[int] = field(default_factory=set)
@@ -99,6 +97,14 @@ class FleetView:
         for robot in self.poses.keys() - robots.keys():
             del self.poses[robot]
         return change
+
+    def on_grid(self, message: dict[str, Any]) -> ViewChange:
+        """Set the grid's rotation from a ``nav_msgs/OccupancyGrid`` of ``/fleet/map``."""
+        yaw = _yaw_of(message["info"]["origin"]["orientation"])
+        if yaw == self._yaw or not isfinite(yaw):
+            return _NOTHING
+        self._yaw = yaw
+        return ViewChange(is_new_map=self._map is not None)
 
     def on_changes(self, message: dict[str, Any]) -> ViewChange:
         """Apply a ``fleet/FleetChanges`` that follows the known state."""
@@ -139,6 +145,7 @@ class FleetView:
             "columns": self._map["columns"],
             "cell_size": self._map["cell_size"],
             "origin": [self._map["origin_x"], self._map["origin_y"]],
+            "yaw": self._yaw,
             "robot_radius": ROBOT_RADIUS,
             "walls": list(self._map["walls"]),
         }
@@ -176,3 +183,11 @@ def _ascending(cells: set[int]) -> tuple[int, ...]:
 
 def _cell(number: int) -> int | None:
     return None if number < 0 else number
+
+
+def _yaw_of(turn: dict[str, float]) -> float:
+    """Return the yaw of a ``geometry_msgs/Quaternion`` in its JSON form, radians."""
+    return atan2(
+        2.0 * (turn["w"] * turn["z"] + turn["x"] * turn["y"]),
+        1.0 - 2.0 * (turn["y"] ** 2 + turn["z"] ** 2),
+    )

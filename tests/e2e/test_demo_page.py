@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 from collections.abc import AsyncIterator
+from math import hypot
 from pathlib import Path
 from typing import Any
 
@@ -179,6 +180,16 @@ async def test_the_page_shows_engine_and_refusals() -> None:
                 return has("fleetChanges") && has("getState") && !has("fleetState");
             }"""
         )
+        # Layers come from the robot's own graph, through the engine.
+        await page.get_by_label("of robot").select_option("Robot1")
+        await page.get_by_label("Scan", exact=True).check()
+        await page.wait_for_function("rceFleet.layers.newest.get('scan')?.points?.length > 100")
+        placed, at = await page.evaluate(
+            "[rceFleet.layers.newest.get('scan').header.pose, rceFleet.fleet.robots.get('Robot1').pose]"
+        )
+        assert hypot(placed[0] - at["x"], placed[1] - at["y"]) < 0.5
+        await page.screenshot(path=artifact("fleet-scan.png"), full_page=True)
+        await page.get_by_label("Scan", exact=True).uncheck()
         wall = await page.evaluate("[...rceFleet.fleet.walls][0]")
         async with page.expect_response(lambda reply: f"/cells/{wall}" in reply.url) as answered:
             await click_cell(page, wall)

@@ -1,4 +1,4 @@
-"""Where the messages of layers come from, and subscriptions that last as long as someone needs them."""
+"""Where the messages of layers come from, and subscriptions that last while they have listeners."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class LayerSource(ABC):
 
 
 class SharedTopics:
-    """Subscribes to each topic of a robot once, for as long as someone takes its messages.
+    """Subscribes to each topic of a robot once, while it has listeners.
 
     Args:
         source: Gives the messages.
@@ -75,7 +75,7 @@ class SharedTopics:
             shared = self._shared[robot, topic] = _Shared()
             self._tasks.spawn(self._keep(robot, topic, shared), name=f"{topic.key} of {robot}")
         entry = take, tell
-        shared.takers.append(entry)
+        shared.listeners.append(entry)
         return partial(shared.leave, entry)
 
     async def close(self) -> None:
@@ -83,8 +83,8 @@ class SharedTopics:
         await self._tasks.close()
 
     async def _keep(self, robot: str, topic: LayerTopic, shared: _Shared) -> None:
-        """Subscribe until nobody takes the messages any more."""
-        while shared.takers:
+        """Subscribe until no listener is left."""
+        while shared.listeners:
             try:
                 async with self._source.open(robot, topic, shared.take, shared.tell):
                     await shared.wait_unused()
@@ -97,26 +97,26 @@ class SharedTopics:
 
 
 class _Shared:
-    """Those who take the messages of one topic."""
+    """The listeners of one topic."""
 
     def __init__(self) -> None:
-        self.takers: list[tuple[Take, Tell]] = []
+        self.listeners: list[tuple[Take, Tell]] = []
         self._left = asyncio.Event()
 
     def take(self, payload: Payload) -> None:
-        for take in dict.fromkeys(take for take, _ in self.takers):
+        for take in dict.fromkeys(take for take, _ in self.listeners):
             take(payload)
 
     def tell(self, text: str) -> None:
-        for _, tell in tuple(self.takers):
+        for _, tell in tuple(self.listeners):
             tell(text)
 
     def leave(self, entry: tuple[Take, Tell]) -> None:
         with suppress(ValueError):
-            self.takers.remove(entry)
+            self.listeners.remove(entry)
         self._left.set()
 
     async def wait_unused(self) -> None:
-        while self.takers:
+        while self.listeners:
             self._left.clear()
             await self._left.wait()

@@ -4,7 +4,7 @@
 export const TRAIL_LENGTH = 240;
 
 export class Fleet extends EventTarget {
-  map = null;          // {rows, columns, cell_size, origin: [x, y], robot_radius, walls}; row 0 is the lowest
+  map = null;          // {rows, columns, cell_size, origin: [x, y], yaw, robot_radius, walls}; row 0 is the lowest
   robots = new Map();  // id -> {id, state, reason, cell, goal, plan, granted, replans, pose, seen, trail}
   walls = new Set();   // blocked cells that belong to the map
   blocked = new Set();
@@ -129,15 +129,31 @@ export class Fleet extends EventTarget {
   }
 
   cellAt(x, y) {
-    const { rows, columns, cell_size, origin } = this.map;
-    const column = Math.floor((x - origin[0]) / cell_size);
-    const row = Math.floor((y - origin[1]) / cell_size);
+    const { rows, columns, cell_size, origin, yaw = 0 } = this.map;
+    const [right, up] = [x - origin[0], y - origin[1]];
+    const column = Math.floor((right * Math.cos(yaw) + up * Math.sin(yaw)) / cell_size);
+    const row = Math.floor((up * Math.cos(yaw) - right * Math.sin(yaw)) / cell_size);
     return column >= 0 && column < columns && row >= 0 && row < rows ? row * columns + column : null;
   }
 
   centre(cell) {
-    const { columns, cell_size, origin } = this.map;
-    return [origin[0] + ((cell % columns) + 0.5) * cell_size, origin[1] + (Math.floor(cell / columns) + 0.5) * cell_size];
+    const { columns } = this.map;
+    return this.#place((cell % columns) + 0.5, Math.floor(cell / columns) + 0.5);
+  }
+
+  // The rectangle around the grid: [least x, least y, greatest x, greatest y], metres.
+  bounds() {
+    const { rows, columns } = this.map;
+    const corners = [[0, 0], [columns, 0], [0, rows], [columns, rows]].map(([column, row]) => this.#place(column, row));
+    const [xs, ys] = [corners.map(([x]) => x), corners.map(([, y]) => y)];
+    return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+  }
+
+  // The point of a column and row, which may be fractions, in the map frame.
+  #place(column, row) {
+    const { cell_size, origin: [x, y], yaw = 0 } = this.map;
+    const [right, up] = [column * cell_size, row * cell_size];
+    return [x + right * Math.cos(yaw) - up * Math.sin(yaw), y + right * Math.sin(yaw) + up * Math.cos(yaw)];
   }
 
   #robot(id) {

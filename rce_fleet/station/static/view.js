@@ -55,13 +55,13 @@ export class View {
   }
 
   #fit() {
-    const { rows, columns, cell_size, origin } = this.fleet.map;
-    const margin = MARGIN * cell_size;
-    const width = columns * cell_size + 2 * margin;
-    const height = rows * cell_size + 2 * margin;
+    const [x0, y0, x1, y1] = this.fleet.bounds();
+    const margin = MARGIN * this.fleet.map.cell_size;
+    const width = x1 - x0 + 2 * margin;
+    const height = y1 - y0 + 2 * margin;
     this.scale = Math.min(this.canvas.width / width, this.canvas.height / height);
-    this.left = (this.canvas.width - width * this.scale) / 2 + (margin - origin[0]) * this.scale;
-    this.bottom = (this.canvas.height + height * this.scale) / 2 - (margin - origin[1]) * this.scale;
+    this.left = (this.canvas.width - width * this.scale) / 2 + (margin - x0) * this.scale;
+    this.bottom = (this.canvas.height + height * this.scale) / 2 - (margin - y0) * this.scale;
   }
 
   #x(x) { return this.left + x * this.scale; }
@@ -81,8 +81,19 @@ export class View {
     this.layers.drawAbove(this);
   }
 
+  // Go to the grid: the first cell begins at the origin; its columns go right and its rows up (negative).
+  #enterGrid() {
+    const { context, fleet } = this;
+    const [x, y] = fleet.map.origin;
+    context.save();
+    context.translate(this.#x(x), this.#y(y));
+    context.rotate(-(fleet.map.yaw ?? 0));
+  }
+
   #drawCells() {
     const { context, fleet, colour } = this;
+    const { rows, columns } = fleet.map;
+    this.#enterGrid();
     const overMap = this.layers.hasMap;
     const side = fleet.map.cell_size * this.scale;
     const small = side < 24;
@@ -90,10 +101,9 @@ export class View {
     context.font = `${Math.round(side * 0.16)}px system-ui, sans-serif`;
     context.textAlign = "left";
     context.textBaseline = "top";
-    for (let cell = 0; cell < fleet.map.rows * fleet.map.columns; cell++) {
-      const [x, y] = fleet.centre(cell);
-      const left = this.#x(x) - side / 2 + gap;
-      const top = this.#y(y) - side / 2 + gap;
+    for (let cell = 0; cell < rows * columns; cell++) {
+      const left = (cell % columns) * side + gap;
+      const top = -(Math.floor(cell / columns) + 1) * side + gap;
       const wall = fleet.walls.has(cell);
       const boxed = !wall && fleet.blocked.has(cell);
       context.fillStyle = wall ? colour.wall : boxed ? colour.shut : fleet.pending.has(cell) ? colour.pending : colour.cell;
@@ -107,12 +117,13 @@ export class View {
         context.strokeRect(left, top, side - 2 * gap, side - 2 * gap);
       } else if (wall) context.fillRect(left - gap - 0.5, top - gap - 0.5, side + 1, side + 1);
       else context.fillRect(left, top, side - 2 * gap, side - 2 * gap);
-      if (boxed) this.#drawBox(this.#x(x), this.#y(y), BOX * side);
+      if (boxed) this.#drawBox(left - gap + side / 2, top - gap + side / 2, BOX * side);
       if (!small && !wall) {
         context.fillStyle = colour.quiet;
         context.fillText(cell, left + side * 0.05, top + side * 0.05);
       }
     }
+    context.restore();
   }
 
   #drawCursor() {
@@ -120,10 +131,12 @@ export class View {
     const { context, fleet } = this;
     const side = fleet.map.cell_size * this.scale;
     const gap = side < 24 ? 0 : Math.max(1, side * 0.02);
-    const [x, y] = fleet.centre(this.cursor);
+    const [left, top] = [(this.cursor % fleet.map.columns) * side, -(Math.floor(this.cursor / fleet.map.columns) + 1) * side];
+    this.#enterGrid();
     context.strokeStyle = this.colour.accent;
     context.lineWidth = Math.max(2, side * 0.04);
-    context.strokeRect(this.#x(x) - side / 2 + gap, this.#y(y) - side / 2 + gap, side - 2 * gap, side - 2 * gap);
+    context.strokeRect(left + gap, top + gap, side - 2 * gap, side - 2 * gap);
+    context.restore();
   }
 
   #drawBox(x, y, side) {

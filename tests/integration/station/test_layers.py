@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from aiohttp import ClientWebSocketResponse, WSMsgType, web
 from aiohttp.test_utils import TestClient, TestServer
-from support.layers import ROBOT, STATE, RobotTopics, scan
+from support.layers import ROBOT, STATE, RobotTopics, pose, scan
 from support.multimaster import DiscoveryNetwork
 
 from rce.ros.core import Core
@@ -234,6 +234,15 @@ async def test_the_page_draws_layers_that_are_checked() -> None:
             await page.locator("main").screenshot(path=ARTIFACTS / "layers.png")
             drawn = await page.evaluate(_PIXEL, [0.05, 4.0])
             assert drawn[:3] != await page.evaluate(_PIXEL, [1.5, 6.5]), "a wall differs from the floor"
+            corner = await page.evaluate("rceFleet.fleet.centre(0)")
+            turned = {"orientation": pose(0.0, 0.0, 0.5)["orientation"]}
+            made.feed.on_change(made.view.on_grid({"info": {"origin": turned}}))
+            await page.wait_for_function("rceFleet.fleet.map.yaw > 0.4")
+            there = await page.evaluate("rceFleet.fleet.centre(0)")
+            assert there == pytest.approx([0.199, 0.679], abs=1e-3)
+            assert there != corner
+            assert await page.evaluate("rceFleet.fleet.cellAt(...rceFleet.fleet.centre(37))") == 37
+            await page.locator("main").screenshot(path=ARTIFACTS / "layers-turned.png")
             await page.emulate_media(color_scheme="dark")
             await page.wait_for_function(
                 "before => String(eval(`(${before[0]})`)(before[1])) !== String(before[2])",

@@ -171,3 +171,16 @@ async def test_events_are_kept_up_to_a_limit() -> None:
         pages.send_event(f"event {number}")
     assert await page.take() == [f"event {number}" for number in range(5, MAX_EVENTS + 5)]
     assert list(pages) == [page]
+
+
+def test_the_rotation_of_the_grid_is_a_new_map() -> None:
+    view = FleetView()
+    turned = {"info": {"origin": {"orientation": {"x": 0.0, "y": 0.0, "z": sin(0.25), "w": cos(0.25)}}}}
+    assert not view.on_grid(turned), "no map is known yet"
+    view.on_state(state())
+    grid = view.map()
+    assert grid is not None
+    assert grid["yaw"] == pytest.approx(0.5)
+    straight = {"info": {"origin": {"orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}}}
+    assert view.on_grid(straight).is_new_map
+    assert not view.on_grid(straight)
