@@ -112,7 +112,7 @@ def localize(
         begin = time.perf_counter()
         found = read_log(log, scan=scan, odometry=odom)
         print_faults(found.faults, sys.stderr)
-        scans = _recorded(with_progress(found.records, sys.stderr))
+        scans = corrected(with_progress(found.records, sys.stderr))
         poses = [each.pose.as_array() for each in replay(scans, grid, seed=seed, start=start)]
         write_trajectory(folder / "trajectory.csv", [each.time for each in found.records], np.array(poses))
         write_report(
@@ -134,8 +134,8 @@ def _pose(text: str) -> Pose:
     return Pose(x, y, yaw)
 
 
-def _recorded(records: Iterable[LaserRecord]) -> Iterator[Recorded]:
-    """Yield scans with odometry that was corrected by matching each scan with those before.
+def corrected(records: Iterable[LaserRecord]) -> Iterator[Recorded]:
+    """Yield scans for AMCL, with odometry that was corrected by matching each scan with those before.
 
     Wheels slip, and some robots record backward motion as forward; AMCL's model of odometry has neither.
     """
