@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from rce_fleet.demo.floor import DOOR, FLOOR, OUTER_WALL
+from rce_fleet.demo.floor import FLOOR, with_surroundings
 from rce_fleet.demo.resources import LOOPBACK, Ports
 from rce_fleet.drivers.scene import scene_of
 from rce_fleet.planning.scenario import Scenario
@@ -106,6 +106,5 @@ class DemoConfig:
         """Write the file that the simulated world reads."""
         scene = scene_of(self.scenario, self.seed)
         if self.scenario.grid == FLOOR:
-            around = {"enclosed": False, "walls": (*scene.walls, OUTER_WALL), "doors": (DOOR,)}
-            scene = scene.model_copy(update=around)
+            scene = with_surroundings(scene)
         self.scene.write_text(scene.model_dump_json(indent=1), encoding="utf-8")

@@ -18,9 +18,13 @@ Localization without a first pose needs a floor that has no symmetry, neither by
 from __future__ import annotations
 
 from math import pi
+from typing import TYPE_CHECKING
 
 from rce_fleet.drivers.scene_items import DoorItem, WallItem
 from rce_fleet.planning.grid import GridMap
+
+if TYPE_CHECKING:
+    from rce_fleet.drivers.scene import Scene
 
 FLOOR = GridMap(rows=8, columns=8, cell_size=1.0, blocked=frozenset({9, 20, 21, 23, 37, 41, 42, 45, 50}))
 """The cells."""
@@ -37,3 +41,9 @@ OUTER_WALL = WallItem(
 
 DOOR = DoorItem(id="door", at=(6.0, 2.0), yaw=0.0, width=0.95, swing=pi / 2, open=True)
 """The door between the room in the south-east and the hall."""
+
+
+def with_surroundings(scene: Scene) -> Scene:
+    """Return a scene of the floor's cells with what its cells do not show: the outer wall and the door."""
+    more = {"enclosed": False, "walls": (*scene.walls, OUTER_WALL), "doors": (*scene.doors, DOOR)}
+    return scene.model_copy(update=more)
