@@ -75,6 +75,25 @@ _IN_TLS = [
     for size, limit in TLS_RATIO.items()
 ]
 
+_LOCALIZATION = [
+    Target(
+        f"amcl, {sensor}, 100 runs: {what}",
+        f"localization.{suite}",
+        _column(column, sensor=sensor),
+        limit or near,
+        unit,
+        at_least=at_least,
+    )
+    for suite, sensor, near in (("lidar", "lidar", 0.05), ("camera", "depth camera", 0.10))
+    for what, column, limit, unit, at_least in (
+        ("position RMSE, median", "position RMSE m", 0.0, "m", False),
+        ("position RMSE, worst run", "worst run m", 0.25, "m", False),
+        ("heading RMSE, median", "heading RMSE deg", 1.5, "degrees", False),
+        ("NEES, most", "NEES", 6.0, "", False),
+        ("NEES, least", "NEES", 1.0, "", True),
+    )
+]
+
 TARGETS = [
     *_ROUND_TRIPS,
     *_IN_TLS,
@@ -153,6 +172,33 @@ TARGETS = [
             ("median path by the shortest", "path / shortest", 1.15, "x", False),
             ("control step at 10 Hz, CPU, p99", "step p99 ms", 10, "ms", False),
         )
+    ),
+    *(
+        Target(
+            f"amcl: an update, 500 particles x 60 beams, {form}",
+            "localization.update",
+            _column("likelihood_field ms", form=form),
+            limit,
+            "ms",
+        )
+        for form, limit in (("numpy", 0.8), ("compiled", 0.25))
+    ),
+    *_LOCALIZATION,
+    Target(
+        "amcl, global localization right within 30 s",
+        "localization.global",
+        _column("right in time %", runs=100),
+        95,
+        "%",
+        at_least=True,
+    ),
+    Target(
+        "amcl, a kidnapped robot right again within 60 s",
+        "localization.kidnapped",
+        _column("right in time %", runs=100),
+        90,
+        "%",
+        at_least=True,
     ),
     Target("container start to first message, p50", "start", _column("p50_ms"), 250, "ms"),
     Target("100 containers at once", "many", _column("all at once", containers=100), 20, "s"),

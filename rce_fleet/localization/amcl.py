@@ -33,7 +33,7 @@ CONVERGED_M = 0.5
 """Beams are skipped only while all particles are this near to their middle, in x and in y."""
 
 
-APART = 0.3
+APART = 0.6
 """Least effective share of the particles after a scan, while they are apart. Then they are far from dense,
 and the best of them may be a wrong one."""
 TOGETHER = 0.02
@@ -41,6 +41,10 @@ TOGETHER = 0.02
 CAUTION = 1.05
 """Random particles are drawn if scans fit worse than they used to by more than this factor: nu of Gutmann
 and Fox, "An experimental comparison of localization methods continued", IROS 2002."""
+FRESH_M, FRESH_RAD = 0.2, 0.5
+"""A scan that was taken nearer to the one before repeats its errors: those of the map, and of things that are
+not on it. Its likelihood is taken to the power of the share of this way or turn."""
+LEAST_FRESH = 0.25
 _JUDGES = 64
 
 
@@ -81,6 +85,7 @@ class Amcl:
     def __init__(self, grid: OccupancyMap, parameters: AmclParameters, rng: np.random.Generator) -> None:
         self.parameters = parameters
         self._rng = rng
+        self._fresh = 1.0
         self._odometry: Pose | None = None
         self.set_map(grid)
         start = Pose(parameters.initial_pose_x, parameters.initial_pose_y, parameters.initial_pose_a)
@@ -178,7 +183,9 @@ class Amcl:
         """
         if not self.needs_update(odometry):
             return None
+        self._fresh = 1.0
         if self._odometry is not None:
+            self._fresh = _fresh_share(self._odometry, odometry)
             self._particles = move_particles(
                 self._particles, self._odometry, odometry, self.parameters, self._rng
             )
@@ -216,7 +223,9 @@ class Amcl:
 
     def _apply(self, logs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Multiply the weights by the exponentials of ``logs``, tempered; return the new weights."""
-        self._weights = temper(self._weights, logs, TOGETHER if self._has_converged() else APART)
+        self._weights = temper(
+            self._weights, self._fresh * logs, TOGETHER if self._has_converged() else APART
+        )
         return self._weights
 
     def _fit(
@@ -267,3 +276,10 @@ class Amcl:
         drawn[:2] = self._grid.cell_to_world(inside).T
         drawn[2] = self._rng.uniform(-np.pi, np.pi, count)
         return drawn
+
+
+def _fresh_share(before: Pose, after: Pose) -> float:
+    """Return how much of a scan is new after a motion, 0 .. 1."""
+    way = hypot(after.x - before.x, after.y - before.y)
+    turn = abs(wrap(after.yaw - before.yaw))
+    return min(max(way / FRESH_M, turn / FRESH_RAD, LEAST_FRESH), 1.0)

@@ -42,11 +42,11 @@ def scan(pose: Pose, grid: OccupancyMap = GRID) -> LaserScan:
     return LaserScan(ranges, -pi, 2 * pi / BEAMS, 0.1, 8.0)
 
 
-def way(count: int, start: Pose = START) -> list[Pose]:
+def way(count: int, start: Pose = START, turn: float = 0.13) -> list[Pose]:
     """Poses 0.22 m apart on an arc."""
     poses = [start]
     for _ in range(count - 1):
-        poses.append(poses[-1].compose(Pose(0.22, 0.0, 0.13)))
+        poses.append(poses[-1].compose(Pose(0.22, 0.0, turn)))
     return poses
 
 
@@ -155,7 +155,7 @@ def test_a_robot_without_a_known_pose_is_found() -> None:
 def test_a_robot_that_was_moved_by_hand_is_found() -> None:
     amcl = filtered(replace(SMALL, max_particles=4000, recovery_alpha_slow=0.001, recovery_alpha_fast=0.1))
     drive(amcl, way(6))
-    moved = way(22, Pose(3.8, 2.2, 2.0))
+    moved = way(40, Pose(3.1, 1.2, pi / 2), 0.367)
     amcl.request_update()
     estimate = drive(amcl, moved)
     assert error(estimate, moved[-1])[0] < 0.25
