@@ -28,6 +28,10 @@ WIDE = 3.0
 TURN_STEP = 0.012
 PRIOR_WEIGHT = 0.1
 SIGMAS = 3.0
+LARGE_REACH = 1.5
+"""From this reach on a window is large, metres: matches in it need..."""
+LARGE_SCORE = 0.5
+LARGE_INLIERS = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,8 +114,11 @@ def place_scan(
     before: NDArray[np.float64],
     moved: NDArray[np.float64],
     parameters: GraphParameters,
+    doubt: float = 1.0,
 ) -> Placement:
     """Return where a scan is on a submap.
+
+    A match in a large window has to be better than one in a small window, as it is more often false.
 
     Args:
         scan: The scan.
@@ -119,19 +126,22 @@ def place_scan(
         before: Pose of the scan before, in the submap's frame.
         moved: What odometry says that the robot moved since then, (x, y, yaw) in its own frame.
         parameters: Parameters.
+        doubt: How much less than usual the odometry is trusted: factor of its standard deviations.
     """
     expected = compose(before, moved)
-    shift, turn = odometry_sigmas(moved, parameters)
-    prior = odometry_information(moved, parameters)
+    shift, turn = (doubt * sigma for sigma in odometry_sigmas(moved, parameters))
+    prior = odometry_information(moved, parameters) / doubt**2
     if len(scan) < parameters.fewest_points:
         return Placement(expected, prior, 0.0, 0.0)
     placement = None
     for wider in (1.0, WIDE):
         window = Window(wider * SIGMAS * shift, min(wider * SIGMAS * turn, np.pi), TURN_STEP, PRIOR_WEIGHT)
-        match = find_match(submap.field, scan.points, expected, window, at_least=parameters.least_score)
+        is_large = window.reach > LARGE_REACH
+        least = max(parameters.least_score, LARGE_SCORE if is_large else 0.0)
+        match = find_match(submap.field, scan.points, expected, window, at_least=least)
         if match is not None:
             aligned = align(scan, submap.reference, match.pose, prior=(expected, prior))
-            if aligned.inliers > 0:
+            if aligned.inliers > (LARGE_INLIERS if is_large else 0.0):
                 placement = Placement(aligned.pose, aligned.information + prior, match.score, aligned.inliers)
                 break
     return placement or Placement(expected, prior, 0.0, 0.0)

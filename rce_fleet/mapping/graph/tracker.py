@@ -14,6 +14,7 @@ from rce_fleet.mapping.graph.front_end import (
     in_frame_of,
     make_submap,
     odometry_information,
+    odometry_sigmas,
     place_scan,
 )
 from rce_fleet.mapping.graph.key_graph import Edge
@@ -30,6 +31,23 @@ BLIND_WAY = 1.0
 """After this way without a match a scan becomes a keyscan by odometry alone, metres."""
 BLIND_TURN = 1.0
 """The same for the turn, radians."""
+LOST_SHIFT = 1.0
+"""If odometry may err by more than this, metres, the robot is lost: the scan begins a part of its own."""
+LOST_TURN = 1.0
+"""The same for the heading, radians."""
+GAP = 20.0
+"""After so many seconds without a scan, and several usual pauses, a robot that moved is lost too..."""
+GAP_PAUSES = 5.0
+GAP_MOVE = 0.5
+"""... if it moved by this, metres or radians. Odometry says where it is, not how far it went meanwhile."""
+PAUSE_SHARE = 0.1
+"""How fast the usual pause follows the pauses."""
+CHANGED_BEAMS = 0.15
+"""The robot has moved if more than this share of the beams has changed, whatever its odometry says..."""
+CHANGE = (0.06, 0.03)
+"""... by more than this, metres and share of the range."""
+UNTRUSTED = 5.0
+"""Odometry that says "still" then is trusted this much less than usual."""
 MATCHED_LENGTH = 0.01
 """What an edge adds to the way of the robot, metres."""
 BLIND_LENGTH = 20.0
@@ -60,6 +78,9 @@ class Tracker:
         self.unmatched = 0
         self.entries: list[tuple[int, NDArray[np.float64]]] = []
         self._odometry = np.zeros(3)
+        self._ranges = np.zeros(0, np.float32)
+        self._heard = 0.0
+        self._pause = 0.0
         self._submap: Submap | None = None
         self._submap_of = (-1, -1)
 
@@ -85,18 +106,25 @@ class Tracker:
         odometry = np.array(record.odometry, np.float64)
         if self.key < 0:
             scan = prepare_scan(record, farthest=parameters.usable_range, cell=parameters.point_cell)
-            self._odometry = odometry
+            self._odometry, self._ranges, self._heard = odometry, scan.ranges, record.time
             self.key = self._graph.add(scan, np.zeros(3) if start is None else start, self.robot, 0.0)
             self.entries.append((self.key, self.offset))
             return self.key
+        is_gap = self._is_gap(record.time)
         moved = relative(self._odometry, odometry)
         way, turn = hypot(moved[0], moved[1]), abs(float(moved[2]))
-        if way < parameters.still_distance and turn < parameters.still_turn:
+        is_still = way < parameters.still_distance and turn < parameters.still_turn
+        if is_still and not self._has_changed(record):
             self.entries.append((self.key, compose(self.offset, moved)))
             return None
         scan = prepare_scan(record, farthest=parameters.usable_range, cell=parameters.point_cell)
         before = compose(self._graph.poses[self.key], self.offset)
-        placement = place_scan(scan, self._current_submap(), before, moved, parameters)
+        shift_error, turn_error = odometry_sigmas(moved, parameters)
+        is_lost = is_gap and max(way, turn) > GAP_MOVE
+        if is_lost or shift_error > LOST_SHIFT or turn_error > LOST_TURN:
+            return self._begin_part(scan, compose(before, moved), odometry, way)
+        doubt = UNTRUSTED if is_still else 1.0
+        placement = place_scan(scan, self._current_submap(), before, moved, parameters, doubt)
         if not placement.is_matched:
             self.unmatched += 1
             if way < BLIND_WAY and turn < BLIND_TURN:
@@ -105,8 +133,37 @@ class Tracker:
                 return None
         else:
             self.matched += 1
-        self._odometry = odometry
+        self._odometry, self._ranges = odometry, scan.ranges
         return self._settle(scan, placement, before)
+
+    def _is_gap(self, time: float) -> bool:
+        """Return whether scans before this one are missing."""
+        pause, self._heard = time - self._heard, time
+        if pause > GAP and pause > GAP_PAUSES * self._pause > 0:
+            return True
+        if pause > 0:
+            self._pause += (PAUSE_SHARE if self._pause else 1.0) * (pause - self._pause)
+        return False
+
+    def _has_changed(self, record: LaserRecord) -> bool:
+        """Return whether a scan differs so much from the last placed one that the robot has moved."""
+        if len(record.ranges) != len(self._ranges):
+            return True
+        with np.errstate(invalid="ignore"):
+            both = np.isfinite(record.ranges) & np.isfinite(self._ranges)
+            changed = np.abs(record.ranges - self._ranges) > CHANGE[0] + CHANGE[1] * self._ranges
+        return int(np.count_nonzero(changed & both)) > CHANGED_BEAMS * max(1, np.count_nonzero(both))
+
+    def _begin_part(
+        self, scan: ScanPoints, pose: NDArray[np.float64], odometry: NDArray[np.float64], way: float
+    ) -> int:
+        """Make a scan the first keyscan of a part, which loops may join to the others; return its number."""
+        self.unmatched += 1
+        self.way += way
+        self._odometry, self._ranges = odometry, scan.ranges
+        self.key, self.offset = self._graph.add(scan, pose, self.robot, self.way), np.zeros(3)
+        self.entries.append((self.key, self.offset))
+        return self.key
 
     def _settle(self, scan: ScanPoints, placement: Placement, before: NDArray[np.float64]) -> int | None:
         """Take over a placement, and make the scan a keyscan if it is far enough from the last one."""
@@ -136,6 +193,7 @@ class Tracker:
         state = (self.key, graph.moves)
         if self._submap is None or self._submap_of != state:
             keys = graph.keys_of(self.robot)[-self._parameters.submap_keys :]
+            keys = [key for key in keys if graph.parts[key] == graph.parts[self.key]]
             self._submap = make_submap(
                 [graph.scans[key] for key in keys], graph.poses[keys], self._parameters
             )

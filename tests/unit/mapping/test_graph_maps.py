@@ -152,6 +152,41 @@ def test_gap_in_log_is_bridged() -> None:
     assert worst_error(mapper.trajectory(), truth[kept]) < 0.3
 
 
+def test_lost_robot_is_found_on_its_own_map() -> None:
+    """After a gap that odometry cannot bridge the robot begins a new part, which loops join again."""
+    truth = drive([*RING_WAY, (12.3, 1.8), (12.3, 5)])
+    log = drive_log(RING, truth, np.random.default_rng(6))
+    gap = range(150, 190)
+    turned = compose((0.0, 0.0, 0.8), np.array([record.odometry for record in log]))
+    kept = [index for index in range(len(log)) if index not in gap]
+    mapper = GraphMapper()
+    for index in kept:
+        odometry = log[index].odometry if index < gap.start else tuple(turned[index].tolist())
+        mapper.add(replace(log[index], odometry=odometry))
+    assert len(np.unique(mapper.graph.parts)) == 1
+    assert worst_error(mapper.trajectory(), truth[kept]) < 0.1
+
+
+@pytest.mark.parametrize(("silence", "parts"), [(100.0, 2), (5.0, 1)])
+def test_robot_is_lost_after_a_long_silence(silence: float, parts: int) -> None:
+    mapper = GraphMapper()
+    truth = drive([(1.5, 1.5), (6, 1.6)], step=0.5)
+    for index, pose in enumerate(truth):
+        record = scan_at(RING, pose, index=index, odometry=relative(truth[0], pose))
+        mapper.add(replace(record, time=0.2 * index + (silence if index >= 5 else 0.0)))
+        if index == 5:
+            assert len(np.unique(mapper.graph.parts)) == parts
+
+
+def test_robot_moves_though_odometry_stands_still() -> None:
+    truth = drive([(1.5, 1.5), (6, 1.6)], step=0.15)
+    mapper = GraphMapper()
+    for record in drive_log(RING, truth, np.random.default_rng(2)):
+        mapper.add(replace(record, odometry=(0.0, 0.0, 0.0)))
+    # Dead reckoning errs by 4.5 m; along the corridor scans alone tell little.
+    assert worst_error(mapper.trajectory(), truth) < 0.5
+
+
 @pytest.mark.parametrize(("beams", "field_of_view"), [(61, 4.0), (541, 4.7), (360, 6.265)])
 def test_other_lasers_are_mapped(beams: int, field_of_view: float) -> None:
     truth = drive([(1.5, 1.5), (8, 1.6)], step=0.4)
