@@ -152,7 +152,7 @@ class Tracker:
         with np.errstate(invalid="ignore"):
             both = np.isfinite(record.ranges) & np.isfinite(self._ranges)
             changed = np.abs(record.ranges - self._ranges) > CHANGE[0] + CHANGE[1] * self._ranges
-        return int(np.count_nonzero(changed & both)) > CHANGED_BEAMS * max(1, np.count_nonzero(both))
+        return int(np.count_nonzero(changed & both)) > CHANGED_BEAMS * max(1, int(np.count_nonzero(both)))
 
     def _begin_part(
         self, scan: ScanPoints, pose: NDArray[np.float64], odometry: NDArray[np.float64], way: float
