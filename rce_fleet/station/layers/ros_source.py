@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING
@@ -39,6 +41,11 @@ class RosLayerSource(LayerSource):
         self._types = types
         self._masters: dict[str, str] = {}
         """The robots' own masters by robot ID, as they were found last."""
+        self._nodes: dict[str, Node] = {}
+        """The station's node in each graph, by master."""
+        self._users: Counter[str] = Counter()
+        """Open topics in each graph."""
+        self._joining: dict[str, asyncio.Lock] = {}
 
     @asynccontextmanager
     async def open(self, robot: str, topic: LayerTopic, take: Take, tell: Tell) -> AsyncIterator[None]:
@@ -47,22 +54,8 @@ class RosLayerSource(LayerSource):
         outside = own is not None or topic.is_global
         names = [f"/{robot}/{name}" for name in topic.names]
         names += [f"/{name}" for name in topic.names if outside]
-        node = Node(
-            NODE,
-            anonymous=True,
-            argv=(),
-            master_uri=own or self._master_uri,
-            types=self._types,
-            signals=False,
-            master_timeout=0,
-            rosout=False,
-        )
         async with AsyncExitStack() as stack:
-            try:
-                await stack.enter_async_context(node)
-            except MasterError:
-                self._masters.pop(robot, None)  # The robot may come back elsewhere.
-                raise
+            node = await stack.enter_async_context(self._joined(own or self._master_uri, robot))
             for name in names:
                 subscriber = await node.subscribe_serialized(
                     name, topic.type_name, lambda payload, _: take(payload)
@@ -70,6 +63,36 @@ class RosLayerSource(LayerSource):
                 stack.push_async_callback(release, subscriber)
             tell("")
             yield
+
+    @asynccontextmanager
+    async def _joined(self, uri: str, robot: str) -> AsyncIterator[Node]:
+        """Give a node in a graph: one for all topics, as long as one of them is open."""
+        joining = self._joining.setdefault(uri, asyncio.Lock())
+        async with joining:
+            if uri not in self._nodes:
+                node = Node(
+                    NODE,
+                    anonymous=True,
+                    argv=(),
+                    master_uri=uri,
+                    types=self._types,
+                    signals=False,
+                    master_timeout=0,
+                    rosout=False,
+                )
+                try:
+                    await node.__aenter__()
+                except MasterError:
+                    self._masters.pop(robot, None)  # The robot may come back elsewhere.
+                    raise
+                self._nodes[uri] = node
+            self._users[uri] += 1
+        try:
+            yield self._nodes[uri]
+        finally:
+            self._users[uri] -= 1
+            if not self._users[uri]:
+                await self._nodes.pop(uri).__aexit__(None, None, None)
 
     async def _find_master(self, robot: str) -> str | None:
         """Return the URI of the robot's own master; None if it is in the planner's graph."""

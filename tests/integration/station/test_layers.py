@@ -59,6 +59,12 @@ class World:
             topic for topic, names in state[1] if any(name.startswith("/operator_station") for name in names)
         }
 
+    async def nodes(self) -> set[str]:
+        """The station's nodes in the graph."""
+        async with RpcClient() as rpc:
+            state = await MasterClient(self.core.uri, "/test", "", rpc).call("getSystemState")
+        return {name for _, names in state[1] for name in names if name.startswith("/operator_station")}
+
     async def until_subscribed(self, condition: Callable[[set[str]], bool]) -> None:
         async with asyncio.timeout(LIMIT_S):
             while not condition(await self.subscriptions()):
@@ -126,6 +132,7 @@ async def test_pages_share_subscriptions_until_none_looks() -> None:
                     assert len((await receive_all(page, "scan", "map"))["scan"]) == 4 * 360
                 assert made.hub.streams == {("Robot1", "scan"), ("Robot1", "map")}
                 await made.until_subscribed(lambda topics: {"/Robot1/scan", "/Robot1/map", "/tf"} <= topics)
+                assert len(await made.nodes()) == 1, "one node for all topics"
             await receive(first, is_frame("scan"))
             await first.send_json({"robot": "Robot1", "layers": ["map"]})
             await made.until_subscribed(lambda topics: topics == {"/Robot1/map", "/map"})
