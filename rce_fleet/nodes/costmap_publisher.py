@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from rce_fleet.navigation.costmap.layered import LayeredCostmap
 
 
+WHOLE_EVERY = 10.0
+"""Seconds after which a whole costmap is published again: clients of a bridge join unnoticed."""
+
+
 class CostmapPublisher:
     """Publishes ``~NAME/costmap``, ``~NAME/costmap_updates`` and ``~NAME/footprint``.
 
@@ -31,7 +35,7 @@ class CostmapPublisher:
         self._changed = NOWHERE
         self._sent: tuple[object, ...] = ()
         self._readers = 0
-        self._published_at = float("-inf")
+        self._published_at = self._renewed_at = float("-inf")
         self._whole: Publisher
         self._updates: Publisher
         self._footprint: Publisher
@@ -39,7 +43,10 @@ class CostmapPublisher:
     async def start(self) -> None:
         """Advertise the topics."""
         node, name = self._node, self._name
-        self._whole = await node.advertise(f"~{name}/costmap", "nav_msgs/OccupancyGrid", queue_size=2)
+        # Latched, so that a bridge gives the last one to clients that join it later.
+        self._whole = await node.advertise(
+            f"~{name}/costmap", "nav_msgs/OccupancyGrid", latch=True, queue_size=2
+        )
         self._updates = await node.advertise(f"~{name}/costmap_updates", "map_msgs/OccupancyGridUpdate")
         self._footprint = await node.advertise(f"~{name}/footprint", "geometry_msgs/PolygonStamped")
 
@@ -47,17 +54,18 @@ class CostmapPublisher:
         """Note which cells changed since the last call."""
         self._changed = self._changed.joined(changed)
 
-    def publish(self, robot: Pose) -> None:
+    def publish(self, robot: Pose, frame: str) -> None:
         """Publish what changed, if it is time and there are subscribers.
 
         Args:
             robot: Pose of the robot in the costmap's frame.
+            frame: Full name of this frame.
         """
         now, frequency = self._node.time(), self._costmap.parameters.publish_frequency
         if frequency <= 0 or 0 <= now - self._published_at < 1 / frequency:
             return
         self._published_at = now
-        header = {"stamp": self._node.now(), "frame_id": self._costmap.parameters.global_frame}
+        header = {"stamp": self._node.now(), "frame_id": frame}
         if self._footprint.connections:
             outline = self._costmap.footprint.at(robot.x, robot.y, robot.yaw)
             points = [{"x": float(x), "y": float(y)} for x, y in outline]
@@ -65,15 +73,15 @@ class CostmapPublisher:
         readers = self._whole.connections
         grid = self._costmap.grid
         place = (grid.shape, grid.origin, grid.resolution)
-        joined = readers > self._readers
+        renew = readers > self._readers or not 0 <= now - self._renewed_at < WHOLE_EVERY
         self._readers = readers
         if not readers:
             self._sent = ()
             return
         changed = self._changed.clipped(*grid.shape)
-        if joined or place != self._sent or self._costmap.parameters.always_send_full_costmap:
+        if renew or place != self._sent or self._costmap.parameters.always_send_full_costmap:
             self._publish_whole(header)
-            self._sent = place
+            self._sent, self._renewed_at = place, now
         elif not changed.is_empty:
             self._publish_update(header, changed)
         self._changed = NOWHERE

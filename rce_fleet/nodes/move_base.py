@@ -29,7 +29,7 @@ from rce_fleet.nodes.move_base_goals import MoveBaseGoals
 from rce_fleet.nodes.move_base_parameters import read_settings, space_of
 from rce_fleet.nodes.observation_sources import ObservationSources
 from rce_fleet.nodes.planar import path_fields, read_map, twist_fields
-from rce_fleet.nodes.robot_place import RobotPlace
+from rce_fleet.nodes.robot_place import RobotPlace, full_name
 
 if TYPE_CHECKING:
     from rce.ros.node import Publisher
@@ -61,6 +61,7 @@ class MoveBaseNode:
         self._steps: deque[tuple[float, float]] = deque(maxlen=500)
         self._problem = ""
         self._plan_seconds = 0.0
+        self._frames: tuple[str, ...] = ()
         self._place: RobotPlace
         self._goals: MoveBaseGoals
         self._sources: list[ObservationSources]
@@ -92,6 +93,7 @@ class MoveBaseNode:
         async with TransformListener(node, prefix="") as transforms:
             costmaps = (stack.global_costmap, stack.local_costmap)
             world, local = (one.parameters for one in costmaps)
+            self._frames = tuple(full_name(transforms, one.global_frame)[1:] for one in (world, local))
             self._place = RobotPlace(
                 node,
                 transforms,
@@ -207,9 +209,9 @@ class MoveBaseNode:
         self._steps.append((time.perf_counter() - began, time.thread_time() - worked))
         if not place.problem:
             self._publish_local_plan(decision)
-            publishers[0].publish(at)
+            publishers[0].publish(at, self._frames[0])
             publishers[1].note(stack.local_costmap.grid.whole)
-            publishers[1].publish(place.pose)
+            publishers[1].publish(place.pose, self._frames[1])
 
     def _command(self, twist: Twist) -> None:
         self._commanded = twist
@@ -249,15 +251,11 @@ class MoveBaseNode:
         if not plan.found:
             self._complaints.warn("plan", f"no plan: {plan.reason}")
             return
-        header = {
-            "stamp": self._node.now(),
-            "frame_id": stack.global_costmap.parameters.global_frame,
-        }
+        header = {"stamp": self._node.now(), "frame_id": self._frames[0]}
         self._plans.publish(path_fields(plan.path, header))
 
     def _publish_local_plan(self, decision: Decision) -> None:
-        frame = self.stack.local_costmap.parameters.global_frame
-        header = {"stamp": self._node.now(), "frame_id": frame}
+        header = {"stamp": self._node.now(), "frame_id": self._frames[1]}
         if decision.trajectory is not None and self._local_plan.connections:
             self._local_plan.publish(path_fields(decision.trajectory, header))
         path = self.stack.local_planner.path

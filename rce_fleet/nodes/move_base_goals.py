@@ -14,6 +14,7 @@ from rce.ros.tf.exceptions import TransformError
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.navigation.move_base.core import Ending
 from rce_fleet.nodes.planar import path_fields, pose_fields, pose_of, read_pose
+from rce_fleet.nodes.robot_place import full_name, named_in_message
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher
@@ -157,10 +158,12 @@ class MoveBaseGoals:
         pose, frame = read_pose(stamped.pose), stamped.header.frame_id
         if not frame:
             raise ValueError(f"its frame_id is empty; expected {self._frame} or another frame of tf")
-        if self._transforms.resolve(frame) == self._transforms.resolve(self._frame):
+        if frame.lstrip("/") in (self._driver.settings.global_costmap.global_frame.lstrip("/"), self._frame):
             return pose
         # As in ROS's move_base the latest transform counts, whatever the stamp says.
-        found = await self._transforms.wait_for(self._frame, frame, timeout=TRANSFORM_TIMEOUT)
+        found = await self._transforms.wait_for(
+            f"/{self._frame}", named_in_message(frame), timeout=TRANSFORM_TIMEOUT
+        )
         return pose_of(found.transform).compose(pose)
 
     def _take_simple(self, message: Message) -> None:
@@ -205,4 +208,5 @@ class MoveBaseGoals:
 
     @property
     def _frame(self) -> str:
-        return self._driver.settings.global_costmap.global_frame
+        """Full name of the global frame."""
+        return full_name(self._transforms, self._driver.settings.global_costmap.global_frame)[1:]

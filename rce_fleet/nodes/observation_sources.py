@@ -13,6 +13,7 @@ from rce.ros.tf.exceptions import ExtrapolationError, TransformError
 from rce_fleet.navigation.costmap.observation import observe_points, observe_scan
 from rce_fleet.navigation.scans import fault_of_scan, fault_of_stamp
 from rce_fleet.nodes.planar import pose_of
+from rce_fleet.nodes.robot_place import full_name, named_in_message
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -93,10 +94,9 @@ class ObservationSources:
         stamp = message.header.stamp
         fault = _fault(message, source, now)
         if not fault:
-            frame, target = (
-                source.sensor_frame or message.header.frame_id,
-                self._costmap.parameters.global_frame,
-            )
+            own = source.sensor_frame
+            frame = full_name(self._transforms, own) if own else named_in_message(message.header.frame_id)
+            target = full_name(self._transforms, self._costmap.parameters.global_frame)
             try:
                 found = self._transforms.lookup(target, frame, stamp or None)
                 seen = _observe(message, source, found.transform, stamp.to_sec() if stamp else now)

@@ -28,6 +28,7 @@ from rce_fleet.nodes.complaints import Complaints
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import pose_of, read_map, read_pose
+from rce_fleet.nodes.robot_place import full_name, named_in_message
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -170,9 +171,9 @@ class ObstacleCellsNode:
         if fault:
             self._complaints.warn("scan", f"a scan is ignored: {fault}")
             return True
-        frame, when = message.header.frame_id, message.header.stamp
+        frame, when = named_in_message(message.header.frame_id), message.header.stamp
         try:
-            found = self._tf.lookup(self._parameters.map_frame, frame, when)
+            found = self._tf.lookup(full_name(self._tf, self._parameters.map_frame), frame, when)
         except ExtrapolationError as error:
             return not error.is_future
         except TransformError as error:

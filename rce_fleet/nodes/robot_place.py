@@ -22,6 +22,22 @@ JUMP = 1.0
 """A robot that moves by more than this between two control steps has jumped, metres."""
 
 
+def full_name(transforms: TransformListener, frame: str) -> str:
+    """Return the full name of a frame that a parameter names, with a slash before it.
+
+    A name that begins with the robot's ``tf_prefix`` is full already.
+    """
+    prefix = transforms.prefix.strip("/")
+    if prefix and frame.startswith(f"{prefix}/"):
+        return f"/{frame}"
+    return f"/{transforms.resolve(frame)}"
+
+
+def named_in_message(frame: str) -> str:
+    """Return the name of a frame in a message's header, which is full, with a slash before it."""
+    return f"/{frame.lstrip('/')}"
+
+
 @dataclass(frozen=True, slots=True)
 class Place:
     """Where the robot is.
@@ -60,7 +76,7 @@ class RobotPlace:
     ) -> None:
         self._node = node
         self._transforms = transforms
-        self._global, self._local, self._base = frames
+        self._global, self._local, self._base = (full_name(transforms, frame) for frame in frames)
         self._tolerance = tolerance
         self._complaints = complaints
         self._last: Pose | None = None

@@ -25,6 +25,7 @@ from rce_fleet.nodes.complaints import Complaints
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import pose_of, read_pose, read_twist, twist_fields
+from rce_fleet.nodes.robot_place import full_name, named_in_message
 
 if TYPE_CHECKING:
     from rce.ros.node import Publisher
@@ -110,7 +111,10 @@ class VelocityLimiterNode:
         if not fault and at is None:
             fault = "there is no odometry at its time"
         try:
-            mounted = self._tf.lookup(self._parameters.robot_base_frame, message.header.frame_id)
+            mounted = self._tf.lookup(
+                full_name(self._tf, self._parameters.robot_base_frame),
+                named_in_message(message.header.frame_id),
+            )
         except TransformError as error:
             fault = fault or str(error)
         if fault:
