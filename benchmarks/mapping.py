@@ -29,7 +29,7 @@ from rce_fleet.mapping.gmapping.mapper import ParticleMapper
 from rce_fleet.mapping.graph.mapper import GraphMapper
 from rce_fleet.mapping.occupancy_mapping import draw_map
 from rce_fleet.mapping.trajectory import odometry_of, read_trajectory, write_trajectory
-from rce_fleet.offline.commands import corrected
+from rce_fleet.offline.commands import CORRECTED, corrected
 from rce_fleet.offline.inputs import read_log
 
 if TYPE_CHECKING:
@@ -106,7 +106,10 @@ def measure(name: str, number: int | None) -> tuple[list[Row], dict[str, Occupan
         )
     begin = process_time()
     followed = np.array(
-        [each.pose.as_array() for each in replay(corrected(records), maps["gmapping"], start=Pose(0, 0, 0))]
+        [
+            each.pose.as_array()
+            for each in replay(corrected(records), maps["gmapping"], CORRECTED, start=Pose(0, 0, 0))
+        ]
     )
     rate = len(records) / (process_time() - begin)
     rows.append(

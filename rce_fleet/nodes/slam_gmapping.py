@@ -35,7 +35,8 @@ from rce_fleet.mapping.occupancy_mapping import map_of
 from rce_fleet.mapping.records import LaserRecord
 from rce_fleet.nodes.complaints import Complaints
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
-from rce_fleet.nodes.map_messages import map_fields, read_scan
+from rce_fleet.nodes.map_messages import map_fields
+from rce_fleet.nodes.mapped_robot import scan_record
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import pose_of
 
@@ -170,27 +171,16 @@ class SlamGmappingNode:
                 parameters.base_frame, f"/{frame.lstrip('/')}", timeout=WAIT
             )
             self._lasers[frame] = found.transform
-        scan = read_scan(message, self._lasers[frame])
         moved = await self._listener.wait_for(
             parameters.odom_frame, parameters.base_frame, stamp, timeout=WAIT
         )
         pose = pose_of(moved.transform)
+        record = scan_record(message, self._lasers[frame], pose, self._count - 1)
         jump = self._watch.check(pose, stamp.to_sec())
         if jump:
             self._complaints.warn("odometry", f"{jump}; the pose before it is kept")
             self._filter.forget_odometry()
-        with np.errstate(invalid="ignore"):
-            seen = (scan.ranges >= max(scan.range_min, 1e-3)) & (scan.ranges < scan.range_max)
-        return LaserRecord(
-            index=self._count - 1,
-            time=stamp.to_sec(),
-            ranges=np.where(seen, scan.ranges, inf),
-            angle_min=scan.angle_min,
-            angle_increment=scan.angle_increment,
-            range_max=scan.range_max,
-            odometry=(pose.x, pose.y, pose.yaw),
-            laser=(scan.laser.x, scan.laser.y, scan.laser.yaw),
-        )
+        return record
 
     def _use(self, record: LaserRecord) -> bool:
         """Use a scan, in a thread; return whether there is a new map or pose of the particles."""

@@ -16,6 +16,7 @@ import typer
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.exceptions import FleetError
 from rce_fleet.geometry.poses import Pose
+from rce_fleet.localization.parameters import AmclParameters
 from rce_fleet.localization.replay import Recorded, replay
 from rce_fleet.localization.scan import LaserScan
 from rce_fleet.mapping.gmapping.filter import GridFilter
@@ -34,6 +35,11 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as of shells."""
+
+CORRECTED = AmclParameters(
+    odom_alpha1=0.05, odom_alpha2=0.05, odom_alpha3=0.05, odom_alpha4=0.05, laser_max_beams=60
+)
+"""AMCL's parameters for odometry corrected by matching scans: it errs less than ROS's defaults say."""
 
 Log = Annotated[
     Path, typer.Argument(help="CARMEN log (also compressed with gzip) or ROS 1 bag.", show_default=False)
@@ -113,7 +119,8 @@ def localize(
         found = read_log(log, scan=scan, odometry=odom)
         print_faults(found.faults, sys.stderr)
         scans = corrected(with_progress(found.records, sys.stderr))
-        poses = [each.pose.as_array() for each in replay(scans, grid, seed=seed, start=start)]
+        followed = replay(scans, grid, CORRECTED, seed=seed, start=start)
+        poses = [each.pose.as_array() for each in followed]
         write_trajectory(folder / "trajectory.csv", [each.time for each in found.records], np.array(poses))
         write_report(
             folder / "report.json",
