@@ -78,7 +78,7 @@ class Agreement:
         others = [
             one for one in self.pending if one not in group and self._is_between_same_parts(one, closure)
         ]
-        if len(others) > parameters.join_doubt * len(group):
+        if len(others) > parameters.join_disagreement * len(group):
             return []
         self.pending = [other for other in self.pending if other not in group]
         return group

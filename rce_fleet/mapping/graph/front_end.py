@@ -114,7 +114,7 @@ def place_scan(
     before: NDArray[np.float64],
     moved: NDArray[np.float64],
     parameters: GraphParameters,
-    doubt: float = 1.0,
+    sigma_scale: float = 1.0,
 ) -> Placement:
     """Return where a scan is on a submap.
 
@@ -126,11 +126,11 @@ def place_scan(
         before: Pose of the scan before, in the submap's frame.
         moved: What odometry says that the robot moved since then, (x, y, yaw) in its own frame.
         parameters: Parameters.
-        doubt: How much less than usual the odometry is trusted: factor of its standard deviations.
+        sigma_scale: Factor of the standard deviations of the odometry, to trust it less than usual.
     """
     expected = compose(before, moved)
-    shift, turn = (doubt * sigma for sigma in odometry_sigmas(moved, parameters))
-    prior = odometry_information(moved, parameters) / doubt**2
+    shift, turn = (sigma_scale * sigma for sigma in odometry_sigmas(moved, parameters))
+    prior = odometry_information(moved, parameters) / sigma_scale**2
     if len(scan) < parameters.fewest_points:
         return Placement(expected, prior, 0.0, 0.0)
     placement = None

@@ -39,7 +39,7 @@ class GraphParameters:
         loop_group: So many loops have to agree.
         join_group: So many loops have to agree before they join two robots.
         join_spread: These loops are spread over at least this way, metres.
-        join_doubt: Loops that disagree with them are at most this share of them.
+        join_disagreement: Loops that disagree with them are at most this share of them.
         join_conflicts: Greatest share of points that the robots saw through on each other's way.
         loop_spread: The loops of a group are spread over at least this way, metres.
         join_places: So many places of other parts are tried for each keyscan of a robot that is not joined.
@@ -73,7 +73,7 @@ class GraphParameters:
     loop_group: int = 2
     join_group: int = 5
     join_spread: float = 3.0
-    join_doubt: float = 0.5
+    join_disagreement: float = 0.5
     join_conflicts: float = 0.08
     loop_spread: float = 0.25
     join_places: int = 4

@@ -123,8 +123,8 @@ class Tracker:
         is_lost = is_gap and max(way, turn) > GAP_MOVE
         if is_lost or shift_error > LOST_SHIFT or turn_error > LOST_TURN:
             return self._begin_part(scan, compose(before, moved), odometry, way)
-        doubt = UNTRUSTED if is_still else 1.0
-        placement = place_scan(scan, self._current_submap(), before, moved, parameters, doubt)
+        sigma_scale = UNTRUSTED if is_still else 1.0
+        placement = place_scan(scan, self._current_submap(), before, moved, parameters, sigma_scale)
         if not placement.is_matched:
             self.unmatched += 1
             if way < BLIND_WAY and turn < BLIND_TURN:
