@@ -34,6 +34,7 @@ UP = (
     ("/tf", "tf2_msgs/TFMessage"),
     ("/tf_static", "tf2_msgs/TFMessage"),
     ("/initialpose", "geometry_msgs/PoseWithCovarianceStamped"),
+    ("/move_base_simple/goal", "geometry_msgs/PoseStamped"),
 )
 """What an off-loaded robot sends to its container."""
 DOWN = (("/raw_cmd_vel", "geometry_msgs/Twist"),)

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 from support.engine import Program
-from support.ports import free_port
 
 from rce.ros.actions import ActionClient
 from rce.ros.core import Core
@@ -75,28 +74,21 @@ async def check_drive(judge: Node, namespace: str = "") -> None:
 
 
 async def test_a_robot_with_its_own_master_drives(tmp_path: Path) -> None:
-    port = free_port()
-    uri = f"http://127.0.0.1:{port}/"
-    scene = (
-        "sim",
-        str(TURTLEBOT.parent / "scene.yaml"),
-        "--no-stand-ins",
-        "--core-port",
-        str(port),
-        "--world-port",
-        "0",
-    )
+    ports = ("--core-port", "0", "--world-port", "0")
+    scene = ("sim", str(TURTLEBOT.parent / "scene.yaml"), "--no-stand-ins", *ports)
     launch = ("launch", str(TURTLEBOT / "botmotion.launch"), "robot:=Robot1")
     place = (f"initial_pose_x:={START[0]}", f"initial_pose_y:={START[1]}")
-    async with (
-        program(tmp_path, uri, "simulation ready", *scene),
-        program(tmp_path, uri, "/pose_relay: started", *launch, *place) as launched,
-        Node("judge", argv=[], master_uri=uri) as judge,
-    ):
-        relayed = asyncio.create_task(first(judge, "/Robot1/amcl_pose", POSE))
-        await check_drive(judge)
-        assert (await relayed).header.frame_id == "map"
-        assert "rce_fleet.nodes.amcl" in launched.output()
+    async with program(tmp_path, "", "simulation ready", *scene) as sim:
+        line = next(line for line in sim.output().splitlines() if line.startswith("robot Robot1 "))
+        uri = line.partition("ROS_MASTER_URI=")[2]
+        async with (
+            program(tmp_path, uri, "/pose_relay: started", *launch, *place) as launched,
+            Node("judge", argv=[], master_uri=uri) as judge,
+        ):
+            relayed = asyncio.create_task(first(judge, "/Robot1/amcl_pose", POSE))
+            await check_drive(judge)
+            assert (await relayed).header.frame_id == "map"
+            assert "rce_fleet.nodes.amcl" in launched.output()
 
 
 async def test_a_robot_at_a_shared_master_drives(tmp_path: Path) -> None:

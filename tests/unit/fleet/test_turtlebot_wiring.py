@@ -84,7 +84,7 @@ def test_a_robot_with_its_own_nodes_sends_poses_and_cells() -> None:
 
 def test_an_offloaded_robot_sends_sensors_and_takes_velocities() -> None:
     config = shipped("robot1-offload")
-    up = {"/scan", "/odom", "/tf", "/tf_static", "/initialpose"}
+    up = {"/scan", "/odom", "/tf", "/tf_static", "/initialpose", "/move_base_simple/goal"}
     assert at_robot(config) == {*up, "/raw_cmd_vel"}
     nodes = [f"{item.node.pkg}/{item.node.exe}" for item in config.nodes]
     assert nodes == [
