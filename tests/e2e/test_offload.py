@@ -1,4 +1,4 @@
-"""A robot whose localization and navigation run in its container drives; it stops when the cloud is gone."""
+"""A robot whose localization and navigation run in its container drives; it stops while the cloud is silent."""
 
 from __future__ import annotations
 
@@ -111,7 +111,6 @@ async def test_an_offloaded_robot_drives_and_stops_without_its_cloud(tmp_path: P
             async def has_arrived() -> bool:
                 send_goal()  # move_base may have given the goal up meanwhile
                 await asyncio.sleep(5.0)
-                print(truth.x, truth.y, truth.speed)
                 return truth.far_from(GOAL) < 0.25
 
-            await until(has_arrived, timeout=60, what="the robot arrives")
+            await until(has_arrived, timeout=WAIT_S, what="the robot arrives")
