@@ -1,4 +1,4 @@
-"""A robot whose localization and navigation run in its container drives; it stops while the cloud is silent."""
+"""A robot whose localization and navigation run in its container drives; it stops while they are silent."""
 
 from __future__ import annotations
 
