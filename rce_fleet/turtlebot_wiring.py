@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from rce.config.folders import configs_dir
 from rce.ros.launch import MachineInputs, load_launch_files
 from rce.ros.packages import PackageIndex
-from rce_fleet.wiring import FLEET_CONTAINER, FleetAccount, robot_config
+from rce_fleet.wiring import FLEET_CONTAINER, FleetAccount, layer_interfaces, robot_config
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -97,6 +97,7 @@ def offloaded_config(
         f"move_base/{topic}:=/move_base/{topic}" for topic in ("goal", "cancel", "status", "result")
     )
     config["nodes"] = [*(_node(container, node) for node in moved), client]
+    config["interfaces"] = list(layer_interfaces(config["robotID"], namespace, container))
     config["bridges"] = list(_offload_bridges(container, namespace))
     return config
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from rce_fleet.station.layers.kinds import TOPICS
+from rce_fleet.station.layers.kinds import SCAN, TF, TF_STATIC, TOPICS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -36,6 +36,8 @@ FLOOR_PARAMETERS: dict[str, bool | int | float | str | list[Any]] = {
 
 _POSE = "geometry_msgs/PoseWithCovarianceStamped"
 _CELLS = "std_msgs/Int32MultiArray"
+_OF_BASE = (SCAN, TF, TF_STATIC)
+"""Topics of layers that come from the robot's sensors and wheels, wherever its other nodes run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +74,7 @@ def robot_config(number: int, account: FleetAccount | None = None) -> dict[str, 
                 "namespace": namespace,
             }
         ],
-        "interfaces": list(_layers(robot, namespace)),
+        "interfaces": list(layer_interfaces(robot, namespace)),
         "bridges": list(_bridges(container, namespace)),
     }
 
@@ -106,17 +108,28 @@ def fleet_config(
     }
 
 
-def _layers(robot: str, namespace: str) -> Iterator[dict[str, Any]]:
-    """Offer the topics of layers to the station, which connects them while a page shows them."""
+def layer_interfaces(robot: str, namespace: str, container: str = "") -> Iterator[dict[str, Any]]:
+    """Offer the topics of layers to the station, which connects them while a page shows them.
+
+    Args:
+        robot: The robot's ID in the engine.
+        namespace: The robot's ID in the fleet.
+        container: Container that localization and navigation run in; empty: they run on the robot.
+    """
     for topic in TOPICS:
-        tag, name = topic.interface_tag(namespace), f"/{topic.names[0]}"
-        yield {
-            "eTag": robot,
-            "iTag": tag,
-            "iType": "SubscriberForwarder",
-            "iCls": topic.type_name,
-            "addr": name,
-        }
+        ends = {robot: "SubscriberForwarder"}
+        if container and topic not in _OF_BASE:
+            ends = {container: "SubscriberInterface"}
+        elif container and topic is TF:
+            ends[container] = "SubscriberInterface"
+        for endpoint, interface_type in ends.items():
+            yield {
+                "eTag": endpoint,
+                "iTag": topic.interface_tag(namespace),
+                "iType": interface_type,
+                "iCls": topic.type_name,
+                "addr": f"/{topic.names[0]}",
+            }
 
 
 def _bridges(container: str, namespace: str) -> Iterator[dict[str, Any]]:

@@ -47,9 +47,9 @@ class EngineLayerSource(LayerSource):
         if connection is None:
             raise LayerError("the engine is not connected yet")
         tag = topic.interface_tag(robot)
-        endpoint = await self._find_interface(tag)
-        container = None if endpoint else await self._find_container(robot)
-        if endpoint is None and container is None:
+        is_offered = bool(await self._find_interfaces(tag))
+        container = None if is_offered else await self._find_container(robot)
+        if not is_offered and container is None:
             raise LayerError(
                 f"{robot} does not offer {topic.names[0]}: add the interface {tag} to its config (see the"
                 " documentation of the page's layers)"
@@ -74,22 +74,23 @@ class EngineLayerSource(LayerSource):
                 await asyncio.sleep(CHECK_S)
                 continue
             with suppress(LayerError, ClientError):
-                endpoint = await self._find_interface(tag)
-                if endpoint is None:
+                endpoints = await self._find_interfaces(tag)
+                if not endpoints:
                     tell(f"{robot} does not offer it any more; waiting for the interface {tag}")
-                else:
+                for endpoint in endpoints:
                     await connection.connect(f"{connection.robot_id}/{tag}", f"{endpoint}/{tag}")
             with suppress(TimeoutError):
                 await connection.wait_active(tag, CHECK_S)
 
-    async def _find_interface(self, tag: str) -> str | None:
-        """Return the robot or container that has an interface; the station's own does not count."""
+    async def _find_interfaces(self, tag: str) -> list[str]:
+        """Return the robots and containers that have an interface; the station's own does not count.
+
+        Transforms of an off-loaded robot come from the robot and from its container.
+        """
         connection = self._connection()
         own = "" if connection is None else connection.robot_id
-        for item in await self._read_items("interfaces"):
-            if item["tag"] == tag and item["endpoint"] != own:
-                return str(item["endpoint"])
-        return None
+        items = await self._read_items("interfaces")
+        return [str(item["endpoint"]) for item in items if item["tag"] == tag and item["endpoint"] != own]
 
     async def _find_container(self, robot: str) -> str | None:
         """Return the container with nodes in the robot's namespace."""
