@@ -120,7 +120,7 @@ class SlamGmappingNode:
         self._entropies = await node.advertise("~entropy", "std_msgs/Float64", latch=True)
         diagnostics = await Diagnostics.start(node, "mapping")
         async with AsyncExitStack() as stack:
-            self._listener = await stack.enter_async_context(TransformListener(node))
+            self._listener = await stack.enter_async_context(TransformListener(node, prefix=""))
             broadcaster = await stack.enter_async_context(
                 TransformBroadcaster(node, prefix=self._listener.prefix)
             )

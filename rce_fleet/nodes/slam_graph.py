@@ -92,8 +92,8 @@ class SlamGraphNode:
         await node.advertise_service("~save_map", "std_srvs/Trigger", self._save)
         await node.advertise_service("~load_map", "std_srvs/Trigger", self._load)
         async with AsyncExitStack() as stack:
-            listener = await stack.enter_async_context(TransformListener(node))
-            broadcaster = await stack.enter_async_context(TransformBroadcaster(node))
+            listener = await stack.enter_async_context(TransformListener(node, prefix=""))
+            broadcaster = await stack.enter_async_context(TransformBroadcaster(node, prefix=listener.prefix))
             tasks = await stack.enter_async_context(asyncio.TaskGroup())
             for name in parameters.robots or ("",):
                 robot = MappedRobot(node, name, parameters, listener, self._complaints, self._take)
