@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from enum import StrEnum
 from math import isfinite, nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, assert_never
 
 import numpy as np
 import typer
@@ -170,6 +170,8 @@ def _mapper(algorithm: Algorithm, seed: int) -> Mapper:
             from rce_fleet.mapping.graph.mapper import GraphMapper
 
             return GraphMapper()
+        case _:
+            assert_never(algorithm)
 
 
 @contextmanager
