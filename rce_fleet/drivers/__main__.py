@@ -66,11 +66,12 @@ def simulate(
     except ConfigError as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(BAD_SCENE) from None
+    failure = ""
     try:
         uvloop.run(_until_signal(simulation))
     except* RefusedError as group:
-        typer.echo(f"simulation: the engine refused the connection: {group.exceptions[0]}", err=True)
-        raise typer.Exit(FAILED) from None
+        failure = f"simulation: the engine refused the connection: {group.exceptions[0]}"
+    _end_if(failure)
 
 
 def sim(
@@ -146,14 +147,19 @@ def sim(
     except (FleetError, OSError) as error:
         typer.echo(f"rce sim: {error}", err=True)
         raise typer.Exit(FAILED) from None
+    failure = ""
     try:
         uvloop.run(_until_signal(simulation))
-    except* PortTakenError as group:
-        typer.echo(f"rce sim: {group.exceptions[0]}", err=True)
-        raise typer.Exit(FAILED) from None
-    except* MasterError as group:
-        typer.echo(f"rce sim: {group.exceptions[0]}", err=True)
-        raise typer.Exit(FAILED) from None
+    except* (PortTakenError, MasterError) as group:
+        failure = f"rce sim: {group.exceptions[0]}"
+    _end_if(failure)
+
+
+def _end_if(failure: str) -> None:
+    """End with a message; not called in ``except*``, which would put the exit into a group."""
+    if failure:
+        typer.echo(failure, err=True)
+        raise typer.Exit(FAILED)
 
 
 async def _until_signal(simulation: Simulation) -> None:

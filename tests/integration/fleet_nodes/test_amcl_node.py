@@ -103,7 +103,7 @@ class World:
 @asynccontextmanager
 async def world(settings: AmclNodeParameters = SETTINGS, *, with_map: bool = True) -> AsyncIterator[World]:
     async with AsyncExitStack() as stack:
-        core = await stack.enter_async_context(Core())
+        core = await stack.enter_async_context(Core(port=0))
 
         async def node(name: str) -> Node:
             return await stack.enter_async_context(Node(name, argv=[], master_uri=core.uri))

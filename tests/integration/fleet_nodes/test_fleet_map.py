@@ -32,7 +32,7 @@ async def planning(uri: str) -> AsyncIterator[Node]:
 
 
 async def test_the_planner_publishes_its_grid() -> None:
-    async with Core() as core, planning(core.uri), Node("judge", argv=[], master_uri=core.uri) as judge:
+    async with Core(port=0) as core, planning(core.uri), Node("judge", argv=[], master_uri=core.uri) as judge:
         grids = await judge.subscribe("/fleet/map", TYPE)
         async with asyncio.timeout(PATIENCE):
             async for message in grids:
@@ -46,7 +46,7 @@ async def test_the_planner_publishes_its_grid() -> None:
 
 
 async def test_an_old_robot_file_gets_the_grid_on_map() -> None:
-    async with Core() as core, planning(core.uri):
+    async with Core(port=0) as core, planning(core.uri):
         async with Node("rce_environment", argv=[], master_uri=core.uri) as environment:
             grids = await environment.subscribe("/map", TYPE)
             async with asyncio.timeout(PATIENCE):
@@ -57,7 +57,7 @@ async def test_an_old_robot_file_gets_the_grid_on_map() -> None:
 @pytest.mark.parametrize("resolution", [0.5, 0.05])
 async def test_a_move_client_takes_an_old_grid(resolution: float, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(move_client, "OLD_MAP_AFTER", 0.2)
-    async with Core() as core, Node("rce_environment", argv=[], master_uri=core.uri) as environment:
+    async with Core(port=0) as core, Node("rce_environment", argv=[], master_uri=core.uri) as environment:
         grids = await environment.advertise("/map", TYPE, latch=True)
         fields = grid_fields(GRID, (), environment.now())
         grids.publish(fields | {"info": fields["info"] | {"resolution": resolution}})

@@ -42,7 +42,7 @@ async def serving(uri: str, file: Path | str, frame: str = "map") -> AsyncIterat
 async def test_a_map_is_saved_as_it_was_served(tmp_path: Path) -> None:
     file = hall(tmp_path)
     async with (
-        Core() as core,
+        Core(port=0) as core,
         serving(core.uri, file, "hall"),
         Node("map_saver", argv=[], master_uri=core.uri) as node,
     ):
@@ -60,7 +60,7 @@ async def test_a_map_is_saved_as_it_was_served(tmp_path: Path) -> None:
 async def test_a_faulty_map_is_reported_and_replaced(tmp_path: Path) -> None:
     good, bad = hall(tmp_path), tmp_path / "bad.yaml"
     bad.write_text(good.read_text().replace("resolution: 0.05", "resolution: -1"))
-    async with Core() as core, Node("judge", argv=[], master_uri=core.uri) as judge:
+    async with Core(port=0) as core, Node("judge", argv=[], master_uri=core.uri) as judge:
         logs = await judge.subscribe("/rosout", "rosgraph_msgs/Log")
         states = await judge.subscribe("/diagnostics", "diagnostic_msgs/DiagnosticArray")
         async with serving(core.uri, bad):
@@ -84,7 +84,7 @@ async def test_a_faulty_map_is_reported_and_replaced(tmp_path: Path) -> None:
 
 
 async def test_a_faulty_message_is_not_saved(tmp_path: Path) -> None:
-    async with Core() as core, Node("source", argv=[], master_uri=core.uri) as source:
+    async with Core(port=0) as core, Node("source", argv=[], master_uri=core.uri) as source:
         maps = await source.advertise("map", "nav_msgs/OccupancyGrid", latch=True)
         maps.publish(info={"width": 3, "height": 3, "resolution": 0.05, "origin": {"orientation": {"w": 1}}})
         async with Node("map_saver", argv=[], master_uri=core.uri) as node:

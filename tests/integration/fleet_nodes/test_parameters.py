@@ -18,7 +18,7 @@ class Settings:
 
 
 async def test_problems_are_on_rosout_and_the_node_lives() -> None:
-    async with Core() as core, Node("judge", argv=[], master_uri=core.uri) as judge:
+    async with Core(port=0) as core, Node("judge", argv=[], master_uri=core.uri) as judge:
         heard: asyncio.Queue[tuple[int, str]] = asyncio.Queue()
 
         def take(message: object) -> None:

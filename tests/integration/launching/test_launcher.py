@@ -52,6 +52,8 @@ class Running:
         await self.until(lambda lines: sum(text in line for line in lines) >= count)
 
     async def code(self) -> int:
+        """Wait for its end and its last line; return its exit code."""
+        await self.until(lambda lines: lines[-1:] == ["(end)"])
         async with asyncio.timeout(WAIT_S):
             return await self.process.wait()
 

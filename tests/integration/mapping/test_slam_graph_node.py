@@ -91,7 +91,7 @@ class World:
         self.states: list[Message] = []
 
     async def start(self, values: dict[str, Any]) -> None:
-        core = await self.stack.enter_async_context(Core())
+        core = await self.stack.enter_async_context(Core(port=0))
         self.judge = await self.stack.enter_async_context(Node("judge", argv=[], master_uri=core.uri))
         await self.judge.set_param("/slam_graph", {"map_update_interval": 0.5, **values})
         await self.judge.subscribe("/rosout", "rosgraph_msgs/Log", lambda log: self.heard.append(log.msg))

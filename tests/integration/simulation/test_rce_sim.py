@@ -104,7 +104,7 @@ async def test_simulated_time_stands_still_and_steps(tmp_path: Path) -> None:
         assert robot.is_time_simulated
         assert world.is_time_simulated
         await robot.sleep(1.0)
-        assert robot.time() > 1.0
+        assert robot.time() >= 1.0
         await world.service_client("/gazebo/pause_physics", "std_srvs/Empty")()
         step = world.service_client("/simulation/step", "fleet/StepWorld")
         before = (await step(seconds=0.0)).time

@@ -127,6 +127,8 @@ def test_compiled_rays_equal_those_of_numpy() -> None:
 
 
 def test_kernels_run_in_numpy_when_turned_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel = ray_casting.cast_in_cells
+    monkeypatch.setattr(kernel, "_used", kernel.numpy)  # other tests may have compiled it
     monkeypatch.setenv("RCE_COMPILED", "no")
     assert not compile_kernels()
     assert not ray_casting.cast_in_cells.is_compiled
