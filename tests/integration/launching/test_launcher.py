@@ -189,7 +189,7 @@ async def test_the_end_of_a_required_node_ends_all(folder: Path, code: int) -> N
 async def test_a_deaf_node_is_killed(folder: Path) -> None:
     text = '<node pkg="tools" type="stubborn" name="s" output="screen"/>'
     async with launched(folder, text, "--sigint-timeout", "0.3", "--sigterm-timeout", "0.3") as running:
-        await running.has("deaf")
+        await running.until(lambda lines: "deaf" in lines)
         running.process.send_signal(signal.SIGTERM)
         assert await running.code() == 0
     told = [line for line in running.lines if "did not end" in line]
@@ -200,7 +200,7 @@ async def test_a_deaf_node_is_killed(folder: Path) -> None:
 async def test_a_second_interrupt_does_not_wait(folder: Path) -> None:
     text = '<node pkg="tools" type="stubborn" name="s" output="screen"/>'
     async with launched(folder, text, "--sigint-timeout", "500", "--sigterm-timeout", "500") as running:
-        await running.has("deaf")
+        await running.until(lambda lines: "deaf" in lines)
         running.process.send_signal(signal.SIGINT)
         await asyncio.sleep(0.5)
         running.process.send_signal(signal.SIGINT)
