@@ -281,12 +281,13 @@ class GraphMember:
             async with asyncio.timeout(GOODBYE_TIMEOUT):
                 for service in list(self._services.values()):
                     await service.close()
-                for output in list(self._topics.outputs.values()):
-                    for publisher in list(output.publishers):
-                        await publisher.close()
+                # First what calls the program, which may publish until then.
                 for source in list(self._topics.inputs.values()):
                     for subscriber in list(source.subscribers):
                         await subscriber.close()
+                for output in list(self._topics.outputs.values()):
+                    for publisher in list(output.publishers):
+                        await publisher.close()
                 await self._parameters.unwatch_all()
         except (MasterError, TimeoutError) as error:
             _log.info("%s left without telling its master: %s", self.name, str(error) or "it took too long")

@@ -9,7 +9,7 @@ from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
 from rce.ros.errors import MasterUnreachableError, NodeClosedError, TypeMismatchError
-from rce.ros.node import Node, Subscriber
+from rce.ros.node import Node, Publisher, Subscriber
 from rce.ros.tcpros.header import encode_header
 from rce.ros.types import Message, TypeRegistry
 from rce.ros.xmlrpc import RpcClient
@@ -375,3 +375,30 @@ async def test_statistics_count_what_flowed(make_node: MakeNode) -> None:
             [["/rosout", "rosgraph_msgs/Log"], ["/t", STRING]],
         ]
         assert await rpc.call(b.uri, "getSubscriptions", ("/x",)) == [1, "subscriptions", [["/t", STRING]]]
+
+
+async def test_callbacks_may_publish_until_they_end(
+    make_node: MakeNode, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A node that leaves is not called any more when its publishers are closed."""
+    async with make_node("flood") as flood:
+        source = await flood.advertise("in", STRING)
+        async with make_node("pass") as passing:
+            output = await passing.advertise("out", STRING)
+            seen = asyncio.Event()
+
+            def pass_on(message: Message) -> None:
+                output.publish(message)
+                seen.set()
+
+            await passing.subscribe("in", STRING, pass_on)
+            sending = asyncio.create_task(_keep_publishing(source))
+            await asyncio.wait_for(seen.wait(), 20)
+        sending.cancel()
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
+
+
+async def _keep_publishing(publisher: Publisher) -> None:
+    while True:
+        publisher.publish(data="x")
+        await asyncio.sleep(0)
