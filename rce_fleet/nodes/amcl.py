@@ -27,12 +27,12 @@ from rce_fleet.localization.scan import LaserScan
 from rce_fleet.nodes.amcl_frames import RobotFrames
 from rce_fleet.nodes.amcl_parameters import UNUSED, AmclNodeParameters
 from rce_fleet.nodes.amcl_state import describe
-from rce_fleet.nodes.complaints import Complaints
 from rce_fleet.nodes.diagnostics import Diagnostics
 from rce_fleet.nodes.map_messages import read_scan
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import pose_fields, read_map
 from rce_fleet.nodes.pose_messages import pose_with_covariance_fields, read_pose_with_covariance
+from rce_fleet.nodes.throttled_log import ThrottledLog
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -71,7 +71,7 @@ class AmclNode:
         self._start: tuple[Pose, NDArray[np.float64]] | None = None
         self._found: _Found | None = None
         self._watch = OdometryWatch()
-        self._complaints = Complaints(node)
+        self._throttled_log = ThrottledLog(node)
         self._fault = ""
         self._used_at: float | None = None
         self._scan_stamp = Time()
@@ -121,7 +121,7 @@ class AmclNode:
             try:
                 answer = await client.call({})
             except RosError as error:
-                self._complaints.warn("map", f"waiting for the map: service static_map: {error}")
+                self._throttled_log.warn("map", f"waiting for the map: service static_map: {error}")
                 await asyncio.sleep(MAP_RETRY)
                 continue
             if not self._take_map(answer.map):
@@ -135,7 +135,7 @@ class AmclNode:
         """Use a map; return whether it can be used."""
         frame = message.header.frame_id.lstrip("/")
         if frame and not self._frames.is_map(frame):
-            self._complaints.warn(
+            self._throttled_log.warn(
                 "map frame",
                 f"the map is in frame {frame!r}, and global_frame_id is {self._parameters.global_frame_id!r};"
                 " its poses are used as they are",
@@ -150,7 +150,7 @@ class AmclNode:
                 self._amcl.set_map(grid)
                 self._amcl.request_update()
         except (MapError, ValueError) as error:
-            self._complaints.warn("map", f"the map cannot be used: {error}")
+            self._throttled_log.warn("map", f"the map cannot be used: {error}")
             self._fault = f"the map cannot be used: {error}"
             return False
         self._fault = ""
@@ -233,14 +233,14 @@ class AmclNode:
         self._use(scan, odometry, stamp)
 
     def _refuse(self, subject: str, text: str) -> None:
-        self._complaints.warn(subject, text)
+        self._throttled_log.warn(subject, text)
         self._fault = text
 
     def _use(self, scan: LaserScan, odometry: Pose, stamp: Time) -> None:
         assert self._amcl is not None
         jump = self._watch.check(odometry, stamp.to_sec())
         if jump:
-            self._complaints.warn("odometry", f"{jump}; the pose before it is kept")
+            self._throttled_log.warn("odometry", f"{jump}; the pose before it is kept")
             self._amcl.forget_odometry()
         estimate = self._amcl.update(odometry, scan)
         self._fault, self._used_at = "", self._node.time()
@@ -300,7 +300,7 @@ class AmclNode:
                 for name, value in values.items():
                     await self._node.set_param(f"~{name}", value)
             except RosError as error:
-                self._complaints.warn("save", f"the pose cannot be stored in the parameters: {error}")
+                self._throttled_log.warn("save", f"the pose cannot be stored in the parameters: {error}")
 
 
 def _seconds(later: Time, earlier: Time) -> float:

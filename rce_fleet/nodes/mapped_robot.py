@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from rce.ros.node import Node
     from rce.ros.tf import TransformListener
     from rce.ros.types import Message, Time
-    from rce_fleet.nodes.complaints import Complaints
     from rce_fleet.nodes.slam_graph_parameters import SlamGraphParameters
+    from rce_fleet.nodes.throttled_log import ThrottledLog
 
 WAIT = 0.5
 """Seconds that a scan waits for its transforms."""
@@ -42,7 +42,7 @@ class MappedRobot:
         name: Namespace of the robot; empty for that of the node.
         parameters: The node's parameters.
         listener: Hears transforms.
-        complaints: Takes what is wrong with scans.
+        throttled_log: Takes what is wrong with scans.
         take: Called with the robot's name and each usable scan.
 
     Attributes:
@@ -58,7 +58,7 @@ class MappedRobot:
         name: str,
         parameters: SlamGraphParameters,
         listener: TransformListener,
-        complaints: Complaints,
+        throttled_log: ThrottledLog,
         take: Callable[[str, LaserRecord], None],
     ) -> None:
         self.name = name
@@ -67,7 +67,7 @@ class MappedRobot:
         self._node = node
         self._parameters = parameters
         self._listener = listener
-        self._complaints = complaints
+        self._throttled_log = throttled_log
         self._take = take
         prefix = f"{name.strip('/')}/" if name else ""
         self.odom_frame = prefix + parameters.odom_frame
@@ -123,7 +123,7 @@ class MappedRobot:
 
     def _refuse(self, subject: str, text: str) -> None:
         self.fault = text
-        self._complaints.warn(f"{self.name} {subject}", f"{self.name}: {text}" if self.name else text)
+        self._throttled_log.warn(f"{self.name} {subject}", f"{self.name}: {text}" if self.name else text)
 
     async def _laser(self, frame: str) -> Transform:
         """Return ``base_from_laser``, which never changes."""

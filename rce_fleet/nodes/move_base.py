@@ -22,7 +22,6 @@ from rce_fleet.navigation.costmap.layered import LayeredCostmap
 from rce_fleet.navigation.move_base.core import Decision, State
 from rce_fleet.navigation.move_base.situation import Situation
 from rce_fleet.navigation.move_base.stack import NavigationSettings, NavigationStack
-from rce_fleet.nodes.complaints import Complaints
 from rce_fleet.nodes.costmap_publisher import CostmapPublisher
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
 from rce_fleet.nodes.move_base_goals import MoveBaseGoals
@@ -30,6 +29,7 @@ from rce_fleet.nodes.move_base_parameters import read_settings, space_of
 from rce_fleet.nodes.observation_sources import ObservationSources
 from rce_fleet.nodes.planar import path_fields, read_map, twist_fields
 from rce_fleet.nodes.robot_place import RobotPlace, full_name
+from rce_fleet.nodes.throttled_log import ThrottledLog
 
 if TYPE_CHECKING:
     from rce.ros.node import Publisher
@@ -55,7 +55,7 @@ class MoveBaseNode:
         self._node = node
         self._settings = settings
         self.stack = NavigationStack(settings)
-        self._complaints = Complaints(node)
+        self._throttled_log = ThrottledLog(node)
         self._commanded = STANDING
         self._global_at = float("-inf")
         self._steps: deque[tuple[float, float]] = deque(maxlen=500)
@@ -99,15 +99,17 @@ class MoveBaseNode:
                 transforms,
                 (world.global_frame, local.global_frame, local.robot_base_frame),
                 max(world.transform_tolerance, local.transform_tolerance),
-                self._complaints,
+                self._throttled_log,
             )
-            self._sources = [ObservationSources(node, transforms, one, self._complaints) for one in costmaps]
+            self._sources = [
+                ObservationSources(node, transforms, one, self._throttled_log) for one in costmaps
+            ]
             for costmap in costmaps:
                 await self._hear_map(costmap)
             for source in self._sources:
                 await source.start()
             await node.subscribe("odom", "nav_msgs/Odometry", self._place.take_odometry)
-            self._goals = MoveBaseGoals(node, self, transforms, self._complaints)
+            self._goals = MoveBaseGoals(node, self, transforms, self._throttled_log)
             async with self._goals, asyncio.TaskGroup() as tasks:
                 told = float("-inf")
                 async for _ in node.rate(parameters.controller_frequency):
@@ -158,14 +160,14 @@ class MoveBaseNode:
             try:
                 costmap.set_map(read_map(message))
             except ValueError as error:
-                self._complaints.warn("map", f"a map on {self._node.resolve(topic)} is ignored: {error}")
+                self._throttled_log.warn("map", f"a map on {self._node.resolve(topic)} is ignored: {error}")
 
         def update(message: Message) -> None:
             try:
                 values = np.asarray(message.data, np.int8).reshape(message.height, message.width)
                 layer.update_map(values, message.y, message.x)
             except ValueError as error:
-                self._complaints.warn("map", f"an update of a map is ignored: {error}")
+                self._throttled_log.warn("map", f"an update of a map is ignored: {error}")
 
         await self._node.subscribe(topic, "nav_msgs/OccupancyGrid", take)
         if layer.parameters.subscribe_to_updates:
@@ -230,7 +232,7 @@ class MoveBaseNode:
 
     def _note(self, problem: str, decision: Decision) -> None:
         if problem and self.stack.core.state is not State.IDLE:
-            self._complaints.warn("problem", f"the robot stands: {problem}")
+            self._throttled_log.warn("problem", f"the robot stands: {problem}")
         elif decision.text and decision.ending is None and not problem:
             self._node.log.warning("%s", decision.text)
         self._problem = problem
@@ -249,7 +251,7 @@ class MoveBaseNode:
             return
         stack.core.take_plan(plan, self._node.time())
         if not plan.found:
-            self._complaints.warn("plan", f"no plan: {plan.reason}")
+            self._throttled_log.warn("plan", f"no plan: {plan.reason}")
             return
         header = {"stamp": self._node.now(), "frame_id": self._frames[0]}
         self._plans.publish(path_fields(plan.path, header))
@@ -280,7 +282,7 @@ class MoveBaseNode:
                 "control step p99 (ms)": f"{1e3 * slowest:.2f}",
                 "control step p99, CPU (ms)": f"{1e3 * busiest:.2f}",
                 "last plan (ms)": f"{1e3 * self._plan_seconds:.2f}",
-                "warnings": str(self._complaints.count),
+                "warnings": str(self._throttled_log.count),
                 "speed": f"{self._commanded.speed:.3f}",
             },
         )

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rce.ros.types import Message
     from rce_fleet.navigation.move_base.core import Decision
     from rce_fleet.navigation.move_base.stack import NavigationSettings, NavigationStack
-    from rce_fleet.nodes.complaints import Complaints
+    from rce_fleet.nodes.throttled_log import ThrottledLog
 
 ACTION = "move_base"
 TYPE = "move_base_msgs/MoveBaseAction"
@@ -58,19 +58,19 @@ class MoveBaseGoals:
         node: Running node.
         driver: Drives the robot.
         transforms: What is known of frames.
-        complaints: Where warnings go.
+        throttled_log: Where warnings go.
 
     Attributes:
         target: The present goal in the global frame; None without one.
     """
 
     def __init__(
-        self, node: Node, driver: GoalDriver, transforms: TransformListener, complaints: Complaints
+        self, node: Node, driver: GoalDriver, transforms: TransformListener, throttled_log: ThrottledLog
     ) -> None:
         self._node = node
         self._driver = driver
         self._transforms = transforms
-        self._complaints = complaints
+        self._throttled_log = throttled_log
         self.target: Pose | None = None
         self._goal: ServerGoal | None = None
         self._ended: asyncio.Future[Decision] | None = None

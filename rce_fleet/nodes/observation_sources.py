@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rce_fleet.navigation.costmap.layered import LayeredCostmap
     from rce_fleet.navigation.costmap.observation import Observation
     from rce_fleet.navigation.costmap.parameters import ObservationSource
-    from rce_fleet.nodes.complaints import Complaints
+    from rce_fleet.nodes.throttled_log import ThrottledLog
 
 TYPES = {
     "LaserScan": "sensor_msgs/LaserScan",
@@ -48,16 +48,16 @@ class ObservationSources:
         node: Running node.
         transforms: What is known of frames.
         costmap: The costmap, with an obstacle layer.
-        complaints: Where warnings go.
+        throttled_log: Where warnings go.
     """
 
     def __init__(
-        self, node: Node, transforms: TransformListener, costmap: LayeredCostmap, complaints: Complaints
+        self, node: Node, transforms: TransformListener, costmap: LayeredCostmap, throttled_log: ThrottledLog
     ) -> None:
         self._node = node
         self._transforms = transforms
         self._costmap = costmap
-        self._complaints = complaints
+        self._throttled_log = throttled_log
         self._waiting: dict[str, deque[Message]] = {}
 
     async def start(self) -> None:
@@ -107,12 +107,12 @@ class ObservationSources:
                     return False
                 fault = str(error)
             except TransformError as error:
-                self._complaints.warn(f"source {name}", f"source {name} waits for its transform: {error}")
+                self._throttled_log.warn(f"source {name}", f"source {name} waits for its transform: {error}")
                 return False
             except ValueError as error:
                 fault = str(error)
         if fault:
-            self._complaints.warn(f"source {name}", f"a message of source {name} is ignored: {fault}")
+            self._throttled_log.warn(f"source {name}", f"a message of source {name} is ignored: {fault}")
         return True
 
 

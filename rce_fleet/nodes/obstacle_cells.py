@@ -24,11 +24,11 @@ from rce_fleet.navigation.costmap.observation import observe_scan
 from rce_fleet.navigation.costmap.parameters import ObservationSource
 from rce_fleet.navigation.obstacle_cells.watch import CellWatch, Findings, WatchParameters
 from rce_fleet.navigation.scans import fault_of_scan, fault_of_stamp
-from rce_fleet.nodes.complaints import Complaints
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import pose_of, read_map, read_pose
 from rce_fleet.nodes.robot_place import full_name, named_in_message
+from rce_fleet.nodes.throttled_log import ThrottledLog
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -89,7 +89,7 @@ class ObstacleCellsNode:
         self._node = node
         self._parameters = parameters
         self._robot = parameters.robot or node.namespace.strip("/")
-        self._complaints = Complaints(node)
+        self._throttled_log = ThrottledLog(node)
         self._watch: CellWatch | None = None
         self._fleet: OccupancyMap | None = None
         self._known: OccupancyMap | None = None
@@ -125,7 +125,7 @@ class ObstacleCellsNode:
         try:
             picture = read_map(message)
         except ValueError as error:
-            self._complaints.warn("map", f"a map is ignored: {error}")
+            self._throttled_log.warn("map", f"a map is ignored: {error}")
             return
         if not fleet:
             self._known = picture
@@ -152,7 +152,7 @@ class ObstacleCellsNode:
         try:
             self._others.poses[robot] = (self._node.time(), read_pose(message.pose.pose))
         except ValueError as error:
-            self._complaints.warn(f"pose of {robot}", f"the pose of {robot} is ignored: {error}")
+            self._throttled_log.warn(f"pose of {robot}", f"the pose of {robot} is ignored: {error}")
 
     def _take_scan(self, message: Message) -> None:
         self._waiting.append(message)
@@ -169,7 +169,7 @@ class ObstacleCellsNode:
         stamp = message.header.stamp.to_sec()
         fault = fault_of_scan(len(message.ranges), angles, limits) or fault_of_stamp(stamp, now, OLDEST)
         if fault:
-            self._complaints.warn("scan", f"a scan is ignored: {fault}")
+            self._throttled_log.warn("scan", f"a scan is ignored: {fault}")
             return True
         frame, when = named_in_message(message.header.frame_id), message.header.stamp
         try:
@@ -177,7 +177,7 @@ class ObstacleCellsNode:
         except ExtrapolationError as error:
             return not error.is_future
         except TransformError as error:
-            self._complaints.warn("tf", f"scans wait for their transform: {error}")
+            self._throttled_log.warn("tf", f"scans wait for their transform: {error}")
             return True
         reach = self._parameters.sight + 1.0
         source = ObservationSource(

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rce.ros.node import Node
     from rce.ros.tf import TransformListener
     from rce.ros.types import Message
-    from rce_fleet.nodes.complaints import Complaints
+    from rce_fleet.nodes.throttled_log import ThrottledLog
 
 ODOMETRY_TIMEOUT = 0.5
 """Odometry older than this does not tell the robot's speeds any more, seconds."""
@@ -63,7 +63,7 @@ class RobotPlace:
         transforms: What is known of frames.
         frames: The global frame, the local frame and the robot's frame.
         tolerance: Oldest transform that counts, seconds.
-        complaints: Where warnings go.
+        throttled_log: Where warnings go.
     """
 
     def __init__(
@@ -72,13 +72,13 @@ class RobotPlace:
         transforms: TransformListener,
         frames: tuple[str, str, str],
         tolerance: float,
-        complaints: Complaints,
+        throttled_log: ThrottledLog,
     ) -> None:
         self._node = node
         self._transforms = transforms
         self._global, self._local, self._base = (full_name(transforms, frame) for frame in frames)
         self._tolerance = tolerance
-        self._complaints = complaints
+        self._throttled_log = throttled_log
         self._last: Pose | None = None
         self._twist = Twist()
         self._moved_at = float("-inf")
@@ -87,7 +87,7 @@ class RobotPlace:
         """Take the robot's speeds."""
         twist = read_twist(message.twist.twist)
         if not (isfinite(twist.speed) and isfinite(twist.turn_rate)):
-            self._complaints.warn("odom", "odometry is ignored: its speeds are not finite")
+            self._throttled_log.warn("odom", "odometry is ignored: its speeds are not finite")
             return
         self._twist, self._moved_at = twist, self._node.time()
 

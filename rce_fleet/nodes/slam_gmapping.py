@@ -33,12 +33,12 @@ from rce_fleet.mapping.gmapping.filter import GridFilter
 from rce_fleet.mapping.gmapping.parameters import FilterParameters
 from rce_fleet.mapping.occupancy_mapping import map_of
 from rce_fleet.mapping.records import LaserRecord
-from rce_fleet.nodes.complaints import Complaints
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
 from rce_fleet.nodes.map_messages import map_fields
 from rce_fleet.nodes.mapped_robot import scan_record
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import pose_of
+from rce_fleet.nodes.throttled_log import ThrottledLog
 
 if TYPE_CHECKING:
     from rce.ros.node import Publisher
@@ -96,7 +96,7 @@ class SlamGmappingNode:
             parameters, np.random.default_rng(None if parameters.seed < 0 else parameters.seed)
         )
         self._watch = OdometryWatch()
-        self._complaints = Complaints(node)
+        self._throttled_log = ThrottledLog(node)
         self._fault = ""
         self._count = 0
         self._stamp = Time()
@@ -178,7 +178,7 @@ class SlamGmappingNode:
         record = scan_record(message, self._lasers[frame], pose, self._count - 1)
         jump = self._watch.check(pose, stamp.to_sec())
         if jump:
-            self._complaints.warn("odometry", f"{jump}; the pose before it is kept")
+            self._throttled_log.warn("odometry", f"{jump}; the pose before it is kept")
             self._filter.forget_odometry()
         return record
 
@@ -194,7 +194,7 @@ class SlamGmappingNode:
         return updated
 
     def _refuse(self, subject: str, text: str) -> None:
-        self._complaints.warn(subject, text)
+        self._throttled_log.warn(subject, text)
         self._fault = text
 
     # What goes out

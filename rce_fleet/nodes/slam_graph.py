@@ -18,13 +18,13 @@ from rce.ros.tf import StampedTransform, Transform, TransformBroadcaster, Transf
 from rce.ros.types import Time
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.exceptions import FleetError, MapError
-from rce_fleet.nodes.complaints import Complaints
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
 from rce_fleet.nodes.map_messages import map_fields
 from rce_fleet.nodes.mapped_robot import MappedRobot
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.slam_graph_parameters import GMAPPING_ONLY, SlamGraphParameters
 from rce_fleet.nodes.slam_graph_session import SlamGraphSession
+from rce_fleet.nodes.throttled_log import ThrottledLog
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -60,7 +60,7 @@ class SlamGraphNode:
     def __init__(self, node: Node, parameters: SlamGraphParameters) -> None:
         self._node = node
         self._parameters = parameters
-        self._complaints = Complaints(node)
+        self._throttled_log = ThrottledLog(node)
         self._session = SlamGraphSession(replace(parameters, load_map=False, localize_only=False))
         self._turn = asyncio.Lock()
         self._scans: asyncio.Queue[tuple[str, LaserRecord]] = asyncio.Queue()
@@ -96,7 +96,7 @@ class SlamGraphNode:
             broadcaster = await stack.enter_async_context(TransformBroadcaster(node, prefix=listener.prefix))
             tasks = await stack.enter_async_context(asyncio.TaskGroup())
             for name in parameters.robots or ("",):
-                robot = MappedRobot(node, name, parameters, listener, self._complaints, self._take)
+                robot = MappedRobot(node, name, parameters, listener, self._throttled_log, self._take)
                 self._robots.append(robot)
                 await robot.start()
             work = [
@@ -119,7 +119,7 @@ class SlamGraphNode:
     def _take(self, robot: str, record: LaserRecord) -> None:
         if self._scans.qsize() >= WAITING_SCANS:
             self._scans.get_nowait()
-            self._complaints.warn(
+            self._throttled_log.warn(
                 "slow", "scans come faster than they can be mapped: some are left out; raise ~throttle_scans"
             )
         self._scans.put_nowait((robot, record))
@@ -130,7 +130,7 @@ class SlamGraphNode:
             try:
                 transform = await self._in_thread(self._session.add, robot, record)
             except (FleetError, ValueError) as error:
-                self._complaints.warn("scan", f"a scan cannot be mapped: {error}")
+                self._throttled_log.warn("scan", f"a scan cannot be mapped: {error}")
                 continue
             self.mapped[robot] = self.mapped.get(robot, 0) + 1
             self._odometry[robot] = np.array(record.odometry)
@@ -183,7 +183,7 @@ class SlamGraphNode:
             self._map = await self._in_thread(self._session.occupancy_map)
         except MapError as error:
             self._fault = f"the map cannot be drawn: {error}"
-            self._complaints.warn("draw", self._fault)
+            self._throttled_log.warn("draw", self._fault)
 
     def _map_fields(self, drawn: OccupancyMap) -> dict[str, Any]:
         return map_fields(drawn, self._parameters.map_frame, self._node.now())

@@ -21,11 +21,11 @@ from rce_fleet.navigation.safety.limiter import STANDING, VelocityLimiter, Verdi
 from rce_fleet.navigation.safety.parameters import SafetyParameters
 from rce_fleet.navigation.safety.seen import Scan, sensor_pose
 from rce_fleet.navigation.scans import fault_of_scan, fault_of_stamp
-from rce_fleet.nodes.complaints import Complaints
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import pose_of, read_pose, read_twist, twist_fields
 from rce_fleet.nodes.robot_place import full_name, named_in_message
+from rce_fleet.nodes.throttled_log import ThrottledLog
 
 if TYPE_CHECKING:
     from rce.ros.node import Publisher
@@ -46,7 +46,7 @@ class VelocityLimiterNode:
     def __init__(self, node: Node, parameters: SafetyParameters) -> None:
         self._node = node
         self._parameters = parameters
-        self._complaints = Complaints(node)
+        self._throttled_log = ThrottledLog(node)
         footprint = Footprint.read(
             parameters.footprint, parameters.robot_radius, parameters.footprint_padding
         )
@@ -90,12 +90,12 @@ class VelocityLimiterNode:
         try:
             pose = read_pose(message.pose.pose)
         except ValueError as error:
-            self._complaints.warn("odom", f"odometry is ignored: {error}")
+            self._throttled_log.warn("odom", f"odometry is ignored: {error}")
             return
         stamp, now = message.header.stamp.to_sec(), self._node.time()
         fault = fault_of_stamp(stamp, now, self._parameters.transform_timeout)
         if fault:
-            self._complaints.warn("odom", f"odometry is ignored: {fault}")
+            self._throttled_log.warn("odom", f"odometry is ignored: {fault}")
             return
         self._limiter.take_pose(pose, stamp)
         self._odometry.append((stamp, pose))
@@ -118,7 +118,7 @@ class VelocityLimiterNode:
         except TransformError as error:
             fault = fault or str(error)
         if fault:
-            self._complaints.warn("scan", f"a scan of {self._node.resolve('scan')} is ignored: {fault}")
+            self._throttled_log.warn("scan", f"a scan of {self._node.resolve('scan')} is ignored: {fault}")
             return
         assert at is not None
         ranges = np.asarray(message.ranges, np.float64)
@@ -157,7 +157,7 @@ class VelocityLimiterNode:
             return
         verdict = self._limiter.limit(self._node.time())
         if verdict.stopped and not self._last.stopped and "no command" not in verdict.reason:
-            self._complaints.warn("stop", f"the robot stands: {verdict.reason}")
+            self._throttled_log.warn("stop", f"the robot stands: {verdict.reason}")
         self._limited += bool(verdict.reason and not verdict.stopped)
         self._last = verdict
         self._out.publish(twist_fields(verdict.twist))

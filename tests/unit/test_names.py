@@ -119,8 +119,7 @@ BANS = (
     Ban(
         "complaint complaints",
         "a text about a fault, or a limit on its log lines",
-        "failure, LogThrottle",
-        ENGINE,
+        "failure, LogThrottle, ThrottledLog",
     ),
     Ban("stranger strangers", "a peer that has not authenticated", "unauthenticated", ENGINE),
     Ban("everybody somebody anybody", "who may do it", "any_role, none", ENGINE),

@@ -12,7 +12,7 @@ EVERY = 5.0
 """Seconds after which a warning on the same subject is logged again."""
 
 
-class Complaints:
+class ThrottledLog:
     """Logs warnings of a node, each subject at most once in ``EVERY`` seconds.
 
     Args:
