@@ -23,6 +23,7 @@ INSIDE = {  # what an interface takes from its connection, not from the program
     "on_active",
     "on_closed",
     "on_fault",
+    "on_inactive",
     "on_lost",
 }
 WITHOUT_END = {"Connection.wait_refused"}
