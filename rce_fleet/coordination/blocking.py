@@ -72,7 +72,7 @@ class CellBlocking:
         return Reply(True, f"cell {cell} will be blocked when {owner} has left it")
 
     def free_cell(self, event: CellFreed) -> Reply:
-        """Free a cell, whoever blocked it."""
+        """Free a cell, regardless of who blocked it."""
         cell = event.cell
         refusal = refuse_block(self._state, cell)
         if refusal:

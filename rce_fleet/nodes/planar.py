@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rce.ros.types import Message
 
 _LEAST_TURN = 1e-3
-"""A quaternion shorter than this is no rotation."""
+"""A quaternion shorter than this is not a rotation."""
 
 
 def pose_of(transform: Transform) -> Pose:
@@ -39,7 +39,7 @@ def read_pose(message: Message) -> Pose:
     length = sum(value * value for value in (turn.x, turn.y, turn.z, turn.w)) ** 0.5
     if length < _LEAST_TURN:
         raise ValueError(
-            "the orientation is (0, 0, 0, 0), which is no rotation; (0, 0, 0, 1) is straight ahead"
+            "the orientation is (0, 0, 0, 0), which is not a rotation; (0, 0, 0, 1) is straight ahead"
         )
     x, y, z, w = (value / length for value in (turn.x, turn.y, turn.z, turn.w))
     if x * x + y * y > 0.1:  # noqa: PLR2004 - upright by less than about 35 degrees

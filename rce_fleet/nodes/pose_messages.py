@@ -22,7 +22,7 @@ def read_pose_with_covariance(message: Message) -> tuple[Pose, NDArray[np.float6
     """Return the pose of a ``geometry_msgs/PoseWithCovariance`` and its covariance, shape (3, 3): x, y, yaw.
 
     Raises:
-        ValueError: A number is not finite, the orientation is no rotation about z, or a variance is negative.
+        ValueError: A number is not finite, the rotation is not about z, or a variance is negative.
     """
     pose = read_pose(message.pose)
     covariance = np.asarray(message.covariance, np.float64).reshape(6, 6)[PLANE]
