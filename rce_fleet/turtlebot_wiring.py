@@ -94,8 +94,11 @@ def offloaded_config(
     ]
     client = config["nodes"][0]
     client["args"] = " ".join(
-        f"move_base/{topic}:=/move_base/{topic}" for topic in ("goal", "cancel", "status", "result")
+        f"move_base/{topic}:=/move_base/{topic}"
+        for topic in ("goal", "cancel", "status", "result", "feedback")
     )
+    # What the container's nodes say does not show that the robot is there; its odometry does.
+    client["args"] += " _alive_topic:=/odom"
     config["nodes"] = [*(_node(container, node) for node in moved), client]
     config["interfaces"] = list(layer_interfaces(config["robotID"], namespace, container))
     config["bridges"] = list(_offload_bridges(container, namespace))

@@ -2,7 +2,8 @@
 
 An answer is a ``std_msgs/Int32MultiArray`` with three parts, one for each dimension: the list's cells; the
 last cell reached and the one driven to, -1 for none; and cells that the robot has found blocked. The label of
-the first is ``answer=17 driving``: the list's number and the move client's state. Lists have other labels. A
+the first is ``answer=17 driving``: the list's number and the move client's state. Lists have other labels.
+The label of the second tells of the robot: ``robot_age=0.2 pose=1.5,2.5,0.0``, each only if it is known. A
 fourth part, cells that the robot saw free again, is there only if there are such cells.
 """
 
@@ -12,12 +13,15 @@ from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rce_fleet.coordination.move_client import ClientReport, ClientState
+from rce_fleet.coordination.robot_signs import NO_SIGN, RobotPose, RobotSign
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _MARK = "answer="
 _NUMBER = "revision="
+_AGE = "robot_age="
+_POSE = "pose="
 _NONE = -1
 _PARTS = (3, 4)
 
@@ -30,6 +34,8 @@ class Answer(NamedTuple):
     """Cells that the robot has found blocked."""
     freed: tuple[int, ...] = ()
     """Cells that the robot has seen free again."""
+    sign: RobotSign = NO_SIGN
+    """What the move client last heard of the robot."""
 
 
 def is_answer(labels: Sequence[str]) -> bool:
@@ -43,7 +49,7 @@ def answer_array(answer: Answer) -> dict[str, Any]:
     progress = [_NONE if cell is None else cell for cell in (report.reached, report.target)]
     parts = {
         f"{_MARK}{report.revision} {report.state.value}": list(report.cells),
-        "reached and target": progress,
+        _sign_label(answer.sign): progress,
         "blocked": list(answer.blocked),
     }
     if answer.freed:
@@ -72,7 +78,33 @@ def read_answer(labels: Sequence[str], sizes: Sequence[int], data: Sequence[int]
     cells, progress, blocked, *rest = (tuple(data[begin:end]) for begin, end in pairwise(ends))
     reached, target = (None if cell == _NONE else cell for cell in progress)
     report = ClientReport(int(revision), ClientState(state), cells, reached, target)
-    return Answer(report, blocked, rest[0] if rest else ())
+    return Answer(report, blocked, rest[0] if rest else (), _read_sign(labels[1]))
+
+
+def _sign_label(sign: RobotSign) -> str:
+    words = ["reached and target"]
+    if sign.age is not None:
+        words.append(f"{_AGE}{sign.age!r}")
+    if sign.pose is not None:
+        words.append(_POSE + ",".join(map(repr, sign.pose)))
+    return " ".join(words)
+
+
+def _read_sign(label: str) -> RobotSign:
+    """Read what a label tells of the robot.
+
+    Raises:
+        ValueError: A number cannot be read.
+    """
+    age: float | None = None
+    pose: RobotPose | None = None
+    for word in label.split():
+        if word.startswith(_AGE):
+            age = float(word.removeprefix(_AGE))
+        elif word.startswith(_POSE):
+            x, y, yaw = map(float, word.removeprefix(_POSE).split(","))
+            pose = x, y, yaw
+    return RobotSign(age, pose)
 
 
 def numbered_array(cells: Sequence[int], revision: int) -> dict[str, Any]:

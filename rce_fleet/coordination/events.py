@@ -23,6 +23,14 @@ class PoseSeen:
 
 
 @dataclass(frozen=True, slots=True)
+class RobotHeard:
+    """A robot gave a sign of life ``age`` seconds ago, which is not a pose."""
+
+    robot: str
+    age: float
+
+
+@dataclass(frozen=True, slots=True)
 class ReportSeen:
     """A robot's move client reported its state."""
 
@@ -89,6 +97,7 @@ class Tick:
 
 Event = (
     PoseSeen
+    | RobotHeard
     | ReportSeen
     | ObstacleSeen
     | ObstacleGone

@@ -14,7 +14,7 @@ The cost of an event depends on what it changes: records that depend on other ro
 
 from __future__ import annotations
 
-from math import inf, isfinite
+from math import inf, isfinite, isnan
 from typing import TYPE_CHECKING, Any
 
 from rce_fleet.coordination.blocking import CellBlocking
@@ -32,6 +32,7 @@ from rce_fleet.coordination.events import (
     PoseSeen,
     Reply,
     ReportSeen,
+    RobotHeard,
     RobotRemoved,
     SendCancel,
     SendCells,
@@ -49,6 +50,8 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.changes import FleetChanges
     from rce_fleet.coordination.snapshot import FleetSnapshot
     from rce_fleet.planning.grid import GridMap
+
+NO_POSE = "it has sent no pose yet: its localization does not run, or has no map or scans"
 
 
 class FleetPlanner:
@@ -74,6 +77,7 @@ class FleetPlanner:
         self._now = 0.0
         self._handlers: dict[type, Callable[[Any], Reply | None]] = {
             PoseSeen: self._take_pose,
+            RobotHeard: self._take_sign,
             ReportSeen: self._take_report,
             ObstacleSeen: self._blocking.take_obstacle,
             ObstacleGone: self._blocking.take_gone,
@@ -134,12 +138,24 @@ class FleetPlanner:
             return
         record = self._record(event.robot)
         record.see(event.x, event.y, event.yaw, self._now, self.settings)
+        if record.reason == NO_POSE:
+            record.reason = "new"
+            self.state.touch(record)
         self._look_soon_if_silent(record)
         if record.phase is Phase.ACTIVE:
             self._follow(record)
             return
         if not self.state.ledger.length(record.id):
             self._watch_newcomer(record)
+        if record.phase is Phase.HOLDING:
+            self._dispatcher.to_settle.add(record.id)
+
+    def _take_sign(self, event: RobotHeard) -> None:
+        if self._gone(event.robot):
+            return
+        record = self._record(event.robot)
+        record.hear(self._now - max(event.age, 0.0))
+        self._look_soon_if_silent(record)
         if record.phase is Phase.HOLDING:
             self._dispatcher.to_settle.add(record.id)
 
@@ -238,6 +254,9 @@ class FleetPlanner:
                 self._dispatcher.hold(record, "it sends messages again")
         elif not heard:
             self._lose(record)
+        elif isnan(record.x) and record.reason != NO_POSE:
+            record.reason = NO_POSE
+            self.state.touch(record)
         elif record.phase is Phase.ACTIVE and self._stalled(record):
             self._dispatcher.hold(record, "it did not move")
         elif self._now - record.sent_at >= self.settings.repeat_after:
@@ -254,15 +273,19 @@ class FleetPlanner:
         sent = record.sent_at if self._is_unconfirmed(record) else self._now
         times = [
             max(sent, self._now - self.settings.repeat_after) + self.settings.repeat_after,
-            min(record.posed_at, record.reported_at) + self.settings.silence_timeout,
+            min(record.alive_at, record.reported_at) + self.settings.silence_timeout,
         ]
         if self._is_busy(record):
             times.append(max(record.still_since(), record.sent_at) + self.settings.stall_timeout)
         return min(times)
 
     def _lose(self, record: RobotRecord) -> None:
-        robot_first = record.posed_at < record.reported_at
-        reason = "the robot sends no poses" if robot_first else "its move client sends no reports"
+        robot_first = record.alive_at < record.reported_at
+        reason = (
+            "the robot sends neither poses nor states of its goals"
+            if robot_first
+            else "its move client sends no reports"
+        )
         self.state.change(record, Cause.LOST, reason)
         self.state.ledger.truncate(record.id)
         self._dispatcher.outdated = True
@@ -301,7 +324,7 @@ class FleetPlanner:
         record = self.state.robots.get(robot)
         if record is None:
             record = self.state.robots[robot] = RobotRecord(
-                robot, self._first_revision, posed_at=self._now, reported_at=self._now
+                robot, self._first_revision, alive_at=self._now, reported_at=self._now
             )
             self._deadlines.set(robot, self._now + self.settings.repeat_after)
             self._dispatcher.hold(record, "new")

@@ -23,7 +23,7 @@ class Phase(Enum):
     ACTIVE = "active"
     """It has a cell, takes part in plans and is granted cells."""
     SILENT = "silent"
-    """The robot or its move client sends no messages. It keeps its cells: it may stand in any of them."""
+    """It gives no sign of life, or its move client no report. It keeps its cells: it may stand in each."""
 
 
 class Cause(Enum):
@@ -68,7 +68,9 @@ class RobotRecord:
         revision: Number of the last list of cells sent.
         phase: Its phase.
         x, y, yaw: Last pose, metres and radians; not a number before the first.
-        posed_at: When the last pose came; at first, when the robot's first message came.
+        posed_at: When the last pose came.
+        alive_at: When the robot last gave a sign of life: a pose, or what its move client heard of it. At
+            first, when the robot's first message came.
         report: Last report of its move client.
         reported_at: When that came, likewise.
         obeyed_at: When its move client first reported to be at the end of the last list.
@@ -90,6 +92,7 @@ class RobotRecord:
     y: float = float("nan")
     yaw: float = float("nan")
     posed_at: float = -inf
+    alive_at: float = -inf
     report: ClientReport | None = None
     reported_at: float = -inf
     obeyed_at: float = inf
@@ -116,9 +119,13 @@ class RobotRecord:
 
     def see(self, x: float, y: float, yaw: float, now: float, settings: FleetSettings) -> None:
         """Update the pose."""
-        self.x, self.y, self.yaw, self.posed_at = x, y, yaw, now
+        self.x, self.y, self.yaw, self.posed_at, self.alive_at = x, y, yaw, now, now
         if hypot(x - self._anchor[0], y - self._anchor[1]) > settings.still_distance:
             self._anchor, self._anchored_at = (x, y), now
+
+    def hear(self, alive_at: float) -> None:
+        """Note a sign of life that is not a pose."""
+        self.alive_at = max(self.alive_at, alive_at)
 
     def still_since(self) -> float:
         """Since when the poses have stayed in one place."""
@@ -126,7 +133,7 @@ class RobotRecord:
 
     def heard(self, now: float, settings: FleetSettings) -> bool:
         """Return whether robot and move client sent messages recently."""
-        return now - min(self.posed_at, self.reported_at) <= settings.silence_timeout
+        return now - min(self.alive_at, self.reported_at) <= settings.silence_timeout
 
     def take(self, report: ClientReport, now: float) -> None:
         """Update the move client's report."""
@@ -143,6 +150,11 @@ class RobotRecord:
         return self.revision
 
     def stands(self, settings: FleetSettings) -> bool:
-        """Whether it was told to stand still, acknowledged it, and its poses stay in one place."""
-        still_for = self.posed_at - self._anchored_at
-        return still_for >= settings.settle_time and self.posed_at >= self.obeyed_at
+        """Whether it was told to stand still, acknowledged it, and its poses stay in one place.
+
+        A robot that sends poses shows that by them. Localization may send none while the robot stands; then
+        the robot must have lived so long without one that no pose of the drive before is still on its way.
+        """
+        if self.posed_at >= self.obeyed_at and self.posed_at - self._anchored_at >= settings.settle_time:
+            return True
+        return self.alive_at - max(self.obeyed_at, self._anchored_at) >= settings.pose_timeout

@@ -17,6 +17,8 @@ class FleetSettings:
         corridor: Maximum distance of a robot from its path.
         still_distance: A robot that stays within this distance stands still ...
         settle_time: ... after this time.
+        pose_timeout: A robot that was told to stand still, did so and sends no poses stands still after this
+            time: longer than a pose is on its way.
         ahead: Maximum number of granted cells beyond a robot's own.
         silence_timeout: A robot without messages for this time is silent.
         hold_timeout: The others wait this long for a robot that is stopping.
@@ -34,6 +36,7 @@ class FleetSettings:
     corridor: float = 0.25
     still_distance: float = 0.05
     settle_time: float = 0.35
+    pose_timeout: float = 1.0
     ahead: int = 4
     silence_timeout: float = 3.0
     hold_timeout: float = 6.0

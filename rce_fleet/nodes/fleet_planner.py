@@ -32,6 +32,7 @@ from rce_fleet.coordination.events import (
     PoseSeen,
     Reply,
     ReportSeen,
+    RobotHeard,
     RobotRemoved,
     SendCancel,
     SendCells,
@@ -39,6 +40,7 @@ from rce_fleet.coordination.events import (
 )
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.robot_signs import RobotSign
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.geometry.angles import yaw_of
 from rce_fleet.nodes.grid_messages import GRID_TOPIC, OLD_TOPIC, grid_fields, wants_old_topic
@@ -166,7 +168,7 @@ class PlannerNode:
         await self._node.subscribe(
             f"/{robot}/moveClient/status",
             "fleet/MoveStatus",
-            lambda message: self._take(ReportSeen(robot, _report(message))),
+            lambda message: self._take_report(robot, _report(message), _sign(message)),
         )
         await self._node.subscribe(
             f"/{robot}/blockedCells",
@@ -190,11 +192,19 @@ class PlannerNode:
         except ValueError as error:
             self._node.log.warning("%s: %s", robot, error)
             return
-        self._take(ReportSeen(robot, answer.report))
+        self._take_report(robot, answer.report, answer.sign)
         if answer.blocked:
             self._take(ObstacleSeen(robot, answer.blocked))
         if answer.freed:
             self._take(ObstacleGone(robot, answer.freed))
+
+    def _take_report(self, robot: str, report: ClientReport, sign: RobotSign) -> None:
+        """Handle a move client's report; what it heard of the robot comes first, because it is older."""
+        if sign.pose is not None:
+            self._take(PoseSeen(robot, *sign.pose))
+        if sign.age is not None:
+            self._take(RobotHeard(robot, sign.age))
+        self._take(ReportSeen(robot, report))
 
     async def _keep_time(self) -> None:
         while await self._node.sleep(TICK):
@@ -268,6 +278,14 @@ def _report(message: Message) -> ClientReport:
         reached=None if message.reached < 0 else message.reached,
         target=None if message.target < 0 else message.target,
     )
+
+
+def _sign(message: Message) -> RobotSign:
+    age = message.robot_age if message.robot_age >= 0 else None
+    if len(message.pose) != 3:  # noqa: PLR2004 - x, y and yaw
+        return RobotSign(age)
+    x, y, yaw = message.pose
+    return RobotSign(age, (x, y, yaw))
 
 
 async def read_fleet_parameters(node: Node) -> dict[str, Any]:

@@ -17,13 +17,15 @@ from rce.ros.xmlrpc import RpcClient
 from rce_fleet.coordination.answers import Answer, answer_array, is_answer, revision_of
 from rce_fleet.coordination.move_client import (
     ClientReport,
+    ClientState,
     GoalState,
     Instruction,
     MoveClient,
     SendGoal,
     SendStop,
 )
-from rce_fleet.geometry.angles import quaternion_z
+from rce_fleet.coordination.robot_signs import RobotSigns
+from rce_fleet.geometry.angles import quaternion_z, yaw_of
 from rce_fleet.nodes.grid_messages import GRID_TOPIC, LEAST_CELL, MAP_FRAME, OLD_TOPIC, read_grid
 from rce_fleet.nodes.grid_parameters import make_grid
 from rce_fleet.planning.grid import GridMap
@@ -56,6 +58,8 @@ class MoveClientNode:
         self._reports: Publisher
         self._answers = False
         self._hears_old = False
+        self._signs = RobotSigns()
+        self._alive_topic = ""
 
     async def run(self) -> None:
         """Send the robot along until the node is stopped."""
@@ -78,6 +82,12 @@ class MoveClientNode:
         await node.subscribe("cancelGoal", "std_msgs/Bool", self._take_cancel)
         await node.subscribe("move_base/status", "actionlib_msgs/GoalStatusArray", self._take_states)
         await node.subscribe("move_base/result", "move_base_msgs/MoveBaseActionResult", self._take_result)
+        await node.subscribe(
+            "move_base/feedback", "move_base_msgs/MoveBaseActionFeedback", self._take_feedback
+        )
+        self._alive_topic = str(values.get("alive_topic", ""))
+        if self._alive_topic:
+            await node.subscribe_serialized(self._alive_topic, "*", lambda _payload, _latched: self._hear())
         look_at = time.monotonic() + OLD_MAP_AFTER
         while await node.sleep(TICK):
             if self._client is None:
@@ -145,7 +155,12 @@ class MoveClientNode:
         if self._client is not None and message.data:
             self._do(self._client.cancel(self._node.time()))
 
+    def _hear(self) -> None:
+        self._signs.hear(time.monotonic())
+
     def _take_states(self, message: Message) -> None:
+        if not self._alive_topic:
+            self._hear()
         if self._client is not None:
             states = {entry.goal_id.id: GoalState(entry.status) for entry in message.status_list}
             self._do(self._client.take_goal_states(states, self._node.time()))
@@ -154,6 +169,15 @@ class MoveClientNode:
         if self._client is not None:
             status = message.status
             self._do(self._client.take_result(status.goal_id.id, GoalState(status.status), self._node.time()))
+
+    def _take_feedback(self, message: Message) -> None:
+        """Note where the robot is; planners need it where localization is silent."""
+        place = message.feedback.base_position
+        if place.header.frame_id.lstrip("/") != MAP_FRAME:
+            return  # a move_base that plans in another frame: its poses are not of the map
+        position, turn = place.pose.position, place.pose.orientation
+        yaw = yaw_of(turn.x, turn.y, turn.z, turn.w)
+        self._signs.take_pose(position.x, position.y, yaw, time.monotonic())
 
     # What goes out
 
@@ -190,8 +214,9 @@ class MoveClientNode:
         self, report: ClientReport, blocked: tuple[int, ...] = (), freed: tuple[int, ...] = ()
     ) -> None:
         self._reported_at = self._node.time()
+        sign = self._signs.sign(time.monotonic(), is_driving=report.state is ClientState.DRIVING)
         if self._answers:
-            self._reports.publish(answer_array(Answer(report, blocked, freed)))
+            self._reports.publish(answer_array(Answer(report, blocked, freed, sign)))
             return
         self._reports.publish(
             revision=report.revision,
@@ -199,6 +224,8 @@ class MoveClientNode:
             cells=list(report.cells),
             reached=-1 if report.reached is None else report.reached,
             target=-1 if report.target is None else report.target,
+            robot_age=-1.0 if sign.age is None else sign.age,
+            pose=[] if sign.pose is None else list(sign.pose),
         )
 
 

@@ -22,13 +22,22 @@ from rce_fleet.coordination.events import (
     PoseSeen,
     Reply,
     ReportSeen,
+    RobotHeard,
     RobotRemoved,
     SendCancel,
     SendCells,
     Tick,
 )
-from rce_fleet.coordination.move_client import ClientReport, GoalState, MoveClient, SendGoal, SendStop
+from rce_fleet.coordination.move_client import (
+    ClientReport,
+    ClientState,
+    GoalState,
+    MoveClient,
+    SendGoal,
+    SendStop,
+)
 from rce_fleet.coordination.replanning import compute_plan
+from rce_fleet.coordination.robot_signs import RobotSign, RobotSigns
 from rce_fleet.coordination.snapshot import FleetSnapshot, RobotSnapshot, RobotState
 
 if TYPE_CHECKING:
@@ -111,6 +120,8 @@ class SimulatedClients:
         seed: Draws what goes wrong.
         loss: Share of messages that get lost.
         plan_delays: How long plans take, in seconds of the fleet's time; one of them is drawn for each plan.
+        pose_step: Robots send a pose after each so many metres, as ROS's localization does, and none at rest;
+            0: always. Their navigation sends feedback then.
     """
 
     def __init__(
@@ -121,7 +132,11 @@ class SimulatedClients:
         *,
         loss: float = 0.1,
         plan_delays: tuple[float, ...] = (0.0,),
+        pose_step: float = 0.0,
     ) -> None:
+        self.pose_step = pose_step
+        self.posed: dict[str, tuple[float, float]] = {}
+        self.signs: dict[str, RobotSigns] = defaultdict(RobotSigns)
         self.rng = Random(seed)
         self.loss = loss
         self.plan_delays = plan_delays
@@ -230,7 +245,7 @@ class SimulatedClients:
                 self._post("result", robot.id, self._result, robot.id, goal_id, state)
             if robot.id in self.silent:
                 continue
-            self._post("pose", robot.id, self.tell, PoseSeen(robot.id, robot.x, robot.y, 0.0))
+            self._sense(robot)
             self._post("states", robot.id, self._goal_states, robot.id, dict(robot.goals))
             if robot.found:
                 self._post("obstacle", robot.id, self.tell, ObstacleSeen(robot.id, tuple(robot.found)))
@@ -238,6 +253,16 @@ class SimulatedClients:
             self._instruct(robot.id, [*client.tick(self.now), client.report])
         self.tell(Tick())
         self.check()
+
+    def _sense(self, robot: MakeBelieveRobot) -> None:
+        """Send what localization and navigation publish."""
+        x, y = self.posed.get(robot.id, (float("inf"), 0.0))
+        if hypot(robot.x - x, robot.y - y) >= self.pose_step:
+            self.posed[robot.id] = robot.x, robot.y
+            self._post("pose", robot.id, self.tell, PoseSeen(robot.id, robot.x, robot.y, 0.0))
+        if self.pose_step and self.clients[robot.id].report.target is not None:
+            signs = self.signs[robot.id]
+            self._post("feedback", robot.id, signs.take_pose, robot.x, robot.y, 0.0, self.now)
 
     def check(self) -> None:
         self.planner.validate()
@@ -313,6 +338,7 @@ class SimulatedClients:
         self._instruct(robot, self.clients[robot].take_result(goal_id, state, self.now))
 
     def _goal_states(self, robot: str, states: dict[str, GoalState]) -> None:
+        self.signs[robot].hear(self.now)
         self._instruct(robot, self.clients[robot].take_goal_states(states, self.now))
 
     def _instruct(self, robot: str, instructions: Iterable[SendGoal | SendStop | ClientReport]) -> None:
@@ -323,7 +349,16 @@ class SimulatedClients:
                 case SendStop():
                     self._post("stop", robot, self.robots[robot].take_stop, instruction)
                 case ClientReport():
-                    self._post("report", robot, self.tell, ReportSeen(robot, instruction))
+                    is_driving = instruction.state is ClientState.DRIVING
+                    sign = self.signs[robot].sign(self.now, is_driving=is_driving)
+                    self._post("report", robot, self._report, robot, instruction, sign)
+
+    def _report(self, robot: str, report: ClientReport, sign: RobotSign) -> None:
+        if sign.pose is not None:
+            self.tell(PoseSeen(robot, *sign.pose))
+        if sign.age is not None:
+            self.tell(RobotHeard(robot, sign.age))
+        self.tell(ReportSeen(robot, report))
 
 
 def without_poses(snapshot: FleetSnapshot) -> FleetSnapshot:

@@ -16,6 +16,7 @@ from rce_fleet.coordination.answers import (
     revision_of,
 )
 from rce_fleet.coordination.move_client import ClientReport, ClientState
+from rce_fleet.coordination.robot_signs import RobotSign
 from rce_fleet.nodes.grid_parameters import make_grid
 
 CELLS = st.lists(st.integers(0, 2**31 - 1), max_size=5).map(tuple)
@@ -26,14 +27,18 @@ REPORTS = st.builds(
 ARRAY = TypeRegistry().message("std_msgs/Int32MultiArray")
 
 
-@given(report=REPORTS, blocked=CELLS)
-def test_encoded_answer_is_decoded(report: ClientReport, blocked: tuple[int, ...]) -> None:
-    message = ARRAY.deserialize(ARRAY.serialize(answer_array(Answer(report, blocked))))
+NUMBERS = st.floats(-1e9, 1e9)
+SIGNS = st.builds(RobotSign, st.none() | st.floats(0, 1e9), st.none() | st.tuples(NUMBERS, NUMBERS, NUMBERS))
+
+
+@given(report=REPORTS, blocked=CELLS, sign=SIGNS)
+def test_encoded_answer_is_decoded(report: ClientReport, blocked: tuple[int, ...], sign: RobotSign) -> None:
+    message = ARRAY.deserialize(ARRAY.serialize(answer_array(Answer(report, blocked, (), sign))))
     labels = [dimension.label for dimension in message.layout.dim]
     assert is_answer(labels)
     assert revision_of(labels) is None
     read = read_answer(labels, [dimension.size for dimension in message.layout.dim], message.data)
-    assert read == Answer(report, blocked)
+    assert read == Answer(report, blocked, (), sign)
 
 
 def test_cell_lists_are_not_answers() -> None:
@@ -50,10 +55,12 @@ def test_cell_lists_are_not_answers() -> None:
         (["answer=3 driving", "", ""], [1, 3, 0], [5, 1, 1, 1]),
         (["answer=x driving", "", ""], [1, 2, 0], [5, 1, 1]),
         (["answer=3 flying", "", ""], [1, 2, 0], [5, 1, 1]),
+        (["answer=3 driving", "robot_age=long", ""], [1, 2, 0], [5, 1, 1]),
+        (["answer=3 driving", "pose=1,2", ""], [1, 2, 0], [5, 1, 1]),
     ],
 )
 def test_answer_of_another_form_is_refused(labels: list[str], sizes: list[int], data: list[int]) -> None:
-    with pytest.raises(ValueError, match=r"answer|invalid literal|ClientState"):
+    with pytest.raises(ValueError, match=r"answer|invalid literal|ClientState|convert|unpack"):
         read_answer(labels, sizes, data)
 
 

@@ -175,7 +175,7 @@ def test_silent_robot_keeps_its_cells_others_drive_around(make: Make) -> None:
     fleet = make(GridMap(3, 5), [7, 5])
     fleet.silent = {"Robot1"}
     fleet.run(lambda: robot(fleet).state is RobotState.SILENT)
-    assert "sends no poses" in robot(fleet).reason
+    assert "sends neither poses nor states" in robot(fleet).reason
     fleet.ask(GoalSet("Robot2", 9))
     fleet.run(lambda: robot(fleet, 2).state is RobotState.ARRIVED)
     assert robot(fleet).granted == (7,)
