@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterator
 from enum import Enum
 from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import griffe
@@ -143,6 +145,6 @@ def meaning(member: Enum) -> str:
 
 @cache
 def _module(name: str) -> griffe.Module:
-    module = griffe.load(name, resolve_aliases=False)
-    assert isinstance(module, griffe.Module)
-    return module
+    """Read one module; ``griffe.load`` would read its whole package."""
+    path = Path(str(sys.modules[name].__file__))
+    return griffe.visit(name.rpartition(".")[2], filepath=path, code=path.read_text(encoding="utf-8"))

@@ -16,7 +16,7 @@ _DISTRIBUTION = re.compile(
     r"[A-Za-z0-9][A-Za-z0-9._-]*+\s*+(?:\[[A-Za-z0-9._,\s-]*+\])?+\s*+(?:[(<>=!~][0-9A-Za-z.*+!<>=~,()\s-]*+)?"
 )
 _MARKER = re.compile(r"[A-Za-z0-9_.'\"<>=!~,()\s-]*+")
-_HASH_OPTION = re.compile(r"\s+--hash=")
+_HASH_OPTION = re.compile(r"\s--hash=")
 _HASH = re.compile(r"sha(?:256|384|512):[0-9a-f]+")
 _COMMENT = re.compile(r"(?:^|\s)#.*$")
 _SHOWN = 80

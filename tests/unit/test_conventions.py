@@ -8,8 +8,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
-PACKAGES = ("rce", "rce_client", "rce_container", "rce_fleet", "rce_master", "rce_robot")
+from support.sources import PACKAGES, ROOT, files, statements, text_of
+
 _BUILT_IN = frozenset(
     name
     for name, value in vars(builtins).items()
@@ -42,15 +42,15 @@ TINY = {
 _RULER = re.compile(r"^\s*#\s*[-=~]{2,}|^\s*#.*[-=~]{4,}\s*$", re.MULTILINE)
 
 
-def files() -> Iterator[Path]:
+def modules() -> Iterator[Path]:
     for package in PACKAGES:
-        yield from (ROOT / package).rglob("*.py")
+        yield from files(package)
 
 
 def classes() -> Iterator[tuple[str, set[str]]]:
     """Names of all classes, with the names of their bases."""
-    for file in files():
-        for node in ast.walk(ast.parse(file.read_text())):
+    for file in modules():
+        for node in statements(file):
             if isinstance(node, ast.ClassDef):
                 yield node.name, {ast.unparse(base).rpartition(".")[2] for base in node.bases}
 
@@ -72,15 +72,15 @@ def test_exceptions_end_in_error() -> None:
 def test_a_module_has_one_logger_of_one_name() -> None:
     wrong = [
         f"{file.relative_to(ROOT)}: {line}"
-        for file in files()
-        for line in file.read_text().splitlines()
+        for file in modules()
+        for line in text_of(file).splitlines()
         if re.search(r"^\w+ = logging.getLogger\(__name__\)", line) and not line.startswith("_log = ")
     ]
     assert wrong == []
 
 
 def test_sections_have_plain_headings() -> None:
-    ruled = [str(file.relative_to(ROOT)) for file in files() if _RULER.search(file.read_text())]
+    ruled = [str(file.relative_to(ROOT)) for file in modules() if _RULER.search(text_of(file))]
     assert ruled == []
 
 
@@ -88,7 +88,7 @@ def test_a_tiny_module_has_a_reason() -> None:
     """Two files that are one thought are one file; the others are listed in ``TINY``."""
     tiny = {
         file.relative_to(ROOT).as_posix()
-        for file in files()
-        if not file.name.startswith("__") and len(file.read_text().splitlines()) < MIN_LINES
+        for file in modules()
+        if not file.name.startswith("__") and len(text_of(file).splitlines()) < MIN_LINES
     }
     assert sorted(tiny ^ TINY.keys()) == []

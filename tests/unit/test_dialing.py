@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
-from pathlib import Path
 
-import rce
+from support.sources import ROOT, files, text_of
 
-ROOT = Path(rce.__file__).parents[1]
 CALLS = ("create_connection", "open_connection", "connect")
 
 
 def connecting_calls() -> Iterator[tuple[str, ast.Call]]:
     """Yield all calls in the packages that connect by TCP, with where they are."""
     for package in ("rce", "rce_master", "rce_robot", "rce_container", "rce_client"):
-        for file in sorted((ROOT / package).rglob("*.py")):
-            tree = ast.parse(file.read_text())
-            takes_sockets = "from websockets" in file.read_text()
-            for node in ast.walk(tree):
+        for file in files(package):
+            text = text_of(file)
+            if not any(f"{call}(" in text for call in CALLS):
+                continue
+            takes_sockets = "from websockets" in text
+            for node in ast.walk(ast.parse(text)):
                 if not isinstance(node, ast.Call):
                     continue
                 called = (

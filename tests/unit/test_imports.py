@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
-PACKAGES = ("rce", "rce_client", "rce_container", "rce_fleet", "rce_master", "rce_robot")
+from support.sources import PACKAGES, ROOT, files, statements
+
 _ROW = re.compile(r"^\| `(rce[\w.]*)` \|.*\| ([^|]*) \|$", re.MULTILINE)
 
 
@@ -28,7 +28,7 @@ def is_in(module: str, package: str) -> bool:
 def imports(file: Path) -> list[tuple[int, str]]:
     """Lines and modules of the project that a file imports, also inside of functions and for types only."""
     found = []
-    for node in ast.walk(ast.parse(file.read_text())):
+    for node in statements(file):
         match node:
             case ast.Import():
                 names = [alias.name for alias in node.names]
@@ -48,7 +48,7 @@ def is_module(name: str) -> bool:
 
 def modules() -> Iterator[tuple[Path, str]]:
     for package in PACKAGES:
-        for file in sorted((ROOT / package).rglob("*.py")):
+        for file in files(package):
             name = ".".join(file.relative_to(ROOT).with_suffix("").parts)
             yield file, name.removesuffix(".__init__")
 
