@@ -39,6 +39,8 @@ UP = (
 """What an off-loaded robot sends to its container."""
 DOWN = (("/raw_cmd_vel", "geometry_msgs/Twist"),)
 """What it gets: velocities, for the safety stage before the wheels."""
+LAST_POSE_TIMEOUT = 30.0
+"""Seconds that a new container waits for the robot to say where it is."""
 _CELLS = "std_msgs/Int32MultiArray"
 _STATE = ("/fleet/state", "fleet/FleetState")
 _GRID = ("/fleet/map", "nav_msgs/OccupancyGrid")
@@ -92,6 +94,9 @@ def offloaded_config(
         for name, value in everything.parameters.items()
         if name.startswith(tuple(names))
     ]
+    config["parameters"].append(
+        {"cTag": container, "name": "/amcl/last_pose_timeout", "value": LAST_POSE_TIMEOUT}
+    )
     client = config["nodes"][0]
     client["args"] = " ".join(
         f"move_base/{topic}:=/move_base/{topic}"
@@ -131,7 +136,10 @@ def _offload_bridges(container: str, namespace: str) -> Iterator[dict[str, Any]]
     for name, kind in DOWN:
         yield _topic(name, kind, container, "robot")
     pose = "geometry_msgs/PoseWithCovarianceStamped"
-    for name, kind in (("amcl_pose", pose), ("blockedCells", _CELLS), ("freedCells", _CELLS)):
+    # The robot keeps its pose for the next `amcl`, if this container is made again.
+    yield _topic("/amcl_pose", pose, container, [f"{planner}:/{namespace}/amcl_pose", "robot"])
+    yield {"service": "/last_pose", "type": "fleet/GetLastPose", "server": "robot", "clients": container}
+    for name, kind in (("blockedCells", _CELLS), ("freedCells", _CELLS)):
         yield _topic(f"/{name}", kind, container, f"{planner}:/{namespace}/{name}")
     yield _topic(f"/{namespace}/moveClient/status", "fleet/MoveStatus", container, planner)
     yield _topic(f"/{namespace}/goalNodesList", _CELLS, planner, container)
@@ -140,5 +148,5 @@ def _offload_bridges(container: str, namespace: str) -> Iterator[dict[str, Any]]
         yield _topic(name, kind, planner, container)
 
 
-def _topic(name: str, kind: str, source: str, target: str) -> dict[str, Any]:
+def _topic(name: str, kind: str, source: str, target: str | list[str]) -> dict[str, Any]:
     return {"topic": name, "type": kind, "from": source, "to": target}

@@ -31,6 +31,7 @@ from rce_fleet.nodes.diagnostics import Diagnostics
 from rce_fleet.nodes.map_messages import read_scan
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import pose_fields, read_map
+from rce_fleet.nodes.pose_keeper import ask_for_last_pose
 from rce_fleet.nodes.pose_messages import pose_with_covariance_fields, read_pose_with_covariance
 from rce_fleet.nodes.throttled_log import ThrottledLog
 
@@ -99,6 +100,8 @@ class AmclNode:
             await node.subscribe(
                 "initialpose", "geometry_msgs/PoseWithCovarianceStamped", self._take_initial_pose
             )
+            if parameters.last_pose_timeout > 0:
+                await self._ask_for_last_pose()
             tasks = await stack.enter_async_context(asyncio.TaskGroup())
             asking = None
             if parameters.use_map_topic:
@@ -112,6 +115,22 @@ class AmclNode:
             for task in (asking, saving):
                 if task is not None:
                     task.cancel()
+
+    # The start
+
+    async def _ask_for_last_pose(self) -> None:
+        """Begin where the robot was localized before this node was started again, if that is known."""
+
+        def waits(fault: str) -> bool:
+            self._fault = fault
+            self._throttled_log.warn("last pose", fault)
+            self._report()
+            return self._start is None  # else an initial pose came meanwhile
+
+        found = await ask_for_last_pose(self._node, self._parameters.last_pose_timeout, waits)
+        if found is not None and self._start is None:
+            self._start_at(found)
+        self._fault = ""
 
     # The map
 

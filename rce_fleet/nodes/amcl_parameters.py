@@ -28,6 +28,8 @@ class AmclNodeParameters(AmclParameters):
         tf_broadcast: Whether ``map`` -> ``odom`` is published.
         use_map_topic: Take the map from the topic ``map`` instead of the service ``static_map``.
         first_map_only: Ignore all maps on the topic but the first.
+        last_pose_timeout: How long the node waits at its start for the service ``last_pose`` of the node
+            ``pose_keeper``, which knows where the robot was localized before, seconds; 0: not at all.
         save_pose_rate: How often the pose is stored in the parameters ``initial_pose_*``, 1/s; not positive:
             never.
         std_warn_level_x: Standard deviation from which ``/diagnostics`` warns, metres.
@@ -44,6 +46,7 @@ class AmclNodeParameters(AmclParameters):
     tf_broadcast: bool = True
     use_map_topic: bool = False
     first_map_only: bool = False
+    last_pose_timeout: float = field(default=0.0, metadata={"minimum": 0.0})
     save_pose_rate: float = 0.5
     std_warn_level_x: float = field(default=0.2, metadata={"above": 0.0})
     std_warn_level_y: float = field(default=0.2, metadata={"above": 0.0})

@@ -24,7 +24,7 @@ from rce_fleet.nodes.amcl import AmclNode
 from rce_fleet.nodes.amcl_parameters import AmclNodeParameters
 from rce_fleet.nodes.map_messages import map_fields
 from rce_fleet.nodes.planar import pose_fields, pose_of
-from rce_fleet.nodes.pose_messages import read_pose_with_covariance
+from rce_fleet.nodes.pose_messages import pose_with_covariance_fields, read_pose_with_covariance
 
 PATIENCE = 60.0
 START = Pose(1.0, 1.0, 0.3)
@@ -263,3 +263,30 @@ async def test_without_a_map_the_state_says_so() -> None:
     async with world(with_map=False) as here:
         await here.says("waiting for the map: service static_map")
         await here.until(lambda: (2, "waits for the map") in here.states)
+
+
+async def test_last_pose_of_the_robot_counts_before_parameters() -> None:
+    far = replace(SETTINGS, initial_pose_x=4.0, initial_pose_y=3.0, last_pose_timeout=1e6)
+    async with AsyncExitStack() as stack:
+        core = await stack.enter_async_context(Core(port=0))
+        keeper, judge = [
+            await stack.enter_async_context(Node(name, argv=[], master_uri=core.uri))
+            for name in ("keeper", "judge")
+        ]
+        pose = pose_with_covariance_fields(START, np.diag((0.02, 0.02, 0.02)))
+        answer = {"known": True, "pose": {"header": {"frame_id": "map"}, "pose": pose}}
+        await keeper.advertise_service("last_pose", "fleet/GetLastPose", lambda _: answer)
+        robot = Robot(keeper, START)
+        here = World(core, judge, robot)
+        await here.listen(stack)
+        fields = map_fields(hall(), "map", Time(1, 0))
+        await keeper.advertise_service("static_map", "nav_msgs/GetMap", lambda _: {"map": fields})
+        await robot.start(stack)
+        amcl = await stack.enter_async_context(Node("amcl", argv=[], master_uri=core.uri))
+        running = asyncio.create_task(AmclNode(amcl, far, seed=1).run())
+        await here.says("initial pose (1.000, 1.000, 0.300)")
+        await here.says("map of 100 x 80 cells")
+        await here.until(lambda: robot._scans.connections)
+        assert here.error(await here.drive(2))[0] < 0.2
+        amcl.shutdown("the test is over")
+        await running

@@ -1,0 +1,205 @@
+"""Keeps a robot's pose while its localization is away. Runs on a robot whose ``amcl`` runs in its container.
+
+It subscribes to ``amcl_pose`` and to the odometry on tf, and answers the service ``last_pose``: the last pose
+on the map, moved on by odometry. An ``amcl`` that was started again asks for it (``~last_pose_timeout``) and
+so begins where the robot is, not where it was in the morning.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, field
+from math import hypot
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rce.ros.errors import RosError
+from rce.ros.node import Node, run
+from rce.ros.tf import TransformError, TransformListener
+from rce_fleet.geometry.poses import Pose
+from rce_fleet.localization.jumps import OdometryWatch
+from rce_fleet.nodes.parameters import read_parameters
+from rce_fleet.nodes.planar import pose_of
+from rce_fleet.nodes.pose_messages import pose_with_covariance_fields, read_pose_with_covariance
+from rce_fleet.nodes.throttled_log import ThrottledLog
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from rce.ros.types import Message, Time
+
+SERVICE, TYPE = "last_pose", "fleet/GetLastPose"
+ANSWER_TIMEOUT = 2.0
+"""Seconds for an answer, until the question is asked again."""
+RETRY = 0.5
+"""Seconds between two questions."""
+WATCH_EVERY = 0.2
+"""Seconds between two looks at the odometry."""
+TRANSFORM_TIMEOUT = 0.5
+"""Seconds that a pose waits for the odometry of its time."""
+
+
+@dataclass(frozen=True)
+class PoseKeeperParameters:
+    """Parameters of the node.
+
+    Attributes:
+        odom_frame_id: Frame of the odometry.
+        base_frame_id: Frame of the robot's base.
+        odom_error: Error of the odometry, as a share of the way; widens the pose that is answered.
+        least_error: Standard deviation of the answered pose at least, metres and radians.
+    """
+
+    odom_frame_id: str = "odom"
+    base_frame_id: str = "base_link"
+    odom_error: float = field(default=0.2, metadata={"minimum": 0.0})
+    least_error: float = field(default=0.05, metadata={"above": 0.0})
+
+
+@dataclass(frozen=True, slots=True)
+class KeptPose:
+    """A pose on the map and the odometry of the same moment.
+
+    Attributes:
+        frame: Frame of the map.
+        pose: On the map.
+        covariance: Of the pose, shape (3, 3): x, y, yaw.
+        odometry: Pose by odometry.
+    """
+
+    frame: str
+    pose: Pose
+    covariance: NDArray[np.float64]
+    odometry: Pose
+
+    def moved_on(self, odometry: Pose, share: float, least: float) -> tuple[Pose, NDArray[np.float64]]:
+        """Return the pose on the map, and its covariance, for a later pose by odometry.
+
+        Args:
+            odometry: The later pose by odometry.
+            share: Standard deviation that is added, as a share of the distance.
+            least: Standard deviation that is added in any case, metres and radians.
+        """
+        moved = odometry.relative_to(self.odometry)
+        added = least + share * hypot(moved.x, moved.y)
+        return self.pose.compose(moved), self.covariance + np.diag((added**2,) * 3)
+
+
+class PoseKeeper:
+    """The last pose of a robot, in its ROS graph.
+
+    Args:
+        node: A running node.
+        parameters: Its parameters.
+    """
+
+    def __init__(self, node: Node, parameters: PoseKeeperParameters) -> None:
+        self._node = node
+        self._parameters = parameters
+        self._throttled_log = ThrottledLog(node)
+        self._watch = OdometryWatch()
+        self._odometry: Pose | None = None
+        self._kept: KeptPose | None = None
+        self._tf: TransformListener
+
+    async def run(self) -> None:
+        """Keep the pose until the node is stopped."""
+        node = self._node
+        async with AsyncExitStack() as stack:
+            self._tf = await stack.enter_async_context(TransformListener(node, prefix=""))
+            await node.subscribe(
+                "amcl_pose", "geometry_msgs/PoseWithCovarianceStamped", self._take, queue_size=1
+            )
+            await node.advertise_service(SERVICE, TYPE, self._answer)
+            while await node.sleep(WATCH_EVERY):
+                self._look()
+
+    async def _take(self, message: Message) -> None:
+        """Keep a pose of the localization, with the odometry of its time."""
+        try:
+            pose, covariance = read_pose_with_covariance(message.pose)
+            odometry = await self._odometry_at(message.header.stamp)
+        except (ValueError, TransformError) as error:
+            self._throttled_log.warn("pose", f"a pose is not kept: {error}")
+            return
+        self._kept = KeptPose(message.header.frame_id, pose, covariance, odometry)
+
+    async def _odometry_at(self, stamp: Time) -> Pose:
+        names = self._parameters
+        found = await self._tf.wait_for(
+            names.odom_frame_id, names.base_frame_id, stamp, timeout=TRANSFORM_TIMEOUT
+        )
+        return pose_of(found.transform)
+
+    def _look(self) -> None:
+        """Note the odometry; when it jumped, the robot did not."""
+        names = self._parameters
+        try:
+            found = self._tf.lookup(names.odom_frame_id, names.base_frame_id)
+        except TransformError:
+            return
+        odometry, before = pose_of(found.transform), self._odometry
+        jump = self._watch.check(odometry, self._node.time())
+        if jump and self._kept is not None and before is not None:
+            self._throttled_log.warn("odometry", f"{jump}; the pose before it is kept")
+            pose, covariance = self._kept.moved_on(before, self._parameters.odom_error, 0.0)
+            self._kept = KeptPose(self._kept.frame, pose, covariance, odometry)
+        self._odometry = odometry
+
+    def _answer(self, _request: Message) -> dict[str, Any]:
+        self._look()
+        if self._kept is None or self._odometry is None:
+            return {"known": False}
+        limits = self._parameters
+        pose, covariance = self._kept.moved_on(self._odometry, limits.odom_error, limits.least_error)
+        self._node.log.info("the localization asks: the robot is at (%.2f, %.2f)", pose.x, pose.y)
+        return {
+            "known": True,
+            "pose": {
+                "header": {"stamp": self._node.now(), "frame_id": self._kept.frame},
+                "pose": pose_with_covariance_fields(pose, covariance),
+            },
+        }
+
+
+async def ask_for_last_pose(node: Node, timeout: float, waits: Callable[[str], bool]) -> Message | None:
+    """Return where the robot was localized before this node was started again; None if that is not known.
+
+    Args:
+        node: The node that localizes the robot.
+        timeout: Seconds to wait for the robot, which may be cut off from the cloud.
+        waits: Called with the reason whenever the robot did not answer; returns whether to ask again.
+
+    Returns:
+        A ``geometry_msgs/PoseWithCovarianceStamped``.
+    """
+    client = node.service_client(SERVICE, TYPE)
+    late = time.monotonic() + timeout
+    try:
+        while True:
+            try:
+                answer = await client.call({}, timeout=ANSWER_TIMEOUT)
+            except RosError as error:
+                if not waits(f"waiting for the robot's last pose: service {node.resolve(SERVICE)}: {error}"):
+                    return None
+                if time.monotonic() < late and await node.sleep(RETRY):
+                    continue
+                node.log.warning("no last pose in time: the initial pose of the parameters is used")
+                return None
+            return answer.pose if answer.known else None
+    finally:
+        await client.close()
+
+
+async def main() -> None:
+    """Run the node until it is stopped."""
+    async with Node("pose_keeper") as node:
+        await PoseKeeper(node, await read_parameters(node, PoseKeeperParameters)).run()
+
+
+if __name__ == "__main__":
+    run(main())
