@@ -28,6 +28,7 @@ from rce_fleet.coordination.robot_signs import RobotSigns
 from rce_fleet.geometry.angles import quaternion_z, yaw_of
 from rce_fleet.nodes.grid_messages import GRID_TOPIC, LEAST_CELL, MAP_FRAME, OLD_TOPIC, read_grid
 from rce_fleet.nodes.grid_parameters import make_grid
+from rce_fleet.nodes.throttled_log import ThrottledLog
 from rce_fleet.planning.grid import GridMap
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ class MoveClientNode:
         self._answers = False
         self._hears_old = False
         self._signs = RobotSigns()
+        self._throttled_log = ThrottledLog(node)
         self._alive_topic = ""
 
     async def run(self) -> None:
@@ -163,7 +165,19 @@ class MoveClientNode:
             self._hear()
         if self._client is not None:
             states = {entry.goal_id.id: GoalState(entry.status) for entry in message.status_list}
+            if self._client.report.state is ClientState.CANCELLING:
+                self._warn_of_others(self._client, states)
             self._do(self._client.take_goal_states(states, self._node.time()))
+
+    def _warn_of_others(self, client: MoveClient, states: dict[str, GoalState]) -> None:
+        """Tell people why their goal ends, who sent it past the planner."""
+        for goal, state in states.items():
+            if not state.over and not goal.startswith(f"{client.name}-"):
+                self._throttled_log.warn(
+                    "goal",
+                    f"the goal {goal!r} is cancelled: robots of a fleet enter only cells that the planner"
+                    " granted; set goals on the fleet's page",
+                )
 
     def _take_result(self, message: Message) -> None:
         if self._client is not None:

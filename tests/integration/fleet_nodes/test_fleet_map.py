@@ -79,3 +79,28 @@ async def test_a_move_client_takes_an_old_grid(resolution: float, monkeypatch: p
             assert client._client.grid == GridMap(3, 4, 0.5, (1.0, 2.0), yaw=client._client.grid.yaw)
             node.shutdown("the test is over")
             await task
+
+
+async def test_move_client_warns_of_goals_past_the_planner() -> None:
+    """A goal that a person gave in rviz is cancelled when the move client starts, and it says why."""
+    async with Core(port=0) as core, Node("rviz", argv=[], master_uri=core.uri) as rviz:
+        grids = await rviz.advertise("/fleet/map", TYPE, latch=True)
+        grids.publish(grid_fields(GRID, (), rviz.now()))
+        logs = await rviz.subscribe("/rosout", "rosgraph_msgs/Log")
+        stops = await rviz.subscribe("/Robot1/move_base/cancel", "actionlib_msgs/GoalID")
+        states = await rviz.advertise("/Robot1/move_base/status", "actionlib_msgs/GoalStatusArray")
+
+        async def publish_states() -> None:
+            goals = [{"goal_id": {"id": name}, "status": 1} for name in ("/rviz-1", "Robot1-5.0-1")]
+            while await rviz.sleep(0.1):
+                states.publish(status_list=goals)
+
+        async with Node("move_client", namespace="Robot1", argv=[], master_uri=core.uri) as node:
+            tasks = [asyncio.create_task(MoveClientNode(node).run()), asyncio.create_task(publish_states())]
+            async with asyncio.timeout(PATIENCE):
+                found = await anext(line.msg async for line in logs if "is cancelled" in line.msg)
+                await anext(aiter(stops))
+            assert "the goal '/rviz-1' is cancelled: robots of a fleet enter only cells" in found
+            node.shutdown("the test is over")
+            await tasks[0]
+            tasks[1].cancel()

@@ -61,8 +61,8 @@ def test_robots_at_one_master_have_namespaces() -> None:
     assert dict(second.nodes[1].remappings)["static_map"] == "/static_map"
 
 
-def test_an_offloaded_robot_keeps_safety_only() -> None:
-    assert names(plan(offload="true")) == ["/velocity_limiter"]
+def test_an_offloaded_robot_keeps_safety_and_its_pose() -> None:
+    assert names(plan(offload="true")) == ["/velocity_limiter", "/pose_keeper"]
 
 
 @pytest.mark.parametrize("tf_prefix", ["", "Robot1"])
