@@ -10,6 +10,7 @@ import socket
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rce.aio.servers import close_servers
 from rce.aio.tasks import BackgroundTasks
 from rce.dialing import open_socket
 from rce.guard.lobby import Lobby, address_of
@@ -156,8 +157,7 @@ class LinkHub:
     async def close(self) -> None:
         """Stop listening and end every link. No socket and no socket file is left."""
         self._closed = True
-        for server in self._servers:
-            server.close()
+        await close_servers(self._servers)
         for path, inode in self._unix_sockets.items():
             unlink_own(path, inode)
         for acceptor in self._doormen:

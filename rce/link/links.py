@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
+from msgspec.structs import replace
+
 from rce.link.carrier import LocalCarrier
 from rce.link.exceptions import LinkError
 from rce.link.link import Link, add_traffic
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rce.aio.tasks import BackgroundTasks
-    from rce.control.model import LinkSpec
+    from rce.control.model import LinkAddress, LinkSpec
     from rce.link.carrier import Carrier
     from rce.link.hub import LinkHub
     from rce.model import EndpointId
@@ -105,9 +107,9 @@ class EndpointLinks:
             else:
                 self._hub.register(link)
         elif link.spec != spec:
-            moved = spec.dial and link.spec.address != spec.address
+            redial = spec.dial and _must_redial(link, spec.address)
             link.spec = spec
-            if moved and (link.carrier is None or link.carrier.kind != "local"):
+            if redial:
                 self._stop_dialing(link)
                 link.detach()
                 self._dial(link)
@@ -152,6 +154,18 @@ async def _keep_dialed(link: Link, hub: LinkHub) -> None:
         if hub.loop.time() - since > _LONG_ENOUGH:
             pauses.reset()
         await hub.wait_registered(link.spec.id, pauses.next())
+
+
+def _must_redial(link: Link, address: LinkAddress) -> bool:
+    """Return whether a link must be dialed at a new address now.
+
+    A connection by TCP continues when only the path of the peer's unix socket changed: a process that
+    ended took its connections with it, so this one was made with its successor, before the path was known.
+    """
+    former, carrier = link.spec.address, link.carrier
+    if former == address or (carrier is not None and carrier.kind == "local"):
+        return False
+    return carrier is None or carrier.kind != "tcp" or replace(former, unix=address.unix) != address
 
 
 def _loop_back(link: Link) -> Link:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Iterable
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 from rce.ros.errors import MasterError
 
@@ -26,20 +25,45 @@ class Closable(Protocol):
         """Close now."""
 
 
-async def close_all(connections: Iterable[Closable]) -> None:
-    """Close connections and wait until their sockets are closed; abort those that take too long."""
-    pending = list(connections)
-    for connection in pending:
-        connection.close()
-    try:
-        async with asyncio.timeout(CLOSE_TIMEOUT):
+C = TypeVar("C", bound=Closable)
+
+
+class OpenConnections(Generic[C]):
+    """The open connections of one server."""
+
+    def __init__(self) -> None:
+        self._connections: set[C] = set()
+        self._closed = False
+
+    def __len__(self) -> int:
+        return len(self._connections)
+
+    def add(self, connection: C) -> None:
+        """Note an open connection; abort it if the server closed while the connection was accepted."""
+        if self._closed:
+            connection.abort()
+        else:
+            self._connections.add(connection)
+
+    def discard(self, connection: C) -> None:
+        """Forget a connection whose socket is closed."""
+        self._connections.discard(connection)
+
+    async def close(self) -> None:
+        """Close all and wait until their sockets are closed; abort those that take too long."""
+        self._closed = True
+        pending = list(self._connections)
+        for connection in pending:
+            connection.close()
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                for connection in pending:
+                    await connection.gone.wait()
+        except TimeoutError:
+            for connection in pending:
+                connection.abort()
             for connection in pending:
                 await connection.gone.wait()
-    except TimeoutError:
-        for connection in pending:
-            connection.abort()
-        for connection in pending:
-            await connection.gone.wait()
 
 
 _log = logging.getLogger(__name__)

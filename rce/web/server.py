@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Self, cast
 from aiohttp import web
 from yarl import URL
 
+from rce.aio.servers import close_servers
 from rce.guard.lobby import Guest, Lobby, address_of
 from rce.guard.plain import PlainPort
 from rce.tls.gate import TlsGate
@@ -98,7 +99,7 @@ class HttpServer:
 
     async def __aexit__(self, *_: object) -> None:
         assert self._server is not None
-        self._server.close()
+        await close_servers([self._server])
         if self._gate is not None:
             await self._gate.close()
         await self._runner.cleanup()

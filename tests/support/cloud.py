@@ -122,6 +122,8 @@ class FakeMaster:
         self.users = {"testUser"}
         self.inside: set[str] = set()
         self.left: list[str] = []
+        self.refused_logins = 0
+        self._replies: set[asyncio.Future[None]] = set()
         self.gone: list[str] = []
         self.requests: list[tuple[str, str, Any]] = []
         self.usage: Usage | None = None
@@ -160,7 +162,9 @@ class FakeMaster:
             case ClientRequest():
                 assert (message.content is not None) is self.in_patches
                 self.requests.append((message.id, message.type, write_request(content_of(message))))
-                peer.send(ClientReply(request=message.request, errors=await self.answer(message)))
+                task = asyncio.ensure_future(self._reply(peer, message))
+                self._replies.add(task)
+                task.add_done_callback(self._replies.discard)
             case Status():
                 self.statuses[message.status.id] = message.status
             case PatchStatus() | SpecWanted():
@@ -176,6 +180,10 @@ class FakeMaster:
                 self.faults.append(message.text)
             case _:
                 raise AssertionError(message)
+        self.changed.set()
+
+    async def _reply(self, peer: Peer, request: ClientRequest) -> None:
+        peer.send(ClientReply(request=request.request, errors=await self.answer(request)))
         self.changed.set()
 
     def _take_patching(self, peer: Peer, message: PatchStatus | SpecWanted) -> None:
@@ -194,6 +202,7 @@ class FakeMaster:
         if message.user not in self.users or message.password != DIGEST:
             return LoginReply(request=message.request, status=401, reason="Wrong user or password.")
         if id_ in self.inside:
+            self.refused_logins += 1
             return LoginReply(request=message.request, status=409, reason=f"{id_} is already connected.")
         self.inside.add(id_)
         return LoginReply(request=message.request, endpoint=self.spec(id_))

@@ -22,6 +22,7 @@ TINY = {
     "rce/control/timeouts.py": BASE,
     "rce/packages/limits.py": BASE,
     "rce/protocol/limits.py": BASE,
+    "rce/aio/servers.py": "about one fault of the event loop, which five servers avoid by it",
     "rce/protocol/printable.py": "the one module of the package that `rce.ros` may import",
     "rce/ros/actions/topics.py": BASE,
     "rce/ros/tf/frames.py": BASE,

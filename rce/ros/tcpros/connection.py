@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import Protocol, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
 from rce.buffers import write_together
 from rce.ros.errors import TcprosError
 from rce.ros.tcpros.framing import MAX_FRAME, Chunks, FrameReader
 from rce.ros.tcpros.header import MAX_HEADER
+
+if TYPE_CHECKING:
+    from rce.ros.closing import OpenConnections
 
 _log = logging.getLogger(__name__)
 
@@ -54,13 +57,15 @@ class Connection(asyncio.BufferedProtocol):
         gone: Set when the socket is closed.
     """
 
-    def __init__(self, owner: Owner, scratch: memoryview, *, siblings: set[Connection] | None = None) -> None:
+    def __init__(
+        self, owner: Owner, scratch: memoryview, *, siblings: OpenConnections[Connection] | None = None
+    ) -> None:
         """Make a connection for a transport.
 
         Args:
             owner: Takes the frames.
             scratch: Buffer shared by all connections of one event loop's node.
-            siblings: The set of open connections, to which it adds itself.
+            siblings: The server's open connections, to which it adds itself.
         """
         self.owner = owner
         self.full = False

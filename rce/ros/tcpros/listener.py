@@ -8,7 +8,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
-from rce.ros.closing import close_all
+from rce.aio.servers import close_servers
+from rce.ros.closing import OpenConnections
 from rce.ros.errors import HandshakeRefusedError
 from rce.ros.tcpros.connection import Connection
 from rce.ros.tcpros.header import decode_header, encode_header
@@ -43,7 +44,7 @@ class Listener:
         self._scratch = scratch
         self._topic = topic
         self._service = service
-        self._connections: set[Connection] = set()
+        self._connections = OpenConnections[Connection]()
         self._server: asyncio.Server | None = None
 
     async def __aenter__(self) -> Self:
@@ -56,8 +57,8 @@ class Listener:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._server is not None:
-            self._server.close()
-        await close_all(self._connections)
+            await close_servers([self._server])
+        await self._connections.close()
 
     def _accept(self) -> Connection:
         return Connection(_Greeter(self._topic, self._service), self._scratch, siblings=self._connections)

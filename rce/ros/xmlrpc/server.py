@@ -14,7 +14,8 @@ from typing import Self, cast
 
 import h11
 
-from rce.ros.closing import close_all
+from rce.aio.servers import close_servers
+from rce.ros.closing import OpenConnections
 from rce.ros.xmlrpc.dispatch import Dispatcher
 
 _log = logging.getLogger(__name__)
@@ -45,7 +46,7 @@ class RpcServer:
         self.port = port
         self._dispatcher = dispatcher
         self._host = host
-        self._connections: set[_Connection] = set()
+        self._connections = OpenConnections[_Connection]()
         self._server: asyncio.Server | None = None
 
     async def __aenter__(self) -> Self:
@@ -59,8 +60,8 @@ class RpcServer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._server is not None:
-            self._server.close()
-        await close_all(self._connections)
+            await close_servers([self._server])
+        await self._connections.close()
 
     def _accept(self) -> _Connection:
         return _Connection(self._dispatcher, self._connections)
@@ -69,7 +70,7 @@ class RpcServer:
 class _Connection(asyncio.Protocol):
     """One client's connection."""
 
-    def __init__(self, dispatcher: Dispatcher, siblings: set[_Connection]) -> None:
+    def __init__(self, dispatcher: Dispatcher, siblings: OpenConnections[_Connection]) -> None:
         self._dispatcher = dispatcher
         self._siblings = siblings
         self.gone = asyncio.Event()

@@ -98,7 +98,11 @@ class Gate:
         except HandshakeError as error:
             namespace = self._admission.find(EndpointId(credentials.user, credentials.robot))
             former = None if namespace is None else namespace.session
-            if error.status != _CONFLICT or former is None or await former.probe():
+            if (
+                error.status != _CONFLICT
+                or namespace is None
+                or (former is not None and await former.probe())
+            ):
                 raise
             spec = await self._admission.log_in(credentials, address)
         namespace = await self._admission.settle(spec)

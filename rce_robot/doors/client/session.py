@@ -126,7 +126,10 @@ class Session:
         await self.ended.wait()
 
     async def probe(self) -> bool:
-        """Return whether the robot still answers; end the connection if it does not."""
+        """Return whether the robot still answers; end the connection if it does not.
+
+        The answer comes when the session has ended, which takes as long as its last requests take.
+        """
         if not self.lost:
             with contextlib.suppress(TimeoutError, ConnectionClosed):
                 async with asyncio.timeout(self._settings.probe_timeout):
@@ -134,7 +137,7 @@ class Session:
                     return True
             self._socket.abort()
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(self._settings.probe_timeout):
+            async with asyncio.timeout(self._drain_timeout + self._settings.probe_timeout):
                 await self.ended.wait()
         return not self.ended.is_set()
 

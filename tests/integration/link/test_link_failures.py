@@ -94,6 +94,20 @@ async def test_changed_address_is_dialed_at_once(rig: Rig) -> None:
     assert a.fakes["i1"].active == [True, False, True]
 
 
+async def test_tcp_connection_outlives_a_changed_socket_path(rig: Rig) -> None:
+    """A peer that was reached by TCP before its new socket's path was known is not left again."""
+    a, b = await rig.pair("tcp")
+    b.address = replace(b.address, machine="here", unix=str(rig.folder / "former"))
+    await rig.join(a, b, [TOPIC_OUT])
+    await a.connected(1)
+    by_tcp = b.address
+    await rig.listen(b, "unix")
+    await a.apply(links=[replace(a.spec.links[0], address=replace(by_tcp, unix=b.address.unix))])
+    a.fakes["i1"].port.send(b"hi")
+    assert await b.fakes["i1"].received.get() == (b"hi", False)
+    assert a.fakes["i1"].active == [True]
+
+
 async def test_link_waits_for_its_address(rig: Rig) -> None:
     a, b = await rig.pair("unix")
     address, b.address = b.address, LinkAddress()

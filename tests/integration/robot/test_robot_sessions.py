@@ -103,6 +103,26 @@ async def test_a_dead_connection_makes_room_for_the_robots_new_one(dial: Dial) -
             await dead.recv()
 
 
+async def test_robot_that_returns_waits_for_its_last_requests(dial: Dial, robot_of: type[Robot]) -> None:
+    """A robot that disconnects during a request and connects again is admitted."""
+    async with running_cloud(SessionSettings(probe_timeout=0.05, drain_timeout=30.0)) as cloud:
+        asked, released = asyncio.Event(), asyncio.Event()
+
+        async def wait(_: object) -> tuple[str, ...]:
+            asked.set()
+            await released.wait()
+            return ()
+
+        cloud.master.answer = wait
+        async with dial(cloud) as socket:
+            await robot_of(socket).send("CC", {"containerTag": "c"})
+            await asked.wait()
+        asyncio.get_running_loop().call_later(0.3, released.set)  # some times as long as a probe takes
+        async with dial(cloud) as again:
+            await (await again.ping())
+        assert cloud.master.refused_logins
+
+
 async def test_dead_connection_ends_when_robot_moves(dial: Dial) -> None:
     """A dead connection is ended when its robot comes elsewhere."""
     settings = SessionSettings(probe_timeout=0.2, drain_timeout=1.0)

@@ -59,7 +59,7 @@ class RelayConnection(asyncio.Protocol):
         self.ended: asyncio.Future[None] = loop.create_future()
         self.gone = asyncio.Event()
         self._ends: tuple[Callable[[Frame], None], ...] = ()
-        self.refused = False
+        self._refused = False
         self._stopped = False
         self._transport: asyncio.Transport | None = None
         self._early: list[Frame] = []
@@ -127,6 +127,11 @@ class RelayConnection(asyncio.Protocol):
             self._transport.abort()
         self.ended.cancel()
 
+    def refuse(self) -> None:
+        """Close now, or as soon as the connection is made."""
+        self._refused = True
+        self.abort()
+
     # For the transport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -136,7 +141,7 @@ class RelayConnection(asyncio.Protocol):
         self.address = address_of(transport.get_extra_info("peername"))
         if self._lobby is not None:
             self._guest = self._lobby.enter(self.address, self._transport.abort)
-        if self.refused or (self._lobby is not None and self._guest is None):
+        if self._refused or (self._lobby is not None and self._guest is None):
             self._transport.abort()
         early, self._early = self._early, []
         for frame in early:

@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from rce.aio.backoff import Backoff
+from rce.aio.servers import close_servers
 from rce.aio.tasks import TaskScope
 from rce.dialing import open_socket
 from rce.guard.lobby import Lobby
@@ -115,14 +116,16 @@ class RelayLinks:
                     link = await self._guests.get()
                     tasks.spawn(self._serve_guest(link), name="relay link")
         finally:
-            server.close()
+            await close_servers([server])
+            while not self._guests.empty():
+                self._guests.get_nowait().refuse()
 
     def _accept(self) -> RelayConnection:
         link = RelayConnection(self._lobby)
         try:
             self._guests.put_nowait(link)
         except asyncio.QueueFull:
-            link.refused = True
+            link.refuse()
         return link
 
     async def _serve_guest(self, link: RelayConnection) -> None:
