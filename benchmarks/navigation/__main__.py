@@ -1,6 +1,7 @@
 """Measure navigation: ``python -m benchmarks.navigation [--quick] [--runs N] [--only NAME ...]``.
 
-``drive``: seeded runs in a world with boxes that are on no map and walkers, against the targets.
+``drive``: seeded runs on the demo's floor in the simulation, with localization, ``move_base`` and safety
+stage, among walkers and boxes of which some are on no map, against the targets; saved after every ten runs.
 ``sampling``: the same runs with the two ways to choose trajectories, by time and smoothness. ``plan``: a plan
 on a costmap of 400 x 400 cells, compiled and in numpy.
 """
@@ -8,7 +9,7 @@ on a costmap of 400 x 400 cells, compiled and in numpy.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from statistics import median
 from time import process_time
 from typing import Any
@@ -32,40 +33,47 @@ from rce_fleet.navigation.planners.global_planner import make_plan
 
 Rows = list[dict[str, Any]]
 
+FIRST_SEED = 1000
 RUNS, QUICK_RUNS = 200, 10
+SAVE_EVERY = 10
 TARGETS = {"contacts": 0, "reached %": 99.0, "path / shortest": 1.15, "step p99 ms": 10.0}
 SIDE = 400
 
 
-def drive(runs: int, sampling: str = "pursuit") -> Rows:
-    """Drive robots through worlds of seeds 1000, 1001, ..., and compare with the targets."""
+def drive(runs: int, sampling: str = "pursuit") -> Iterator[Rows]:
+    """Drive robots on floors of seeds 1000, 1001, ...; give the figures so far after every ten runs."""
     results: list[RunResult] = []
-    seed = 1000
+    seed = FIRST_SEED
     while len(results) < runs:
         result = run(seed, sampling=sampling)
         if result.shortest:  # there is a way for the robot's footprint
             results.append(result)
             if not result.reached or result.contacts:
-                print(f"seed {seed}: {result.text}, {result.contacts} contacts")
+                print(f"seed {seed}: {result.text}; {result.contacts} contacts", flush=True)
+            if len(results) % SAVE_EVERY == 0 or len(results) == runs:
+                yield [figures(results, sampling)]
         seed += 1
+
+
+def figures(results: list[RunResult], sampling: str) -> dict[str, Any]:
+    """Return the row of some runs."""
     steps = [step for result in results for step in result.steps]
-    reached = [result for result in results if result.reached]
-    return [
-        {
-            "sampling": sampling,
-            "runs": len(results),
-            "contacts": sum(result.contacts for result in results),
-            "walked into": sum(result.pushed for result in results),
-            "reached %": 100 * len(reached) / len(results),
-            "path / shortest": median(result.driven / result.shortest for result in reached),
-            "step p50 ms": 1e3 * percentile(steps, 0.5),
-            "step p99 ms": 1e3 * percentile(steps, 0.99),
-            "s / m": median(result.seconds / result.shortest for result in reached),
-            "turning rad/s/m": median(result.turning for result in reached),
-            "jerk m/s3": median(result.jerk for result in reached),
-            "recoveries": sum(result.recoveries for result in results),
-        }
-    ]
+    reached = [result for result in results if result.reached] or results
+    return {
+        "sampling": sampling,
+        "runs": len(results),
+        "contacts": sum(result.contacts for result in results),
+        "walked into": sum(result.pushed for result in results),
+        "reached %": 100 * sum(result.reached for result in results) / len(results),
+        "path / shortest": median(result.driven / result.shortest for result in reached),
+        "step p50 ms": 1e3 * percentile(steps, 0.5),
+        "step p99 ms": 1e3 * percentile(steps, 0.99),
+        "s / m": median(result.seconds / result.shortest for result in reached),
+        "turning rad/s/m": median(result.turning for result in reached),
+        "jerk m/s3": median(result.jerk for result in reached),
+        "localization RMSE m": median(result.error for result in results),
+        "recoveries": sum(result.recoveries for result in results),
+    }
 
 
 def with_targets(rows: Rows) -> Rows:
@@ -73,12 +81,16 @@ def with_targets(rows: Rows) -> Rows:
     return [*rows, {name: TARGETS.get(name, "") for name in rows[0]} | {"sampling": "target"}]
 
 
-def compare(runs: int) -> Rows:
+def compare(runs: int) -> Iterator[Rows]:
     """Drive the same runs with both ways to choose trajectories."""
-    return [*drive(runs, "pursuit"), *drive(runs, "window")]
+    first: Rows = []
+    for first in drive(runs, "pursuit"):
+        yield first
+    for second in drive(runs, "window"):
+        yield [*first, *second]
 
 
-def plan(repeats: int) -> Rows:
+def plan(repeats: int) -> Iterator[Rows]:
     """Measure a plan across a costmap with boxes, compiled and in numpy."""
     rng = np.random.default_rng(1)
     picture = np.zeros((SIDE, SIDE), np.int8)
@@ -100,10 +112,10 @@ def plan(repeats: int) -> Rows:
             times.append(process_time() - began)
         length = float(np.hypot(*np.diff(made.path[:, :2], axis=0).T).sum())
         rows.append({"form": form, "cells": SIDE * SIDE, "best ms": 1e3 * min(times), "path m": length})
-    return rows
+    yield rows
 
 
-def suites(*, quick: bool, runs: int) -> dict[str, tuple[str, Callable[[], Rows]]]:
+def suites(*, quick: bool, runs: int) -> dict[str, tuple[str, Callable[[], Iterator[Rows]]]]:
     """What can be measured, by name."""
     return {
         "plan": ("A plan on 400 x 400 cells", lambda: plan(5 if quick else 20)),
@@ -124,9 +136,11 @@ def main() -> None:
     results: dict[str, Rows] = {}
     for name in options.only or chosen:
         title, suite = chosen[name]
-        results[name] = suite()
-        show(title, results[name] if name == "plan" else with_targets(results[name]))
-    print("results:", save("navigation", results))
+        for rows in suite():
+            results[name] = rows if name == "plan" else with_targets(rows)
+            path = save("navigation", results)
+        show(title, results[name])
+    print("results:", path)
 
 
 if __name__ == "__main__":

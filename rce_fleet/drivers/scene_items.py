@@ -128,10 +128,13 @@ class WalkerItem(Strict):
     loop: bool = True
     social_distance: Seconds = 0.0
     start: Seconds = 0.0
+    patience: Length | None = None
+    """Seconds of waiting for a robot after which the walker turns back; never if not given."""
 
     def spec(self) -> WalkerSpec:
         """Return how the walker walks."""
-        return WalkerSpec(**self.model_dump(exclude={"id"}))
+        fields = self.model_dump(exclude={"id", "patience"})
+        return WalkerSpec(**fields, patience=inf if self.patience is None else self.patience)
 
 
 class DockItem(Strict):

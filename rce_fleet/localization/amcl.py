@@ -216,7 +216,7 @@ class Amcl:
             factors = self._field.sums_of_cubes(particles, beams)
             return self._fit(self._apply(np.log(factors)), factors, count, beams)
         skip = parameters.do_beamskip and self._has_converged()
-        self._apply(self._field.log_products(particles, beams, skip=skip))
+        self._apply(beams.independence * self._field.log_products(particles, beams, skip=skip))
         judges = systematic(self._weights, min(_JUDGES, len(self._weights)), self._rng)
         shares = np.full(len(judges), 1.0 / len(judges))
         return self._fit(shares, self._field.sums_of_cubes(particles[:, judges], beams), count, beams)

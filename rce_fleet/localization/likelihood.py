@@ -166,16 +166,21 @@ def sum_at_ends(
     last_row, last_column = table.shape[0] - 1.0, table.shape[1] - 1.0
     turn_c, turn_s = np.cos(to_map[2]), np.sin(to_map[2])
     inverse = 1.0 / resolution
+    width, values = table.shape[1], table.reshape(table.size)
+    # First the cells, then the values: a loop without look-ups is compiled to vector instructions.
+    cells = np.empty(ends.shape[1], np.int32)
     result = np.empty(particles.shape[1])
     for i in range(particles.shape[1]):
         x, y = particles[0, i], particles[1, i]
         c, s = np.cos(particles[2, i] + to_map[2]) * inverse, np.sin(particles[2, i] + to_map[2]) * inverse
         local_x = (to_map[0] + turn_c * x - turn_s * y) * inverse + 1.0
         local_y = (to_map[1] + turn_s * x + turn_c * y) * inverse + 1.0
+        for k in range(ends.shape[1]):
+            column = min(max(local_x + c * ends[0, k] - s * ends[1, k], 0.0), last_column)
+            row = min(max(local_y + s * ends[0, k] + c * ends[1, k], 0.0), last_row)
+            cells[k] = np.int32(row) * np.int32(width) + np.int32(column)
         total = 0.0
         for k in range(ends.shape[1]):
-            column = local_x + c * ends[0, k] - s * ends[1, k]
-            row = local_y + s * ends[0, k] + c * ends[1, k]
-            total += table[int(min(max(row, 0.0), last_row)), int(min(max(column, 0.0), last_column))]
+            total += values[np.uint32(cells[k])]  # unsigned: no look whether the index is negative
         result[i] = total
     return result

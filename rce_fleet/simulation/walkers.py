@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import atan2, cos, hypot, pi
+from math import atan2, cos, hypot, inf, pi
 from typing import TYPE_CHECKING
 
 import pymunk
@@ -31,6 +31,7 @@ class WalkerSpec:
         social_distance: The walker stops for a robot that is this near in front, metres between hulls;
             0: never.
         start: Seconds after which the walker begins to walk.
+        patience: A walker who has stopped for a robot for so many seconds goes back to the last waypoint.
     """
 
     waypoints: tuple[Point, ...]
@@ -40,6 +41,7 @@ class WalkerSpec:
     loop: bool = True
     social_distance: float = 0.0
     start: float = 0.0
+    patience: float = inf
 
 
 class Walker:
@@ -62,6 +64,7 @@ class Walker:
         self._next = 0
         self._direction = 1
         self._stands_until = 0.0
+        self._waited = 0.0
         self.reset()
 
     @property
@@ -77,6 +80,7 @@ class Walker:
         self.waits = False
         self._next, self._direction = min(1, len(self.spec.waypoints) - 1), 1
         self._stands_until = self.spec.start
+        self._waited = 0.0
 
     def walk(self, now: float, dt: float, robots: Floats) -> None:
         """Choose the velocity for the next ``dt`` seconds.
@@ -98,6 +102,9 @@ class Walker:
             self.body.velocity = (0.0, 0.0)
             return
         self.waits = self._in_front(goal, robots)
+        self._waited = self._waited + dt if self.waits else 0.0
+        if self._waited > spec.patience:
+            self._turn_back()
         pace = 0.0 if self.waits else min(spec.speed, away / dt) / away
         self.body.velocity = (pace * (goal[0] - x), pace * (goal[1] - y))
 
@@ -109,6 +116,11 @@ class Walker:
         if not self.spec.loop and not 0 <= self._next + self._direction < count:
             self._direction = -self._direction
         self._next = (self._next + self._direction) % count
+
+    def _turn_back(self) -> None:
+        self._waited = 0.0
+        self._direction = -self._direction
+        self._next = (self._next + self._direction) % len(self.spec.waypoints)
 
     def _in_front(self, goal: Point, robots: Floats) -> bool:
         """Return whether a robot is in front, nearer than the social distance."""

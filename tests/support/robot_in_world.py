@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchmarks.navigation.world import Rectangle, Walker, World
 from rce.ros.node import Node
 from rce.ros.tf import StampedTransform, Transform
 from rce_fleet.geometry.poses import Pose, Twist
 from rce_fleet.nodes.planar import pose_fields, read_twist, twist_fields
 from rce_fleet.simulation.lidar import LidarSpec
+from support.flat_world import Rectangle, World
 
 if TYPE_CHECKING:
     from rce.ros.types import Message
@@ -51,7 +51,7 @@ class RobotInWorld:
         self.node = node
         rng = np.random.default_rng(1)
         size = (max(one[2] for one in walls), max(one[3] for one in walls))
-        self.world = World(walls, boxes, list[Walker](), at, rng, lidar=LidarSpec(BEAMS, 6.0), size=size)
+        self.world = World(walls, boxes, at, rng, lidar=LidarSpec(BEAMS, 6.0), size=size)
         self.commands: list[tuple[float, Twist]] = []
         self.senses = True
         self.map_from_odom = Pose(0.4, -0.3, 0.2)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 
 import pytest
+from support.flat_world import edges_of
 from support.robot_in_world import robot_in_world, room
 
-from benchmarks.navigation.world import edges_of
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.types import Message

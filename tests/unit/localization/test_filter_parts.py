@@ -149,6 +149,14 @@ def test_skipped_beams_do_not_count() -> None:
     assert field.log_products(particles, beams, skip=True) == pytest.approx(all_of_them)
 
 
+@pytest.mark.parametrize(("beams", "share"), [(4, 1.0), (61, 0.5), (601, 0.05)])
+def test_near_beams_count_less(beams: int, share: float) -> None:
+    """They end on a wall of 3 m, 5 cm or 5 mm apart."""
+    ends = np.stack((np.full(beams, 2.0), np.linspace(-1.5, 1.5, beams)))
+    seen = Beams(np.hypot(*ends), np.arctan2(ends[1], ends[0]), 10.0, Pose(0.0, 0.0, 0.0))
+    assert seen.independence == pytest.approx(share, rel=1e-6)
+
+
 def test_compiled_likelihoods_equal_those_of_numpy() -> None:
     pytest.importorskip("numba")
     draw = rng(3)

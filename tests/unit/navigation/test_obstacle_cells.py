@@ -6,8 +6,8 @@ from math import inf, pi
 
 import numpy as np
 import pytest
+from support.flat_world import edges_of
 
-from benchmarks.navigation.world import edges_of
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.maps.occupancy_map import OccupancyMap
 from rce_fleet.navigation.costmap.observation import Observation, observe_scan

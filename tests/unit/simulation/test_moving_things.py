@@ -95,6 +95,19 @@ def test_a_polite_walker_waits_for_a_robot() -> None:
     assert walker.position[0] > 3.0
 
 
+def test_a_walker_turns_back_when_patience_ends() -> None:
+    world = World(GridMap())
+    spec = WalkerSpec(((1.0, 1.0), (5.0, 1.0)), social_distance=0.5, loop=False, patience=1.0)
+    walker = world.add_walker("P", spec)
+    world.place_robot("R", Pose(3.0, 1.0, pi / 2))
+    world.step(1.5)  # it waits since 0.9 s
+    assert walker.waits
+    before = walker.position[0]
+    world.step(1.0)
+    assert walker.position[0] < before - 0.3
+    assert world.collisions.total == 0
+
+
 def test_a_contact_tells_whose_motion_caused_it() -> None:
     world = World(GridMap())
     world.add_walker("P", WalkerSpec(((1.0, 1.0), (5.0, 1.0))))
