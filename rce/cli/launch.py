@@ -40,6 +40,10 @@ def launch(
     screen: Annotated[bool, typer.Option("--screen", help="Show the output of all nodes.")] = False,
     log: Annotated[bool, typer.Option(help="Write the logs of the run into a folder of its own.")] = True,
     wait: Annotated[bool, typer.Option("--wait", help="Wait for the master; do not start one.")] = False,
+    one_process: Annotated[
+        bool,
+        typer.Option("--one-process", help="Run nodes of Python packages in this process, to save memory."),
+    ] = False,
     port: Annotated[
         int, typer.Option("--port", "-p", help="Port of a master on this machine; default: ROS_MASTER_URI.")
     ] = 0,
@@ -66,7 +70,11 @@ def launch(
             _print_command(plan, inputs.packages, uri, args)
             return
         timeouts = StopTimeouts(sigint_timeout, sigterm_timeout)
-        code = uvloop.run(_launch(plan, inputs, uri, timeouts, logs=log, waits=wait, shows_all=screen))
+        code = uvloop.run(
+            _launch(
+                plan, inputs, uri, timeouts, logs=log, waits=wait, shows_all=screen, one_process=one_process
+            )
+        )
     except LaunchError as error:
         typer.echo(f"rce launch: {error}", err=True)
         raise typer.Exit(1) from error

@@ -3,7 +3,7 @@
 :class:`~rce.launching.launcher.Launcher` does what ``roslaunch`` does with its files.
 """
 
+from rce.launching.launched import StopTimeouts
 from rce.launching.launcher import Launcher
-from rce.launching.process import StopTimeouts
 
 __all__ = ["Launcher", "StopTimeouts"]

@@ -23,6 +23,10 @@ class NodeCommand(NamedTuple):
     folder: Path
     choice: str = ""
     """For the log: which of several programs of its name was chosen; else empty."""
+    module: str = ""
+    """A Python module that a distribution adds as this node; else empty."""
+    arguments: tuple[str, ...] = ()
+    """The part of ``argv`` that follows the program."""
 
 
 def node_command(
@@ -52,15 +56,15 @@ def node_command(
     if node.namespace != "/":
         variables["ROS_NAMESPACE"] = node.namespace
     variables.update(node.environ)
-    argv = [*node.prefix, *program.command, *node.arguments, *node.ros_arguments]
-    if log is not None:
-        argv.append(f"__log:={log}")
+    arguments = (*node.arguments, *node.ros_arguments, *([] if log is None else [f"__log:={log}"]))
+    argv = [*node.prefix, *program.command, *arguments]
+    module = program.target if ":" not in program.target else ""
     own = Path(program.command[-1]).parent
     if node.folder is WorkingFolder.NODE:
         folder = own if own.is_dir() else program.package.path
     else:
         folder = ros_home(environ)
-    return NodeCommand(argv, variables, folder, program.choice)
+    return NodeCommand(argv, variables, folder, program.choice, module, arguments)
 
 
 def ros_home(environ: Mapping[str, str]) -> Path:

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 
 from rce.launching.command import node_command
 from rce.launching.graph import launch_graph, wait_for_master
-from rce.launching.process import NodeProcess, StopTimeouts, describe_end
+from rce.launching.hosted import HostedNode, can_host
+from rce.launching.launched import LaunchedNode, StopTimeouts, describe_end
+from rce.launching.process import NodeProcess
 from rce.ros.errors import PackageError
 from rce.ros.launch.exceptions import LaunchError
 from rce.ros.launch.plan import Output
@@ -35,6 +37,7 @@ class Launcher:
         timeouts: How long a node may take to end.
         waits: Wait for the master instead of starting it.
         shows_all: Show the output of all nodes, also of those that ask for a file.
+        one_process: Run the nodes that Python distributions add in this process.
 
     Example:
         >>> launcher = Launcher(plan, PackageIndex.of_machine(), "http://127.0.0.1:11311/", None)
@@ -54,6 +57,7 @@ class Launcher:
         timeouts: StopTimeouts = StopTimeouts(),  # noqa: B008 - a value
         waits: bool = False,
         shows_all: bool = False,
+        one_process: bool = False,
     ) -> None:
         self._plan = plan
         self._packages = packages
@@ -64,14 +68,15 @@ class Launcher:
         self._timeouts = timeouts
         self._waits = waits
         self._shows_all = shows_all
-        self._processes: list[NodeProcess] = []
+        self._one_process = one_process
+        self._nodes: list[LaunchedNode] = []
         self._is_told = asyncio.Event()
         self._failures = 0
 
     def stop(self) -> None:
         """End all nodes, then the master if it was started here; a second call does not wait for them."""
-        for process in self._processes if self._is_told.is_set() else ():
-            process.hurry()
+        for node in self._nodes if self._is_told.is_set() else ():
+            node.hurry()
         self._is_told.set()
 
     async def run(self) -> int:
@@ -95,16 +100,16 @@ class Launcher:
         self._report(f"ROS_MASTER_URI={graph.uri}" + (" (started here)" if graph.is_own else ""))
         folder = await self._make_folder(graph)
         await graph.apply(self._plan)
-        for number, node in enumerate(self._plan.nodes, 1):
-            process = self._prepare(node, number, graph, folder)
-            if process is not None:
-                self._processes.append(process)
-            elif node.required:
-                self._report(f"{node.name} is required: no node is started")
+        for number, plan in enumerate(self._plan.nodes, 1):
+            prepared = self._prepare(plan, number, graph, folder)
+            if prepared is not None:
+                self._nodes.append(prepared)
+            elif plan.required:
+                self._report(f"{plan.name} is required: no node is started")
                 return
         async with asyncio.TaskGroup() as group:
             stopping = group.create_task(self._stop_all_when_told())
-            nodes = [group.create_task(self._run_node(process)) for process in self._processes]
+            nodes = [group.create_task(self._run_node(node)) for node in self._nodes]
             for task in nodes:
                 await task
             stopping.cancel()
@@ -125,7 +130,7 @@ class Launcher:
 
     def _prepare(
         self, node: NodePlan, number: int, graph: LaunchGraph, folder: Path | None
-    ) -> NodeProcess | None:
+    ) -> LaunchedNode | None:
         label = "-".join(segments(node.name)) + f"-{number}"
         log = folder / f"{label}.log" if folder is not None else None
         output = None
@@ -138,12 +143,14 @@ class Launcher:
             return None
         if command.choice:
             self._report(f"{node.name}: {command.choice}")
+        if self._one_process and can_host(node, command):
+            return HostedNode(node, command, self._report, self._timeouts)
         return NodeProcess(node, command, output, self._report, self._timeouts)
 
-    async def _run_node(self, process: NodeProcess) -> None:
-        node = process.plan
+    async def _run_node(self, launched: LaunchedNode) -> None:
+        node = launched.plan
         try:
-            code = await process.run()
+            code = await launched.run()
         except OSError as error:
             self._fail(node, f"cannot be started: {error.strerror}: {error.filename}")
             code = 1
@@ -154,8 +161,8 @@ class Launcher:
 
     async def _stop_all_when_told(self) -> None:
         await self._is_told.wait()
-        for process in self._processes:
-            process.stop()
+        for node in self._nodes:
+            node.stop()
 
     def _fail(self, node: NodePlan, reason: str) -> None:
         self._failures += 1

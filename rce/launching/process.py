@@ -8,8 +8,9 @@ import os
 import signal
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
+from rce.launching.launched import LaunchedNode, StopTimeouts, describe_end
 from rce.supervision.process import end_with
 
 if TYPE_CHECKING:
@@ -18,24 +19,14 @@ if TYPE_CHECKING:
     from rce.launching.command import NodeCommand
     from rce.ros.launch.plan import NodePlan
 
-MIN_RESPAWN_S = 0.1
-"""Least pause before a node is started again."""
-
 KILL_S = 5.0
 """How long the end of a killed process is waited for."""
 
 
-class StopTimeouts(NamedTuple):
-    """How long a node may take to end, in seconds, as ``roslaunch`` has it."""
+class NodeProcess(LaunchedNode):
+    """A node of a launch, in a process of its own.
 
-    interrupt: float = 15.0
-    """After SIGINT."""
-    terminate: float = 2.0
-    """After SIGTERM, which comes next; then SIGKILL."""
-
-
-class NodeProcess:
-    """A node of a launch.
+    It is ended by SIGINT, then SIGTERM, then SIGKILL.
 
     Args:
         plan: The node.
@@ -53,38 +44,9 @@ class NodeProcess:
         report: Callable[[str], None],
         timeouts: StopTimeouts,
     ) -> None:
-        self.plan = plan
+        super().__init__(plan, report, timeouts)
         self._command = command
         self._output = output
-        self._report = report
-        self._timeouts = timeouts
-        self._stopping = asyncio.Event()
-        self._hurrying = asyncio.Event()
-
-    async def run(self) -> int:
-        """Run the node until it ends for good; return its last exit code.
-
-        Cancelling this kills the node and everything that it started.
-
-        Raises:
-            OSError: It cannot be started.
-        """
-        while True:
-            code = await self._run_once()
-            if self._stopping.is_set() or not self.plan.respawn:
-                return code
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(max(self.plan.respawn_delay, MIN_RESPAWN_S)):
-                    await self._stopping.wait()
-                return code
-
-    def stop(self) -> None:
-        """End the node: SIGINT, then SIGTERM, then SIGKILL. :meth:`run` then returns."""
-        self._stopping.set()
-
-    def hurry(self) -> None:
-        """Do not wait any longer for the node to end: go to the next signal."""
-        self._hurrying.set()
 
     async def _run_once(self) -> int:
         process = await self._start()
@@ -106,21 +68,18 @@ class NodeProcess:
                 await asyncio.wait_for(asyncio.shield(ended), KILL_S)
 
     async def _start(self) -> asyncio.subprocess.Process:
-        argv, env, folder, _ = self._command
-        folder.mkdir(parents=True, exist_ok=True)
+        command = self._command
+        command.folder.mkdir(parents=True, exist_ok=True)
         if self._output is None:
-            return await _spawn(argv, env, folder, None)
+            return await _spawn(command, None)
         with self._output.open("ab") as output:
-            return await _spawn(argv, env, folder, output.fileno())
+            return await _spawn(command, output.fileno())
 
     async def _escalate(self, pid: int, ended: asyncio.Future[int]) -> None:
         steps = ((signal.SIGINT, self._timeouts.interrupt), (signal.SIGTERM, self._timeouts.terminate))
         for number, timeout in steps:
             _signal_group(pid, number)
-            hurrying = asyncio.ensure_future(self._hurrying.wait())
-            await asyncio.wait((ended, hurrying), timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
-            hurrying.cancel()
-            self._hurrying.clear()
+            await self._wait(ended, timeout)
             if ended.done():
                 return
             self._report(f"{self.plan.name}: did not end on {number.name}")
@@ -130,13 +89,11 @@ class NodeProcess:
         return f"; its output is in {self._output}" if self._output is not None else ""
 
 
-async def _spawn(
-    argv: list[str], env: dict[str, str], folder: Path, output: int | None
-) -> asyncio.subprocess.Process:
+async def _spawn(command: NodeCommand, output: int | None) -> asyncio.subprocess.Process:
     return await asyncio.create_subprocess_exec(
-        *argv,
-        env=env,
-        cwd=folder,
+        *command.argv,
+        env=command.env,
+        cwd=command.folder,
         stdout=output,
         start_new_session=True,  # a Ctrl-C at the terminal reaches the launcher only
         preexec_fn=partial(end_with, os.getpid()),
@@ -146,10 +103,3 @@ async def _spawn(
 def _signal_group(pid: int, number: signal.Signals) -> None:
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(pid, number)
-
-
-def describe_end(code: int) -> str:
-    """Return how a process ended, in words."""
-    if code < 0:
-        return f"was ended by {signal.Signals(-code).name}"
-    return f"ended with exit code {code}" if code else "ended"

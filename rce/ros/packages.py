@@ -115,11 +115,11 @@ class Package(NamedTuple):
     def _distributed_program(self, exe: str, target: str) -> Program:
         command = [sys.executable, *arguments_of(target)]
         if self.name in distributed_packages():
-            return Program(command, self)
+            return Program(command, self, target=target)
         folder = folder_of(target)
         why = "" if self.path == folder else f"; the package in {self.path} does not have it"
         package = Package(self.name, folder, python="engine")
-        return Program(command, package, f"{self.name}/{exe} is {target}{why}")
+        return Program(command, package, f"{self.name}/{exe} is {target}{why}", target)
 
     def _folders(self) -> Iterator[Path]:
         for folder in FOLDERS:
@@ -143,6 +143,8 @@ class Program(NamedTuple):
     """To which it belongs; a program of a Python distribution is not part of a ROS package of its name."""
     choice: str = ""
     """For the log: which one was chosen, if a distribution adds one of this name; else empty."""
+    target: str = ""
+    """``module[:function]`` of a Python distribution's program; else empty."""
 
 
 class PackageIndex:

@@ -10,8 +10,12 @@ from typing import Any
 from rce_fleet.demo.floor import FLOOR, with_surroundings
 from rce_fleet.demo.resources import LOOPBACK, Ports
 from rce_fleet.drivers.scene import scene_of
+from rce_fleet.maps.ros_map import save_map
 from rce_fleet.planning.scenario import Scenario
 from rce_fleet.wiring import FleetAccount
+
+ROBOT_RADIUS = 0.18
+"""Radius of a TurtleBot's hull as the planner knows it, metres."""
 
 
 class Mode(StrEnum):
@@ -84,6 +88,11 @@ class DemoConfig:
         return self.folder / "scene.json"
 
     @property
+    def map_file(self) -> Path:
+        """The map of the walls, for localization and navigation: ``map.yaml``."""
+        return self.folder / "map.yaml"
+
+    @property
     def report(self) -> Path:
         """File that the simulated world writes its reports to."""
         return self.folder / "world.json"
@@ -94,7 +103,7 @@ class DemoConfig:
         scenario, grid = self.scenario, self.scenario.grid
         cells = {"walls": sorted(grid.blocked), "blocked": list(scenario.known_boxes)}
         known = {name: value for name, value in cells.items() if value}
-        return {**self.map_parameters, "seed": self.seed, **known}
+        return {**self.map_parameters, "seed": self.seed, "robot_radius": ROBOT_RADIUS, **known}
 
     @property
     def map_parameters(self) -> dict[str, Any]:
@@ -103,8 +112,9 @@ class DemoConfig:
         return {"rows": grid.rows, "columns": grid.columns, "cell_size": grid.cell_size}
 
     def write_scene(self) -> None:
-        """Write the file that the simulated world reads."""
+        """Write the file that the simulated world reads, and the map of its walls."""
         scene = scene_of(self.scenario, self.seed)
         if self.scenario.grid == FLOOR:
             scene = with_surroundings(scene)
         self.scene.write_text(scene.model_dump_json(indent=1), encoding="utf-8")
+        save_map(scene.draw(), self.map_file)

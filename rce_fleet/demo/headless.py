@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import aiohttp
 
 from rce_fleet.demo.config import DemoConfig, Mode
 from rce_fleet.demo.exceptions import DemoError
+from rce_fleet.demo.judge import Judge, RobotScore
 from rce_fleet.demo.modes import RunningDemo, start_demo
 from rce_fleet.demo.scenario_run import ScenarioRun
 from rce_fleet.demo.traffic import MessageTotals
@@ -37,6 +38,7 @@ class RunReport:
         totals: Messages that were received; None if they could not be read.
         problem: Why the run was stopped early; empty if it was not.
         mode: What carried the fleet's messages.
+        scores: How well each robot localized; empty if the run did not begin.
     """
 
     scenario: Scenario
@@ -46,6 +48,7 @@ class RunReport:
     totals: MessageTotals | None
     problem: str = ""
     mode: Mode = Mode.CLOUD
+    scores: Mapping[str, RobotScore] = field(default_factory=dict)
 
     @property
     def ok(self) -> bool:
@@ -86,6 +89,7 @@ class RunReport:
                     "reached": run is not None and robot in run.reached,
                     "replans": 0 if run is None else run.replans[robot],
                     "distance_m": distances.get(robot, 0.0),
+                    **_localization(self.scores.get(robot, RobotScore())),
                 }
                 for robot, start, goal in zip(scenario.robots, scenario.starts, scenario.goals, strict=True)
             ],
@@ -128,7 +132,26 @@ async def run_headless(
         problem = str(error)
     # The world writes its last report when it stops, with all collisions until then.
     truth = read_report(config.report)
-    return RunReport(config.scenario, config.seed, headless.run, truth, headless.totals, problem, config.mode)
+    return RunReport(
+        config.scenario,
+        config.seed,
+        headless.run,
+        truth,
+        headless.totals,
+        problem,
+        config.mode,
+        headless.scores,
+    )
+
+
+def _localization(score: RobotScore) -> dict[str, Any]:
+    """Return what the report says of a robot's localization and navigation."""
+    rmse = score.rmse
+    return {
+        "localization_rmse_m": None if rmse is None else round(rmse, 4),
+        "localization_max_m": None if rmse is None else round(score.max_error, 4),
+        "recoveries": score.recoveries,
+    }
 
 
 def _show_tails(config: DemoConfig, say: Callable[[str], None]) -> None:
@@ -149,11 +172,14 @@ class _HeadlessRun:
     def __init__(self, config: DemoConfig, say: Callable[[str], None]) -> None:
         self.run: ScenarioRun | None = None
         self.totals: MessageTotals | None = None
+        self.scores: Mapping[str, RobotScore] = {}
         self._config = config
         self._say = say
 
     async def perform(self, demo: RunningDemo) -> None:
-        async with aiohttp.ClientSession() as session:
+        judge = Judge(demo.mode.graphs())
+        self.scores = judge.scores
+        async with aiohttp.ClientSession() as session, judge:
             station = StationClient(session, demo.page)
             self.run = ScenarioRun(
                 station, self._config.scenario, demo.truth, self._say, self._config.blocked_cells

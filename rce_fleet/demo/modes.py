@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Protocol
@@ -11,10 +11,11 @@ from typing import Protocol
 from rce.config.documents import write_items
 from rce_fleet.demo.config import DemoConfig, Mode
 from rce_fleet.demo.programs import RCE, START_TIMEOUT, Program, ProgramGroup
+from rce_fleet.demo.robots import RobotGraph, client_config, start_robot
 from rce_fleet.demo.ros_modes import MultiCorePrograms, SingleCorePrograms
 from rce_fleet.demo.traffic import MessageTotals, read_engine_totals
 from rce_fleet.drivers.report import WorldReport, read_report
-from rce_fleet.wiring import fleet_config, robot_config
+from rce_fleet.wiring import fleet_config
 
 
 class ModePrograms(Protocol):
@@ -28,6 +29,9 @@ class ModePrograms(Protocol):
             OSError: A program cannot be started, or a file cannot be written.
         """
 
+    def graphs(self) -> Sequence[RobotGraph]:
+        """Return where the nodes of each robot are, once all programs are started."""
+
     async def read_totals(self) -> MessageTotals:
         """Return how many messages were received until now.
 
@@ -37,10 +41,14 @@ class ModePrograms(Protocol):
 
 
 class CloudPrograms:
-    """The engine: planner and move clients run in containers, ``rce-ros`` bridges the robots."""
+    """The engine: planner and move clients run in containers, ``rce-ros`` bridges the robots.
+
+    Localization and navigation run on the robots.
+    """
 
     def __init__(self, config: DemoConfig) -> None:
         self._config = config
+        self._graphs: list[RobotGraph] = []
 
     async def start(self, group: ProgramGroup) -> str:
         """Start all programs; return the URL of the page."""
@@ -50,21 +58,27 @@ class CloudPrograms:
         world = await group.start("world", self._world_argv())
         await group.wait_line(engine, "RCE ready:", START_TIMEOUT)
         station = await group.start("station", self._station_argv(), restartable=True)
-        uris = await self._graphs(group, world)
+        self._graphs = await self._find_graphs(group, world)
         page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)
+        for graph in self._graphs:
+            await start_robot(group, config, graph, robot=graph.robot, relay=False)
         bridges = [
             await group.start(
                 f"robot{number}",
                 [sys.executable, "-m", "rce_client.ros_bridge", str(config.folder / f"robot{number}.config")],
-                env={"ROS_MASTER_URI": uris[robot]},
+                env={"ROS_MASTER_URI": graph.uri},
                 restartable=True,
             )
-            for number, robot in enumerate(config.scenario.robots, start=1)
+            for number, graph in enumerate(self._graphs, start=1)
         ]
         for bridge in bridges:
             await group.wait_line(bridge, "rce-ros ready:", START_TIMEOUT)
         await group.wait_line(world, "simulation ready:", START_TIMEOUT)
         return page
+
+    def graphs(self) -> Sequence[RobotGraph]:
+        """Return where the nodes of each robot are."""
+        return self._graphs
 
     async def read_totals(self) -> MessageTotals:
         """Read the message totals from the master."""
@@ -77,15 +91,15 @@ class CloudPrograms:
         fleet = fleet_config(account, config.planner_parameters)
         (folder / "fleet.config").write_text(write_items(fleet), encoding="utf-8")
         for number in range(1, len(config.scenario.robots) + 1):
-            text = write_items(robot_config(number, account))
+            text = write_items(client_config(config, number))
             (folder / f"robot{number}.config").write_text(text, encoding="utf-8")
 
-    async def _graphs(self, group: ProgramGroup, world: Program) -> dict[str, str]:
-        """Return the URI of each robot's ROS master, as the world prints it."""
-        return {
-            robot: await group.wait_line(world, f"robot {robot} ROS_MASTER_URI=", START_TIMEOUT)
+    async def _find_graphs(self, group: ProgramGroup, world: Program) -> list[RobotGraph]:
+        """Return each robot's graph, as the world prints it."""
+        return [
+            RobotGraph(robot, await group.wait_line(world, f"robot {robot} ROS_MASTER_URI=", START_TIMEOUT))
             for robot in self._config.scenario.robots
-        }
+        ]
 
     def _engine_argv(self) -> list[str]:
         config, ports = self._config, self._config.ports

@@ -19,6 +19,13 @@ from rce_fleet.demo.exceptions import NotReadyError, ProgramEndedError, describe
 
 RCE = (sys.executable, "-c", "from rce.cli import main; main()")
 """Command of the ``rce`` program of this installation."""
+
+
+def rce_command(name: str) -> list[str]:
+    """Return the command line of one command of ``rce``; it starts faster than all of them."""
+    return [sys.executable, "-c", f"import typer; from rce.cli.{name} import {name}; typer.run({name})"]
+
+
 START_TIMEOUT = 90.0
 """Seconds for one program to start, on a machine that starts many at once."""
 TAIL_LINES = 25
@@ -125,6 +132,7 @@ class ProgramGroup:
         env: Mapping[str, str] | None = None,
         stop_last: bool = False,
         restartable: bool = False,
+        again: Sequence[str] | None = None,
     ) -> Program:
         """Start a program.
 
@@ -134,7 +142,9 @@ class ProgramGroup:
             env: Environment variables to change.
             stop_last: Other programs need it while they stop: stop it after them.
             restartable: It can be restarted while the others run; see :meth:`enable_restarts`.
+            again: Its command line when it is restarted; None: the same.
         """
+        lines = iter([argv])
         log = (self._folder / f"{name}.log").open("a", encoding="utf-8", buffering=1)
 
         def show(line: str) -> None:
@@ -142,7 +152,7 @@ class ProgramGroup:
             self._show(f"[{name}] {line}")
 
         async def begin() -> Child:
-            return await Child.start(name, argv, env=env)
+            return await Child.start(name, next(lines, again or argv), env=env)
 
         program = Program(name, begin, show, stop_last=stop_last, restartable=restartable)
         with contextlib.ExitStack() as stack:

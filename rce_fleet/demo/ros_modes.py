@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +14,9 @@ from rce.ros.packages import PackageIndex
 from rce_fleet.demo.config import CoreProgram, DemoConfig
 from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.network import DemoMachine, Network, create_network
-from rce_fleet.demo.programs import RCE, START_TIMEOUT, Program, ProgramGroup
+from rce_fleet.demo.programs import RCE, START_TIMEOUT, Program, ProgramGroup, rce_command
 from rce_fleet.demo.resources import LOOPBACK
+from rce_fleet.demo.robots import RobotGraph, start_robot
 from rce_fleet.demo.traffic import MessageTotals, read_graph_totals
 
 PLANNER = "planner"
@@ -24,6 +25,10 @@ FROM_ROBOT = ("amcl_pose", "goalNodesList")
 """Topics in each robot's namespace that the planner's machine subscribes to; lists are answered there."""
 TO_ROBOT = ("goalNodesList", "cancelGoal")
 """Topics in a robot's namespace that the robot's machine subscribes to at the planner's."""
+TO_ALL = ("/fleet/map", "/fleet/state")
+"""Topics of the planner that each robot's machine subscribes to: what obstacles are compared with."""
+MOVE_BASE = ("goal", "cancel", "status", "result", "feedback")
+CELLS = ("blockedCells", "freedCells")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +68,17 @@ def planner_argv(config: DemoConfig, **more: Any) -> list[str]:
     return [*_executable("fleet_planner.py"), *_parameters({**config.planner_parameters, **more})]
 
 
-def move_client_argv(robot: str, **parameters: Any) -> list[str]:
-    """Return the command of a robot's move client, with private parameters."""
-    return [*_executable("move_client.py"), f"__ns:={robot}", *_parameters(parameters)]
+def move_client_argv(robot: str, *, namespace: bool = True, **parameters: Any) -> list[str]:
+    """Return the command of a robot's move client.
+
+    Args:
+        robot: The robot.
+        namespace: Whether the robot's other nodes are in its namespace.
+        parameters: Private parameters.
+    """
+    names = () if namespace else (*(f"move_base/{name}" for name in MOVE_BASE), *CELLS)
+    remappings = (f"{name}:=/{name}" for name in names)
+    return [*_executable("move_client.py"), f"__ns:={robot}", *remappings, *_parameters(parameters)]
 
 
 def station_argv(config: DemoConfig, planner_core: str) -> list[str]:
@@ -74,17 +87,30 @@ def station_argv(config: DemoConfig, planner_core: str) -> list[str]:
     return [*station, "--ros-master", planner_core, "--port", str(config.ports.page)]
 
 
-def world_argv(config: DemoConfig, planner_core: str, cores: Mapping[str, str]) -> list[str]:
-    """Return the command of the simulated world; its robots join the graphs of ``cores`` (robot to URI)."""
+def world_argv(
+    config: DemoConfig, planner_core: str, cores: Mapping[str, str], *, namespaces: bool = True
+) -> list[str]:
+    """Return the command of the simulated world.
+
+    Args:
+        config: What the demo runs.
+        planner_core: URI of the planner's master.
+        cores: URI of each robot's master.
+        namespaces: Whether robots have namespaces there.
+    """
     program = [sys.executable, "-m", "rce_fleet.drivers", str(config.scene), "--report", str(config.report)]
     joins = [part for robot, uri in cores.items() for part in ("--core", f"{robot}={uri}")]
-    return [*program, "--planner-core", planner_core, *joins]
+    return [*program, "--planner-core", planner_core, *joins, *([] if namespaces else ["--no-namespaces"])]
 
 
-def node_names(config: DemoConfig) -> frozenset[str]:
+ROBOT_NODES = ("robot", "amcl", "move_base", "velocity_limiter", "obstacle_cells")
+
+
+def node_names(graphs: Iterable[RobotGraph]) -> frozenset[str]:
     """Return the global names of the demo's nodes; a graph may have others."""
-    robots = [f"/{robot}/{node}" for robot in config.scenario.robots for node in ("robot", "move_client")]
-    return frozenset((*robots, "/fleet_planner", "/operator_station", "/world"))
+    robots = {graph.topic(node) for graph in graphs for node in ROBOT_NODES}
+    clients = {f"/{graph.robot}/move_client" for graph in graphs}
+    return frozenset((*robots, *clients, "/map_server", "/fleet_planner", "/operator_station", "/world"))
 
 
 def _parameters(values: Mapping[str, Any]) -> Iterable[str]:
@@ -101,6 +127,7 @@ class SingleCorePrograms:
     def __init__(self, config: DemoConfig) -> None:
         self._config = config
         self._uri = config.core_uri or f"http://{LOOPBACK}:{config.ports.core}/"
+        self._graphs = [RobotGraph(robot, self._uri, prefix=robot) for robot in config.scenario.robots]
 
     async def start(self, group: ProgramGroup) -> str:
         """Start all programs; return the URL of the page."""
@@ -116,12 +143,18 @@ class SingleCorePrograms:
         for number, robot in enumerate(robots, start=1):
             await host.start(group, f"move_client{number}", move_client_argv(robot), restartable=True)
         page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)
+        for index, graph in enumerate(self._graphs):
+            await start_robot(group, config, graph, tf_prefix=graph.prefix, map_server=index == 0)
         await group.wait_line(world, "simulation ready:", START_TIMEOUT)
         return page
 
+    def graphs(self) -> Sequence[RobotGraph]:
+        """Return where the nodes of each robot are: in its namespace."""
+        return self._graphs
+
     async def read_totals(self) -> MessageTotals:
         """Read the message totals of all nodes."""
-        return await read_graph_totals([self._uri], node_names(self._config))
+        return await read_graph_totals([self._uri], node_names(self._graphs))
 
     async def _start_core(self, group: ProgramGroup) -> None:
         config, port = self._config, str(self._config.ports.core)
@@ -143,13 +176,15 @@ class SingleCorePrograms:
 class MultiCorePrograms:
     """A ROS core per machine: one for the planner, one for each robot, which share a few topics.
 
-    Each robot's machine runs its core and move client; discovery and sync run on every machine. The
-    simulated world has no core: it stands for the robots' hardware, and its nodes join the robots' cores.
+    Each robot's machine runs its core, its nodes and its move client; discovery and sync run on every
+    machine. The simulated world has no core: it stands for the robots' hardware, and its nodes join the
+    robots' cores.
     """
 
     def __init__(self, config: DemoConfig) -> None:
         self._config = config
         self._cores: list[str] = []
+        self._graphs: list[RobotGraph] = []
 
     async def start(self, group: ProgramGroup) -> str:
         """Start all programs; return the URL of the page."""
@@ -162,31 +197,38 @@ class MultiCorePrograms:
         uris = {machine.name: machine.core_uri for machine in others}
         here = RosHost("here", planner.core_uri)
         world_host = RosHost("world", planner.core_uri, prefix=network.world_prefix)
-        world = await world_host.start(group, "world", world_argv(config, planner.core_uri, uris))
+        self._graphs = [RobotGraph(machine.name, machine.core_uri, host=machine.prefix) for machine in others]
+        argv = world_argv(config, planner.core_uri, uris, namespaces=False)
+        world = await world_host.start(group, "world", argv)
         station = await here.start(group, "station", station_argv(config, planner.core_uri), restartable=True)
         argv = planner_argv(config, answers=True)
         await _host_of(planner).start(group, "planner", argv, restartable=True)
         for number, machine in enumerate(others, start=1):
-            argv = move_client_argv(machine.name, answers=True, **config.map_parameters)
+            argv = move_client_argv(machine.name, namespace=False, answers=True, **config.map_parameters)
             await _host_of(machine).start(group, f"move_client{number}", argv, restartable=True)
         await _join_machines(network, robots, group)
         page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)
+        for graph in self._graphs:
+            await start_robot(group, config, graph, robot=graph.robot)
         await group.wait_line(world, "simulation ready:", START_TIMEOUT)
         return page
 
+    def graphs(self) -> Sequence[RobotGraph]:
+        """Return where the nodes of each robot are: at its own core."""
+        return self._graphs
+
     async def read_totals(self) -> MessageTotals:
         """Read the message totals of all nodes."""
-        return await read_graph_totals(self._cores, node_names(self._config))
+        return await read_graph_totals(self._cores, node_names(self._graphs))
 
 
 def sync_argv(machine: str, robots: Iterable[str]) -> list[str]:
     """Return the command of a machine's sync: the topics, and the machines that it takes them from."""
     if machine == PLANNER:
-        # The node of a robot's hardware runs on another machine, with the world.
         topics = [f"/{robot}/{name}" for robot in robots for name in FROM_ROBOT]
-        return [*_command("sync"), "--topics", ",".join(topics), "--sync-remote-nodes"]
-    topics = [f"/{machine}/{name}" for name in TO_ROBOT]
-    return [*_command("sync"), "--topics", ",".join(topics), "--hosts", PLANNER]
+        return [*rce_command("sync"), "--topics", ",".join(topics)]
+    topics = [*(f"/{machine}/{name}" for name in TO_ROBOT), *TO_ALL]
+    return [*rce_command("sync"), "--topics", ",".join(topics), "--hosts", PLANNER]
 
 
 def discovery_argv(machine: DemoMachine, network: Network) -> list[str]:
@@ -198,12 +240,7 @@ def discovery_argv(machine: DemoMachine, network: Network) -> list[str]:
         "--rpc-addr": machine.address,
         "--rpc-port": machine.rpc_port,
     }
-    return [*_command("discovery"), *(str(part) for item in options.items() for part in item)]
-
-
-def _command(name: str) -> list[str]:
-    """Return a command line for one command of ``rce``; it starts faster than all of them."""
-    return [sys.executable, "-c", f"import typer; from rce.cli.{name} import {name}; typer.run({name})"]
+    return [*rce_command("discovery"), *(str(part) for item in options.items() for part in item)]
 
 
 def _host_of(machine: DemoMachine) -> RosHost:

@@ -51,6 +51,9 @@ def simulate(
             help="ROS master that robots join in their namespaces: URI or ROBOT=URI; may be repeated."
         ),
     ] = None,
+    namespaces: Annotated[
+        bool, typer.Option(help="Join the ROS masters in namespaces, with prefixes of frames.")
+    ] = True,
 ) -> None:
     """Simulate a world with robots in real time; each robot has its own ROS graph unless --core names one."""
     start_logging(logging.WARNING)
@@ -60,7 +63,7 @@ def simulate(
         watch = GraphCellWatch(planner_core, types)
     elif master:
         watch = EngineCellWatch(WorldAccount(master, user, password, robot_id), container)
-    cores = Cores.read(core or ())
+    cores = Cores.read(core or (), namespaces=namespaces)
     try:
         simulation = Simulation(load_scene(scene), types, typer.echo, report=report, watch=watch, cores=cores)
     except ConfigError as error:
@@ -100,6 +103,9 @@ def sim(
             help="ROS master that robots join in their namespaces: URI or ROBOT=URI; may be repeated."
         ),
     ] = None,
+    namespaces: Annotated[
+        bool, typer.Option(help="Join the ROS masters in namespaces, with prefixes of frames.")
+    ] = True,
     stand_ins: Annotated[
         bool | None,
         typer.Option(
@@ -138,9 +144,8 @@ def sim(
             save_map(read.draw(), write_map.with_suffix(""))
             typer.echo(f"wrote {write_map.with_suffix('.yaml')} and {write_map.with_suffix('.pgm')}")
             return
-        simulation = Simulation(
-            read, TypeRegistry(), typer.echo, report=report, cores=Cores.read(core or ()), options=options
-        )
+        cores = Cores.read(core or (), namespaces=namespaces)
+        simulation = Simulation(read, TypeRegistry(), typer.echo, report=report, cores=cores, options=options)
     except ConfigError as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(BAD_SCENE) from None

@@ -42,9 +42,11 @@ class Cores:
     default: str | None = None
     """For robots that are not listed."""
     robots: Mapping[str, str] = field(default_factory=dict)
+    namespaces: bool = True
+    """Whether robots join them in namespaces, with prefixes of their frames."""
 
     @classmethod
-    def read(cls, texts: Iterable[str]) -> Cores:
+    def read(cls, texts: Iterable[str], *, namespaces: bool = True) -> Cores:
         """Read ``URI`` (for all robots) and ``ROBOT=URI``."""
         default, robots = None, {}
         for text in texts:
@@ -53,7 +55,7 @@ class Cores:
                 robots[robot] = uri
             else:
                 default = text
-        return cls(default, robots)
+        return cls(default, robots, namespaces)
 
     def of(self, robot: str) -> str | None:
         """Return the master of a robot's graph; None for its own graph."""
@@ -191,7 +193,8 @@ class Simulation:
             uri = await self._start_core(stack, self._next_port(), f"robot {robot}")
             name, namespace, prefix = robot, "", ""
         else:
-            name, namespace, prefix = ROBOT_NODE, robot, robot
+            prefix = robot if self._cores.namespaces else ""
+            name, namespace = ROBOT_NODE, prefix
         node = await stack.enter_async_context(self._node(name, uri, namespace))
         if prefix:
             await node.set_param(frames.PARAMETER, prefix)

@@ -243,7 +243,10 @@ def _check_inside(cells: Iterable[int], count: int) -> None:
 
 
 def scene_of(scenario: Scenario, seed: int = 0) -> Scene:
-    """Return the initial state of a scenario, with known and hidden boxes."""
+    """Return the initial state of a scenario, with known and hidden boxes.
+
+    Its robots are TurtleBots with a lidar; localization and navigation are for other programs.
+    """
     grid = scenario.grid
     starts = zip(scenario.robots, scenario.starts, scenario.headings, strict=True)
     return Scene(
@@ -252,7 +255,9 @@ def scene_of(scenario: Scenario, seed: int = 0) -> Scene:
         cell_size=grid.cell_size,
         walls=tuple(sorted(grid.blocked)),
         boxes=tuple(sorted(scenario.boxes)),
-        robots=tuple(RobotStart(id=robot, cell=cell, yaw=yaw) for robot, cell, yaw in starts),
+        model="turtlebot2",
+        robots=tuple(RobotStart(id=robot, cell=cell, yaw=yaw, sensor="lidar") for robot, cell, yaw in starts),
+        stand_ins=False,
         seed=seed,
     )
 

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rce.ros.node import Node, run
+from rce.ros.node.hosting import program_arguments
 from rce_fleet.exceptions import MapError
 from rce_fleet.maps.occupancy_map import FREE_UP_TO, OCCUPIED_FROM
 from rce_fleet.maps.ros_map import save_map
@@ -84,7 +85,7 @@ async def save(node: Node, options: argparse.Namespace) -> Path | None:
 
 async def main() -> int:
     """Save a map; return the program's status."""
-    options = parse(sys.argv[1:])
+    options = parse(program_arguments())
     async with Node("map_saver", anonymous=False) as node:
         return 0 if await save(node, options) else 1
 

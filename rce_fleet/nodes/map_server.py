@@ -11,7 +11,6 @@ A file that cannot be read is an error on ``/rosout`` and ``/diagnostics``; the 
 from __future__ import annotations
 
 import asyncio
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from rce.ros.errors import ServiceFaultError
 from rce.ros.node import Node, run
+from rce.ros.node.hosting import program_arguments
 from rce_fleet.exceptions import MapError
 from rce_fleet.maps.ros_map import load_map
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
@@ -126,7 +126,7 @@ async def main() -> None:
     """Run the node until it is stopped."""
     async with Node("map_server") as node:
         parameters = await read_parameters(node, MapServerParameters)
-        words = arguments(sys.argv[1:])
+        words = arguments(program_arguments())
         if len(words) > 1:
             node.log.error("expected one map file, found %s; %s", " ".join(words), USAGE)
         await MapServer(node, parameters).run(words[0] if words else parameters.map_file)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from rce.ros.node.clock import NANOSECONDS
+from rce.ros.node.hosting import hosted_program, program_arguments, program_environ
 from rce.ros.node.member import DEFAULT_QUEUE, GraphMember
 from rce.ros.node.parameters import REQUIRED, ParameterCallback
 from rce.ros.node.publisher import Publisher
@@ -87,8 +86,8 @@ class Node(GraphMember):
         settings = NodeSettings.gather(
             name,
             namespace=namespace,
-            argv=sys.argv[1:] if argv is None else argv,
-            environ=os.environ,
+            argv=program_arguments() if argv is None else argv,
+            environ=program_environ(),
             master_uri=master_uri,
             anonymous=anonymous,
         )
@@ -101,6 +100,9 @@ class Node(GraphMember):
             intra_process=intra_process,
             rosout=rosout,
         )
+        program = hosted_program()
+        if program is not None:
+            program.add(self)
 
     def resolve(self, name: str) -> str:
         """Return the global name that ``name`` stands for, after remapping.

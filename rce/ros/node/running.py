@@ -9,6 +9,8 @@ from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
+from rce.ros.node.hosting import hosted_program
+
 T = TypeVar("T")
 
 
@@ -32,9 +34,10 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 def stop_signals(callback: Callable[[str], None]) -> Iterator[None]:
     """Call ``callback(reason)`` at the first signal. The second one has its usual effect.
 
-    Without effect outside the main thread, where Python takes no signals.
+    Without effect outside the main thread, where Python takes no signals, and in a program that shares its
+    process with others: they belong to the process.
     """
-    if threading.current_thread() is not threading.main_thread():
+    if threading.current_thread() is not threading.main_thread() or hosted_program() is not None:
         yield
         return
     loop = asyncio.get_running_loop()
