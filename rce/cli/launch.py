@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -55,11 +56,14 @@ def launch(
     ] = 2.0,
 ) -> None:
     """Start the nodes of a launch file."""
+    from rce.config.logs import start_logging
     from rce.launching import StopTimeouts
     from rce.ros.launch import MachineInputs
 
     inputs = MachineInputs(_packages())
     uri = _master_uri(port)
+    if one_process:
+        start_logging(logging.WARNING, line="%(levelname)s %(name)s: %(message)s")
     try:
         plan = _load(what, inputs)
         for warning in plan.warnings:

@@ -61,7 +61,7 @@ class CloudPrograms:
         self._graphs = await self._find_graphs(group, world)
         page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)
         for graph in self._graphs:
-            await start_robot(group, config, graph, robot=graph.robot, relay=False)
+            await start_robot(group, config, graph, {"robot": graph.robot, "relay": False})
         bridges = [
             await group.start(
                 f"robot{number}",

@@ -62,7 +62,7 @@ def environment(config: DemoConfig, uri: str) -> dict[str, str]:
 
 
 async def start_robot(
-    group: ProgramGroup, config: DemoConfig, graph: RobotGraph, **arguments: object
+    group: ProgramGroup, config: DemoConfig, graph: RobotGraph, arguments: Mapping[str, object]
 ) -> Program:
     """Start the nodes of a robot: its launch file, in one process.
 
@@ -74,7 +74,7 @@ async def start_robot(
         graph: Where the robot's nodes are.
         arguments: More arguments of the launch file.
     """
-    argv = [*graph.host, *launch_argv(config, graph.robot, **arguments)]
+    argv = [*graph.host, *launch_argv(config, graph.robot, arguments)]
     return await group.start(
         f"nodes-{graph.robot}",
         argv,
@@ -84,7 +84,7 @@ async def start_robot(
     )
 
 
-def launch_argv(config: DemoConfig, robot: str, **arguments: object) -> list[str]:
+def launch_argv(config: DemoConfig, robot: str, arguments: Mapping[str, object]) -> list[str]:
     """Return the command that starts the nodes of a robot.
 
     Args:

@@ -144,7 +144,8 @@ class SingleCorePrograms:
             await host.start(group, f"move_client{number}", move_client_argv(robot), restartable=True)
         page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)
         for index, graph in enumerate(self._graphs):
-            await start_robot(group, config, graph, tf_prefix=graph.prefix, map_server=index == 0)
+            arguments = {"tf_prefix": graph.prefix, "map_server": index == 0}
+            await start_robot(group, config, graph, arguments)
         await group.wait_line(world, "simulation ready:", START_TIMEOUT)
         return page
 
@@ -209,7 +210,7 @@ class MultiCorePrograms:
         await _join_machines(network, robots, group)
         page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)
         for graph in self._graphs:
-            await start_robot(group, config, graph, robot=graph.robot)
+            await start_robot(group, config, graph, {"robot": graph.robot})
         await group.wait_line(world, "simulation ready:", START_TIMEOUT)
         return page
 

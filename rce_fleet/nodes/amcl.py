@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rce.ros.errors import RosError
+from rce.ros.errors import NodeClosedError, RosError
 from rce.ros.node import Node, run
 from rce.ros.tf import TransformBroadcaster, TransformError, TransformListener
 from rce.ros.types import Time
@@ -247,6 +247,8 @@ class AmclNode:
             return
         except ValueError as error:
             self._refuse("scan", f"a scan of frame {frame!r} cannot be used: {error}")
+            return
+        except NodeClosedError:  # the node was stopped while the scan waited
             return
         self._scan_stamp = stamp
         self._use(scan, odometry, stamp)

@@ -43,7 +43,7 @@ def prepare(launch_environment: LaunchEnvironment, mark: str) -> Launch:
     spec, packages = launch_environment.spec, launch_environment.packages
     environ: Mapping[str, str] = launch_environment.environ
     try:
-        executable, package, choice = packages.find(spec.pkg).program(spec.exe)
+        executable, package, choice, _ = packages.find(spec.pkg).program(spec.exe)
         arguments = split_arguments(spec.args, packages, environ)
     except (LookupError, ValueError, OSError) as error:
         raise NodeError(str(error)) from error
