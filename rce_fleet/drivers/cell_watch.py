@@ -1,4 +1,7 @@
-"""Watches the cells that the planner blocks, so that the world puts boxes there."""
+"""Watches the cells that people block, so that the world puts boxes there.
+
+Cells that a robot's sensors found blocked get no box: there is something already, or the sensor was wrong.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ if TYPE_CHECKING:
     from rce.ros.types import Message, TypeRegistry
 
 CELLS = "std_msgs/Int32MultiArray"
-TOPIC = "/fleet/blockedCells"
+TOPIC = "/fleet/requestedCells"
 NODE = "world"
 
 

@@ -1,4 +1,4 @@
-"""Watches the planner's blocked cells through the engine."""
+"""Watches the cells that people block through the engine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rce_fleet.drivers.cell_watch import CELLS, TOPIC, cells_of
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-OWN_TAG = "blockedCells"
+OWN_TAG = "requestedCells"
 JOIN_TIMEOUT = 3.0
 """Seconds after which the interface is requested again."""
 LOOK_EVERY = 1.0
@@ -37,7 +37,7 @@ class WorldAccount:
 
 
 class EngineCellWatch:
-    """Watches the planner's blocked cells through an interface of its container.
+    """Watches the cells that people block through an interface of its container.
 
     The planner's container may start later than the world, or be restarted: the interface is requested until
     it is connected, and again when it is lost.

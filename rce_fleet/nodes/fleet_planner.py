@@ -81,9 +81,11 @@ class PlannerNode:
         self._requests: asyncio.Queue[PlanRequest] = asyncio.Queue()
         self._state = StatePublisher(node, planner)
         self._blocked: Publisher
+        self._requested: Publisher
         self._map: Publisher
         self._old_map: Publisher | None = None
         self._shown_blocked: tuple[int, ...] = ()
+        self._shown_requested: tuple[int, ...] | None = None
         self._looks_for_old = 0
 
     async def run(self, blocked: list[int]) -> None:
@@ -94,6 +96,9 @@ class PlannerNode:
         """
         node = self._node
         self._blocked = await node.advertise("/fleet/blockedCells", "std_msgs/Int32MultiArray", latch=True)
+        self._requested = await node.advertise(
+            "/fleet/requestedCells", "std_msgs/Int32MultiArray", latch=True
+        )
         self._map = await node.advertise(GRID_TOPIC, "nav_msgs/OccupancyGrid", latch=True)
         self._publish_blocked(())
         for cell in blocked:
@@ -230,6 +235,7 @@ class PlannerNode:
         """Pass a request to the planner; return the fields of the response."""
         reply = next(done for done in self._handle(event) if isinstance(done, Reply))
         self._node.log.info("%s", reply.message)
+        self._publish_requested(self._shown_blocked)
         return {"ok": reply.ok, "message": reply.message}
 
     def _take(self, event: Event) -> None:
@@ -255,8 +261,16 @@ class PlannerNode:
                     assert_never(instruction)
         return instructions
 
+    def _publish_requested(self, blocked: tuple[int, ...]) -> None:
+        """Publish the blocked cells that people asked for, if they changed."""
+        requested = tuple(cell for cell in blocked if cell not in self._planner.state.sensed)
+        if requested != self._shown_requested:
+            self._shown_requested = requested
+            self._requested.publish(data=list(requested))
+
     def _publish_blocked(self, cells: tuple[int, ...]) -> None:
         self._blocked.publish(data=list(cells))
+        self._publish_requested(cells)
         fields = grid_fields(self._planner.state.grid, cells, self._node.now())
         for grids in (self._map, self._old_map):
             if grids is not None:

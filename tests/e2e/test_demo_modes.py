@@ -105,13 +105,15 @@ async def test_machines_share_only_the_synced_topics() -> None:
 
         heard = {f"/Robot{n}/{name}" for n in (1, 2) for name in ("amcl_pose", "goalNodesList")}
         await until(lambda: _holds(published("planner"), heard), timeout=20, what="the planner hears all")
-        at_robot = {"/Robot1/goalNodesList", "/Robot1/cancelGoal", "/Robot1/odom"}
+        at_robot = {"/Robot1/goalNodesList", "/Robot1/cancelGoal", "/fleet/map", "/fleet/state", "/odom"}
         await until(lambda: _holds(published("Robot1"), at_robot), timeout=20, what="the robot hears it")
         station = StationClient(session, demo.page)
         await until(lambda: _is(_state(station), "idle"), timeout=30, what="lists are answered")
-        assert await foreign("planner") == heard
-        assert await foreign("Robot1") == {"/Robot1/goalNodesList", "/Robot1/cancelGoal"}
-        assert await foreign("Robot2") == {"/Robot2/goalNodesList", "/Robot2/cancelGoal"}
+        lists = {f"/Robot{n}/goalNodesList" for n in (1, 2)}
+        assert await foreign("planner") == lists
+        grid = {"/fleet/map", "/fleet/state"}
+        assert await foreign("Robot1") == {"/Robot1/goalNodesList", "/Robot1/cancelGoal", *grid}
+        assert await foreign("Robot2") == {"/Robot2/goalNodesList", "/Robot2/cancelGoal", *grid}
 
 
 @pytest.mark.parametrize("mode", ["single", "multi"])

@@ -115,7 +115,7 @@ class CellWatch:
             seen: What the sensor saw, in the map's frame.
             now: Time, seconds.
             robots: Other robots, shape (K, 3): x, y and radius, metres.
-            held: Cells that other robots hold; nothing in them is reported.
+            held: Cells that other robots hold; nothing in them is reported, and what was seen is forgotten.
             suspects: Cells that are blocked as far as the fleet knows; they are reported if they are free.
         """
         self._start = self._start or now
@@ -126,6 +126,7 @@ class CellWatch:
         for cell in self._in_sight(sensor):
             if cell in held:
                 self._since.pop(cell, None)
+                self._evidence[self._square(cell)] = 0  # it may be the robot, which drives on unseen
                 continue
             is_blocked = self._is_blocked(cell, sensor)
             was, since = self._since.get(cell, (not is_blocked, now))

@@ -91,7 +91,7 @@ async def test_the_planners_cells_get_boxes_from_its_graph(tmp_path: Path) -> No
     report = tmp_path / "world.json"
     argv = [sys.executable, "-m", "rce_fleet.drivers", str(tmp_path / "scene.json")]
     async with Core(port=0) as core, Node("p", argv=(), master_uri=core.uri, signals=False) as node:
-        cells = await node.advertise("/fleet/blockedCells", "std_msgs/Int32MultiArray", latch=True)
+        cells = await node.advertise("/fleet/requestedCells", "std_msgs/Int32MultiArray", latch=True)
         cells.publish(data=[20])
         options = ["--planner-core", core.uri, "--report", str(report)]
         program = Program("simulation", [*argv, *options], dict(os.environ), tmp_path)

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 from rce.config.client import loads
 from rce.config.documents import write_items
 from rce_fleet.demo.config import DemoConfig
 from rce_fleet.demo.resources import Ports
-from rce_fleet.demo.ros_modes import PLANNER, node_names, planner_argv, sync_argv, world_argv
+from rce_fleet.demo.robots import RobotGraph, launch_argv
+from rce_fleet.demo.ros_modes import (
+    PLANNER,
+    move_client_argv,
+    node_names,
+    planner_argv,
+    sync_argv,
+    world_argv,
+)
 from rce_fleet.demo.scenario import choose_scenario
 from rce_fleet.demo.traffic import received
 from rce_fleet.wiring import fleet_config
@@ -37,14 +44,32 @@ def test_each_robot_of_the_world_joins_its_own_core() -> None:
     joins = [argv[place + 1] for place, word in enumerate(argv) if word == "--core"]
     assert joins == ["Robot1=http://a:1/", "Robot2=http://b:1/"]
     assert argv[argv.index("--planner-core") + 1] == "http://c:1/"
+    assert "--no-namespaces" not in argv
+    assert "--no-namespaces" in world_argv(CONFIG, "http://c:1/", {}, namespaces=False)
+
+
+def test_robot_starts_at_its_dock_and_later_where_it_was() -> None:
+    """A launch gives the robot the pose of its start; one that follows lets it keep the stored pose."""
+    argv = launch_argv(CONFIG, "Robot2", {"robot": "Robot2"})
+    scenario = CONFIG.scenario
+    x, y = scenario.grid.centre(scenario.starts[1])
+    assert {f"initial_pose_x:={x}", f"initial_pose_y:={y}", "map:=/folder/map.yaml"} <= {*argv}
+    assert f"initial_pose_a:={scenario.headings[1]}" in argv
+    assert argv[-1] == "robot:=Robot2"
+
+
+def test_move_client_without_namespace_finds_the_robots_topics() -> None:
+    argv = move_client_argv("Robot1", namespace=False, answers=True)
+    assert {"__ns:=Robot1", "move_base/goal:=/move_base/goal", "blockedCells:=/blockedCells"} <= {*argv}
+    assert "_answers:=true" in argv
+    assert not any("move_base" in word for word in move_client_argv("Robot1"))
 
 
 def test_only_the_demos_own_nodes_are_counted() -> None:
-    one = replace(CONFIG, scenario=choose_scenario(1, 0))
-    assert node_names(one) == {
-        *("/Robot1/robot", "/Robot1/move_client"),
-        *("/fleet_planner", "/operator_station", "/world"),
-    }
+    shared = node_names([RobotGraph("Robot1", "http://a:1/", prefix="Robot1")])
+    assert {"/Robot1/robot", "/Robot1/amcl", "/Robot1/move_client", "/map_server"} <= shared
+    alone = node_names([RobotGraph("Robot1", "http://a:1/")])
+    assert {"/robot", "/amcl", "/Robot1/move_client", "/fleet_planner"} <= alone
 
 
 def test_received_counts_sum_topics_and_connections() -> None:
@@ -57,7 +82,8 @@ def test_received_counts_sum_topics_and_connections() -> None:
 def test_robots_machine_syncs_only_its_own_topics() -> None:
     argv = sync_argv("Robot1", ["Robot1", "Robot2"])
     assert argv[argv.index("--hosts") + 1] == PLANNER
-    assert argv[argv.index("--topics") + 1] == "/Robot1/goalNodesList,/Robot1/cancelGoal"
+    topics = argv[argv.index("--topics") + 1].split(",")
+    assert topics == ["/Robot1/goalNodesList", "/Robot1/cancelGoal", "/fleet/map", "/fleet/state"]
 
 
 def test_planners_machine_syncs_two_topics_per_robot() -> None:

@@ -10,6 +10,7 @@ import pytest
 from support.fleet_states import truth
 
 from rce_fleet.demo.headless import RunReport
+from rce_fleet.demo.judge import RobotScore
 from rce_fleet.demo.scenario import choose_scenario
 from rce_fleet.demo.scenario_run import ScenarioRun
 from rce_fleet.demo.traffic import MessageTotals
@@ -22,9 +23,21 @@ def make_report(reached: set[str], problem: str = "", collisions: int = 0) -> Ru
     unused: Any = None
     run = ScenarioRun(unused, SCENARIO, lambda: None, lambda _: None)
     run.reached = reached
-    return RunReport(
-        SCENARIO, 0, run, truth(ROBOTS, apart=0.5, collisions=collisions), MessageTotals(10, 1), problem
-    )
+    score = RobotScore()
+    for error in (0.01, 0.07):
+        score.compare(error)
+    for reported in (1, 1, 2):
+        score.count_recoveries(reported)
+    seen = truth(ROBOTS, apart=0.5, collisions=collisions)
+    totals = MessageTotals(10, 1)
+    return RunReport(SCENARIO, 0, run, seen, totals, problem, scores={"Robot1": score})
+
+
+def test_recoveries_count_on_after_a_restart_of_move_base() -> None:
+    score = RobotScore()
+    for reported in (0, 2, 2, 1, 1, 3):
+        score.count_recoveries(reported)
+    assert score.recoveries == 5
 
 
 def test_report_of_a_good_run() -> None:
@@ -41,6 +54,9 @@ def test_report_of_a_good_run() -> None:
             "reached": True,
             "replans": 0,
             "distance_m": 1.0,
+            "localization_rmse_m": 0.05 if robot == "Robot1" else None,
+            "localization_max_m": 0.07 if robot == "Robot1" else None,
+            "recoveries": 2 if robot == "Robot1" else 0,
         }
         for robot, start, goal in zip(SCENARIO.robots, SCENARIO.starts, SCENARIO.goals, strict=True)
     ]
