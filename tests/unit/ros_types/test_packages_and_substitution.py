@@ -204,11 +204,11 @@ def test_a_real_package_goes_before_a_distributed_node(distributed: Distributed,
     ours = PackageIndex([]).find("shop").program("tool")
     script = Path(json.__file__).parent / "tool.py"
     assert (ours.command, ours.package.python) == ([sys.executable, str(script)], "engine")
-    assert ours.choice == "shop/tool is json.tool"
+    assert (ours.choice, ours.target) == ("shop/tool is json.tool", "json.tool")
     folder = make(tmp_path / "shop", manifest="package.xml", text="<package/>", nodes__tool=0o755)
     real = PackageIndex([tmp_path]).find("shop")
     file = folder / "nodes" / "tool"
-    assert real.program("tool") == ([str(file)], real, f"shop/tool is {file}, not json.tool")
+    assert real.program("tool") == ([str(file)], real, f"shop/tool is {file}, not json.tool", "")
     till = real.program("till")
     assert (till.command, till.package.python) == ([sys.executable, str(script)], "engine")
     assert till.choice == f"shop/till is json.tool; the package in {folder} does not have it"
