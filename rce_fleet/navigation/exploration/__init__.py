@@ -1,0 +1,1 @@
+"""Exploration of an unknown floor: frontiers of a map, and the choice of the next goal. Pure."""
