@@ -69,6 +69,8 @@ class SlamGmappingParameters(FilterParameters):
         tf_delay: Seconds by which transforms are dated ahead; below 0: transform_publish_period.
         throttle_scans: Every so many scans one is used.
         seed: Of the filter's random numbers; below 0: another one each time.
+        map_start_pose: Where the robot is on the map at the first scan: x, y (metres), yaw (radians); named
+            as in slam_toolbox.
     """
 
     base_frame: str = "base_link"
@@ -79,6 +81,7 @@ class SlamGmappingParameters(FilterParameters):
     tf_delay: float = -1.0
     throttle_scans: int = field(default=1, metadata={"minimum": 1})
     seed: int = -1
+    map_start_pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class SlamGmappingNode:
@@ -93,7 +96,9 @@ class SlamGmappingNode:
         self._node = node
         self._parameters = parameters
         self._filter = GridFilter(
-            parameters, np.random.default_rng(None if parameters.seed < 0 else parameters.seed)
+            parameters,
+            np.random.default_rng(None if parameters.seed < 0 else parameters.seed),
+            parameters.map_start_pose,
         )
         self._watch = OdometryWatch()
         self._throttled_log = ThrottledLog(node)

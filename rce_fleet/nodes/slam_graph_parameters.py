@@ -63,7 +63,7 @@ class SlamGraphParameters:
         map_file: File of the graph map (``.npz``): what ``~save_map`` writes and ``~load_map`` reads.
         load_map: Load ``map_file`` when the node starts, and continue it.
         initial_pose: About where the first robot starts on a loaded map, x, y, yaw; without it the robot is
-            searched.
+            searched. On a new map, exactly where; without it at 0, 0, 0.
         localize_only: Localize the robots in ``map_file``, and leave the map as it is.
     """
 

@@ -68,7 +68,7 @@ class SlamGraphSession:
                 self._localizers[robot] = localizer
             pose = localizer.add(record)
             return None if pose is None else compose(pose, inverse(odometry))
-        start = self._take_start() if robot not in self._mapper.robots and len(self.graph) else None
+        start = None if robot in self._mapper.robots else self._take_start()
         self._mapper.add(record, robot, start)
         return self._mapper.map_from_odom(odometry, robot) if self._mapper.is_joined(robot) else None
 

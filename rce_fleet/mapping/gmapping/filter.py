@@ -84,6 +84,7 @@ class GridFilter:
     Args:
         parameters: GMapping's.
         rng: Source of randomness; the same seed gives the same result.
+        start: Pose of the first scan on the map, shape (3,).
 
     Attributes:
         poses: shape (particles, 3): x, y, yaw.
@@ -91,10 +92,15 @@ class GridFilter:
         store: The particles' maps.
     """
 
-    def __init__(self, parameters: FilterParameters, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        parameters: FilterParameters,
+        rng: np.random.Generator,
+        start: tuple[float, ...] = (0.0, 0.0, 0.0),
+    ) -> None:
         number = parameters.particles
         self.parameters = parameters
-        self.poses = np.zeros((number, 3))
+        self.poses = np.tile(np.asarray(start, np.float64), (number, 1))
         self.weights = np.full(number, 1 / number)
         self.store = TileStore(number, parameters.delta)
         self.ancestry = Ancestry()
@@ -102,7 +108,7 @@ class GridFilter:
         self._rng = rng
         self._odometry: Reals | None = None
         self._jumped = False
-        self._base = np.zeros(3)
+        self._base = self.poses[0].copy()
         self._motion = np.zeros(3)
         self._driven = np.zeros(3)
         self._time = 0.0

@@ -83,8 +83,7 @@ class Explorer:
                 return held
         best = next(self._open(search), None)
         if best is None:
-            if self.target is not None:
-                self.target, self._ended_at = None, now
+            self.target = None
             waits = drawn_at <= self._ended_at and now - self._ended_at < MAP_WAIT
             return Action.KEEP if waits or search.reason else Action.DONE
         return self._choose(best, now)

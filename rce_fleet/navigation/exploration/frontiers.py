@@ -204,15 +204,15 @@ def _pieces(cells: Cells, extent: float) -> Iterator[Cells]:
 
 def _sees(blocked: Mask, stands: Cells, cells: Cells) -> Mask:
     """Return whether no obstacle is on the line from each place to its cell, both shape (N, 2)."""
-    away = np.hypot(*(cells - stands).T)
-    far = away > 0
+    away: Floats = np.hypot(*(cells - stands).T)
+    far: Mask = np.asarray(away > 0)
     if far.any():
         rows, columns = (cells - stands)[far].T
         starts = np.ascontiguousarray(stands[far, ::-1] + 0.5, np.float64)
         angles = np.arctan2(rows, columns).astype(np.float64)
         free = cast_in_cells(np.ascontiguousarray(blocked), starts, angles, float(away.max()))
         far[far] = free < away[far]
-    return ~far
+    return np.logical_not(far)
 
 
 def _middle(cells: Cells, allowed: Mask) -> int:

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.lidar_drive import BEAMS, drive
 
-from rce_fleet.geometry.poses import relative
+from rce_fleet.geometry.poses import compose, relative
+from rce_fleet.mapping.gmapping.filter import GridFilter
 from rce_fleet.mapping.gmapping.mapper import ParticleMapper
 from rce_fleet.mapping.gmapping.motion import motion_std, prior_information
 from rce_fleet.mapping.gmapping.parameters import FilterParameters
@@ -22,6 +23,7 @@ from rce_fleet.mapping.gmapping.particles import (
     normalized,
     systematic_sample,
 )
+from rce_fleet.mapping.occupancy_mapping import map_of
 from rce_fleet.mapping.records import LaserRecord
 
 
@@ -71,6 +73,17 @@ def test_the_parameters_of_the_paper_give_a_map_by_odometry() -> None:
     for _ in range(2):
         assert np.allclose(mapper.trajectory(), relative(odometry[0], odometry))
         mapper.finish()
+
+
+def test_a_map_can_begin_at_a_given_pose() -> None:
+    """Everything is as if the map was moved there; cells differ where the grid falls otherwise."""
+    start = (3.0, -2.0, 0.5)
+    true, records = drive(30)
+    found = GridFilter(QUICK, np.random.default_rng(0), start)
+    for record in records:
+        found.add(record)
+    assert np.hypot(*(found.estimate - compose(np.array(start), true[-1]))[:2]) < 0.15
+    assert map_of(found.store, found.best).values_at(compose(np.array(start), true)[:, :2]).max() == 0
 
 
 def test_scans_are_used_after_way_turn_or_time() -> None:

@@ -229,6 +229,14 @@ def test_a_goal_is_kept_while_its_frontier_is_there() -> None:
     assert explorer.goals == 2
 
 
+def test_the_end_comes_at_once_when_all_is_known() -> None:
+    """The robot need not arrive at a goal whose frontier is gone."""
+    explorer = Explorer(PARAMETERS)
+    explorer.update(search_of(HALL), 0.0, 0.0)
+    assert explorer.update(search_of(CLOSED), 1.0, 1.5) is Action.DONE
+    assert explorer.target is None
+
+
 def test_a_goal_without_progress_is_given_up() -> None:
     explorer = Explorer(PARAMETERS)
     explorer.update(search_of(ONE_END), 0.0, 0.0)
