@@ -11,12 +11,13 @@ import os
 import re
 from collections import OrderedDict, deque
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 from msgspec import Struct
 
 from rce.config.logs import redact
+from rce.guard.rates import Rates
 from rce.protocol.printable import one_line
 
 if TYPE_CHECKING:
@@ -37,6 +38,10 @@ KEPT = 10_000
 REPEAT_S = 60.0
 """Refusals of the same user from the same address within this time are one record."""
 MAX_REPEATS = 1000
+BURST = 2000
+"""Records of one user that are written one by one, however fast they come."""
+PER_SECOND = 2.0
+"""Records of one user beyond the burst; more of an action and an address within a minute are one record."""
 MAX_TEXT = 300
 
 SHOWN = 5
@@ -46,6 +51,10 @@ _UPPER = re.compile(r"(?<!^)(?=[A-Z])")
 _NAMES = ("container", "endpoint", "tag", "name", "tag_a", "tag_b")
 
 DONE, REFUSED = "done", "refused"
+
+
+_Key: TypeAlias = tuple[str, str, str, str]
+"""User, action, address and outcome."""
 
 
 class Record(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -69,7 +78,7 @@ class Record(Struct, frozen=True, kw_only=True, omit_defaults=True):
     via: str = ""
     """The robot or station that passed it on."""
     times: int = 1
-    """How often since the previous record of the same user, action and address."""
+    """How often since the previous record of the same user, action, address and outcome."""
 
 
 class AuditLog:
@@ -95,7 +104,8 @@ class AuditLog:
         self._descriptor = -1
         self._size = 0
         self._failed = False
-        self._repeated: OrderedDict[tuple[str, str, str], tuple[float, int]] = OrderedDict()
+        self._repeated: OrderedDict[_Key, tuple[float, int]] = OrderedDict()
+        self._rates = Rates(per_second=PER_SECOND, burst=BURST)
 
     def add(
         self,
@@ -109,40 +119,52 @@ class AuditLog:
         outcome: str = DONE,
         times: int = 1,
     ) -> None:
-        """Record an action.
+        """Record an action. Those of a user who does too much are counted, so that others' records stay.
 
         If a record cannot be written, it is kept in memory, the engine's log reports it, and the engine
         continues.
         """
-        record = Record(
-            id=self._next_id,
-            time=self._clock(),
-            user=_clean(user),
-            action=action,
+        now = self._clock()
+        if outcome == DONE and self._rates.take(user, now):
+            key = user, action, address, DONE
+            self._add_missed(key, self._count(key, now))
+            return
+        self._add(
+            user,
+            action,
+            now,
             subject=_clean(subject),
-            outcome=outcome,
             detail=_clean(detail),
             address=address,
             via=_clean(via),
+            outcome=outcome,
             times=times,
         )
+
+    def _add(self, user: str, action: str, now: float, **fields: Any) -> None:
+        record = Record(id=self._next_id, time=now, user=_clean(user), action=action, **fields)
         self._next_id += 1
         self._records.append(record)
         self._write(msgspec.json.encode(record) + b"\n")
 
     def refuse(self, user: str, action: str, *, detail: str = "", address: str = "") -> None:
         """Record a refusal; repetitions are counted and written at most once a minute."""
-        key, now = (user, action, address), self._clock()
+        times = self._count((user, action, address, REFUSED), self._clock())
+        if times:
+            self.add(user, action, detail=detail, address=address, outcome=REFUSED, times=times)
+
+    def _count(self, key: _Key, now: float) -> int:
+        """Count a repetition; return how many are to be written now: one or more once a minute, else 0."""
         since, count = self._repeated.get(key, (0.0, 0))
         if now - since < REPEAT_S:
             self._repeated[key] = (since, count + 1)
-            return
+            return 0
         self._repeated.pop(key, None)
         while len(self._repeated) >= MAX_REPEATS:
             oldest, (_, missed) = self._repeated.popitem(last=False)
             self._add_missed(oldest, missed)
         self._repeated[key] = (now, 0)
-        self.add(user, action, detail=detail, address=address, outcome=REFUSED, times=count + 1)
+        return count + 1
 
     def flush(self) -> None:
         """Write the repetitions that are due."""
@@ -168,10 +190,13 @@ class AuditLog:
         self._repeated.clear()
         self._close()
 
-    def _add_missed(self, key: tuple[str, str, str], count: int) -> None:
-        user, action, address = key
+    def _add_missed(self, key: _Key, count: int) -> None:
+        user, action, address, outcome = key
         if count:
-            self.add(user, action, detail="again", address=address, outcome=REFUSED, times=count)
+            detail = "again" if outcome == REFUSED else "too often to be listed"
+            self._add(
+                user, action, self._clock(), detail=detail, address=address, outcome=outcome, times=count
+            )
 
     def _write(self, line: bytes) -> None:
         try:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections import deque
-from itertools import takewhile
+from bisect import bisect_right
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from msgspec import Struct
@@ -14,6 +14,11 @@ if TYPE_CHECKING:
     from rce_master.state.changes import StateEvent
 
 CAPACITY = 10_000
+AT_ONCE = 100
+"""Events that a follower gets at a time."""
+_COMPACT_AFTER = 64
+"""Forgotten events after which a list may be made shorter."""
+_ID = attrgetter("id")
 
 
 class Event(Struct, frozen=True, kw_only=True):
@@ -32,6 +37,33 @@ class Event(Struct, frozen=True, kw_only=True):
     text: str = ""
 
 
+class _UserLog:
+    """A user's events, oldest first. Finding one by its id takes a few steps, not one for each event."""
+
+    def __init__(self) -> None:
+        self._events: list[Event] = []
+        self._begin = 0
+
+    def __len__(self) -> int:
+        return len(self._events) - self._begin
+
+    def append(self, event: Event) -> None:
+        """Add the newest event."""
+        self._events.append(event)
+
+    def forget_oldest(self) -> None:
+        """Drop the oldest event."""
+        self._begin += 1
+        if self._begin > max(_COMPACT_AFTER, len(self)):
+            del self._events[: self._begin]
+            self._begin = 0
+
+    def since(self, id_: int, limit: int) -> list[Event]:
+        """Return at most ``limit`` events after an event, oldest first."""
+        first = bisect_right(self._events, id_, lo=self._begin, key=_ID)
+        return self._events[first : first + limit]
+
+
 class EventLog:
     """Keeps the newest events. Followers read from the ring, so a slow one costs no memory.
 
@@ -42,7 +74,7 @@ class EventLog:
     """
 
     def __init__(self, start: float, capacity: int = CAPACITY) -> None:
-        self._events: dict[str, deque[Event]] = {}
+        self._events: dict[str, _UserLog] = {}
         """By user."""
         self._count = 0
         self._capacity = capacity
@@ -65,7 +97,7 @@ class EventLog:
             text=state_event.text,
         )
         self._next_id += 1
-        self._events.setdefault(event.user, deque()).append(event)
+        self._events.setdefault(event.user, _UserLog()).append(event)
         self._count += 1
         if self._count > self._capacity:
             self._forget_one()
@@ -74,7 +106,7 @@ class EventLog:
     def _forget_one(self) -> None:
         """Drop the oldest event of the user with the most events, so that a flood does not affect others."""
         user = max(self._events, key=lambda user: len(self._events[user]))
-        self._events[user].popleft()
+        self._events[user].forget_oldest()
         self._count -= 1
 
     def wake(self) -> None:
@@ -98,9 +130,10 @@ class EventLog:
         """
         if id_ >= self.last_id:
             return []
-        logs = self._events.values() if user is None else [self._events.get(user, deque())]
-        found = [event for log in logs for event in takewhile(lambda event: event.id > id_, reversed(log))]
-        return sorted(found, key=lambda event: event.id)[:limit]
+        if user is not None:
+            return self._events[user].since(id_, limit) if user in self._events else []
+        found = [event for log in self._events.values() for event in log.since(id_, limit)]
+        return sorted(found, key=_ID)[:limit]
 
     async def wait(self, id_: int, timeout: float, user: str | None = None) -> list[Event]:
         """Wait for events after an event.
@@ -113,9 +146,11 @@ class EventLog:
             user: Of this user only; None: of all.
 
         Returns:
-            At most a hundred events, oldest first; none if none came within ``timeout`` seconds, or if the
-            right to follow may have changed.
+            At most :data:`AT_ONCE` events, oldest first; none if none came within ``timeout`` seconds, or if
+            the right to follow may have changed.
         """
-        if not self.since(id_, limit=1, user=user):
-            await self.wait_change(timeout)
-        return self.since(id_, limit=100, user=user)
+        found = self.since(id_, AT_ONCE, user)
+        if found:
+            return found
+        await self.wait_change(timeout)
+        return self.since(id_, AT_ONCE, user)

@@ -5,6 +5,7 @@ Usage is counted per user, so that one user does not affect another. Quotas do n
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import math
 import time
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 READS_AT_ONCE = 32
 READS_WAITING = 512
 """Waiting reads of logs of all users; beyond it, the user with the most is told to try later."""
+REPLAY_BURST = 200
+"""Parts of past events that a user's streams send without a pause: twice all events that are kept."""
 ITEMS_PER_REQUEST = 20
 """How many nodes, interfaces, parameters, ... in one request count as one more request."""
 
@@ -56,7 +59,9 @@ class Quotas:
     ) -> None:
         self._settings = settings or QuotaSettings()
         self._clock = clock
-        self._rest, self._robots = (self._rates() for _ in range(2))
+        burst = self._settings.request_burst
+        self._rest, self._robots = (self._rates(burst) for _ in range(2))
+        self._replays = self._rates(min(burst, REPLAY_BURST))
         self._streams: Counter[str] = Counter()
         self._reads = Turns(READS_AT_ONCE, waiting=READS_WAITING, each=self._settings.log_reads)
 
@@ -79,6 +84,14 @@ class Quotas:
             TooMuchError: There were too many requests.
         """
         self._take(self._robots, user, 1 + items // ITEMS_PER_REQUEST)
+
+    async def replay(self, user: User) -> None:
+        """Count a part of the events of the past that a stream sends; wait if a user's streams sent many.
+
+        Does not count as a request, so that following events leaves all requests to the user.
+        """
+        if self._replays is not None and user.role is not UserRole.ADMIN:
+            await asyncio.sleep(self._replays.reserve(user.name, self._clock()))
 
     @contextlib.contextmanager
     def stream(self, user: User) -> Iterator[None]:
@@ -119,11 +132,10 @@ class Quotas:
         finally:
             await turn.__aexit__(None, None, None)
 
-    def _rates(self) -> Rates | None:
-        settings = self._settings
-        if not settings.requests:
+    def _rates(self, burst: int) -> Rates | None:
+        if not self._settings.requests:
             return None
-        return Rates(per_second=settings.requests, burst=max(1, settings.request_burst))
+        return Rates(per_second=self._settings.requests, burst=max(1, burst))
 
     def _take(self, rates: Rates | None, user: User, cost: int) -> None:
         if rates is None or user.role is UserRole.ADMIN:

@@ -15,6 +15,10 @@ from rce.config.exceptions import RunDirError, ShippedFileError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+MASTER_FOLDER = "master"
+"""The folder of the master's state in an engine's state folder."""
+STORE_FILE = "rce.sqlite"
+"""The file of a master's state, in its folder."""
 
 _PACKAGE = Path(rce.__file__).resolve().parent
 
@@ -22,6 +26,17 @@ _PACKAGE = Path(rce.__file__).resolve().parent
 def default_state_dir() -> Path:
     """Return the default folder for state, such as ``~/.local/state/rce``. Does not create it."""
     return platformdirs.user_state_path("rce")
+
+
+def master_folder(state_dir: Path) -> Path:
+    """Return the folder of the master's state in the folder that ``rce-master --state-dir`` names.
+
+    That is the folder itself, or the folder ``master`` in it where only that holds a state: the named folder
+    is then that of an engine (``rce up --state-dir``), or ``rce user add --state-dir`` made it.
+    """
+    inner = state_dir / MASTER_FOLDER
+    only_inner = (inner / STORE_FILE).exists() and not (state_dir / STORE_FILE).exists()
+    return inner if only_inner else state_dir
 
 
 def run_dir(environ: Mapping[str, str] | None = None) -> Path:

@@ -16,7 +16,7 @@ from typing import Annotated
 from msgspec import Meta, field
 
 from rce.config.fields import Hosts, Memory, Section, Setting, choice
-from rce.config.folders import default_state_dir
+from rce.config.folders import MASTER_FOLDER, default_state_dir, master_folder
 from rce.config.master_settings import ANYWHERE, MasterSettings
 from rce.config.task_set_settings import ContainerSettings, RobotSettings, Runtime
 from rce.masters import split_addresses
@@ -149,7 +149,9 @@ class EngineSettings(Section, frozen=True, kw_only=True):
     @property
     def master_state(self) -> Path:
         """The folder of the master's state."""
-        return self.master.state_dir or self.state_dir / "master"
+        if self.master.state_dir is not None:
+            return master_folder(self.master.state_dir)
+        return self.state_dir / MASTER_FOLDER
 
     @property
     def container_state(self) -> Path:

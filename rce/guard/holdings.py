@@ -13,7 +13,12 @@ if TYPE_CHECKING:
 
 
 class Holding:
-    """One entry. Call :meth:`release` when it is not held any more; further calls have no effect."""
+    """One entry. Call :meth:`release` when it is not held any more; further calls have no effect.
+
+    A released entry does not refer to what gave up its data: that often refers to the data and, through its
+    owner, to the entry itself. Such a cycle would keep the data until the next garbage collection, which
+    counts objects and no bytes.
+    """
 
     __slots__ = ("_give_up", "_holdings", "size")
 
@@ -65,11 +70,13 @@ class Holdings:
         for holding in list(self._held):
             if self.bytes <= goal:
                 return
-            if holding in self._held and holding._give_up is not None:  # noqa: SLF001 - same module
+            give_up = holding._give_up  # noqa: SLF001 - same module
+            if holding in self._held and give_up is not None:
                 self._release(holding)
-                holding._give_up()  # noqa: SLF001 - same module
+                give_up()
 
     def _release(self, holding: Holding) -> None:
         if holding in self._held:
             del self._held[holding]
             self.bytes -= holding.size
+            holding._give_up = None  # noqa: SLF001 - same module

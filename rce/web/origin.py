@@ -7,25 +7,38 @@ import re
 import socket
 from collections.abc import Collection, Iterable
 
-from yarl import URL
-
-_HOST = re.compile(r"(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<name>[^:@\[\]\s/]+))(?::[0-9]{1,5})?")
+_HOST = re.compile(r"(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<name>[^:@\[\]\s/]+))(?::(?P<port>[0-9]{1,5}))?")
+_ORIGIN = re.compile(r"(?P<scheme>https?)://(?P<authority>[^/?#]+)", re.IGNORECASE)
+_DEFAULT_PORTS = {"http": "80", "https": "443"}
 
 
 def is_foreign(origin: str | None, host: str, allowed: Collection[str] = ()) -> bool:
     """Return whether a request comes from a page of another site.
 
+    A browser leaves out the port of ``Origin`` and ``Host`` where it is the scheme's own (80, 443). A server
+    behind a proxy does not know the scheme of its pages, so it is taken from the origin.
+
     Args:
-        origin: The request's ``Origin``; programs that are not browsers send none.
+        origin: The request's ``Origin``; most programs that are not browsers send none.
         host: The request's ``Host``.
         allowed: Origins that may use the server nevertheless.
     """
     if origin is None or origin in allowed:
         return False
-    try:
-        return URL(origin).authority != host
-    except ValueError:
+    found = _ORIGIN.fullmatch(origin)
+    if found is None:
         return True
+    port = _DEFAULT_PORTS[found["scheme"].lower()]
+    page = _address(found["authority"], port)
+    return page is None or page != _address(host, port)
+
+
+def _address(authority: str, default_port: str) -> tuple[str, str] | None:
+    """Return host and port of an authority; None if it is not one."""
+    found = _HOST.fullmatch(authority)
+    if found is None:
+        return None
+    return (found["v6"] or found["name"]).lower(), found["port"] or default_port
 
 
 class ServerNames:

@@ -13,8 +13,9 @@ from rce.config.exceptions import ConfigError
 from rce.config.loading import load_settings
 from rce.model import about
 from rce_master.backup import CERTIFICATES, MASTER, Copy, back_up, restore
+from rce_master.cli.exceptions import CliError
+from rce_master.cli.offline import find_state
 from rce_master.exceptions import StoreError
-from rce_master.store.sqlite import FILE_NAME
 
 Config = Annotated[Path | None, typer.Option(metavar="FILE", help="Settings file: says where the state is.")]
 StateDir = Annotated[
@@ -68,8 +69,13 @@ def _folders(config: Path | None, state_dir: Path | None) -> dict[str, Path]:
     except ConfigError as error:
         typer.echo(error, err=True)
         raise typer.Exit(2) from None
-    if state_dir is not None and (state_dir / FILE_NAME).exists():
-        return {MASTER: state_dir.absolute()}  # a folder that `rce-master --state-dir` was given
-    if state_dir is not None:
-        settings = replace(settings, state_dir=state_dir.absolute())
-    return {MASTER: settings.master_state, CERTIFICATES: settings.certificates}
+    if state_dir is None:
+        return {MASTER: settings.master_state, CERTIFICATES: settings.certificates}
+    try:
+        folder = find_state(state_dir.absolute())
+    except CliError as error:
+        typer.echo(error, err=True)
+        raise typer.Exit(1) from None
+    if folder == state_dir.absolute():
+        return {MASTER: folder}  # a folder that `rce-master --state-dir` was given
+    return {MASTER: folder, CERTIFICATES: replace(settings, state_dir=folder.parent).certificates}

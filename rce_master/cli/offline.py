@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rce.config.exceptions import ConfigError
-from rce.config.folders import default_state_dir
+from rce.config.folders import MASTER_FOLDER, STORE_FILE, default_state_dir
 from rce.config.loading import load_settings
 from rce_master.audit import AuditLog
 from rce_master.cli import credentials
@@ -51,6 +51,26 @@ def choose(state_dir: Path | None) -> Path | Credentials:
         return credentials.load()
     except NotLoggedInError:
         return default_state_dir()
+
+
+def find_state(state_dir: Path) -> Path:
+    """Return the folder of the master's state that belongs to a state folder.
+
+    It is the folder that holds a state: the state folder itself (``rce-master --state-dir``), or ``master``
+    in it (``rce up --state-dir``). A new state is made where both programs find it.
+
+    Raises:
+        CliError: Both hold a state.
+    """
+    inner = state_dir / MASTER_FOLDER
+    is_outer, is_inner = (state_dir / STORE_FILE).exists(), (inner / STORE_FILE).exists()
+    if is_outer and is_inner:
+        raise CliError(
+            f"{state_dir} and {inner} both hold a master's state: rce up uses the second,"
+            " rce-master --state-dir the first. Move the one that is not used aside"
+        )
+    is_own = state_dir.absolute().name == MASTER_FOLDER and not is_inner
+    return state_dir if is_outer or is_own else inner
 
 
 class OfflineState:
@@ -89,10 +109,9 @@ async def open_state(state_dir: Path) -> AsyncIterator[OfflineState]:
     """Open the state in a folder: the master's own, or the engine's, which contains the master's.
 
     Raises:
-        CliError: A master runs on it, or the settings cannot be read.
+        CliError: A master runs on it, there are two states, or the settings cannot be read.
     """
-    inner = state_dir / "master"
-    folder = inner if inner.is_dir() or state_dir == default_state_dir() else state_dir
+    folder = find_state(state_dir)
     try:
         settings = state_settings(load_settings(None))
     except ConfigError as error:

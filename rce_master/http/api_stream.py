@@ -13,7 +13,7 @@ from aiohttp import web
 
 from rce.control.logs import LogLevel, LogQuery, LogStream
 from rce.web.openapi import Query
-from rce_master.events import Event
+from rce_master.events import AT_ONCE, Event
 from rce_master.exceptions import InvalidRequestError
 from rce_master.http import models
 from rce_master.http.routes import ENDED, OF_USER, Call, route_table
@@ -140,6 +140,8 @@ async def _stream(call: Call, scope: str | None, last: int) -> web.StreamRespons
                 await response.write(b"".join(frames) or b":\n\n")
                 written = clock()
             last = news[-1].id if news else last
+            if len(news) == AT_ONCE:
+                await call.services.quotas.replay(call.caller)
     except ConnectionResetError:
         # The client disconnected: a stream does not end in another way from its side.
         return response

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import aiosqlite
 
+from rce.config.folders import STORE_FILE
 from rce_master.exceptions import StaleTermError, StoreError
 from rce_master.store.lock import FolderLock
 
@@ -21,7 +22,7 @@ SCHEMA_VERSION = 2
 """1: interfaces were stored in their endpoints and connections in their links. The form of the table is the
 same: what the rows hold is converted by who reads them (:mod:`rce_master.state.migration`)."""
 _CONVERTIBLE = 1
-FILE_NAME = "rce.sqlite"
+FILE_NAME = STORE_FILE
 
 _SCHEMA = """
 CREATE TABLE record (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 from websockets.asyncio.server import serve
 
@@ -11,6 +12,7 @@ from rce.guard.proxies import TrustedProxies
 from rce.guard.websocket import guarded
 from rce.tls.gate import TlsGate
 from rce.tls.websocket import behind_gate
+from rce.web.origin import ServerNames
 from rce_robot.doors.client.gate import Gate
 from rce_robot.doors.client.session import Session
 from rce_robot.doors.client.websocket import RobotSocket
@@ -52,7 +54,8 @@ class ClientDoor:
     async def opened(self, admission: Admission) -> AsyncIterator[None]:
         """Accept robots within the context."""
         settings, session = self._settings, self._settings.session
-        gate = Gate(admission, session, settings.origins, TrustedProxies(settings.trusted_proxies))
+        proxies = TrustedProxies(settings.trusted_proxies)
+        gate = Gate(admission, session, settings.origins, proxies, _names(settings))
         handshakes = None if self._tls is None else TlsGate("robots", self._tls, self._lobby)
         async with serve(
             _run_session,
@@ -73,6 +76,12 @@ class ClientDoor:
             finally:
                 if handshakes is not None:
                     await handshakes.close()
+
+
+def _names(settings: RobotSettings) -> ServerNames:
+    """Return the host names of the endpoint."""
+    public = urlsplit(settings.public_url).hostname or ""
+    return ServerNames(settings.host, (settings.public_host, public))
 
 
 async def _run_session(connection: ServerConnection) -> None:

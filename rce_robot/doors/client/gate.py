@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from websockets.protocol import State
 
+from rce.guard.lobby import address_of
 from rce.guard.loop_share import LoopShare
 from rce.guard.proxies import TrustedProxies
+from rce.guard.rates import LogThrottle
 from rce.model import EndpointId
 from rce.protocol.exceptions import HandshakeError
 from rce.protocol.http import FEATURES_HEADER, read_credentials, read_features
+from rce.web.origin import ServerNames, is_foreign
 from rce_robot.doors.client.session import Session
 from rce_robot.doors.client.websocket import RobotSocket
 
@@ -41,12 +45,15 @@ class Gate:
         settings: SessionSettings,
         origins: Collection[str],
         proxies: TrustedProxies | None = None,
+        names: ServerNames | None = None,
     ) -> None:
         self._admission = admission
         self._settings = settings
         self._origins = origins
+        self._names = names or ServerNames()
         self._proxies = proxies or TrustedProxies()
         self._share = LoopShare()
+        self._throttle = LogThrottle()
 
     async def admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Admit a robot (None), or return the refusal."""
@@ -55,7 +62,7 @@ class Gate:
         if ",".join(request.headers.get_all("Upgrade")).lower() != "websocket":
             return None  # not a WebSocket handshake: the library answers it
         try:
-            self._check_origin(request.headers.get_all("Origin"))
+            self._check_origin(request.headers.get_all("Origin"), request.headers.get_all("Host"))
             authorization = request.headers.get_all("Authorization")
             query = request.path.partition("?")[2].partition("#")[0]
             credentials = read_credentials(query, authorization)
@@ -63,7 +70,7 @@ class Gate:
             address = self._proxies.origin(connection.remote_address, forwarded)
             namespace = await self._claim(credentials, address)
         except HandshakeError as error:
-            _log.info("refused %s: %s %s", connection.remote_address, error.status, error.reason)
+            self._log_refusal(connection, error)
             return connection.respond(error.status, f"{error.reason}\n")
         client = f"{address or 'an unknown address'} since {_clock()} UTC"
         features = read_features(query)
@@ -85,11 +92,28 @@ class Gate:
         if isinstance(session, Session) and session.features:
             response.headers[FEATURES_HEADER] = ",".join(sorted(session.features))
 
-    def _check_origin(self, origins: list[str]) -> None:
-        """Refuse requests of other sites' pages, which a browser would send from its user's network."""
+    def _log_refusal(self, connection: ServerConnection, error: HandshakeError) -> None:
+        peer = address_of(connection.remote_address)
+        if self._throttle.is_due(f"{peer} {error.status}", asyncio.get_running_loop().time()):
+            _log.info("refused %s: %s %s", connection.remote_address, error.status, error.reason)
+
+    def _check_origin(self, origins: list[str], hosts: list[str]) -> None:
+        """Refuse requests of other sites' pages, which a browser would send from its user's network.
+
+        Some WebSocket libraries of programs name the endpoint itself as their origin. No page has this
+        origin, because the endpoint serves none, unless the page's name leads here (DNS rebinding).
+        """
+        if not origins or "*" in self._origins:
+            return
+        host = hosts[0] if len(hosts) == 1 else ""
+        own = host in self._names
         for origin in origins:
-            if origin not in self._origins and "*" not in self._origins:
-                raise HandshakeError(_FORBIDDEN, f"Origin {origin} may not connect here.")
+            if origin not in self._origins and (not own or is_foreign(origin, host)):
+                reason = (
+                    f"Origin {origin[:100]} may not connect here. A program should send no Origin; the"
+                    " engine's operator can allow the pages of an origin (--origin)."
+                )
+                raise HandshakeError(_FORBIDDEN, reason)
 
     async def _claim(self, credentials: Credentials, address: str) -> Namespace:
         """Log in. A dead former connection of the robot makes room for the new one."""

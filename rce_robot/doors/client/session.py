@@ -92,6 +92,8 @@ class Session:
         self._loop = asyncio.get_running_loop()
         self._now = self._loop.time
         self._reason = ""
+        self._unsent = 0
+        """Reports of errors for which there was no room."""
         self._abort: asyncio.TimerHandle | None = None
         """A timer: a dropped robot has a moment to receive the reason."""
         self.features = features
@@ -229,8 +231,11 @@ class Session:
         self._send_report(ErrorReport(problem=problem, call=call))
 
     def _send_report(self, report: ErrorReport) -> None:
-        if not self.send_urgent(_outgoing(report)):
-            _log.info("not sent: %s", report.text)
+        if self.send_urgent(_outgoing(report)):
+            return
+        self._unsent += 1
+        if self._unsent.bit_count() == 1:  # at 1, 2, 4, 8, ...: a robot must not fill the log
+            _log.info("%s: %d errors not sent, the last: %s", self.client, self._unsent, report.text)
 
     def show_active(self, tag: str, active: bool) -> None:
         """Send an ``ST``."""

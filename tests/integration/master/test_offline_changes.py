@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 from support.master_program import master, rce
 
+from rce.config.master_settings import MasterSettings
+from rce.config.settings import EngineSettings
+
 if TYPE_CHECKING:
     from pathlib import Path
 
 
 def records(folder: Path) -> list[dict[str, Any]]:
-    file = folder / "state" / "audit" / "audit.jsonl"
+    file = folder / "state" / "master" / "audit" / "audit.jsonl"
     return [json.loads(line) for line in file.read_bytes().splitlines()]
 
 
@@ -42,3 +45,26 @@ async def test_changes_without_a_master_are_in_the_audit_log(tmp_path: Path) -> 
         assert "set_limits" in listed
         assert "offline" in listed
     assert [one["id"] for one in records(tmp_path)] == sorted(one["id"] for one in records(tmp_path))
+
+
+async def test_a_new_state_is_found_by_both_programs(tmp_path: Path) -> None:
+    """The first user is made before ``rce up`` or ``rce-master`` made the folder, with the same option."""
+    at = ("--state-dir", str(tmp_path / "state"))
+    await rce(tmp_path, "user", "add", "anna", "--password-stdin", *at, text="secret\n")
+    engine = EngineSettings(state_dir=tmp_path / "state")
+    alone = EngineSettings(master=MasterSettings(state_dir=tmp_path / "state"))
+    assert engine.master_state == alone.master_state == tmp_path / "state" / "master"
+    async with master(tmp_path) as url:
+        await rce(tmp_path, "login", "-u", "anna", "--password-stdin", url, text="secret\n")
+    assert not (tmp_path / "state" / "rce.sqlite").exists()
+
+
+async def test_two_states_in_one_folder_are_refused(tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    at = ("--state-dir", str(state))
+    await rce(tmp_path, "user", "add", "anna", "--password-stdin", *at, text="secret\n")
+    (state / "rce.sqlite").write_bytes((state / "master" / "rce.sqlite").read_bytes())
+    refused = await rce(tmp_path, "user", "list", *at, code=1)
+    assert "both hold a master's state" in " ".join(refused.split())
+    named = await rce(tmp_path, "user", "list", "--state-dir", str(state / "master"))
+    assert "anna" in named

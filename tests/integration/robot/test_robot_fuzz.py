@@ -43,6 +43,7 @@ async def test_raw_handshakes(cloud: Cloud) -> None:
         ("/?userID=%ff&robotID=r&password=x", b"", 400),
         ("/", b"Upgrade: websocket\r\n", 426),
         ("/", b"Origin: http://a\r\nOrigin: http://b\r\n", 403),
+        ("/", b"Origin: http://x\r\n", 403),  # a name that leads here (DNS rebinding): it equals Host
     ],
 )
 async def test_handshakes_that_are_refused(cloud: Cloud, path: str, extra: bytes, status: int) -> None:

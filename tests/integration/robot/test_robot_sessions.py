@@ -83,6 +83,16 @@ async def test_pages_of_other_sites_are_refused(dial: Dial) -> None:
             pass
 
 
+async def test_programs_that_name_the_endpoint_as_origin(cloud: Cloud, dial: Dial) -> None:
+    """Some WebSocket libraries (websocket-client, ws4py) send the endpoint's own address as ``Origin``."""
+    own = cloud.ws_url.replace("ws:", "http:").rstrip("/")
+    async with dial(cloud, origin=Origin(own)):
+        pass
+    for other in ("http://127.0.0.1:1", "http://localhost:1", "null"):
+        status, _ = await refused(dial(cloud, origin=Origin(other)))
+        assert status == 403
+
+
 async def test_no_login_while_the_master_is_away(dial: Dial) -> None:
     async with running_cloud(login_timeout=0.05) as cloud:
         cloud.master.silent = True

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from functools import partial
+
+import pytest
 
 from rce.guard.budget import Ledger
 from rce.guard.holdings import Holdings
@@ -32,6 +36,35 @@ def test_the_oldest_that_can_be_given_up_goes_first() -> None:
     holdings.shed(100)
     assert gone == ["a", "b", "c"]
     assert holdings.bytes == 10
+
+
+class _Owner:
+    """Refers to its entry, which refers to it, as a latched message or a waiting conversion does."""
+
+    def __init__(self, holdings: Holdings, data: bytes) -> None:
+        self.data = data
+        self.holding = holdings.hold(len(data), self.give_up)
+
+    def give_up(self) -> None:
+        self.data = b""
+
+
+@pytest.mark.parametrize("end", ["released", "given up"])
+def test_released_data_needs_no_garbage_collection(end: str) -> None:
+    holdings = Holdings()
+    owner = _Owner(holdings, bytes(10))
+    gone = weakref.ref(owner)
+    gc.disable()
+    try:
+        if end == "released":
+            owner.holding.release()
+        else:
+            holdings.shed(10)
+            assert owner.data == b""
+        del owner
+        assert gone() is None
+    finally:
+        gc.enable()
 
 
 class _Robot:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import stat
 from typing import TYPE_CHECKING
 
-from rce_master.audit import MAX_TEXT, AuditLog, describe
+from rce_master.audit import BURST, MAX_TEXT, PER_SECOND, AuditLog, describe
 from rce_master.state import commands
 
 if TYPE_CHECKING:
@@ -61,6 +61,26 @@ def test_refusals_from_many_addresses_stay_bounded(tmp_path: Path) -> None:
     for number in range(3000):
         log.refuse("anna", "log_in", address=f"10.0.{number // 256}.{number % 256}")
     assert len(log._repeated) <= 1000
+    log.close()
+
+
+def test_flood_of_changes_leaves_the_records_of_others(tmp_path: Path) -> None:
+    """A user who does the same thing over and over cannot push others' records out of the files."""
+    clock = Clock()
+    log = AuditLog(tmp_path, clock, max_bytes=1 << 20, files=2)
+    log.add("bob", "create_container", "bob/c", address="10.0.0.2")
+    for number in range(20_000):
+        log.add("anna", "create_container", f"anna/c{number}", address="10.0.0.1")
+        clock.now += 0.01
+    clock.now += 61
+    log.flush()
+    found = log.since(0, 30_000)
+    assert found[0].user == "bob"
+    assert sum(record.times for record in found) == 20_001
+    assert len(found) < BURST + 200 * PER_SECOND + 10
+    assert found[-1].detail == "too often to be listed"
+    log.add("anna", "remove_container", "anna/c1", address="10.0.0.1")
+    assert log.since(-1, 1)[0].subject == "anna/c1"
     log.close()
 
 

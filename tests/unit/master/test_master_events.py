@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import asyncio
 
-from rce_master.events import EventLog
+from rce_master.events import AT_ONCE, EventLog
 from rce_master.state.changes import StateEvent
 
 
@@ -48,3 +48,26 @@ def test_one_users_flood_costs_nobody_else_their_events() -> None:
     assert [e.text for e in log.since(-1, user="anna")] == [str(number) for number in range(92, 100)]
     assert [e.text for e in log.since(-1, limit=3)] == ["first", "second", "92"]
     assert log.since(-1, user="nobody") == []
+
+
+class _Counted(int):
+    """An id that counts how often ids are compared."""
+
+    compared = 0
+
+    def __lt__(self, other: int) -> bool:
+        _Counted.compared += 1
+        return int(self) < int(other)
+
+
+def test_the_past_is_found_in_few_steps() -> None:
+    """A follower of 10,000 events asks a hundred times; looking at all events each time blocks others."""
+    log = EventLog(0.0)
+    for number in range(12_000):
+        log.add(state_event(str(number)), 0.0)
+    last, texts = _Counted(-1), []
+    while found := log.since(last, AT_ONCE, "anna"):
+        texts += [event.text for event in found]
+        last = _Counted(found[-1].id)
+    assert texts == [str(number) for number in range(2_000, 12_000)]
+    assert _Counted.compared < 100 * 20

@@ -57,6 +57,26 @@ def test_streams_are_counted_for_each_user() -> None:
         pass
 
 
+async def test_replays_of_events_are_paced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They wait, are counted by user, and leave the user's requests."""
+    waited: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        waited.append(seconds)
+
+    monkeypatch.setattr(asyncio, "sleep", sleep)
+    quotas = Quotas(SMALL, Clock())
+    for _ in range(12):
+        await quotas.replay(ANNA)
+    await quotas.replay(BERT)
+    assert waited == [0.0] * 10 + [0.5, 1.0, 0.0]
+    for _ in range(100):
+        await quotas.replay(ADMIN)
+    assert len(waited) == 13
+    for _ in range(10):
+        quotas.request(ANNA)
+
+
 async def test_reads_of_logs_wait_for_those_of_the_same_user_only() -> None:
     quotas = Quotas(SMALL)
     async with quotas.log_read(ANNA):
