@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
+import sys
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import uvloop
@@ -15,6 +18,7 @@ from benchmarks import (
     fanout,
     joining,
     latched,
+    offload,
     rate,
     roundtrip,
     sandboxes,
@@ -26,6 +30,16 @@ from benchmarks.figures import plot_round_trips, save, show
 from benchmarks.targets import RATIOS
 
 Rows = list[dict[str, Any]]
+
+ROOT = Path(__file__).resolve().parent.parent
+
+OF_ROBOTS = (
+    ("localization", "--only", "update"),
+    ("navigation", "--only", "plan"),
+    ("simulation", "--quick"),
+    ("mapping", "--only", "intel", "--scans", "400"),
+)
+"""Other programs with short figures of the part ``robots``; each prints and saves its own."""
 
 
 def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awaitable[Rows]]]]:
@@ -64,6 +78,10 @@ def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awa
             lambda e: latched.run(e, passes=1 if quick else 5),
         ),
         "stalled": ("One client stops reading", lambda e: stalled.run(e, seconds=seconds)),
+        "robots": (
+            "A robot's nodes on the robot, and in its container",
+            lambda e: offload.run(e, seconds=15.0 if quick else 60.0),
+        ),
     }
 
 
@@ -80,6 +98,12 @@ async def measure(names: list[str], *, quick: bool, runtime: str) -> None:
             if name == "roundtrip":
                 print("plot:", plot_round_trips(rows))
     print("results:", save("engine", results))
+    if "robots" in results:
+        for program, *options in OF_ROBOTS:
+            argv = [sys.executable, "-m", f"benchmarks.{program}", *options]
+            other = await asyncio.create_subprocess_exec(*argv, cwd=ROOT)
+            if await other.wait():
+                print(f"benchmarks.{program} {' '.join(options)} failed", file=sys.stderr)
 
 
 def main() -> None:

@@ -167,7 +167,7 @@ def main() -> None:
     """Read the command line and measure."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.mapping", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=LOGS, default=LOGS, metavar="LOG")
-    parser.add_argument("--scans", type=int, help="only the first scans of each log")
+    parser.add_argument("--scans", type=int, help="only the first scans of each log; saves nothing")
     parser.add_argument("--figures", type=Path, help="folder for pictures of the maps")
     options = parser.parse_args()
     if not data().is_dir():
@@ -180,7 +180,8 @@ def main() -> None:
         show(f"Mapping of {name}", with_targets(found))
         if options.figures:
             print("picture:", plot(name, maps, options.figures))
-    print("results:", save("mapping", {"mapping": rows}))
+    if options.scans is None:  # scores of a part say nothing about a log
+        print("results:", save("mapping", {"mapping": rows}))
 
 
 if __name__ == "__main__":

@@ -66,6 +66,7 @@ class MoveBaseNode:
         self._goals: MoveBaseGoals
         self._sources: list[ObservationSources]
         self._velocity: Publisher
+        self._stamped_velocity: Publisher
         self._plans: Publisher
         self._global_plan: Publisher
         self._local_plan: Publisher
@@ -77,6 +78,7 @@ class MoveBaseNode:
             space_of(one) for one in (parameters.base_global_planner, parameters.base_local_planner)
         )
         self._velocity = await node.advertise("cmd_vel", "geometry_msgs/Twist", queue_size=1)
+        self._stamped_velocity = await node.advertise("~stamped_cmd_vel", "geometry_msgs/TwistStamped")
         self._plans = await node.advertise(f"~{planner}/plan", "nav_msgs/Path", latch=True)
         self._global_plan = await node.advertise(f"~{controller}/global_plan", "nav_msgs/Path")
         self._local_plan = await node.advertise(f"~{controller}/local_plan", "nav_msgs/Path")
@@ -218,6 +220,10 @@ class MoveBaseNode:
     def _command(self, twist: Twist) -> None:
         self._commanded = twist
         self._velocity.publish(twist_fields(twist))
+        seen = self._sources[1].newest
+        if seen is not None and self._stamped_velocity.connections:
+            header = {"stamp": seen, "frame_id": self._settings.local_costmap.robot_base_frame}
+            self._stamped_velocity.publish(header=header, twist=twist_fields(twist))
 
     def _problem_of_costmaps(self, now: float) -> str:
         """Return why the robot must stand; empty if it may drive."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from rce.ros.node import Node
     from rce.ros.tf import Transform, TransformListener
-    from rce.ros.types import Message
+    from rce.ros.types import Message, Time
     from rce_fleet.navigation.costmap.layered import LayeredCostmap
     from rce_fleet.navigation.costmap.observation import Observation
     from rce_fleet.navigation.costmap.parameters import ObservationSource
@@ -49,6 +49,9 @@ class ObservationSources:
         transforms: What is known of frames.
         costmap: The costmap, with an obstacle layer.
         throttled_log: Where warnings go.
+
+    Attributes:
+        newest: Time stamp of the newest message that was used; None before the first.
     """
 
     def __init__(
@@ -59,6 +62,7 @@ class ObservationSources:
         self._costmap = costmap
         self._throttled_log = throttled_log
         self._waiting: dict[str, deque[Message]] = {}
+        self.newest: Time | None = None
 
     async def start(self) -> None:
         """Subscribe to the topics of all sources."""
@@ -102,6 +106,8 @@ class ObservationSources:
                 seen = _observe(message, source, found.transform, stamp.to_sec() if stamp else now)
                 if self._costmap.obstacles is not None:
                     self._costmap.obstacles.take(name, seen)
+                if self.newest is None or stamp > self.newest:
+                    self.newest = stamp
             except ExtrapolationError as error:
                 if error.is_future:
                     return False
