@@ -59,13 +59,15 @@ class Measurement:
 
     Attributes:
         bytes: Payload by topic.
-        speed: Of the robot by the latest odometry, m/s.
+        speed: Of the robot, m/s.
+        measures: Whether messages count. They do not while this process looks at others, which takes a while.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self.bytes: dict[str, int] = defaultdict(int)
         self.speed = 0.0
+        self.measures = False
         self._stamps: dict[Command, list[float]] = defaultdict(list)
         self._at_wheels: dict[Command, float] = {}
 
@@ -92,7 +94,8 @@ class Measurement:
         for topic in sorted(topics):
 
             def count(payload: bytes, _latched: bool, topic: str = topic) -> None:
-                self.bytes[topic] += len(payload)
+                if self.measures:
+                    self.bytes[topic] += len(payload)
 
             await node.subscribe_serialized(topic, "*", count)
         await node.subscribe("/ground_truth/pose", "nav_msgs/Odometry", self._take_truth)
@@ -100,7 +103,8 @@ class Measurement:
         await node.subscribe("/cmd_vel", "geometry_msgs/Twist", self._take_at_wheels)
 
     def begin(self) -> None:
-        """Forget everything that was measured."""
+        """Forget what was measured until now, and measure."""
+        self.measures = True
         self.bytes.clear()
         self._stamps.clear()
         self._at_wheels.clear()
@@ -110,11 +114,13 @@ class Measurement:
 
     def _take_stamped(self, message: Message) -> None:
         command = message.twist.linear.x, message.twist.angular.z
-        self._stamps[command].append(message.header.stamp.to_sec())
+        if self.measures:
+            self._stamps[command].append(message.header.stamp.to_sec())
 
     def _take_at_wheels(self, message: Message) -> None:
         """Note the first arrival: the safety stage repeats commands between those of move_base."""
-        self._at_wheels.setdefault((message.linear.x, message.angular.z), self._node.time())
+        if self.measures:
+            self._at_wheels.setdefault((message.linear.x, message.angular.z), self._node.time())
 
 
 @contextlib.asynccontextmanager
@@ -168,13 +174,23 @@ def cpu(processes: list[psutil.Process]) -> float:
     return total
 
 
-async def traffic(running: RunningEngine, bridge: int) -> tuple[int, int]:
-    """Return the bytes that a bridge sent to the engine and got from it, by the kernel's counters."""
+def listening(processes: list[psutil.Process]) -> set[int]:
+    """Return the TCP ports on which processes listen."""
     ports = set()
-    for process in running.named("rce_robot"):
+    for process in processes:
         with contextlib.suppress(psutil.Error):
-            listening = process.net_connections("tcp")
-            ports |= {one.laddr.port for one in listening if one.status == psutil.CONN_LISTEN}
+            found = process.net_connections("tcp")
+            ports |= {one.laddr.port for one in found if one.status == psutil.CONN_LISTEN}
+    return ports
+
+
+async def traffic(bridge: int, ports: set[int]) -> tuple[int, int]:
+    """Return the bytes that a bridge sent to the engine and got from it, by the kernel's counters.
+
+    Args:
+        bridge: Process id of ``rce-ros``.
+        ports: On which the engine accepts robots.
+    """
     show = await asyncio.create_subprocess_exec("ss", "-tinpHO", stdout=asyncio.subprocess.PIPE)
     output, _ = await show.communicate()
     up = down = 0
@@ -281,15 +297,18 @@ async def _drive(
     moving = asyncio.create_task(shuttle())
     try:
         await until(drives, "the robot drives")
-        found.begin()
         robot, cloud = [one for pid in pids for one in tree(pid)], running.processes()
-        began, sent = perf_counter(), await traffic(running, pids[-1])
+        ports = listening(running.named("rce_robot"))
+        await asyncio.sleep(1.0)  # messages that waited meanwhile are late
+        began, sent = perf_counter(), await traffic(pids[-1], ports)
         used = cpu(robot), cpu(cloud)
+        found.begin()
         done, _ = await asyncio.wait([moving], timeout=seconds)
+        found.measures = False
         for task in done:
             task.result()  # it never ends well
         took = perf_counter() - began
-        now = await traffic(running, pids[-1])
+        now = await traffic(pids[-1], ports)
         spent = cpu(robot) - used[0], cpu(cloud) - used[1]
     finally:
         moving.cancel()
