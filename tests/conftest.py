@@ -21,6 +21,8 @@ import pytest
 
 REQUIRE_ALL = os.environ.get("RCE_REQUIRE_ALL") == "1"
 LEAK_TIMEOUT_S = 3.0
+RUN_FOLDER = "RCE_TEST_RUN_FOLDER"
+"""Environment variable for :mod:`support.roscpp_programs`: the folder of what all workers of a run share."""
 WORKERS_PER_CORE = 2
 
 # Nothing fails for being slow: not on a busy machine, nor at the first run, which makes hypothesis's tables.
@@ -195,6 +197,14 @@ def pytest_configure(config: pytest.Config) -> None:
     """Keep ``tmp_path`` short in parallel runs: paths of sockets in it have at most 107 bytes."""
     if _is_worker(config):
         config.option.basetemp = tempfile.mkdtemp(prefix="rce-t-", dir="/tmp")
+    else:  # its environment is that of the workers, which it starts later
+        os.environ[RUN_FOLDER] = tempfile.mkdtemp(prefix="rce-run-", dir="/tmp")
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Remove what the workers of this run shared."""
+    if not _is_worker(config):
+        shutil.rmtree(os.environ.pop(RUN_FOLDER, ""), ignore_errors=True)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
@@ -283,6 +293,18 @@ def _descriptors() -> dict[int, str]:
     return found
 
 
+def _children() -> list[psutil.Process]:
+    """Return this process's descendants; psutil reads about all processes of the machine for that.
+
+    The kernel tells quickly that there is no child, which is so before and after most of the tests.
+    """
+    try:
+        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    except ChildProcessError:
+        return []
+    return psutil.Process().children(recursive=True)
+
+
 def _leaks(fds: dict[int, str], children: set[int], threads: set[threading.Thread]) -> list[str]:
     found = [
         f"descriptor {fd} -> {target}"
@@ -291,11 +313,7 @@ def _leaks(fds: dict[int, str], children: set[int], threads: set[threading.Threa
         and not target.startswith(("/dev/", "anon_inode:", "/proc/"))
         and "__pycache__" not in target
     ]
-    found += [
-        f"process {child.pid} {child.name()}"
-        for child in psutil.Process().children(recursive=True)
-        if child.pid not in children
-    ]
+    found += [f"process {child.pid} {child.name()}" for child in _children() if child.pid not in children]
     found += [
         f"thread {thread.name}"
         for thread in threading.enumerate()
@@ -314,7 +332,7 @@ def _no_leaks(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
         return
     fds, threads = _descriptors(), set(threading.enumerate())
-    children = {child.pid for child in psutil.Process().children(recursive=True)}
+    children = {child.pid for child in _children()}
     yield
     deadline = time.monotonic() + LEAK_TIMEOUT_S
     while leaks := _leaks(fds, children, threads):

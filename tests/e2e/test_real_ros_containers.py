@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
-import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 import pytest
 from support.engine import Engine, running_engine
+from support.roscpp_programs import compiled
 from support.stranger import Stranger, stranger
 
 pytestmark = [
@@ -48,13 +48,7 @@ def packages() -> Iterator[Path]:
     shutil.copy(PROGRAMS / "rospy_peer.py", package / "scripts")
     (package / "scripts" / "surroundings.py").write_text(SURROUNDINGS)
     (package / "scripts" / "surroundings.py").chmod(0o755)
-    flags = subprocess.run(
-        ["pkg-config", "--cflags", "--libs", "roscpp"], capture_output=True, text=True, check=True
-    ).stdout.split()
-    target = str(package / "lib" / "roscpp_peer")
-    subprocess.run(
-        ["g++", "-O0", "-o", target, str(PROGRAMS / "roscpp_peer.cpp"), *flags], check=True, timeout=240
-    )
+    shutil.copy(compiled(PROGRAMS / "roscpp_peer.cpp", "roscpp"), package / "lib")
     yield folder
     shutil.rmtree(folder)
 

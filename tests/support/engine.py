@@ -39,13 +39,15 @@ async def until(
     loop = asyncio.get_running_loop()
     deadline = loop.time() + timeout
     while True:
+        asked = loop.time()
         made = condition()
         found = await made if isinstance(made, Awaitable) else made
         if found:
             return found
         if loop.time() > deadline:
             raise AssertionError(f"{what}: not within {timeout:.0f} s (last: {found!r})")
-        await asyncio.sleep(0.05)
+        # A condition that looks at all processes, or starts one, leaves time to what it waits for.
+        await asyncio.sleep(min(max(0.05, loop.time() - asked), 1.0))
 
 
 class Program:
@@ -266,17 +268,22 @@ def command_line(process: psutil.Process) -> list[str]:
 
 def engine_processes(folder: Path) -> list[psutil.Process]:
     """All processes that an engine with this folder started, whoever their parent is, and their children."""
+    children: dict[int, list[psutil.Process]] = {}
     found: dict[int, psutil.Process] = {}
     for process in psutil.process_iter():
         try:
+            children.setdefault(process.ppid(), []).append(process)
             mine = str(folder) in " ".join(process.cmdline())
             if mine or process.environ().get("XDG_RUNTIME_DIR") == str(folder):
-                found |= {child.pid: child for child in (process, *process.children(recursive=True))}
+                found[process.pid] = process
         except (psutil.NoSuchProcess, psutil.AccessDenied, psutil.ZombieProcess):
             continue
-    for environment in _environments(folder):
-        with contextlib.suppress(psutil.NoSuchProcess):
-            found |= {child.pid: child for child in (environment, *environment.children(recursive=True))}
+    found |= {environment.pid: environment for environment in _environments(folder)}
+    waiting = list(found)
+    for pid in waiting:
+        more = {child.pid: child for child in children.get(pid, ()) if child.pid not in found}
+        found |= more
+        waiting += more
     return list(found.values())
 
 

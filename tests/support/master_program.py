@@ -10,23 +10,11 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
+from support.forked_commands import run_command
 from support.processes import finish
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-SCRIPT = "from rce.cli.main import build_app; from importlib.metadata import EntryPoint;"
-COMMANDS = {
-    "audit": "rce_master.cli.audit:audit",
-    "user": "rce_master.cli.users:app",
-    "login": "rce_master.cli.session:login",
-    "logout": "rce_master.cli.session:logout",
-    "robot": "rce_master.cli.tokens:robots",
-    "token": "rce_master.cli.tokens:tokens",
-    "ps": "rce_master.cli.show:ps",
-    "logs": "rce_master.cli.follow:logs",
-    "events": "rce_master.cli.follow:events",
-}
 
 
 def environment(folder: Path) -> dict[str, str]:
@@ -40,21 +28,9 @@ def environment(folder: Path) -> dict[str, str]:
 
 async def rce(folder: Path, command: str, *args: str, text: str = "", code: int = 0) -> str:
     """Run a command of the ``rce`` program; returns what it printed."""
-    point = f"[EntryPoint({command!r}, {COMMANDS[command]!r}, 'rce.commands')]"
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        "-c",
-        f"{SCRIPT} build_app({point})(prog_name='rce')",
-        command,
-        *args,
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.STDOUT,
-        env=environment(folder),
-    )
-    output, _ = await process.communicate(text.encode())
-    assert process.returncode == code, output.decode()
-    return output.decode()
+    ended, output = await run_command((command, *args), env=environment(folder), folder=folder, typed=text)
+    assert ended == code, output
+    return output
 
 
 @asynccontextmanager

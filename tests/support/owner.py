@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from support.engine import Engine
+from support.forked_commands import run_command
 
 
 class Owner:
@@ -31,10 +32,9 @@ class Owner:
         )
 
     async def rce(self, *words: str, typed: str = "", fails: bool = False) -> str:
-        process = await self.start(*words, stderr=asyncio.subprocess.STDOUT)
-        output, _ = await process.communicate(typed.encode())
-        text = output.decode()
-        assert (process.returncode != 0) == fails, text
+        env = {**self.env, "COLUMNS": "200"}
+        code, text = await run_command(words, env=env, folder=self.folder, typed=typed)
+        assert (code != 0) == fails, text
         return text
 
     async def login(self) -> None:

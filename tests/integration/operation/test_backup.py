@@ -18,6 +18,7 @@ from typing import Any
 import aiohttp
 import pytest
 from support.engine import Program
+from support.forked_commands import run_command
 from support.ports import free_ports
 
 from rce_master.backup import MANIFEST
@@ -40,17 +41,9 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 async def rce(folder: Path, *words: str, typed: str = "", code: int = 0) -> str:
-    process = await asyncio.create_subprocess_exec(
-        *(str(BIN / "rce"), *words),
-        cwd=folder,
-        env=environment(folder),
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.STDOUT,
-    )
-    output, _ = await process.communicate(typed.encode())
-    assert process.returncode == code, output.decode()
-    return output.decode()
+    ended, output = await run_command(words, env=environment(folder), folder=folder, typed=typed)
+    assert ended == code, output
+    return output
 
 
 @asynccontextmanager

@@ -6,13 +6,13 @@ import asyncio
 import contextlib
 import json
 import os
-import subprocess
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support.roscpp_programs import compiled
 
 from rce.ros.actions import (
     ActionClient,
@@ -148,17 +148,6 @@ Peer = Callable[[str], AbstractAsyncContextManager[asyncio.subprocess.Process]]
 """Starts "servers" or "client" of a real actionlib."""
 
 
-@pytest.fixture(scope="session")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The roscpp program."""
-    program = tmp_path_factory.mktemp("roscpp_actions") / "roscpp_actions"
-    find = ["pkg-config", "--cflags", "--libs", "actionlib", "roscpp"]
-    flags = subprocess.run(find, capture_output=True, text=True, check=True).stdout.split()
-    source = str(PROGRAMS / "roscpp_actions.cpp")
-    subprocess.run(["g++", "-O0", "-o", str(program), source, *flags], check=True, timeout=240)
-    return program
-
-
 @pytest.fixture(params=LANGUAGES)
 def peer(request: pytest.FixtureRequest, core: Core, tmp_path: Path) -> Peer:
     """A real actionlib's other end, in both languages."""
@@ -170,7 +159,7 @@ def peer(request: pytest.FixtureRequest, core: Core, tmp_path: Path) -> Peer:
             return program(core, tmp_path, "/usr/bin/python3", str(script))
 
         return start
-    binary = request.getfixturevalue("compiled")
+    binary = compiled(PROGRAMS / "roscpp_actions.cpp", "actionlib", "roscpp")
     return lambda what: program(core, tmp_path, str(binary), what)
 
 
@@ -238,28 +227,33 @@ async def test_our_client_at_a_full_server(node: Node, peer: Peer) -> None:
     async with (
         peer("servers") as process,
         node,
-        ActionClient(node, "full", TEST, silence_timeout=30) as client,
         asyncio.timeout(200),
     ):
-        await until_results_come(client)
-        goals = [await client.send(goal=number) for number in (1, 2, 3, 4)]
-        rejected = await client.send(goal=-1)
-        assert (await rejected.wait(), rejected.text) == (GoalState.REJECTED, "negative")
-        goals[1].cancel()
-        assert (await goals[1].wait(), goals[1].text) == (GoalState.PREEMPTED, "cancelled")
-        client.cancel_before(goals[0].stamp)
-        assert await goals[0].wait() is GoalState.PREEMPTED
-        waiting = await client.send(goal=100)
-        waiting.cancel()
-        assert await waiting.wait() is GoalState.RECALLED
-        last = await client.send(goal=10)
-        assert [(await goal.result()).result for goal in (goals[2], goals[3], last)] == [10, 10, 10]
+        async with ActionClient(node, "full", TEST, silence_timeout=30) as client:
+            await use_full_server(client)
+        async with ActionClient(node, "full", TEST, silence_timeout=SILENCE_S) as client:
+            await until_results_come(client)
+            dying = await client.send(goal=5)
+            process.kill()
+            with pytest.raises(GoalFailedError, match="the server is silent"):
+                await dying.result()
+            assert dying.state is GoalState.LOST
 
-        dying = await client.send(goal=5)
-        process.kill()
-        with pytest.raises(GoalFailedError, match="the server is silent"):
-            await dying.result()
-        assert dying.state is GoalState.LOST
+
+async def use_full_server(client: ActionClient) -> None:
+    await until_results_come(client)
+    goals = [await client.send(goal=number) for number in (1, 2, 3, 4)]
+    rejected = await client.send(goal=-1)
+    assert (await rejected.wait(), rejected.text) == (GoalState.REJECTED, "negative")
+    goals[1].cancel()
+    assert (await goals[1].wait(), goals[1].text) == (GoalState.PREEMPTED, "cancelled")
+    client.cancel_before(goals[0].stamp)
+    assert await goals[0].wait() is GoalState.PREEMPTED
+    waiting = await client.send(goal=100)
+    waiting.cancel()
+    assert await waiting.wait() is GoalState.RECALLED
+    last = await client.send(goal=10)
+    assert [(await goal.result()).result for goal in (goals[2], goals[3], last)] == [10, 10, 10]
 
 
 async def answer(goal: ServerGoal) -> dict[str, Any] | None:

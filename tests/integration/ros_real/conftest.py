@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Unpack
@@ -10,6 +9,7 @@ from typing import Unpack
 import pytest
 from support.ros_nodes import MakeGraphNode, NodeOptions
 from support.ros_real import GRAPHS, Graph, our_graph
+from support.roscpp_programs import compiled
 
 from rce.ros.node import Node
 
@@ -48,25 +48,12 @@ def rospy_peer() -> tuple[str, str]:
 
 
 @pytest.fixture(scope="session")
-def roscpp_peer(tmp_path_factory: pytest.TempPathFactory) -> tuple[str]:
-    """How to start the roscpp node ``/roscpp_peer``; compiled once."""
-    return (compiled("roscpp_peer", tmp_path_factory),)
+def roscpp_peer() -> tuple[str]:
+    """How to start the roscpp node ``/roscpp_peer``."""
+    return (str(compiled(SOURCES / "roscpp_peer.cpp", "roscpp")),)
 
 
 @pytest.fixture(scope="session")
-def roscpp_library(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The program that uses what roscpp's client library has; compiled once."""
-    return compiled("roscpp_library", tmp_path_factory)
-
-
-def compiled(name: str, folders: pytest.TempPathFactory) -> str:
-    """Compile a program of this folder against roscpp."""
-    program = folders.mktemp("roscpp") / name
-    flags = subprocess.run(
-        ["pkg-config", "--cflags", "--libs", "roscpp"], capture_output=True, text=True, check=True
-    ).stdout.split()
-    source = SOURCES / f"{name}.cpp"
-    subprocess.run(
-        ["g++", "-O0", "-pthread", "-o", str(program), str(source), *flags], check=True, timeout=240
-    )
-    return str(program)
+def roscpp_library() -> str:
+    """The program that uses what roscpp's client library has."""
+    return str(compiled(SOURCES / "roscpp_library.cpp", "roscpp"))
