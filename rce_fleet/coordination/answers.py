@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _MARK = "answer="
 _NUMBER = "revision="
+_GRID = "grid="
 _AGE = "robot_age="
 _POSE = "pose="
 _NONE = -1
@@ -107,10 +108,23 @@ def _read_sign(label: str) -> RobotSign:
     return RobotSign(age, pose)
 
 
-def numbered_array(cells: Sequence[int], revision: int) -> dict[str, Any]:
-    """Return the fields of a ``std_msgs/Int32MultiArray`` for a numbered list of cells."""
-    dimension = {"label": f"{_NUMBER}{revision}", "size": len(cells), "stride": len(cells)}
-    return {"layout": {"dim": [dimension], "data_offset": 0}, "data": list(cells)}
+def numbered_array(cells: Sequence[int], revision: int, grid: str = "") -> dict[str, Any]:
+    """Return the fields of a ``std_msgs/Int32MultiArray`` for a numbered list of cells.
+
+    Args:
+        cells: The cells.
+        revision: Number of the list.
+        grid: Names the grid that the cells belong to; empty: not said.
+    """
+    dimensions = [{"label": f"{_NUMBER}{revision}", "size": len(cells), "stride": len(cells)}]
+    if grid:
+        dimensions.append({"label": f"{_GRID}{grid}", "size": 0, "stride": 0})
+    return {"layout": {"dim": dimensions, "data_offset": 0}, "data": list(cells)}
+
+
+def grid_of(labels: Sequence[str]) -> str:
+    """Return the grid that a list belongs to; empty if it does not say."""
+    return next((label.removeprefix(_GRID) for label in labels if label.startswith(_GRID)), "")
 
 
 def revision_of(labels: Sequence[str]) -> int | None:

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from math import ceil, floor
+from math import ceil, floor, isfinite, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rce_fleet.exceptions import MapError
 from rce_fleet.geometry.poses import Pose, transform_points
+from rce_fleet.maps.occupancy_map import OCCUPIED, OccupancyMap
 from rce_fleet.planning.grid import GridMap
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from rce_fleet.maps.occupancy_map import OccupancyMap
-
 MAX_CELLS = 4_000_000
 """Maximum number of cells, so that a wrong cell size does not fill the memory."""
 BLOCKED_SHARE = 0.1
 """A cell is blocked if a greater share of its area is occupied or unknown."""
+_FINE = 0.05
+"""Edge of a pixel of a grid's map, metres, so that other cells can be laid over it."""
+_PIXELS = 4_000_000
+"""Pixels of such a map: a large grid gets larger ones."""
 
 
 def fleet_grid(
@@ -30,6 +33,7 @@ def fleet_grid(
     rows: int | None = None,
     columns: int | None = None,
     blocked_share: float = BLOCKED_SHARE,
+    max_cells: int = MAX_CELLS,
 ) -> GridMap:
     """Return the grid of cells over a map.
 
@@ -42,21 +46,24 @@ def fleet_grid(
         columns: Number of columns, likewise.
         blocked_share: A cell is blocked if more than this share of it is occupied, unknown or outside of the
             map, 0 .. 1.
+        max_cells: Maximum number of cells.
 
     Raises:
-        MapError: The grid would have no free cell, or more than ``MAX_CELLS``; or a number is out of range.
+        MapError: The grid would have no free cell, or more than ``max_cells``; or a number is out of range.
     """
-    if not cell_size > 0:
+    if not (cell_size > 0 and isfinite(cell_size)):
         raise MapError(f"the cell size must be a positive number of metres, not {cell_size}")
     if not 0 <= blocked_share <= 1:
         raise MapError(f"the share that blocks a cell must be within 0 .. 1, not {blocked_share}")
     place = drawn.origin if origin is None else origin
+    if not all(map(isfinite, (place.x, place.y, place.yaw))):
+        raise MapError(f"the origin must be three finite numbers, not {place}")
     needed_rows, needed_columns = _size(drawn, place, cell_size)
     rows = needed_rows if rows is None else rows
     columns = needed_columns if columns is None else columns
-    if not 0 < rows * columns <= MAX_CELLS or rows < 0:
+    if not 0 < rows * columns <= max_cells or rows < 0:
         raise MapError(
-            f"a grid of {columns} x {rows} cells is not within 1 .. {MAX_CELLS} cells; check cell size and"
+            f"a grid of {columns} x {rows} cells is not within 1 .. {max_cells} cells; check cell size and"
             " origin"
         )
     shares = np.concatenate([_taken(drawn, place, cell_size, row, columns) for row in range(rows)])
@@ -67,6 +74,17 @@ def fleet_grid(
             f" cells, or let more than {blocked_share:.0%} of a cell be occupied"
         )
     return GridMap(rows, columns, cell_size, (place.x, place.y), frozenset(map(int, blocked)), yaw=place.yaw)
+
+
+def map_of_grid(grid: GridMap) -> OccupancyMap:
+    """Return a map whose occupied places are the blocked cells of a grid."""
+    fine = min(ceil(grid.cell_size / _FINE), floor(sqrt(_PIXELS / len(grid))))
+    cells = np.zeros(len(grid), np.int8)
+    cells[sorted(grid.blocked)] = OCCUPIED
+    pixels = cells.reshape(grid.rows, grid.columns)
+    for axis in (0, 1):
+        pixels = np.repeat(pixels, max(fine, 1), axis)
+    return OccupancyMap(pixels, grid.cell_size / max(fine, 1), Pose(*grid.origin, grid.yaw))
 
 
 def _size(drawn: OccupancyMap, place: Pose, cell_size: float) -> tuple[int, int]:

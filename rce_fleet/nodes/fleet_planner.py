@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import re
 import time
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, assert_never
 
 from rce.ros.errors import MasterError
@@ -38,20 +37,29 @@ from rce_fleet.coordination.events import (
     SendCells,
     Tick,
 )
-from rce_fleet.coordination.move_client import ClientReport, ClientState
+from rce_fleet.coordination.grid_change import next_planner, refuse_grid
 from rce_fleet.coordination.planner import FleetPlanner
-from rce_fleet.coordination.robot_signs import RobotSign
 from rce_fleet.coordination.settings import FleetSettings
-from rce_fleet.geometry.angles import yaw_of
-from rce_fleet.nodes.grid_messages import GRID_TOPIC, OLD_TOPIC, grid_fields, wants_old_topic
-from rce_fleet.nodes.grid_parameters import make_grid
+from rce_fleet.nodes.grid_choice import CHOSEN, GridChoice, GridChooser
+from rce_fleet.nodes.grid_messages import (
+    GRID_TOPIC,
+    OLD_TOPIC,
+    grid_fields,
+    grid_name,
+    wants_old_topic,
+)
+from rce_fleet.nodes.grid_parameters import make_grid, read_fleet_parameters
 from rce_fleet.nodes.plan_worker import PlanWorker
+from rce_fleet.nodes.robot_messages import read_pose_seen, read_report, read_sign
 from rce_fleet.nodes.state_publisher import StatePublisher
 
 if TYPE_CHECKING:
     from rce.ros.node import Publisher
     from rce.ros.types import Message
+    from rce_fleet.coordination.move_client import ClientReport
     from rce_fleet.coordination.replanning import PlanRequest
+    from rce_fleet.coordination.robot_signs import RobotSign
+    from rce_fleet.planning.grid import GridMap
 
 TICK = 0.1
 """Seconds between two timer events; changes of the state are published at most this often."""
@@ -59,6 +67,8 @@ LOOK_AROUND = 0.5
 """Seconds between two searches for new robots."""
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 ROBOT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/amcl_pose")
+OLD_CELLS_LAST = 3.0
+"""Seconds after a change of the grid in which robots may report cells of the one before."""
 OLD_TOPIC_LOOKS = 3
 """So many looks in a row must find only robot files from before on the old topic of the grid."""
 
@@ -69,16 +79,23 @@ class PlannerNode:
     Args:
         node: Running node.
         planner: The planner.
+        chooser: Makes other grids over its map.
         takes_answers: Move clients answer on ``goalNodesList`` instead of their own topics.
     """
 
-    def __init__(self, node: Node, planner: FleetPlanner, *, takes_answers: bool = False) -> None:
+    def __init__(
+        self, node: Node, planner: FleetPlanner, chooser: GridChooser, *, takes_answers: bool = False
+    ) -> None:
+        self._chooser = chooser
         self._node = node
         self._takes_answers = takes_answers
         self._planner = planner
         self._cells: dict[str, Publisher] = {}
         self._cancels: dict[str, Publisher] = {}
-        self._requests: asyncio.Queue[PlanRequest] = asyncio.Queue()
+        self._requests: asyncio.Queue[tuple[FleetPlanner, PlanRequest]] = asyncio.Queue()
+        self._client_grids: dict[str, str] = {}
+        """The grid that each robot's move client has; empty: it has one from its parameters."""
+        self._obstacles_from = 0.0
         self._state = StatePublisher(node, planner)
         self._blocked: Publisher
         self._requested: Publisher
@@ -106,6 +123,7 @@ class PlannerNode:
         await node.advertise_service("/fleet/set_goal", "fleet/SetGoal", self._set_goal)
         await node.advertise_service("/fleet/block_cell", "fleet/BlockCell", self._block_cell)
         await node.advertise_service("/fleet/remove_robot", "fleet/RemoveRobot", self._remove_robot)
+        await node.advertise_service("/fleet/set_grid", "fleet/SetGrid", self._set_grid)
         await self._state.start()  # last: who sees the state may call the services
         async with PlanWorker(node.log) as worker, asyncio.TaskGroup() as tasks:
             planning = tasks.create_task(self._make_plans(worker))
@@ -162,7 +180,7 @@ class PlannerNode:
         seen = await node.advertise(f"/fleet/poses/{robot}", POSE, latch=True)
 
         def take(message: Message) -> None:
-            self._take(_pose(robot, message))
+            self._take(read_pose_seen(robot, message))
             seen.publish(message)
 
         await node.subscribe(f"/{robot}/amcl_pose", POSE, take)
@@ -173,17 +191,17 @@ class PlannerNode:
         await self._node.subscribe(
             f"/{robot}/moveClient/status",
             "fleet/MoveStatus",
-            lambda message: self._take_report(robot, _report(message), _sign(message)),
+            lambda message: self._take_status(robot, message),
         )
         await self._node.subscribe(
             f"/{robot}/blockedCells",
             "std_msgs/Int32MultiArray",
-            lambda message: self._take(ObstacleSeen(robot, tuple(message.data))),
+            lambda message: self._take_obstacle(ObstacleSeen(robot, tuple(message.data))),
         )
         await self._node.subscribe(
             f"/{robot}/freedCells",
             "std_msgs/Int32MultiArray",
-            lambda message: self._take(ObstacleGone(robot, tuple(message.data))),
+            lambda message: self._take_obstacle(ObstacleGone(robot, tuple(message.data))),
         )
 
     def _take_answer(self, robot: str, message: Message) -> None:
@@ -203,6 +221,15 @@ class PlannerNode:
         if answer.freed:
             self._take(ObstacleGone(robot, answer.freed))
 
+    def _take_status(self, robot: str, message: Message) -> None:
+        self._client_grids[robot] = grid_name(message.grid)
+        self._take_report(robot, read_report(message), read_sign(message))
+
+    def _take_obstacle(self, event: ObstacleSeen | ObstacleGone) -> None:
+        """Handle cells that a robot reports, unless they may be of the grid before."""
+        if time.monotonic() >= self._obstacles_from:
+            self._take(event)
+
     def _take_report(self, robot: str, report: ClientReport, sign: RobotSign) -> None:
         """Handle a move client's report; what it heard of the robot comes first, because it is older."""
         if sign.pose is not None:
@@ -218,7 +245,10 @@ class PlannerNode:
 
     async def _make_plans(self, worker: PlanWorker) -> None:
         while True:
-            self._handle(PlanMade(await worker.compute(await self._requests.get())))
+            planner, request = await self._requests.get()
+            result = await worker.compute(request)
+            if planner is self._planner:  # else the grid was changed meanwhile
+                self._handle(PlanMade(result))
 
     def _set_goal(self, request: Message) -> dict[str, Any]:
         return self._ask(GoalSet(request.robot, None if request.cell < 0 else request.cell))
@@ -228,6 +258,37 @@ class PlannerNode:
 
     def _remove_robot(self, request: Message) -> dict[str, Any]:
         return self._ask(RobotRemoved(request.robot))
+
+    async def _set_grid(self, request: Message) -> dict[str, Any]:
+        choice = self._chooser.read(request)
+        reply, grid = await self._chooser.answer(choice, self._refuse_grid, preview=request.preview)
+        if grid is not None:
+            await self._take_grid(grid, choice)
+        return reply
+
+    def _refuse_grid(self, grid: GridMap) -> str:
+        """Return why the fleet cannot change to a grid now; empty if it can."""
+        if self._takes_answers:
+            return (
+                "the move clients have the grid from their parameters (answers): restart them and the planner"
+            )
+        own = grid_name(self._state.started)
+        for robot in sorted(self._planner.state.robots):
+            if self._client_grids.get(robot, own) != own:
+                return f"the move client of {robot} does not take its grid from {GRID_TOPIC}"
+        return refuse_grid(self._planner, grid)
+
+    async def _take_grid(self, grid: GridMap, choice: GridChoice) -> None:
+        """Begin anew with another grid: first the grid is published, then the state and lists of it."""
+        self._planner, instructions = next_planner(self._planner, grid, time.monotonic())
+        self._obstacles_from = time.monotonic() + OLD_CELLS_LAST
+        self._chooser.blocked_share = choice.blocked_share
+        self._state.restart(self._planner)
+        self._publish_blocked(tuple(sorted(self._planner.state.blocked)))
+        self._carry_out(instructions)
+        self._state.publish_whole()
+        self._node.log.info("the fleet has a new grid of cells of %g m", grid.cell_size)
+        await self._node.set_param(f"~{CHOSEN}", self._chooser.stored(choice))
 
     # What goes out
 
@@ -245,21 +306,25 @@ class PlannerNode:
     def _handle(self, event: Event) -> list[Instruction]:
         """Pass an event to the planner and carry out its instructions."""
         instructions = self._planner.handle(event, time.monotonic())
+        self._carry_out(instructions)
+        return instructions
+
+    def _carry_out(self, instructions: list[Instruction]) -> None:
         for instruction in instructions:
             match instruction:
                 case SendCells(robot, revision, cells):
-                    self._cells[robot].publish(numbered_array(cells, revision))
+                    grid = "" if self._takes_answers else grid_name(self._state.started)
+                    self._cells[robot].publish(numbered_array(cells, revision, grid))
                 case SendCancel(robot):
                     self._cancels[robot].publish(data=True)
                 case BlockedChanged(cells):
                     self._publish_blocked(cells)
                 case MakePlan(request):
-                    self._requests.put_nowait(request)
+                    self._requests.put_nowait((self._planner, request))
                 case Reply():
                     pass  # for the caller
                 case _:
                     assert_never(instruction)
-        return instructions
 
     def _publish_requested(self, blocked: tuple[int, ...]) -> None:
         """Publish the blocked cells that people asked for, if they changed."""
@@ -271,45 +336,11 @@ class PlannerNode:
     def _publish_blocked(self, cells: tuple[int, ...]) -> None:
         self._blocked.publish(data=list(cells))
         self._publish_requested(cells)
-        fields = grid_fields(self._planner.state.grid, cells, self._node.now())
+        fields = grid_fields(self._planner.state.grid, cells, self._node.now(), self._state.started)
         for grids in (self._map, self._old_map):
             if grids is not None:
                 grids.publish(fields)
         self._shown_blocked = cells
-
-
-def _pose(robot: str, message: Message) -> PoseSeen:
-    pose = message.pose.pose
-    turn = pose.orientation
-    return PoseSeen(robot, pose.position.x, pose.position.y, yaw_of(turn.x, turn.y, turn.z, turn.w))
-
-
-def _report(message: Message) -> ClientReport:
-    return ClientReport(
-        revision=message.revision,
-        state=ClientState(message.state),
-        cells=tuple(message.cells),
-        reached=None if message.reached < 0 else message.reached,
-        target=None if message.target < 0 else message.target,
-    )
-
-
-def _sign(message: Message) -> RobotSign:
-    age = message.robot_age if message.robot_age >= 0 else None
-    if len(message.pose) != 3:  # noqa: PLR2004 - x, y and yaw
-        return RobotSign(age)
-    x, y, yaw = message.pose
-    return RobotSign(age, (x, y, yaw))
-
-
-async def read_fleet_parameters(node: Node) -> dict[str, Any]:
-    """Return the parameters of the namespace ``/fleet``, overridden by the node's private ones."""
-    values: dict[str, Any] = {}
-    for namespace in ("/fleet", "~"):
-        found = await node.get_param(namespace, {})
-        if isinstance(found, Mapping):
-            values.update(found)
-    return values
 
 
 async def main() -> None:
@@ -320,11 +351,13 @@ async def main() -> None:
             robot_radius=float(values.get("robot_radius", FleetSettings().robot_radius)),
             seed=int(values.get("seed", 0)),
         )
-        planner = FleetPlanner(make_grid(values), settings)
         takes_answers = bool(values.get("answers", False))
-        await PlannerNode(node, planner, takes_answers=takes_answers).run(
-            [int(cell) for cell in values.get("blocked", [])]
-        )
+        chooser = GridChooser(values, make_grid(values))
+        grid, remark = await chooser.grid_at_start(None if takes_answers else values.get(CHOSEN))
+        if remark:
+            node.log.warning("%s", remark)
+        planner = PlannerNode(node, FleetPlanner(grid, settings), chooser, takes_answers=takes_answers)
+        await planner.run(chooser.blocked_at_start(grid))
 
 
 if __name__ == "__main__":

@@ -28,19 +28,20 @@ LEAST_CELL = 0.2
 MAP_FRAME = "map"
 
 
-def grid_fields(grid: GridMap, blocked: Iterable[int], stamp: Time) -> dict[str, Any]:
+def grid_fields(grid: GridMap, blocked: Iterable[int], stamp: Time, made: Time) -> dict[str, Any]:
     """Return the fields of a grid's message.
 
     Args:
         grid: The grid.
         blocked: Cells that are blocked besides the grid's own.
         stamp: When it holds.
+        made: When the planner took the grid; names it.
     """
     picture = occupancy(grid, blocked)
     return {
         "header": {"stamp": stamp, "frame_id": MAP_FRAME},
         "info": {
-            "map_load_time": stamp,
+            "map_load_time": made,
             "resolution": picture.resolution,
             "width": picture.width,
             "height": picture.height,
@@ -65,6 +66,11 @@ def read_grid(message: Message) -> GridMap:
         origin=(corner.x, corner.y),
         yaw=corner.yaw,
     )
+
+
+def grid_name(made: Time) -> str:
+    """Return the name of a grid in lists of cells: when the planner took it; empty if that is unknown."""
+    return f"{made.secs}.{made.nsecs:09}" if made else ""
 
 
 def wants_old_topic(

@@ -1,7 +1,8 @@
-"""The map that the fleet's nodes get by parameters."""
+"""The parameters of the fleet's nodes, and the map that they describe."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from rce.ros.node import Node
 
 
 def make_grid(values: Mapping[str, Any]) -> GridMap:
@@ -58,3 +59,13 @@ def _grid_over(values: Mapping[str, Any], cell_size: float) -> GridMap:
         blocked_share=float(values.get("blocked_share", BLOCKED_SHARE)),
     )
     return grid.with_blocked(grid.blocked.union(int(cell) for cell in values.get("walls", [])))
+
+
+async def read_fleet_parameters(node: Node) -> dict[str, Any]:
+    """Return the parameters of the namespace ``/fleet``, overridden by the node's private ones."""
+    values: dict[str, Any] = {}
+    for namespace in ("/fleet", "~"):
+        found = await node.get_param(namespace, {})
+        if isinstance(found, Mapping):
+            values.update(found)
+    return values

@@ -14,7 +14,7 @@ from rce.ros.node import Node, run
 from rce.ros.node.master import MasterClient
 from rce.ros.types import Time
 from rce.ros.xmlrpc import RpcClient
-from rce_fleet.coordination.answers import Answer, answer_array, is_answer, revision_of
+from rce_fleet.coordination.answers import Answer, answer_array, grid_of, is_answer, revision_of
 from rce_fleet.coordination.move_client import (
     ClientReport,
     ClientState,
@@ -26,7 +26,14 @@ from rce_fleet.coordination.move_client import (
 )
 from rce_fleet.coordination.robot_signs import RobotSigns
 from rce_fleet.geometry.angles import quaternion_z, yaw_of
-from rce_fleet.nodes.grid_messages import GRID_TOPIC, LEAST_CELL, MAP_FRAME, OLD_TOPIC, read_grid
+from rce_fleet.nodes.grid_messages import (
+    GRID_TOPIC,
+    LEAST_CELL,
+    MAP_FRAME,
+    OLD_TOPIC,
+    grid_name,
+    read_grid,
+)
 from rce_fleet.nodes.grid_parameters import make_grid
 from rce_fleet.nodes.throttled_log import ThrottledLog
 from rce_fleet.planning.grid import GridMap
@@ -59,6 +66,7 @@ class MoveClientNode:
         self._reports: Publisher
         self._answers = False
         self._hears_old = False
+        self._grid = Time()
         self._signs = RobotSigns()
         self._throttled_log = ThrottledLog(node)
         self._alive_topic = ""
@@ -106,7 +114,7 @@ class MoveClientNode:
 
     def _take_map(self, message: Message) -> None:
         try:
-            self._take_grid(read_grid(message))
+            self._take_grid(read_grid(message), message.info.map_load_time)
         except ValueError as error:
             self._node.log.warning("the grid on %s cannot be used: %s", GRID_TOPIC, error)
 
@@ -131,9 +139,18 @@ class MoveClientNode:
             self._hears_old = True
             await self._node.subscribe(OLD_TOPIC, "nav_msgs/OccupancyGrid", self._take_old_map)
 
-    def _take_grid(self, grid: GridMap) -> None:
-        if self._client is None:
-            self._client = MoveClient(grid, self._node.namespace.strip("/"), self._node.time())
+    def _take_grid(self, grid: GridMap, made: Time | None = None) -> None:
+        """Drive on a grid; a goal on another one before is cancelled."""
+        self._grid = made or Time()
+        revision = 0
+        if self._client is not None:
+            if grid == self._client.grid:
+                return
+            revision = self._client.report.revision
+            self._node.log.info("new grid of %d x %d cells", grid.columns, grid.rows)
+        now = self._node.time()
+        self._client = MoveClient(grid, self._node.namespace.strip("/"), now, ClientReport(revision))
+        self._do(self._client.tick(now))
 
     def _take_blocked(self, message: Message) -> None:
         if self._client is not None:
@@ -146,6 +163,10 @@ class MoveClientNode:
     def _take_cells(self, message: Message) -> None:
         labels = [dimension.label for dimension in message.layout.dim]
         if self._client is None or is_answer(labels):
+            return
+        wanted, own = grid_of(labels), grid_name(self._grid)
+        if wanted and own and wanted != own:
+            self._node.log.debug("cells of another grid are ignored; they are sent again")
             return
         revision = revision_of(labels)
         try:
@@ -240,6 +261,7 @@ class MoveClientNode:
             target=-1 if report.target is None else report.target,
             robot_age=-1.0 if sign.age is None else sign.age,
             pose=[] if sign.pose is None else list(sign.pose),
+            grid=self._grid,
         )
 
 

@@ -133,6 +133,9 @@ class ObstacleCellsNode:
             return  # Only cells were blocked or freed.
         else:
             self._fleet = picture
+            self._reported.clear()
+            self._freed.clear()
+            self._others.held = self._others.blocked = frozenset()
         if self._fleet is not None:
             self._watch = CellWatch(self._fleet, self._parameters, self._known)
 

@@ -55,7 +55,17 @@ class StatePublisher:
         await node.advertise_service(GET_STATE_SERVICE, GET_STATE, self._get_state)
         self._state = await node.advertise(STATE_TOPIC, STATE, latch=True)
         self._changes = await node.advertise(CHANGES_TOPIC, CHANGES)
-        self._publish_whole()
+        self.publish_whole()
+
+    @property
+    def started(self) -> Time:
+        """When the planner began, with its grid."""
+        return self._started
+
+    def restart(self, planner: FleetPlanner) -> None:
+        """Publish the state of another planner, as after a restart."""
+        self._planner = planner
+        self._started = Time.now()
 
     def update(self, now: float) -> None:
         """Publish what is due at ``now``, in seconds; call it a few times per second."""
@@ -67,9 +77,10 @@ class StatePublisher:
         pause = len(self._planner.state.robots) / WHOLE_ROBOTS_PER_S
         if self._is_whole_due and now - self._whole_at >= pause:
             self._whole_at, self._is_whole_due = now, False
-            self._publish_whole()
+            self.publish_whole()
 
-    def _publish_whole(self) -> None:
+    def publish_whole(self) -> None:
+        """Publish the complete state now."""
         self._state.publish(state_fields(self._started, self._planner))
 
     def _get_state(self, request: Message) -> dict[str, Any]:

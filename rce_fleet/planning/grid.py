@@ -78,7 +78,11 @@ class GridMap:
     def centre(self, cell: int) -> tuple[float, float]:
         """Return the centre of a cell, ``(x, y)`` in metres."""
         row, column = self.place(cell)
-        along, up = (column + 0.5) * self.cell_size, (row + 0.5) * self.cell_size
+        return self.point(row + 0.5, column + 0.5)
+
+    def point(self, row: float, column: float) -> tuple[float, float]:
+        """Return the point ``(x, y)`` in metres at a row and a column, which may be fractions."""
+        along, up = column * self.cell_size, row * self.cell_size
         c, s = self._turn
         return self.origin[0] + c * along - s * up, self.origin[1] + s * along + c * up
 

@@ -34,12 +34,13 @@ from rce_fleet.station.engine_authenticator import EngineAuthenticator, StationA
 from rce_fleet.station.engine_planner_client import EnginePlannerClient
 from rce_fleet.station.engine_watch import EngineWatch
 from rce_fleet.station.feed import Feed
-from rce_fleet.station.fleet_link import FleetLink, PlannerClient
+from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.graph_watch import GraphWatch
 from rce_fleet.station.layers.engine_source import EngineLayerSource
 from rce_fleet.station.layers.hub import LayerHub
 from rce_fleet.station.layers.ros_source import RosLayerSource
 from rce_fleet.station.layers.sources import LayerSource
+from rce_fleet.station.planner_client import PlannerClient
 from rce_fleet.station.ros_planner_client import RosPlannerClient
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView

@@ -24,6 +24,24 @@ class CellRequest(_Model):
     blocked: bool
 
 
+class GridRequest(_Model):
+    """A grid of cells over the planner's map; what is left out stays as it is."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    cell_size: float | None = Field(default=None, description="Edge of a cell, metres.", gt=0)
+    origin: tuple[float, float] | None = Field(default=None, description="Outer corner of cell 0, metres.")
+    yaw: float | None = Field(
+        default=None, description="Direction of the columns, radians counter-clockwise from x."
+    )
+    blocked_share: float | None = Field(
+        default=None,
+        description="A cell is blocked if more than this share of it is occupied or unknown.",
+        ge=0,
+        le=1,
+    )
+
+
 class LayersRequest(_Model):
     """The layers that a page shows; sent on the live socket, it replaces the last one."""
 
@@ -53,6 +71,19 @@ class Answer(_Model):
     """The planner's answer."""
 
     message: str
+
+
+class GridAnswer(_Model):
+    """A grid of cells, and what the planner says of it."""
+
+    message: str = Field(description="Of a preview: why the grid cannot be taken over now, if it cannot.")
+    rows: int
+    columns: int
+    cell_size: float = Field(description="Metres.")
+    origin: tuple[float, float] = Field(description="Outer corner of cell 0, metres.")
+    yaw: float = Field(description="Direction of the columns, radians counter-clockwise from x.")
+    blocked_share: float
+    walls: list[int] = Field(description="Blocked cells that belong to the map and cannot be freed.")
 
 
 class Problem(_Model):

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from yarl import URL
 
 from rce_fleet.exceptions import RequestRefusedError, StationUnavailableError
-from rce_fleet.station.api import FleetModel
+from rce_fleet.station.api import FleetModel, GridAnswer, GridRequest
 
 TIMEOUT = aiohttp.ClientTimeout(total=15)
 
@@ -57,6 +57,16 @@ class StationClient:
             RequestRefusedError: The request was refused.
         """
         await self._request("PUT", f"cells/{cell}", {"blocked": blocked})
+
+    async def set_grid(self, grid: GridRequest, *, preview: bool = False) -> GridAnswer:
+        """Change the grid of cells, or only return the grid that it would be.
+
+        Raises:
+            StationUnavailableError: Station or planner cannot be reached.
+            RequestRefusedError: The request was refused, for example because a robot drives.
+        """
+        method, path = ("POST", "grid/preview") if preview else ("PUT", "grid")
+        return GridAnswer.model_validate(await self._request(method, path, grid.model_dump()))
 
     async def _request(self, method: str, path: str, body: dict[str, Any] | None = None) -> Any:
         try:

@@ -49,6 +49,11 @@ class Desired:
         """Store whether the planner blocked or freed a cell."""
         self._cells[cell] = blocked
 
+    def clear(self) -> None:
+        """Forget everything: the cells are numbered in another way now."""
+        self._goals.clear()
+        self._cells.clear()
+
     def unmet(self, state: dict[str, Any]) -> list[DesiredCell | DesiredGoal]:
         """Return what is missing in a planner's ``state`` (a fleet/FleetState in its JSON form).
 

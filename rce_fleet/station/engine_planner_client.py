@@ -14,7 +14,7 @@ from rce_client.exceptions import CallError, ClientError
 from rce_client.services import ServiceClient
 from rce_client.topics import Subscriber
 from rce_fleet.station.desired import node_requests
-from rce_fleet.station.fleet_link import (
+from rce_fleet.station.planner_client import (
     BLOCK_CELL,
     CALL_TIMEOUT_S,
     CHANGES,
@@ -24,6 +24,7 @@ from rce_fleet.station.fleet_link import (
     GRID_TOPIC,
     POSE,
     SET_GOAL,
+    SET_GRID,
     STATE,
     STATE_TOPIC,
     Call,
@@ -34,6 +35,8 @@ from rce_fleet.station.fleet_link import (
 )
 
 _SERVICES = (("setGoal", SET_GOAL), ("blockCell", BLOCK_CELL))
+_NEWER_SERVICES = (("getState", GET_STATE), ("setGrid", SET_GRID))
+"""Services that planners of earlier releases do not have; the station does not wait for them."""
 
 
 class EnginePlannerClient(PlannerClient):
@@ -101,26 +104,30 @@ class EnginePlannerClient(PlannerClient):
 
     async def _follow_changes(self, connection: Connection) -> None:
         """Receive changes, beside whole states until the planner is known to publish changes."""
-        service = GET_STATE
-        self._calls[service] = _caller(await connection.service_client("getState", service.type_name))
-        await self._join(connection, "getState", "ServiceClientInterface", service.type_name, service.name)
+        for tag, service in _NEWER_SERVICES:
+            self._calls[service] = _caller(await connection.service_client(tag, service.type_name))
+            await self._join(connection, tag, "ServiceClientInterface", service.type_name, service.name)
         await connection.subscriber("fleetChanges", CHANGES, self._listener.take_changes)
         await self._join(connection, "fleetChanges", "SubscriberInterface", CHANGES, CHANGES_TOPIC)
         self._listener.may_have_missed()
 
     async def _read_grid(self, connection: Connection) -> None:
-        """Receive the grid once: its rotation does not change, but each blocked cell publishes it anew."""
+        """Receive the grid once for each start of the planner: each blocked cell publishes it anew."""
         came = asyncio.Event()
 
         def take(message: dict[str, Any]) -> None:
             self._listener.take_grid(message)
             came.set()
 
-        grid = await connection.subscriber("fleetMap", GRID, take)
-        await self._join(connection, "fleetMap", "SubscriberInterface", GRID, GRID_TOPIC)
-        await came.wait()
-        await grid.close()
-        await connection.remove_interface(self._container, "fleetMap")
+        while True:
+            await self._grid_needed.wait()
+            self._grid_needed.clear()
+            came.clear()
+            grid = await connection.subscriber("fleetMap", GRID, take)
+            await self._join(connection, "fleetMap", "SubscriberInterface", GRID, GRID_TOPIC)
+            await came.wait()
+            await grid.close()
+            await connection.remove_interface(self._container, "fleetMap")
 
     async def _follow_states(self, connection: Connection) -> None:
         """Receive whole states while changes are not followed."""

@@ -4,126 +4,34 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
-from typing import Any, NamedTuple, Protocol, TypeAlias, assert_never
+from typing import Any, assert_never
 
 from rce.aio.backoff import Backoff
 from rce_fleet.station.desired import Desired, DesiredCell, DesiredGoal
 from rce_fleet.station.following import ChangeFollower
+from rce_fleet.station.planner_client import (
+    BLOCK_CELL,
+    GET_STATE,
+    SET_GOAL,
+    SET_GRID,
+    PlannerClient,
+    PlannerError,
+    PlannerService,
+    PlannerUnavailableError,
+)
 from rce_fleet.station.view import FleetView, ViewChange
 
-STATE = "fleet/FleetState"
-STATE_TOPIC = "/fleet/state"
-CHANGES = "fleet/FleetChanges"
-CHANGES_TOPIC = "/fleet/changes"
-GRID = "nav_msgs/OccupancyGrid"
-GRID_TOPIC = "/fleet/map"
-POSE = "geometry_msgs/PoseWithCovarianceStamped"
-CALL_TIMEOUT_S = 10.0
 RESEND_FOR_S = 20.0
 """How long goals and blocked cells are sent again to a restarted planner."""
 RESEND_EVERY_S = 0.5
+GRID_WAIT_S = 2.0
+"""How long the grid of a restarted planner is awaited before goals and cells are sent: it may be another."""
 ASK_AGAIN = Backoff(first=1.0, longest=60.0)
 """Pauses before the complete state is requested again, while a planner does not answer."""
 SILENT_S = 10.0
 """A planner publishes a change, or the number of the last one, every second. After this time without one, the
 planner is asked whether it still publishes changes."""
-
-
-class PlannerService(NamedTuple):
-    """A service of the planner: its name in the planner's ROS graph, and its type."""
-
-    name: str
-    type_name: str
-
-
-SET_GOAL = PlannerService("/fleet/set_goal", "fleet/SetGoal")
-BLOCK_CELL = PlannerService("/fleet/block_cell", "fleet/BlockCell")
-GET_STATE = PlannerService("/fleet/get_state", "fleet/GetState")
-
-
-def pose_topic(robot: str) -> str:
-    """Return the topic on which the planner publishes a robot's pose."""
-    return f"/fleet/poses/{robot}"
-
-
-class PlannerError(Exception):
-    """The planner refused a request; the text says why."""
-
-
-class PlannerUnavailableError(PlannerError):
-    """The planner cannot be reached now; try again later."""
-
-
-class PlannerListener(Protocol):
-    """Gets the planner's messages, in their JSON form."""
-
-    def take_state(self, message: dict[str, Any]) -> None:
-        """Handle a ``fleet/FleetState``."""
-
-    def take_changes(self, message: dict[str, Any]) -> None:
-        """Handle a ``fleet/FleetChanges``."""
-
-    def may_have_missed(self) -> None:
-        """Handle a new or restored subscription to changes: some may have been missed."""
-
-    def take_pose(self, robot: str, message: dict[str, Any]) -> None:
-        """Handle a robot's pose message."""
-
-    def take_grid(self, message: dict[str, Any]) -> None:
-        """Handle the grid, a ``nav_msgs/OccupancyGrid``."""
-
-    def take_event(self, text: str, tone: str) -> None:
-        """Handle an event; the tone is ``good``, ``warn`` or ``bad``."""
-
-
-Call: TypeAlias = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
-"""Calls a service of the planner; raises :class:`PlannerUnavailableError` if there is no answer."""
-
-
-class PlannerClient(ABC):
-    """A client of the planner: through the engine, or in the planner's ROS graph.
-
-    Args:
-        away: Error text until the planner's services are connected.
-    """
-
-    def __init__(self, away: str) -> None:
-        self._away = away
-        self._new_robots: asyncio.Queue[str] = asyncio.Queue()
-        self._calls: dict[PlannerService, Call] = {}
-        self._changes_followed = asyncio.Event()
-        self._states_needed = asyncio.Event()
-
-    @abstractmethod
-    async def run(self, listener: PlannerListener, ready: Callable[[], Awaitable[None]]) -> None:
-        """Receive state and poses until cancelled; call ``ready`` once the planner is connected."""
-
-    def follow(self, robot: str) -> None:
-        """Subscribe to a robot's poses."""
-        self._new_robots.put_nowait(robot)
-
-    def stop_states(self) -> None:
-        """Stop receiving complete states; changes are enough."""
-        self._states_needed.clear()
-        self._changes_followed.set()
-
-    def receive_states(self) -> None:
-        """Receive complete states again, if this was stopped."""
-        self._changes_followed.clear()
-        self._states_needed.set()
-
-    async def call(self, service: PlannerService, request: dict[str, Any]) -> dict[str, Any]:
-        """Call a service of the planner.
-
-        Raises:
-            PlannerUnavailableError: There is no answer.
-        """
-        call = self._calls.get(service)
-        if call is None:
-            raise PlannerUnavailableError(self._away)
-        return await call(request)
 
 
 class FleetLink:
@@ -162,6 +70,9 @@ class FleetLink:
         self._desired = Desired()
         self._planner_started: str | None = None
         self._planner_restarted = asyncio.Event()
+        self._grid_came = asyncio.Event()
+        self._changes_grid = False
+        """Whether this station changed the grid, and the planner's new state is not here yet."""
         self._known: set[str] = set()
 
     async def run(self, ready: Callable[[], Awaitable[None]]) -> None:
@@ -193,17 +104,45 @@ class FleetLink:
         self._desired.set_cell(cell, blocked=blocked)
         return said
 
+    async def set_grid(self, choice: dict[str, Any], *, preview: bool) -> dict[str, Any]:
+        """Lay another grid over the planner's map, or only show it; return the planner's answer.
+
+        Goals and blocked cells that were requested are numbers of the grid before, and are forgotten.
+
+        Args:
+            choice: ``cell_size``, ``origin_x``, ``origin_y``, ``origin_yaw`` and ``blocked_share``.
+            preview: Only return the grid.
+
+        Raises:
+            PlannerError: The planner refused, or cannot be reached.
+        """
+        self._changes_grid |= not preview
+        try:
+            answer = await self._ask(SET_GRID, {**choice, "preview": preview})
+        except PlannerError:
+            self._changes_grid &= preview
+            raise
+        if not preview:
+            self._desired.clear()
+        return answer
+
     async def _call(self, service: PlannerService, request: dict[str, Any]) -> str:
+        return str((await self._ask(service, request))["message"])
+
+    async def _ask(self, service: PlannerService, request: dict[str, Any]) -> dict[str, Any]:
         answer = await self._client.call(service, request)
         if not answer["ok"]:
             raise PlannerError(answer["message"])
-        return str(answer["message"])
+        return answer
 
     async def _resend(self) -> None:
         """Send goals and blocked cells to a restarted planner again, for a while or until it reports them."""
         while True:
             await self._planner_restarted.wait()
             self._planner_restarted.clear()
+            with contextlib.suppress(TimeoutError):  # an earlier planner publishes no grid
+                async with asyncio.timeout(GRID_WAIT_S):
+                    await self._grid_came.wait()
             self._on_event("the planner was restarted; sending goals and blocked cells again", "warn")
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(RESEND_FOR_S):
@@ -294,7 +233,14 @@ class FleetLink:
     def _take(self, planner_started: str, change: ViewChange) -> None:
         """Subscribe to new robots, and report the change."""
         if self._planner_started not in (None, planner_started):
-            self._planner_restarted.set()
+            self._grid_came.clear()
+            self._client.read_grid()
+            if self._changes_grid or change.is_new_map:
+                self._desired.clear()
+                self._on_event("the fleet has a new grid; its goals are removed", "warn")
+            else:
+                self._planner_restarted.set()
+            self._changes_grid = False
         self._planner_started = planner_started
         for robot in change.robots:
             if robot not in self._known:
@@ -309,7 +255,11 @@ class FleetLink:
 
     def take_grid(self, message: dict[str, Any]) -> None:
         """Handle the grid, a ``nav_msgs/OccupancyGrid``: it has the rotation."""
-        self._on_change(self._view.on_grid(message))
+        change = self._view.on_grid(message)
+        if change.is_new_map:
+            self._desired.clear()
+        self._grid_came.set()
+        self._on_change(change)
 
     def take_event(self, text: str, tone: str) -> None:
         """Handle an event."""

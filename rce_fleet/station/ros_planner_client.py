@@ -10,7 +10,7 @@ from typing import Any
 from rce.ros.errors import RosError, ServiceError
 from rce.ros.node import Node, ServiceClient
 from rce.ros.types import Duration, Message, Time, TypeRegistry
-from rce_fleet.station.fleet_link import (
+from rce_fleet.station.planner_client import (
     BLOCK_CELL,
     CALL_TIMEOUT_S,
     CHANGES,
@@ -20,6 +20,7 @@ from rce_fleet.station.fleet_link import (
     GRID_TOPIC,
     POSE,
     SET_GOAL,
+    SET_GRID,
     STATE,
     STATE_TOPIC,
     Call,
@@ -55,7 +56,7 @@ class RosPlannerClient(PlannerClient):
             self._heard.set()
 
         async with self._node as node:
-            for service in (SET_GOAL, BLOCK_CELL, GET_STATE):
+            for service in (SET_GOAL, BLOCK_CELL, GET_STATE, SET_GRID):
                 self._calls[service] = _caller(node.service_client(service.name, service.type_name))
             states = await node.subscribe(STATE_TOPIC, STATE, take_state)
             await self._heard.wait()
@@ -74,16 +75,20 @@ class RosPlannerClient(PlannerClient):
                     states = await node.subscribe(STATE_TOPIC, STATE, take_state)
 
     async def _read_grid(self, listener: PlannerListener) -> None:
-        """Receive the grid once: its rotation does not change, but each blocked cell publishes it anew."""
+        """Receive the grid once for each start of the planner: each blocked cell publishes it anew."""
         came = asyncio.Event()
 
         def take(message: Message) -> None:
             listener.take_grid(plain(message))
             came.set()
 
-        grid = await self._node.subscribe(GRID_TOPIC, GRID, take)
-        await came.wait()
-        await grid.close()
+        while True:
+            await self._grid_needed.wait()
+            self._grid_needed.clear()
+            came.clear()
+            grid = await self._node.subscribe(GRID_TOPIC, GRID, take)
+            await came.wait()
+            await grid.close()
 
     async def _follow_robots(self, listener: PlannerListener) -> None:
         while True:

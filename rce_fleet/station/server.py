@@ -24,6 +24,8 @@ from rce_fleet.station.api import (
     CellRequest,
     FleetModel,
     GoalRequest,
+    GridAnswer,
+    GridRequest,
     LayersRequest,
     LoginRequest,
     MapModel,
@@ -32,9 +34,11 @@ from rce_fleet.station.api import (
     UserModel,
 )
 from rce_fleet.station.authentication import AuthenticationError, Authenticator, TokenAuthenticator
-from rce_fleet.station.fleet_link import FleetLink, PlannerError, PlannerUnavailableError
+from rce_fleet.station.fleet_link import FleetLink
+from rce_fleet.station.grids import complete_grid, grid_answer
 from rce_fleet.station.layers.hub import LayerHub
 from rce_fleet.station.live import Broadcast, Page
+from rce_fleet.station.planner_client import PlannerError, PlannerUnavailableError
 from rce_fleet.station.view import FleetView
 
 STATIC = Path(__file__).parent / "static"
@@ -236,6 +240,43 @@ class Station:
         message = await self._fleet.block_cell(int(number), blocked=asked.blocked)
         self._access.audit(request, "block_cell" if asked.blocked else "free_cell", number)
         return _reply(Answer(message=message))
+
+    @ROUTES.route(
+        "POST",
+        "/grid/preview",
+        "Another grid of cells, without taking it over",
+        body=GridRequest,
+        reply=GridAnswer,
+        errors=_CONTROL_ERRORS,
+    )
+    async def preview_grid(self, request: web.Request) -> web.StreamResponse:
+        """Return another grid."""
+        return await self._lay_grid(request, preview=True)
+
+    @ROUTES.route(
+        "PUT",
+        "/grid",
+        "Change the grid of cells; robots must stand, and their goals are removed",
+        body=GridRequest,
+        reply=GridAnswer,
+        errors=_CONTROL_ERRORS,
+    )
+    async def put_grid(self, request: web.Request) -> web.StreamResponse:
+        """Change the grid."""
+        return await self._lay_grid(request, preview=False)
+
+    async def _lay_grid(self, request: web.Request, *, preview: bool) -> web.StreamResponse:
+        refusal = self._access.control_refusal(request, "set_grid", "grid")
+        if refusal is not None:
+            return refusal
+        asked = GridRequest.model_validate_json(await read_whole(request))
+        choice = complete_grid(asked, self._view.map())
+        answer = await self._fleet.set_grid(choice, preview=preview)
+        made = grid_answer(choice, answer)
+        if not preview:
+            detail = f"{made.columns} x {made.rows} cells of {made.cell_size:g} m at {made.origin},"
+            self._access.audit(request, "set_grid", "grid", f"{detail} yaw {made.yaw:g}")
+        return _reply(made)
 
     async def live(self, request: web.Request) -> web.StreamResponse:
         """Send changes to a page until it disconnects.

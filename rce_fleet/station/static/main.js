@@ -1,5 +1,6 @@
 // Connects model, view and panel to the station: a WebSocket for changes, HTTP for the operator's requests.
 
+import { GridEditor } from "./grid_editor.js";
 import { Fleet } from "./model.js";
 import { LayerPanel } from "./layer_panel.js";
 import { Layers } from "./layers.js";
@@ -23,16 +24,21 @@ function say(text, bad = false) {
   message.className = bad ? "bad" : "";
 }
 
+// Send a request; return the answer, or throw an error with its text.
+async function ask(method, path, body) {
+  const response = await fetch(path, {
+    method,
+    headers: { "Content-Type": "application/json" },
+    body: body === undefined ? undefined : JSON.stringify(body),
+  });
+  const answer = await response.json();
+  if (!response.ok) throw new Error(answer.error ?? response.statusText);
+  return answer;
+}
+
 async function request(method, path, body) {
   try {
-    const response = await fetch(path, {
-      method,
-      headers: { "Content-Type": "application/json" },
-      body: body === undefined ? undefined : JSON.stringify(body),
-    });
-    const answer = await response.json();
-    if (!response.ok) throw new Error(answer.error ?? response.statusText);
-    say(answer.message);
+    say((await ask(method, path, body)).message);
   } catch (error) {
     say(error.message, true);
     panel.addEvent(error.message, "bad");
@@ -78,6 +84,10 @@ canvas.addEventListener("keydown", (event) => {
   event.preventDefault();
 });
 
+const editor = new GridEditor(fleet, ask);
+view.editor = editor;
+editor.addEventListener("taken", ({ detail }) => say(detail));
+
 toolBlock.addEventListener("click", () => { if (fleet.selected) fleet.select(fleet.selected); });
 
 fleet.addEventListener("selected", () => {
@@ -94,6 +104,7 @@ fleet.addEventListener("state", () => layers.request());
 
 fleet.addEventListener("map", () => {
   canvas.style.aspectRatio = `${fleet.map.columns} / ${fleet.map.rows}`;
+  view.cursor = null;
 });
 
 async function identify() {
@@ -103,6 +114,7 @@ async function identify() {
   const person = await response.json();
   document.querySelector("#person").textContent = person.logged_in ? `${person.name} (${person.role})` : "";
   document.querySelector("#logout").hidden = !person.logged_in;
+  editor.form.hidden = !person.steers;
   if (!person.steers) {
     for (const tool of [toolBlock, toolGoal]) tool.hidden = true;
     document.querySelector("#hint").textContent = `Your role, ${person.role}, looks and does not steer.`;
@@ -147,4 +159,4 @@ identify();
 connect();
 
 // For automated tests of the page.
-window.rceFleet = { fleet, layers, view };
+window.rceFleet = { fleet, layers, view, editor };

@@ -141,17 +141,19 @@ export class Fleet extends EventTarget {
     return this.#place((cell % columns) + 0.5, Math.floor(cell / columns) + 0.5);
   }
 
-  // The rectangle around the grid: [least x, least y, greatest x, greatest y], metres.
-  bounds() {
-    const { rows, columns } = this.map;
-    const corners = [[0, 0], [columns, 0], [0, rows], [columns, rows]].map(([column, row]) => this.#place(column, row));
+  // The rectangle around the fleet's grid, and another one: [least x, least y, greatest x, greatest y], metres.
+  bounds(other = null) {
+    const corners = [this.map, other].filter(Boolean).flatMap((grid) => {
+      const { rows, columns } = grid;
+      return [[0, 0], [columns, 0], [0, rows], [columns, rows]].map(([column, row]) => this.#place(column, row, grid));
+    });
     const [xs, ys] = [corners.map(([x]) => x), corners.map(([, y]) => y)];
     return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
   }
 
   // The point of a column and row, which may be fractions, in the map frame.
-  #place(column, row) {
-    const { cell_size, origin: [x, y], yaw = 0 } = this.map;
+  #place(column, row, grid = this.map) {
+    const { cell_size, origin: [x, y], yaw = 0 } = grid;
     const [right, up] = [column * cell_size, row * cell_size];
     return [x + right * Math.cos(yaw) - up * Math.sin(yaw), y + right * Math.sin(yaw) + up * Math.cos(yaw)];
   }

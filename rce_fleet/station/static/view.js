@@ -9,6 +9,7 @@ const SMOOTHING = 0.25; // share of the way to the newest pose that a robot is m
 
 export class View {
   cursor = null; // cell under the pointer or the keyboard
+  editor = null; // has the grid that may be taken over
 
   constructor(canvas, fleet, layers) {
     this.canvas = canvas;
@@ -55,7 +56,7 @@ export class View {
   }
 
   #fit() {
-    const [x0, y0, x1, y1] = this.fleet.bounds();
+    const [x0, y0, x1, y1] = this.fleet.bounds(this.editor?.proposed);
     const margin = MARGIN * this.fleet.map.cell_size;
     const width = x1 - x0 + 2 * margin;
     const height = y1 - y0 + 2 * margin;
@@ -75,6 +76,7 @@ export class View {
     this.layers.drawBelow(this);
     if (this.layers.layers.grid) this.#drawCells();
     this.#drawCursor();
+    if (this.editor?.proposed) this.#drawProposed(this.editor.proposed);
     for (const robot of fleet.robots.values()) this.#drawTrail(robot);
     for (const robot of fleet.robots.values()) this.#drawPlan(robot);
     for (const robot of fleet.robots.values()) this.#drawRobot(robot);
@@ -82,12 +84,43 @@ export class View {
   }
 
   // Go to the grid: the first cell begins at the origin; its columns go right and its rows up (negative).
-  #enterGrid() {
-    const { context, fleet } = this;
-    const [x, y] = fleet.map.origin;
+  #enterGrid(grid = this.fleet.map) {
+    const { context } = this;
+    const [x, y] = grid.origin;
     context.save();
     context.translate(this.#x(x), this.#y(y));
-    context.rotate(-(fleet.map.yaw ?? 0));
+    context.rotate(-(grid.yaw ?? 0));
+  }
+
+  // The grid that may be taken over: dashed lines, blocked cells crossed out.
+  #drawProposed(grid) {
+    const { context, colour } = this;
+    const side = grid.cell_size * this.scale;
+    this.#enterGrid(grid);
+    context.strokeStyle = colour.accent;
+    context.lineWidth = Math.max(1, devicePixelRatio);
+    context.setLineDash([4 * devicePixelRatio, 3 * devicePixelRatio]);
+    context.beginPath();
+    for (let row = 0; row <= grid.rows; row++) {
+      context.moveTo(0, -row * side);
+      context.lineTo(grid.columns * side, -row * side);
+    }
+    for (let column = 0; column <= grid.columns; column++) {
+      context.moveTo(column * side, 0);
+      context.lineTo(column * side, -grid.rows * side);
+    }
+    context.stroke();
+    context.setLineDash([]);
+    context.beginPath();
+    for (const cell of grid.walls) {
+      const [left, top] = [(cell % grid.columns) * side, -(Math.floor(cell / grid.columns) + 1) * side];
+      context.moveTo(left, top);
+      context.lineTo(left + side, top + side);
+      context.moveTo(left + side, top);
+      context.lineTo(left, top + side);
+    }
+    context.stroke();
+    context.restore();
   }
 
   #drawCells() {

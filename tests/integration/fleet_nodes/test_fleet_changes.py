@@ -12,7 +12,8 @@ from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce_fleet.station import fleet_link
-from rce_fleet.station.fleet_link import FleetLink, PlannerUnavailableError
+from rce_fleet.station.fleet_link import FleetLink
+from rce_fleet.station.planner_client import PlannerUnavailableError
 from rce_fleet.station.ros_planner_client import RosPlannerClient
 from rce_fleet.station.view import FleetView, ViewChange
 

@@ -12,8 +12,9 @@ from support.master_program import master
 
 from rce.web.server import HttpServer
 from rce_fleet.station.engine_authenticator import EngineAuthenticator, StationAccount
-from rce_fleet.station.fleet_link import FleetLink, PlannerError
+from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.live import Broadcast
+from rce_fleet.station.planner_client import PlannerError
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 

@@ -10,8 +10,9 @@ from aiohttp import web
 from aiohttp.test_utils import TestClient, TestServer
 
 from rce_fleet.station.authentication import TokenAuthenticator
-from rce_fleet.station.fleet_link import FleetLink, PlannerError, PlannerUnavailableError
+from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.live import Broadcast
+from rce_fleet.station.planner_client import PlannerError, PlannerUnavailableError
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 

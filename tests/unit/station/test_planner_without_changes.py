@@ -12,9 +12,9 @@ import pytest
 
 from rce.aio.backoff import Backoff
 from rce_fleet.station import fleet_link
-from rce_fleet.station.fleet_link import (
+from rce_fleet.station.fleet_link import FleetLink
+from rce_fleet.station.planner_client import (
     GET_STATE,
-    FleetLink,
     PlannerClient,
     PlannerListener,
     PlannerUnavailableError,
