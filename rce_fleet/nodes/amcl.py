@@ -77,6 +77,8 @@ class AmclNode:
         self._used_at: float | None = None
         self._scan_stamp = Time()
         self._saved: Pose | None = None
+        self._cloud_due = True
+        """Whether the particles were not published since they changed: there was no subscriber."""
         self._frames: RobotFrames
         self._poses: Publisher
         self._clouds: Publisher
@@ -112,6 +114,8 @@ class AmclNode:
             saving = tasks.create_task(self._save_poses())
             while await node.sleep(1.0):
                 self._report()
+                if self._cloud_due and self._clouds.connections and self._amcl is not None:
+                    self._publish_cloud(node.now())
             for task in (asking, saving):
                 if task is not None:
                     task.cancel()
@@ -172,7 +176,7 @@ class AmclNode:
             self._throttled_log.warn("map", f"the map cannot be used: {error}")
             self._fault = f"the map cannot be used: {error}"
             return False
-        self._fault = ""
+        self._fault, self._cloud_due = "", True
         self._node.log.info("map of %d x %d cells of %.3f m", grid.columns, grid.rows, grid.resolution)
         return True
 
@@ -208,6 +212,7 @@ class AmclNode:
         self._start = pose, covariance
         if self._amcl is not None:
             self._amcl.set_pose(*self._start, self._frames.odometry_now())
+        self._cloud_due = True
         self._node.log.info("initial pose (%.3f, %.3f, %.3f)", pose.x, pose.y, pose.yaw)
         return True
 
@@ -279,11 +284,13 @@ class AmclNode:
             header={"stamp": found.stamp, "frame_id": self._frames.map_frame},
             pose=pose_with_covariance_fields(estimate.pose, estimate.covariance),
         )
+        self._cloud_due = True
         if self._clouds.connections:
             self._publish_cloud(found.stamp)
 
     def _publish_cloud(self, stamp: Time) -> None:
         assert self._amcl is not None
+        self._cloud_due = False
         self._clouds.publish(
             header={"stamp": stamp, "frame_id": self._frames.map_frame},
             poses=[pose_fields(Pose.from_array(each)) for each in self._amcl.particles],

@@ -79,14 +79,19 @@ class PlannerNode:
     Args:
         node: Running node.
         planner: The planner.
-        chooser: Makes other grids over its map.
+        chooser: Makes other grids over its map; if None, over the planner's grid.
         takes_answers: Move clients answer on ``goalNodesList`` instead of their own topics.
     """
 
     def __init__(
-        self, node: Node, planner: FleetPlanner, chooser: GridChooser, *, takes_answers: bool = False
+        self,
+        node: Node,
+        planner: FleetPlanner,
+        chooser: GridChooser | None = None,
+        *,
+        takes_answers: bool = False,
     ) -> None:
-        self._chooser = chooser
+        self._chooser = chooser or GridChooser({}, planner.state.grid)
         self._node = node
         self._takes_answers = takes_answers
         self._planner = planner

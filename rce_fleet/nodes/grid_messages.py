@@ -28,20 +28,22 @@ LEAST_CELL = 0.2
 MAP_FRAME = "map"
 
 
-def grid_fields(grid: GridMap, blocked: Iterable[int], stamp: Time, made: Time) -> dict[str, Any]:
+def grid_fields(
+    grid: GridMap, blocked: Iterable[int], stamp: Time, made: Time | None = None
+) -> dict[str, Any]:
     """Return the fields of a grid's message.
 
     Args:
         grid: The grid.
         blocked: Cells that are blocked besides the grid's own.
         stamp: When it holds.
-        made: When the planner took the grid; names it.
+        made: When the planner took the grid; names it. By default ``stamp``.
     """
     picture = occupancy(grid, blocked)
     return {
         "header": {"stamp": stamp, "frame_id": MAP_FRAME},
         "info": {
-            "map_load_time": made,
+            "map_load_time": stamp if made is None else made,
             "resolution": picture.resolution,
             "width": picture.width,
             "height": picture.height,

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, assert_never
 import numpy as np
 import typer
 
-from rce_fleet.compiled import compile_kernels
 from rce_fleet.exceptions import FleetError
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.localization.parameters import AmclParameters
@@ -25,7 +24,13 @@ from rce_fleet.mapping.occupancy_mapping import draw_map
 from rce_fleet.mapping.trajectory import write_trajectory
 from rce_fleet.maps.ros_map import load_map, save_map
 from rce_fleet.offline.inputs import read_log
-from rce_fleet.offline.outputs import output_folder, print_faults, with_progress, write_report
+from rce_fleet.offline.outputs import (
+    compile_with_notice,
+    output_folder,
+    print_faults,
+    with_progress,
+    write_report,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -73,7 +78,7 @@ def map_log(
     """
     with _errors(), output_folder(output) as folder:
         mapper = _mapper(with_, seed)
-        compile_kernels()
+        compile_with_notice(sys.stderr)
         begin = time.perf_counter()
         found = read_log(log, scan=scan, odometry=odom)
         print_faults(found.faults, sys.stderr)
@@ -114,7 +119,7 @@ def localize(
     start = None if global_ else _pose(initial_pose)
     with _errors(), output_folder(output) as folder:
         grid = load_map(map_)
-        compile_kernels()
+        compile_with_notice(sys.stderr)
         begin = time.perf_counter()
         found = read_log(log, scan=scan, odometry=odom)
         print_faults(found.faults, sys.stderr)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
+import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
+from rce_fleet.compiled import compile_kernels
 from rce_fleet.exceptions import LogError
 
 if TYPE_CHECKING:
@@ -21,15 +23,20 @@ REDRAW_S = 0.2
 SHARE = 0.1
 """Where the output is no terminal, a line is printed after each such share of the scans."""
 SHOWN_FAULTS = 10
+NOTICE_S = 1.0
+"""Seconds after which a user wants to know what takes so long."""
 
 
 @contextmanager
 def output_folder(target: Path) -> Iterator[Path]:
     """Give a folder to write to; its files move to the target when the block ends without an error.
 
+    After an error, folders that were made for it are removed again.
+
     Raises:
         LogError: The target cannot be written to.
     """
+    made = [folder for folder in (target, *target.parents) if not folder.exists()]
     try:
         target.mkdir(parents=True, exist_ok=True)
         unfinished = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=target))
@@ -43,6 +50,25 @@ def output_folder(target: Path) -> Iterator[Path]:
         raise LogError(f"{target}: cannot be written to: {error.strerror or error}") from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
+        with suppress(OSError):  # the first that is not empty ends this
+            for folder in made:
+                folder.rmdir()
+
+
+def compile_with_notice(stream: TextIO) -> None:
+    """Compile the inner loops; say so if it takes long, as it does the first time."""
+    notice = threading.Timer(
+        NOTICE_S,
+        print,
+        ["compiling the inner loops; this is done once and takes some seconds"],
+        {"file": stream},
+    )
+    notice.daemon = True
+    notice.start()
+    try:
+        compile_kernels()
+    finally:
+        notice.cancel()
 
 
 def write_report(path: Path, **values: float) -> None:

@@ -167,6 +167,16 @@ async def test_services_scatter_and_update_a_standing_robot() -> None:
         assert before[0, 0] < 0.05
 
 
+async def test_the_cloud_is_there_before_the_robot_moves() -> None:
+    """A page that shows it later gets it too."""
+    async with world() as here:
+        clouds = await here.judge.subscribe("particlecloud", "geometry_msgs/PoseArray")
+        async with asyncio.timeout(PATIENCE):
+            cloud = await anext(aiter(clouds))
+        spread = np.std([each.position.x for each in cloud.poses])
+        assert 0 < spread < 0.5
+
+
 async def test_an_initial_pose_moves_the_particles() -> None:
     far = replace(SETTINGS, initial_pose_x=4.0, initial_pose_y=3.0)
     async with world(far) as here:

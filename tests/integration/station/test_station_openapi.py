@@ -45,6 +45,9 @@ STATE = {
 }
 
 
+GRID_ANSWER = {"rows": 2, "columns": 2, "walls": [3], "blocked_share": 0.1}
+
+
 class Planner(FleetLink):
     """Does what it is asked for, or refuses it, by turns."""
 
@@ -57,6 +60,9 @@ class Planner(FleetLink):
 
     async def block_cell(self, cell: int, *, blocked: bool) -> str:
         return self._answer()
+
+    async def set_grid(self, choice: dict[str, Any], *, preview: bool) -> dict[str, Any]:
+        return {**GRID_ANSWER, "message": self._answer()}
 
     def _answer(self) -> str:
         self._asked += 1

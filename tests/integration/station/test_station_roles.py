@@ -40,6 +40,10 @@ class RecordingFleet:
         self.desired.append((cell, blocked))
         return "done"
 
+    async def set_grid(self, choice: dict[str, Any], *, preview: bool) -> dict[str, Any]:
+        self.desired.append((choice["cell_size"], preview))
+        return {"message": "done", "rows": 2, "columns": 2, "walls": [], "blocked_share": 0.1}
+
 
 class Site:
     """A master with a user of each role, and a station of testUser's fleet."""
@@ -71,6 +75,11 @@ class Site:
         async with self.session.put(url, json={"cell": 7}, headers=headers) as reply:
             return reply.status
 
+    async def lay_grid(self, token: str) -> int:
+        url, headers = f"{self.station}api/v1/grid", {"Authorization": f"Bearer {token}"}
+        async with self.session.put(url, json={"cell_size": 2}, headers=headers) as reply:
+            return reply.status
+
     async def look(self, token: str) -> int:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         async with self.session.get(f"{self.station}api/v1/fleet", headers=headers) as reply:
@@ -91,7 +100,10 @@ async def running_site(folder: Path, *, open_: bool = False) -> AsyncIterator[Si
         for role in ROLES:
             await site.master("POST", "/users", {"name": role, "password": "pw", "role": role}, status=201)
             await site.log_in(role, "pw")
-        app = Station(FleetView(), site.fleet, Broadcast(), authenticator=authenticator).make_app()  # type: ignore[arg-type]  # as wide as what is called
+        view = FleetView()
+        size = {"rows": 4, "columns": 4, "cell_size": 1.0, "origin_x": 0.0, "origin_y": 0.0}
+        view.on_state({**size, "walls": [], "blocked": [], "pending": [], "robots": []})
+        app = Station(view, site.fleet, Broadcast(), authenticator=authenticator).make_app()  # type: ignore[arg-type]  # as wide as what is called
         async with TestServer(app) as server:
             site.station = str(server.make_url("/"))
             yield site
@@ -110,16 +122,21 @@ async def test_roles_at_station_and_audit(tmp_path: Path) -> None:
         assert found == expected
         assert await site.look("") == await site.look("rce_guess") == 401
         assert site.fleet.desired == [("Robot1", 7)] * 3
+        laid = [await site.lay_grid(site.tokens[who]) for who in ("viewer", "operator")]
+        assert (laid, site.fleet.desired[3:]) == ([403, 200], [(2.0, False)])
         robot = (await site.master("POST", "/robot-tokens", {"robot": "R1"}, status=201))["token"]
         assert await site.look(robot) == 401, "a robot's token is for robots"
 
+        actions = ("set_goal", "set_grid")
+
         async def noted() -> list[tuple[str, str, str]]:
             records = (await site.master("GET", "/audit?since=-1000"))["records"]
-            return [(r["user"], r["detail"], r["outcome"]) for r in records if r["action"] == "set_goal"]
+            return [(r["user"], r["detail"], r["outcome"]) for r in records if r["action"] in actions]
 
         wanted = {
             ("viewer", "", "refused"),
             ("operator", "cell 7", "done"),
+            ("operator", "2 x 2 cells of 2 m at (0.0, 0.0), yaw 0", "done"),
             ("admin", "cell 7", "done"),
             ("testUser", "cell 7", "done"),
         }

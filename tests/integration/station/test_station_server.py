@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import AsyncIterator
+from typing import Any
 
 import pytest
 from aiohttp import web
@@ -29,6 +30,10 @@ class RecordingFleet(FleetLink):
 
     async def block_cell(self, cell: int, *, blocked: bool) -> str:
         return self._note("cell", cell, blocked)
+
+    async def set_grid(self, choice: dict[str, Any], *, preview: bool) -> dict[str, Any]:
+        answer = self._note("preview" if preview else "grid", *choice.values())
+        return {"message": answer, "rows": 4, "columns": 4, "walls": [12], "blocked_share": 0.1}
 
     def _note(self, *requested: object) -> str:
         if self.fault is not None:
@@ -105,6 +110,23 @@ async def test_sets_goals_and_blocks_cells(running: RunningStation) -> None:
     assert running.fleet.desired == [("goal", "Robot1", 5), ("goal", "Robot1", None), ("cell", 7, True)]
 
 
+async def test_previews_and_changes_the_grid(running: RunningStation) -> None:
+    await running.start()
+    early = await running.client.put("/api/v1/grid", json={"cell_size": 0.5})
+    assert (early.status, "not known yet" in (await early.json())["error"]) == (503, True)
+    running.view.on_state(STATE)
+    shown = await running.client.post("/api/v1/grid/preview", json={"cell_size": 0.5, "blocked_share": 0.2})
+    assert await shown.json() == {
+        "message": "done", "rows": 4, "columns": 4, "cell_size": 0.5, "origin": [0.0, 0.0], "yaw": 0.0,
+        "blocked_share": 0.1, "walls": [12],
+    }  # fmt: skip
+    assert (await running.client.put("/api/v1/grid", json={"origin": [1, 2], "yaw": 0.3})).status == 200
+    assert running.fleet.desired == [
+        ("preview", 0.5, 0.0, 0.0, 0.0, 0.2),
+        ("grid", 1.0, 1.0, 2.0, 0.3, -1.0),
+    ]
+
+
 @pytest.mark.parametrize(
     ("path", "body", "words"),
     [
@@ -112,6 +134,10 @@ async def test_sets_goals_and_blocks_cells(running: RunningStation) -> None:
         ("/api/v1/robots/Robot1/goal", '{"cell": -4}', "cell"),
         ("/api/v1/cells/7", '{"blocked": true, "colour": "red"}', "colour"),
         ("/api/v1/cells/7", "no json", "JSON"),
+        ("/api/v1/grid", '{"cell_size": 0}', "cell_size"),
+        ("/api/v1/grid", '{"cell_size": 1e999}', "cell_size"),
+        ("/api/v1/grid", '{"blocked_share": 1.5}', "blocked_share"),
+        ("/api/v1/grid", '{"origin": [0]}', "origin"),
         ("/api/v1/cells/seven", '{"blocked": true}', "seven"),
     ],
 )

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gzip
 import json
+import threading
 from collections.abc import Callable
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,7 @@ from rce_fleet.mapping.gmapping.parameters import FilterParameters
 from rce_fleet.mapping.mapper import Mapper
 from rce_fleet.mapping.trajectory import read_trajectory
 from rce_fleet.maps.ros_map import load_map, save_map
-from rce_fleet.offline import commands
+from rce_fleet.offline import commands, outputs
 from rce_fleet.offline.inputs import read_log
 
 FILES = ["map.pgm", "map.yaml", "report.json", "trajectory.csv"]
@@ -116,7 +118,29 @@ def test_unusable_logs_end_with_a_message(tmp_path: Path, content: str | None) -
     assert result.exit_code == 1
     assert "bad.log: " in result.output
     assert "Traceback" not in result.output
-    assert names(tmp_path / "out") == []
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_bad_log_leaves_folders_of_others(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    assert run(tmp_path / "bad.log", "--output", tmp_path / "mine").exit_code == 1
+    assert run(tmp_path / "bad.log", "--output", tmp_path / "mine" / "new" / "out").exit_code == 1
+    assert names(tmp_path) == ["mine"]
+    assert names(tmp_path / "mine") == []
+
+
+def test_slow_compiling_is_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+    said, stream = threading.Event(), StringIO()
+
+    def announce(text: str, file: StringIO) -> None:
+        file.write(text)
+        said.set()
+
+    monkeypatch.setattr(outputs, "NOTICE_S", 0.01)
+    monkeypatch.setattr(outputs, "print", announce, raising=False)
+    monkeypatch.setattr(outputs, "compile_kernels", lambda: said.wait(30))
+    outputs.compile_with_notice(stream)
+    assert "compiling the inner loops" in stream.getvalue()
 
 
 def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:
