@@ -30,7 +30,9 @@ class GridRequest(_Model):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     cell_size: float | None = Field(default=None, description="Edge of a cell, metres.", gt=0)
-    origin: tuple[float, float] | None = Field(default=None, description="Outer corner of cell 0, metres.")
+    origin: list[float] | None = Field(
+        default=None, description="Outer corner of cell 0, metres.", min_length=2, max_length=2
+    )
     yaw: float | None = Field(
         default=None, description="Direction of the columns, radians counter-clockwise from x."
     )
@@ -80,7 +82,7 @@ class GridAnswer(_Model):
     rows: int
     columns: int
     cell_size: float = Field(description="Metres.")
-    origin: tuple[float, float] = Field(description="Outer corner of cell 0, metres.")
+    origin: list[float] = Field(description="Outer corner of cell 0, metres.", min_length=2, max_length=2)
     yaw: float = Field(description="Direction of the columns, radians counter-clockwise from x.")
     blocked_share: float
     walls: list[int] = Field(description="Blocked cells that belong to the map and cannot be freed.")

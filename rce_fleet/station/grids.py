@@ -40,7 +40,7 @@ def grid_answer(choice: dict[str, Any], answer: dict[str, Any]) -> GridAnswer:
         rows=answer["rows"],
         columns=answer["columns"],
         cell_size=choice["cell_size"],
-        origin=(choice["origin_x"], choice["origin_y"]),
+        origin=[choice["origin_x"], choice["origin_y"]],
         yaw=choice["origin_yaw"],
         blocked_share=answer["blocked_share"],
         walls=answer["walls"],

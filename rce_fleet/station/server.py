@@ -274,7 +274,7 @@ class Station:
         answer = await self._fleet.set_grid(choice, preview=preview)
         made = grid_answer(choice, answer)
         if not preview:
-            detail = f"{made.columns} x {made.rows} cells of {made.cell_size:g} m at {made.origin},"
+            detail = f"{made.columns} x {made.rows} cells of {made.cell_size:g} m at {tuple(made.origin)},"
             self._access.audit(request, "set_grid", "grid", f"{detail} yaw {made.yaw:g}")
         return _reply(made)
 

@@ -229,5 +229,7 @@ async def test_the_document_describes_every_route(running: RunningStation) -> No
         "/api/v1/robots/{robot}",
         "/api/v1/robots/{robot}/goal",
         "/api/v1/cells/{cell}",
+        "/api/v1/grid",
+        "/api/v1/grid/preview",
     }
     assert "GoalRequest" in document["components"]["schemas"]
