@@ -11,7 +11,6 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING, Any, assert_never
 
-import msgspec
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
@@ -30,6 +29,7 @@ from rce.protocol.messages import DataMessage, ErrorReport, InterfaceStatus, Lat
 from rce.protocol.stream import Fault, LargeData, ProtocolStream
 from rce.protocol.weight import is_light, utf8_in_steps
 from rce_robot.doors.client.outbox import Outbox
+from rce_robot.doors.client.waiting_requests import WaitingRequests
 from rce_robot.doors.client.websocket import LARGE_PART
 from rce_robot.exceptions import RobotError
 from rce_robot.outgoing import LatchedDelivery, Outgoing, Serialized
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Coroutine, Iterator, Sequence
 
-    from rce.model import Request
     from rce.protocol.messages import CallId
     from rce.protocol.stream import Event
     from rce_robot.doors.base import Owner, Queued
@@ -82,11 +81,9 @@ class Session:
         self._single = SINGLE_FRAME in features
         self._stream = ProtocolStream.for_engine(limits, single=self._single)
         self._outbox = Outbox(settings.outbox, dropped)
-        self._requests: asyncio.Queue[tuple[Request, int] | None] = asyncio.Queue()
+        self._requests = WaitingRequests(owner, settings, self._send_report)
         self._pending_bytes = 0
         """Bytes of incomplete messages at the last check."""
-        self._waiting_bytes = 0
-        """Text bytes of waiting and running requests."""
         self._tasks: asyncio.TaskGroup | None = None
         self._calls: set[asyncio.Task[None]] = set()
         self._loop = asyncio.get_running_loop()
@@ -109,7 +106,7 @@ class Session:
         """Serve the robot until its connection has ended and its last requests are carried out."""
         try:
             async with asyncio.TaskGroup() as self._tasks:
-                worker = self._tasks.create_task(self._carry_out_requests())
+                worker = self._tasks.create_task(self._requests.carry_out())
                 if not self.lost:
                     self._owner.joined(self)
                 await self._socket.wait_closed()
@@ -158,7 +155,7 @@ class Session:
     @property
     def held(self) -> int:
         """Bytes of waiting messages: to be sent, completed or carried out."""
-        return self._socket.held + self._stream.pending_bytes + self._outbox.bytes + self._waiting_bytes
+        return self._socket.held + self._stream.pending_bytes + self._outbox.bytes + self._requests.bytes
 
     def shed(self, size: int) -> None:
         """Drop incomplete messages, then waiting ones, oldest first: about ``size`` bytes."""
@@ -318,7 +315,7 @@ class Session:
         if self._abort is not None:
             self._abort.cancel()
         self._owner.leaving(self)
-        self._requests.put_nowait(None)
+        self._requests.close()
         if self._tasks is None:
             self._end()
 
@@ -377,7 +374,7 @@ class Session:
                 | ConfigureComponents()
                 | ConfigureConnections()
             ):
-                self._request(event, size)
+                self._requests.put(event, size)
             case _:
                 assert_never(event)
 
@@ -387,21 +384,6 @@ class Session:
         except RobotError as error:
             self.report(error.problem, error.call)
 
-    def _request(self, request: Request, size: int) -> None:
-        if isinstance(request, (ConfigureComponents, ConfigureConnections)):
-            for fault in request.faults:
-                self._send_report(ErrorReport(problem=str(fault), path=fault.path, code=fault.code))
-            request = msgspec.structs.replace(request, faults=())
-        waiting = self._waiting_bytes + size
-        if (
-            self._requests.qsize() >= self._settings.max_requests
-            or waiting > self._settings.max_request_bytes
-        ):
-            self.report(f"{type_of(request)}: too many requests wait; this one was dropped")
-        else:
-            self._waiting_bytes = waiting
-            self._requests.put_nowait((request, size))
-
     async def _guard(self, work: Coroutine[Any, Any, None]) -> None:
         """Prevent a bug in one call from ending the session."""
         try:
@@ -409,14 +391,6 @@ class Session:
         except Exception:  # noqa: BLE001 - logged; it must not end anything else
             _log.exception("service call")
             self.report("internal error in a service call; the engine's log tells more")
-
-    async def _carry_out_requests(self) -> None:
-        """Pass on requests to the master, one at a time and in order."""
-        while (item := await self._requests.get()) is not None:
-            request, size = item
-            for report in await self._owner.ask_master(request):
-                self._send_report(report)
-            self._waiting_bytes -= size
 
 
 def _outgoing(message: ErrorReport | InterfaceStatus | LatchedSources) -> Outgoing:

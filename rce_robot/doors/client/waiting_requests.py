@@ -1,0 +1,64 @@
+"""A robot's requests to the master: bounded, and carried out one after another."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from rce.model import ConfigureComponents, ConfigureConnections
+from rce.protocol.messages import ErrorReport, type_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rce.model import Request
+    from rce_robot.doors.base import Owner
+    from rce_robot.settings import SessionSettings
+
+
+class WaitingRequests:
+    """The requests of one robot, in the order in which it sent them.
+
+    Args:
+        owner: Passes them on to the master.
+        settings: How many may wait, and of how many bytes.
+        send: Sends the robot what was refused.
+
+    Attributes:
+        bytes: Bytes of text of waiting and running requests.
+    """
+
+    def __init__(self, owner: Owner, settings: SessionSettings, send: Callable[[ErrorReport], None]) -> None:
+        self._owner = owner
+        self._settings = settings
+        self._send = send
+        self._queue: asyncio.Queue[tuple[Request, int] | None] = asyncio.Queue()
+        self.bytes = 0
+
+    def put(self, request: Request, size: int) -> None:
+        """Report a request's faults, and let what is valid of it wait; refuse it if too many wait already."""
+        if isinstance(request, (ConfigureComponents, ConfigureConnections)):
+            for fault in request.faults:
+                self._send(ErrorReport(problem=str(fault), path=fault.path, code=fault.code))
+            request = msgspec.structs.replace(request, faults=())
+        waiting = self.bytes + size
+        if self._queue.qsize() >= self._settings.max_requests or waiting > self._settings.max_request_bytes:
+            problem = f"{type_of(request)}: too many requests wait; this one was dropped"
+            self._send(ErrorReport(problem=problem))
+        else:
+            self.bytes = waiting
+            self._queue.put_nowait((request, size))
+
+    def close(self) -> None:
+        """Let :meth:`carry_out` end after the requests that wait now."""
+        self._queue.put_nowait(None)
+
+    async def carry_out(self) -> None:
+        """Pass the requests on to the master until :meth:`close`; cancelling forgets those that wait."""
+        while (item := await self._queue.get()) is not None:
+            request, size = item
+            for report in await self._owner.ask_master(request):
+                self._send(report)
+            self.bytes -= size
