@@ -19,7 +19,7 @@ from rce.ros.packages import PackageIndex
 from rce_fleet.wiring import FLEET_CONTAINER, FleetAccount, layer_interfaces, robot_config
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from rce.ros.launch import LaunchPlan, NodePlan
 
@@ -67,15 +67,19 @@ def offloaded_config(
     account: FleetAccount | None = None,
     *,
     initial_pose: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    launch_arguments: Mapping[str, object] | None = None,
+    own_map: bool = False,
 ) -> dict[str, Any]:
     """Return the config of robot ``number`` whose container runs all its nodes but the safety stage.
 
-    The robot itself runs ``botmotion.launch offload:=true``.
+    The robot itself runs ``botmotion.launch offload:=true``, with ``own_map:=true`` if it brings its map.
 
     Args:
         number: Names robot, container and namespace, as for :func:`rce_fleet.wiring.robot_config`.
         account: Engine and user; None for those of a development engine.
         initial_pose: Where the robot starts, (x, y, yaw) in metres and radians.
+        launch_arguments: More arguments of the launch file, such as ``initial_cov_xx``.
+        own_map: The robot publishes the map; else the container has that of ``configs/map.yaml``.
 
     Raises:
         LaunchFileError: The shipped launch file cannot be read.
@@ -84,19 +88,22 @@ def offloaded_config(
     container, namespace = config["containers"][0]["cTag"], f"Robot{number}"
     x, y, yaw = initial_pose
     pose = {"initial_pose_x": f"{x}", "initial_pose_y": f"{y}", "initial_pose_a": f"{yaw}"}
-    everything = _launch_plan({"map": _MAP, "robot": namespace, **pose})
+    given = {name: str(value) for name, value in (launch_arguments or {}).items()}
+    everything = _launch_plan({"map": _MAP, "robot": namespace, **pose, **given})
     stays = {node.name for node in _launch_plan({"offload": "true"}).nodes}
     # The planner hears the pose from the container itself.
-    moved = [node for node in everything.nodes if node.name not in stays and node.type != "relay"]
+    left_out = {"relay", "map_server"} if own_map else {"relay"}
+    moved = [node for node in everything.nodes if node.name not in stays and node.type not in left_out]
     names = [f"{node.name}/" for node in moved]
     config["parameters"] = [
         {"cTag": container, "name": name, "value": value}
         for name, value in everything.parameters.items()
         if name.startswith(tuple(names))
     ]
-    config["parameters"].append(
-        {"cTag": container, "name": "/amcl/last_pose_timeout", "value": LAST_POSE_TIMEOUT}
-    )
+    more = {"last_pose_timeout": LAST_POSE_TIMEOUT, **({"use_map_topic": True} if own_map else {})}
+    config["parameters"] += [
+        {"cTag": container, "name": f"/amcl/{name}", "value": value} for name, value in more.items()
+    ]
     client = config["nodes"][0]
     client["args"] = " ".join(
         f"move_base/{topic}:=/move_base/{topic}"
@@ -107,6 +114,8 @@ def offloaded_config(
     config["nodes"] = [*(_node(container, node) for node in moved), client]
     config["interfaces"] = list(layer_interfaces(config["robotID"], namespace, container))
     config["bridges"] = list(_offload_bridges(container, namespace))
+    if own_map:
+        config["bridges"].append(_topic("/map", "nav_msgs/OccupancyGrid", "robot", container))
     return config
 
 

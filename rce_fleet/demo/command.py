@@ -18,6 +18,7 @@ from rce.cli.program_files import from_file
 from rce.config.settings import Runtime
 from rce.own_process import end_signals
 from rce_fleet.demo.config import CoreProgram, DemoConfig, MachineBackend, Mode
+from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.headless import run_headless
 from rce_fleet.demo.modes import start_demo
 from rce_fleet.demo.random_goals import send_random_goals
@@ -40,6 +41,9 @@ def demo(
     ] = Mode.CLOUD,
     headless: Annotated[
         bool, typer.Option("--headless", help="Drive to goals once without a page, report, exit.")
+    ] = False,
+    offload: Annotated[
+        bool, typer.Option("--offload", help="Run localization and navigation in the robots' containers.")
     ] = False,
     robots: Annotated[
         int | None, typer.Option(min=1, max=MAX_ROBOTS, help="Number of robots [3; 4 with --scen].")
@@ -108,6 +112,8 @@ def demo(
         "core": core_port,
     }
     try:
+        if offload and mode is not Mode.CLOUD:
+            raise DemoError(f"--offload needs containers: use it with --mode cloud, not --mode {mode}")
         count = robots or (DEFAULT_ROBOTS if scen is None else DEFAULT_ROBOTS_OF_SCEN)
         scenario = choose_scenario(count, seed, world=world, scen=scen)
         ports = _choose_ports(headless, given, _needed_ports(mode, core_uri))
@@ -118,6 +124,7 @@ def demo(
                 ports,
                 folder,
                 runtime=runtime.value if runtime is not None else "",
+                offload=offload,
                 mode=mode,
                 core=core,
                 core_uri=core_uri,

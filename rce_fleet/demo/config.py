@@ -59,6 +59,7 @@ class DemoConfig:
         ports: Ports; those that the mode needs are chosen.
         folder: Folder for configs, logs and state; must exist.
         runtime: The containers' runtime; the engine's default if empty.
+        offload: Localization and navigation run in the robots' containers.
         mode: What carries the fleet's messages.
         core: The program that is the core of the mode ``single``.
         core_uri: A running ROS master to use instead of that program; none if empty.
@@ -71,6 +72,7 @@ class DemoConfig:
     ports: Ports
     folder: Path
     runtime: str = ""
+    offload: bool = False
     mode: Mode = Mode.CLOUD
     core: CoreProgram = CoreProgram.RCE
     core_uri: str = ""

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 NODE = "rce_demo_judge"
 WAIT = 3
 """True poses that wait for the estimate of their time."""
+DRIVEN = 600
+"""True poses that are kept for estimates that come late."""
+SAME_TIME = 0.1
+"""Estimated and true pose of times that differ by less are compared, seconds."""
 MAP = "map"
 RECOVERIES = "recoveries"
 """Key in the diagnosis of ``move_base``."""
@@ -71,12 +75,14 @@ class _Watched:
     graph: RobotGraph
     score: RobotScore
     waiting: deque[Message] = field(default_factory=deque)
+    driven: deque[Message] = field(default_factory=lambda: deque(maxlen=DRIVEN))
 
 
 class Judge:
     """Compares the robots' estimated poses with the true ones. An async context manager.
 
     The estimate is what a robot's nodes use: the transform from ``map`` to its base, ten times a second.
+    That of an off-loaded robot is in its container, from where poses come after each update.
 
     Args:
         graphs: The robots.
@@ -111,7 +117,12 @@ class Judge:
             if robot.graph.uri != node.master_uri:
                 continue
             truth = robot.graph.topic("ground_truth/pose")
-            await node.subscribe(truth, "nav_msgs/Odometry", partial(self._compare, robot, transforms))
+            if robot.graph.offloaded:
+                await node.subscribe(truth, "nav_msgs/Odometry", robot.driven.append)
+                poses, kind = robot.graph.topic("amcl_pose"), "geometry_msgs/PoseWithCovarianceStamped"
+                await node.subscribe(poses, kind, partial(self._compare_pose, robot))
+            else:
+                await node.subscribe(truth, "nav_msgs/Odometry", partial(self._compare, robot, transforms))
             diagnose = partial(self._diagnose, robot)
             await node.subscribe("/diagnostics", "diagnostic_msgs/DiagnosticArray", diagnose)
 
@@ -128,6 +139,14 @@ class Judge:
                 at, place = found.transform.translation, truth.pose.pose.position
                 robot.score.compare(hypot(at.x - place.x, at.y - place.y))
             robot.waiting.popleft()
+
+    def _compare_pose(self, robot: _Watched, message: Message) -> None:
+        """Compare a pose of a localization that runs in the robot's container with the truth of its time."""
+        stamp = message.header.stamp.to_sec()
+        late = {abs(truth.header.stamp.to_sec() - stamp): truth for truth in robot.driven}
+        if late and min(late) <= SAME_TIME:
+            at, place = message.pose.pose.position, late[min(late)].pose.pose.position
+            robot.score.compare(hypot(at.x - place.x, at.y - place.y))
 
     def _diagnose(self, robot: _Watched, message: Message) -> None:
         for status in message.status:

@@ -11,7 +11,7 @@ from typing import Protocol
 from rce.config.documents import write_items
 from rce_fleet.demo.config import DemoConfig, Mode
 from rce_fleet.demo.programs import RCE, START_TIMEOUT, Program, ProgramGroup
-from rce_fleet.demo.robots import RobotGraph, client_config, start_robot
+from rce_fleet.demo.robots import RobotGraph, client_config, cloud_arguments, start_robot
 from rce_fleet.demo.ros_modes import MultiCorePrograms, SingleCorePrograms
 from rce_fleet.demo.traffic import MessageTotals, read_engine_totals
 from rce_fleet.drivers.report import WorldReport, read_report
@@ -43,7 +43,7 @@ class ModePrograms(Protocol):
 class CloudPrograms:
     """The engine: planner and move clients run in containers, ``rce-ros`` bridges the robots.
 
-    Localization and navigation run on the robots.
+    Localization and navigation run on the robots, or off-loaded in their containers.
     """
 
     def __init__(self, config: DemoConfig) -> None:
@@ -61,7 +61,7 @@ class CloudPrograms:
         self._graphs = await self._find_graphs(group, world)
         page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)
         for graph in self._graphs:
-            await start_robot(group, config, graph, {"robot": graph.robot, "relay": False})
+            await start_robot(group, config, graph, cloud_arguments(config, graph.robot))
         bridges = [
             await group.start(
                 f"robot{number}",
@@ -97,7 +97,11 @@ class CloudPrograms:
     async def _find_graphs(self, group: ProgramGroup, world: Program) -> list[RobotGraph]:
         """Return each robot's graph, as the world prints it."""
         return [
-            RobotGraph(robot, await group.wait_line(world, f"robot {robot} ROS_MASTER_URI=", START_TIMEOUT))
+            RobotGraph(
+                robot,
+                await group.wait_line(world, f"robot {robot} ROS_MASTER_URI=", START_TIMEOUT),
+                offloaded=self._config.offload,
+            )
             for robot in self._config.scenario.robots
         ]
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from rce.config.client import loads
 from rce.config.documents import write_items
 from rce_fleet.demo.config import DemoConfig
 from rce_fleet.demo.resources import Ports
-from rce_fleet.demo.robots import RobotGraph, launch_argv
+from rce_fleet.demo.robots import RobotGraph, client_config, cloud_arguments, launch_argv
 from rce_fleet.demo.ros_modes import (
     PLANNER,
     move_client_argv,
@@ -56,6 +57,20 @@ def test_robot_starts_at_its_dock_and_later_where_it_was() -> None:
     assert {f"initial_pose_x:={x}", f"initial_pose_y:={y}", "map:=/folder/map.yaml"} <= {*argv}
     assert f"initial_pose_a:={scenario.headings[1]}" in argv
     assert argv[-1] == "robot:=Robot2"
+
+
+def test_offloaded_robot_brings_its_map_and_starts_at_its_dock() -> None:
+    config = replace(CONFIG, offload=True)
+    made = loads(write_items(dict(client_config(config, 2))))
+    nodes = {item.node.exe for item in made.nodes}
+    assert nodes == {"amcl", "move_base", "obstacle_cells.py", "move_client.py"}
+    parameters = {item.parameter.name: item.parameter.value for item in made.parameters}
+    assert parameters["/amcl/use_map_topic"] is True
+    x, y = config.scenario.grid.centre(config.scenario.starts[1])
+    assert (parameters["/amcl/initial_pose_x"], parameters["/amcl/initial_pose_y"]) == (x, y)
+    ends = {item.path: item.interface.addr for item in made.interfaces}
+    assert {"/map", "/diagnostics"} <= {*ends.values()}
+    assert "own_map:=True" in launch_argv(config, "Robot2", cloud_arguments(config, "Robot2"))
 
 
 def test_move_client_without_namespace_finds_the_robots_topics() -> None:

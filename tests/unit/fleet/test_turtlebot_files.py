@@ -61,6 +61,11 @@ def test_robots_at_one_master_have_namespaces() -> None:
     assert dict(second.nodes[1].remappings)["static_map"] == "/static_map"
 
 
+def test_an_offloaded_robot_publishes_a_map_of_its_own() -> None:
+    found = names(plan(offload="true", own_map="true"))
+    assert sorted(found) == ["/map_server", "/pose_keeper", "/velocity_limiter"]
+
+
 def test_an_offloaded_robot_keeps_safety_and_its_pose() -> None:
     assert names(plan(offload="true")) == ["/velocity_limiter", "/pose_keeper"]
 
