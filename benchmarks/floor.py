@@ -35,7 +35,9 @@ _ROBOT = "Robot1"
 _CONFIGS = Path(__file__).resolve().parent.parent / "configs" / "turtlebot"
 _TRIES = 100_000
 _FAILURES = 1000
-"""Tries without a place for a box after which all boxes are placed anew."""
+"""Tries without a place after which all boxes, or all waypoints of a walker, are chosen anew."""
+_WAYPOINTS = 4
+"""Places between which a walker walks."""
 _OUTLINE = 0.1
 """Distance of the points on a box's outline at which its distance from other things is looked at, metres."""
 
@@ -159,20 +161,24 @@ class Floor:
         speed, radius = float(self.rng.uniform(0.4, 1.0)), 0.2
         room, robot = radius + 0.05, self.robot.pose
         way: list[Point] = []
+        failed = 0
         for place in self._places():
             off_robot = hypot(place[0] - robot.x, place[1] - robot.y) > 1.0
-            if not off_robot or not self.is_free(*place, room):
-                continue
-            if not way or (
-                hypot(place[0] - way[-1][0], place[1] - way[-1][1]) > 1.0
-                and self.has_straight_way(way[-1], place, room)
-            ):
+            if off_robot and self.is_free(*place, room) and (not way or self._is_next(way[-1], place, room)):
                 way.append(place)
-            if len(way) == 4:
+                failed = 0
+            failed += 1
+            if len(way) == _WAYPOINTS:
                 break
+            if failed > _FAILURES:  # there is no way from here: begin somewhere else
+                way, failed = [], 0
         pause = float(self.rng.uniform(0.0, 2.0))
         spec = WalkerSpec(tuple(way), speed, radius, pause, loop=False, social_distance=0.35, patience=1.5)
         self.world.add_walker(name, spec)
+
+    def _is_next(self, last: Point, place: Point, room: float) -> bool:
+        far = hypot(place[0] - last[0], place[1] - last[1]) > 1.0
+        return far and self.has_straight_way(last, place, room)
 
 
 def _outline(box: BoxSpec) -> NDArray[np.float64]:

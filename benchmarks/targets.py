@@ -182,9 +182,9 @@ TARGETS = [
     ),
     *(
         Target(
-            f"amcl: an update, 500 particles x 60 beams, {form}",
+            f"amcl: an update, 500 particles x 60 beams, {form}, median",
             "localization.update",
-            _column("likelihood_field ms", form=form),
+            _column("likelihood_field p50 ms", form=form),
             limit,
             "ms",
         )

@@ -45,6 +45,8 @@ FRESH_M, FRESH_RAD = 0.2, 0.5
 """A scan that was taken nearer to the one before repeats its errors: those of the map, and of things that are
 not on it. Its likelihood is taken to the power of the share of this way or turn."""
 LEAST_FRESH = 0.25
+TRIED = 10
+"""Where the robot may be anywhere, so many times as many places are tried with a scan as are kept."""
 _JUDGES = 64
 
 
@@ -141,6 +143,7 @@ class Amcl:
     def scatter(self) -> None:
         """Draw the particles evenly over all free cells: the robot may be anywhere."""
         self._start_with(self._anywhere(self.parameters.max_particles))
+        self._scattered = True
 
     def request_update(self) -> None:
         """Let the next scan update the filter, even if the robot stands."""
@@ -156,6 +159,7 @@ class Amcl:
         self._weights = np.full(particles.shape[1], 1.0 / particles.shape[1])
         self._odometry = None
         self._forced = True
+        self._scattered = False
         self._updates = 0
         self._slow = self._fast = 0.0
 
@@ -191,13 +195,40 @@ class Amcl:
             )
         self._odometry = odometry
         self._forced = False
-        agreement = self._weigh(select_beams(scan, self.parameters))
+        beams = select_beams(scan, self.parameters)
+        if self._scattered and beams.returned.any():
+            self._scattered, self._fresh = False, 0.0  # The scan is used here, and does not count again.
+            self._particles = self._search(self.parameters.max_particles, beams)
+        agreement = self._weigh(beams)
         self._updates += 1
         hypotheses = find_hypotheses(self._particles, self._weights)
-        resampled = self._updates % self.parameters.resample_interval == 0 and self._resample()
+        resampled = self._updates % self.parameters.resample_interval == 0 and self._resample(beams)
         best = hypotheses[0]
         map_from_odom = best.pose.compose(odometry.inverse())
         return Estimate(best.pose, best.covariance, map_from_odom, hypotheses, resampled, agreement)
+
+    def _search(self, count: int, beams: Beams) -> NDArray[np.float64]:
+        """Draw particles over all free cells, most of them where a scan fits; shape (3, ``count``).
+
+        A few thousand particles are too far apart for one of them to be near enough to the right place.
+        """
+        field = self._field
+        if field is None or not beams.returned.any():  # The beam model is too slow to try so many places.
+            return self._anywhere(count)
+        tried = [self._anywhere(count) for _ in range(TRIED)]
+        logs = np.concatenate([self._logs(field, one, beams) for one in tried])
+        weights = temper(np.full(len(logs), 1.0 / len(logs)), logs, 1 / TRIED)
+        places = np.concatenate(tried, axis=1)
+        return np.ascontiguousarray(places[:, systematic(weights, count, self._rng)])
+
+    def _logs(
+        self, field: LikelihoodField, particles: NDArray[np.float64], beams: Beams
+    ) -> NDArray[np.float64]:
+        """Return the logarithms of the likelihoods of a scan, shape (N,)."""
+        if self.parameters.laser_model_type is LaserModel.LIKELIHOOD_FIELD:
+            return np.asarray(np.log(field.sums_of_cubes(particles, beams)))
+        skip = self.parameters.do_beamskip and self._has_converged()
+        return beams.independence * field.log_products(particles, beams, skip=skip)
 
     def _weigh(self, beams: Beams) -> float:
         """Multiply the weights with those of a scan; return how well it fits."""
@@ -215,8 +246,7 @@ class Amcl:
         if parameters.laser_model_type is LaserModel.LIKELIHOOD_FIELD:
             factors = self._field.sums_of_cubes(particles, beams)
             return self._fit(self._apply(np.log(factors)), factors, count, beams)
-        skip = parameters.do_beamskip and self._has_converged()
-        self._apply(beams.independence * self._field.log_products(particles, beams, skip=skip))
+        self._apply(self._logs(self._field, particles, beams))
         judges = systematic(self._weights, min(_JUDGES, len(self._weights)), self._rng)
         shares = np.full(len(judges), 1.0 / len(judges))
         return self._fit(shares, self._field.sums_of_cubes(particles[:, judges], beams), count, beams)
@@ -247,17 +277,17 @@ class Amcl:
 
     # Resampling
 
-    def _resample(self) -> bool:
+    def _resample(self, beams: Beams) -> bool:
         count = len(self._weights)
         parameters = self.parameters
         if parameters.selective_resampling and effective_count(self._weights) > count / 2:
             return False
         chosen = self._particles[:, resample(self._particles, self._weights, parameters, self._rng)]
         anywhere = self._share_anywhere()
-        if anywhere > 0:
-            extra = self._rng.binomial(parameters.max_particles, anywhere)
+        extra = self._rng.binomial(parameters.max_particles, anywhere) if anywhere > 0 else 0
+        if extra:
             kept = self._rng.permutation(chosen.shape[1])[: parameters.max_particles - extra]
-            chosen = np.concatenate((chosen[:, kept], self._anywhere(extra)), axis=1)
+            chosen = np.concatenate((chosen[:, kept], self._search(extra, beams)), axis=1)
         self._particles = chosen
         self._particles[2] = wrap_array(chosen[2])
         self._weights = np.full(chosen.shape[1], 1.0 / chosen.shape[1])
