@@ -152,6 +152,17 @@ def test_a_robot_without_a_known_pose_is_found() -> None:
     assert error(estimate, poses[-1])[0] < 0.2
 
 
+def test_the_first_scan_draws_particles_where_it_fits() -> None:
+    amcl = Amcl(GRID, SMALL, np.random.default_rng(2))
+    amcl.scatter()
+    amcl.update(Pose(0.0, 0.0, 0.0), scan(START))
+    x, y, yaw = amcl.particles.T
+    near = (np.hypot(x - START.x, y - START.y) < 0.5) & (np.abs(yaw - START.yaw) < 0.3)
+    by_chance = len(x) * (pi * 0.5**2 / (GRID.free.sum() * GRID.resolution**2)) * (0.6 / (2 * pi))
+    assert near.sum() > 4 * by_chance
+    assert len(x) <= SMALL.max_particles
+
+
 def test_a_robot_that_was_moved_by_hand_is_found() -> None:
     amcl = filtered(replace(SMALL, max_particles=4000, recovery_alpha_slow=0.001, recovery_alpha_fast=0.1))
     drive(amcl, way(6))
