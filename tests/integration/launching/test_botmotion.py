@@ -92,9 +92,10 @@ async def test_a_robot_with_its_own_master_drives(tmp_path: Path) -> None:
 
 
 async def test_a_robot_at_a_shared_master_drives(tmp_path: Path) -> None:
+    """Its nodes run in the launch's own process."""
     async with Core(port=0) as core:
         scene = ("sim", str(TURTLEBOT.parent / "scene.yaml"), "--no-stand-ins", "--core", core.uri)
-        launch = ("launch", str(TURTLEBOT / "botmotion.launch"), "tf_prefix:=Robot1")
+        launch = ("launch", "--one-process", str(TURTLEBOT / "botmotion.launch"), "tf_prefix:=Robot1")
         place = (f"initial_pose_x:={START[0]}", f"initial_pose_y:={START[1]}")
         async with (
             program(tmp_path, core.uri, "simulation ready", *scene),
