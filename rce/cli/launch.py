@@ -63,7 +63,9 @@ def launch(
     inputs = MachineInputs(_packages())
     uri = _master_uri(port)
     if one_process:
-        start_logging(logging.WARNING, line="%(levelname)s %(name)s: %(message)s")
+        handler = logging.StreamHandler()
+        handler.setLevel(logging.WARNING)  # nodes' own loggers let more pass
+        start_logging(logging.WARNING, line="%(levelname)s %(name)s: %(message)s", handler=handler)
     try:
         plan = _load(what, inputs)
         for warning in plan.warnings:

@@ -56,6 +56,11 @@ class CellBlocking:
             if cell in self._state.sensed:
                 self._open(cell)
 
+    def take_robot(self, cell: int) -> None:
+        """Free a cell that sensors found blocked and that a robot is in: they saw that robot."""
+        if cell in self._state.sensed:
+            self._open(cell)
+
     # Requests
 
     def block_cell(self, event: CellBlocked) -> Reply:

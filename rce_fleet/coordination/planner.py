@@ -138,6 +138,10 @@ class FleetPlanner:
             return
         record = self._record(event.robot)
         record.see(event.x, event.y, event.yaw, self._now, self.settings)
+        if self.state.sensed:
+            here = self.state.grid.cell_at(event.x, event.y)
+            if here is not None:
+                self._blocking.take_robot(here)
         if record.reason == NO_POSE:
             record.reason = "new"
             self.state.touch(record)

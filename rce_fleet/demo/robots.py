@@ -94,7 +94,8 @@ def launch_argv(config: DemoConfig, robot: str, arguments: Mapping[str, object])
         robot: Name of the robot.
         arguments: More arguments of the launch file.
     """
-    given = {"map": config.map_file, **dict(_initial_pose(config, robot)), **arguments}
+    # Where many robots stand around one, it must not take them for another place.
+    given = {"map": config.map_file, "recovery": False, **dict(_initial_pose(config, robot)), **arguments}
     words = (f"{name}:={value}" for name, value in given.items())
     options = ("--one-process", "--wait", "--no-log", "--screen")
     return [*rce_command("launch"), *options, str(configs_dir() / LAUNCH_FILE), *words]

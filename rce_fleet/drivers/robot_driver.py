@@ -154,11 +154,14 @@ class RobotDriver:
         if topics is None:
             return
         now, stamp = self._world.time, self._now()
-        if self.wants_scan:
+        scans = self.wants_scan
+        if scans:
             self._is_due("scan", 1.0 / self._sensor.rate)
-            self._scan(topics, stamp, self._world.scan(self._robot.id) if ranges is None else ranges)
-        if self._is_due("odometry", 1.0 / self._robot.model.odometry.rate):
+        # A scan's odometry is exact: it is not between two messages.
+        if self._is_due("odometry", 1.0 / self._robot.model.odometry.rate) or scans:
             self._publish_odometry(topics, stamp)
+        if scans:
+            self._scan(topics, stamp, self._world.scan(self._robot.id) if ranges is None else ranges)
         if self._is_due("truth", TRUTH_EVERY) and topics.truth.connections:
             self._publish_truth(topics, stamp)
         self._publish_bumper(topics)

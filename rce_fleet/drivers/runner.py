@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rce_fleet.drivers.robot_driver import RobotDriver
     from rce_fleet.simulation.world import World
 
-MAX_LAG = 0.5
+MAX_LAG = 0.2
 """Maximum delay behind the clock that is caught up, seconds."""
 SPEED_WINDOW = 5.0
 """Seconds over which the reached speed is measured."""
