@@ -82,7 +82,7 @@ async def test_a_robot_with_its_own_master_drives(tmp_path: Path) -> None:
         line = next(line for line in sim.output().splitlines() if line.startswith("robot Robot1 "))
         uri = line.partition("ROS_MASTER_URI=")[2]
         async with (
-            program(tmp_path, uri, "/pose_relay: started", *launch, *place) as launched,
+            program(tmp_path, uri, "/pose_relay_Robot1: started", *launch, *place) as launched,
             Node("judge", argv=[], master_uri=uri) as judge,
         ):
             relayed = asyncio.create_task(first(judge, "/Robot1/amcl_pose", POSE))

@@ -42,6 +42,16 @@ def test_another_robot_may_see_that_a_cell_is_free(planner: FleetPlanner) -> Non
     assert blocked(planner.handle(ObstacleGone("Robot2", (5,)), 2.0)) == [()]
 
 
+def test_a_cell_that_a_robot_is_in_held_that_robot(planner: FleetPlanner) -> None:
+    """A sensor saw a robot that the planner did not know yet; a cell that a person blocked stays blocked."""
+    planner.handle(CellBlocked(9), 1.0)
+    planner.handle(ObstacleSeen("Robot1", (5,)), 1.0)
+    assert blocked(planner.handle(PoseSeen("Robot2", 1.5, 1.5, 0.0), 2.0)) == [(9,)]
+    planner.handle(PoseSeen("Robot3", 1.5, 2.5, 0.0), 3.0)
+    assert planner.state.blocked == {9}
+    planner.validate()
+
+
 def test_sensors_do_not_free_what_a_person_blocked(planner: FleetPlanner) -> None:
     planner.handle(CellBlocked(5), 1.0)
     planner.handle(ObstacleSeen("Robot1", (5,)), 2.0)

@@ -44,11 +44,26 @@ def parameters(found: LaunchPlan, node: str) -> dict[str, Any]:
 
 def test_a_robot_of_its_own_master_has_no_namespace() -> None:
     found = plan(robot="Robot1")
-    nodes = ["map_server", "velocity_limiter", "amcl", "move_base", "obstacle_cells", "pose_relay"]
-    assert names(found) == [f"/{name}" for name in nodes]
+    nodes = ["map_server", "velocity_limiter", "amcl", "move_base", "obstacle_cells"]
+    # Masters that share /RobotN/amcl_pose must not know two nodes of one name.
+    assert names(found) == [*(f"/{name}" for name in nodes), "/pose_relay_Robot1"]
     assert found.nodes[-1].arguments == ("/amcl_pose", "/Robot1/amcl_pose")
     assert found.parameters["/amcl/odom_frame_id"] == "odom"
     assert "/tf_prefix" not in found.parameters
+
+
+def test_a_robot_begins_at_its_dock_or_where_it_was() -> None:
+    given = {"initial_pose_x": "2.5", "initial_cov_xx": "0.01"}
+    assert plan(**given).parameters["/amcl/initial_pose_x"] == 2.5
+    assert plan(**given).parameters["/amcl/initial_cov_xx"] == 0.01
+    stored = plan(**given, stored_pose="true").parameters
+    assert not [name for name in stored if "/initial_" in name]
+
+
+def test_recovery_of_a_lost_place_can_be_turned_off() -> None:
+    assert plan().parameters["/amcl/recovery_alpha_fast"] > 0
+    alone = plan(recovery="false").parameters
+    assert (alone["/amcl/recovery_alpha_slow"], alone["/amcl/recovery_alpha_fast"]) == (0.0, 0.0)
 
 
 def test_robots_at_one_master_have_namespaces() -> None:
