@@ -124,6 +124,16 @@ async def test_robot_process_dies_and_its_robots_come_back() -> None:
         assert node_pids(engine) == nodes
 
 
+async def seen_inactive_and_active(client: Stranger) -> dict[str, list[bool]]:
+    """Wait until all interfaces became inactive, however shortly, and active again; return their states."""
+
+    def states() -> dict[str, list[bool]]:
+        return {tag: [state for name, state in client.statuses if name == tag] for tag in ROBOT_TAGS}
+
+    await until(lambda: all(found[-2:] == [False, True] for found in states().values()), what="active again")
+    return states()
+
+
 @pytest.mark.parametrize("runtime", RUNTIMES)
 async def test_environment_dies_and_is_made_again(runtime: str) -> None:
     async with running_engine(runtime=runtime) as engine, stranger(engine.url) as client:
@@ -133,10 +143,7 @@ async def test_environment_dies_and_is_made_again(runtime: str) -> None:
         for process in environments(engine):
             with contextlib.suppress(psutil.NoSuchProcess):
                 process.kill()
-        await client.wait_status(dict.fromkeys(ROBOT_TAGS, False), timeout=2)
-        await client.wait_status(dict.fromkeys(ROBOT_TAGS, True))
-        for tag in ROBOT_TAGS:
-            assert [state for name, state in client.statuses if name == tag] == [False, True]
+        assert await seen_inactive_and_active(client) == {key: [False, True] for key in ROBOT_TAGS}
         await check_echo(client, "made again")
         await until(lambda: not old & node_pids(engine), what="the old node is gone")
 
@@ -145,11 +152,11 @@ async def test_environment_dies_and_is_made_again(runtime: str) -> None:
 async def test_whole_container_dies_and_is_made_again() -> None:
     async with running_engine(runtime="namespace") as engine, stranger(engine.url) as client:
         await wire_echo(client)
+        client.statuses.clear()
         for process in engine.processes_of("rce_container.environment"):
             with contextlib.suppress(psutil.NoSuchProcess):
                 process.kill()
-        await client.wait_status(dict.fromkeys(ROBOT_TAGS, False), timeout=2)
-        await client.wait_status(dict.fromkeys(ROBOT_TAGS, True))
+        await seen_inactive_and_active(client)
         await check_echo(client, "made again")
 
 

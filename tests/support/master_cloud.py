@@ -93,7 +93,7 @@ class FakePeer:
 
     async def get(self, kind: type[M]) -> M:
         """Take messages until one of a kind comes."""
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             while True:
                 message = await self.inbox.get()
                 if isinstance(message, kind):

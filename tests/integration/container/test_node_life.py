@@ -182,7 +182,7 @@ async def test_nodes_end_in_the_reverse_of_their_order(machine: Machine) -> None
 
 
 async def test_a_node_whose_heart_stops_is_restarted(machine: Machine) -> None:
-    beat = own("beat.py", heartbeat="beat", heartbeat_timeout=0.7, restart=RestartPolicy.ALWAYS)
+    beat = own("beat.py", heartbeat="beat", heartbeat_timeout=2.0, restart=RestartPolicy.ALWAYS)
     async with machine.engine(interrupt_timeout=0.3, terminate_timeout=0.3):
         await machine.put(BOX, nodes=(beat,))
         await until(lambda: NodeState.STUCK in states(machine), what="the node is stuck")

@@ -76,7 +76,7 @@ class FakeInterface(Interface):
 
     async def until_latched(self, *payloads: bytes) -> None:
         """Wait until exactly these messages are in force."""
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while sorted(self.latched.values()) != sorted(payloads):
                 self.unlatched.clear()
                 waits = [
@@ -164,7 +164,7 @@ class Party:
 
     async def until(self, condition: Callable[[], bool]) -> None:
         """Wait for a change that makes ``condition`` true."""
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while not condition():
                 self.changed.clear()
                 await self.changed.wait()

@@ -108,7 +108,7 @@ class TaskSet:
             self.inbox.put_nowait(message)
 
     async def get(self, kind: type[T]) -> T:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while True:
                 message = await self.inbox.get()
                 self.taken.append(message)

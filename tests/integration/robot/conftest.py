@@ -37,7 +37,7 @@ class Robot:
             if message["type"] == type_:
                 self._kept.remove(message)
                 return message["data"]
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while True:
                 frame = await self.socket.recv()
                 assert isinstance(frame, str)
@@ -47,7 +47,7 @@ class Robot:
                 self._kept.append(message)
 
     async def binary(self) -> bytes:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             frame = await self.socket.recv()
         assert isinstance(frame, bytes)
         return frame

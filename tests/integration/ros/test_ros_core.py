@@ -13,6 +13,7 @@ import pytest
 from support.ros_nodes import MakeNode
 
 from rce.ros.core import Change, Core, GraphEvent
+from rce.ros.core.notifier import CALL_TIMEOUT
 from rce.ros.errors import MasterRefusedError, ParameterMissingError, RemoteFaultError
 from rce.ros.node import Node
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
@@ -98,7 +99,7 @@ async def test_a_dead_node_stalls_nobody(core: Core, make_node: MakeNode) -> Non
                 await rpc.call(core.uri, "registerSubscriber", (node, "/t", STRING, uri))
             subscriber = await b.subscribe("t", STRING)
             await a.advertise("t", STRING)
-            await subscriber.wait_for_publishers(timeout=3)
+            await subscriber.wait_for_publishers(timeout=0.9 * CALL_TIMEOUT)
             assert core.forget_uri(refusing_uri)
             assert not core.forget_uri(refusing_uri)
             assert core.forget_node("/silent")
