@@ -91,8 +91,6 @@ class Session:
         self._reason = ""
         self._unsent = 0
         """Reports of errors for which there was no room."""
-        self._abort: asyncio.TimerHandle | None = None
-        """A timer: a dropped robot has a moment to receive the reason."""
         self.features = features
         """The client's features beyond the first protocol; see :mod:`rce.protocol.http`."""
         self.client = client
@@ -169,8 +167,6 @@ class Session:
         self._socket.fail(CloseCode.TRY_AGAIN_LATER, reason[:MAX_REASON])
         self._outbox.clear()
         self._stream.drop_oldest(self._stream.pending_bytes)
-        if self._abort is None:
-            self._abort = self._loop.call_later(self._settings.close_timeout, self._socket.abort)
 
     # To the robot
 
@@ -312,8 +308,6 @@ class Session:
         """Stop sending, and let :meth:`run` come to its end."""
         self.lost = True
         self._reason = reason
-        if self._abort is not None:
-            self._abort.cancel()
         self._owner.leaving(self)
         self._requests.close()
         if self._tasks is None:

@@ -132,6 +132,7 @@ class RobotSocket(GuardedConnection):
         if self.protocol.state is State.OPEN:
             self.protocol.fail(code, reason)
             self.send_data()
+        self._end_soon()
 
     def abort(self) -> None:
         """Drop the connection at once, without waiting for the robot."""
@@ -154,6 +155,8 @@ class RobotSocket(GuardedConnection):
             self._input_bytes -= len(rest)
             self._steps.allow()
             super().data_received(rest)
+            if self.protocol.state is not State.OPEN:
+                self._end_soon()
         if self._input or self._steps.stopped or self._work:
             return True
         self._end_of_input()
@@ -179,6 +182,8 @@ class RobotSocket(GuardedConnection):
         """Messages that are handled in steps, with their sizes; those behind them wait."""
         self._work_bytes = 0
         self._failed = False
+        self._deadline: asyncio.TimerHandle | None = None
+        """When a connection that has failed, or is being closed, is dropped."""
         sock = transport.get_extra_info("socket")
         if sock is not None and hasattr(socket, "TCP_NOTSENT_LOWAT") and sock.family != socket.AF_UNIX:
             # Without it megabytes of old images fill the kernel's buffer, where other messages cannot
@@ -234,6 +239,8 @@ class RobotSocket(GuardedConnection):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Tell the receiver."""
+        if self._deadline is not None:
+            self._deadline.cancel()
         self._forget_work()
         self._forget_input()
         self._steps.allow(None)
@@ -244,6 +251,11 @@ class RobotSocket(GuardedConnection):
             self.receiver.on_lost(str(exc or self.close_exc))
 
     # Private
+
+    def _end_soon(self) -> None:
+        """Give the robot a moment to receive the reason of the end, also if it goes on sending."""
+        if self._deadline is None and not self.transport.is_closing():
+            self._deadline = self.loop.call_later(self.close_timeout or 0.0, self.transport.abort)
 
     def _take_message(self, data: bytes) -> bool:
         """Handle the next frame without the library, if it is a message; return whether it is."""

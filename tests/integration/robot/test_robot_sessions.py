@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import struct
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ from support.client_types import ros_string
 from support.cloud import DIGEST, running_cloud
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.frames import Frame, Opcode
 from websockets.typing import Origin
 
 from rce.control.messages import Probe
@@ -35,6 +37,35 @@ async def refused(attempt: connect) -> tuple[int, str]:
             pass
     body = caught.value.response.body
     return caught.value.response.status_code, bytes(body or b"").decode()
+
+
+async def test_a_robot_that_breaks_the_protocol_is_cut_off() -> None:
+    """It goes on sending, and does not end its side of the connection."""
+    begin = Frame(Opcode.TEXT, b"a", fin=False).serialize(mask=True)
+    ping = Frame(Opcode.PING, b"").serialize(mask=True)
+    async with running_cloud(SessionSettings(ping_interval=None, close_timeout=0.2)) as cloud:
+        port = int(cloud.ws_url.rpartition(":")[2].rstrip("/"))
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(
+            f"GET /?userID=testUser&robotID=r&password={DIGEST} HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\n"
+            "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
+        )
+        assert b" 101 " in await reader.readuntil(b"\r\n\r\n")
+        writer.write(begin + begin)
+        try:
+            async with asyncio.timeout(20):
+                await write_until_lost(writer, ping)
+        finally:
+            writer.transport.abort()
+
+
+async def write_until_lost(writer: asyncio.StreamWriter, data: bytes) -> None:
+    with contextlib.suppress(ConnectionError):
+        while True:
+            writer.write(data)
+            await writer.drain()
+            await asyncio.sleep(0.05)
 
 
 # The handshake
