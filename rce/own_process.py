@@ -1,16 +1,21 @@
-"""This process: the signals that end it, its standard streams, its limit of open files, its time and memory.
+"""This process: the signals that end it, its streams, ports, limit of open files, time and memory.
 
 The kernel is asked directly: a library for it would cost each task set 4 MB.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import resource
 import signal
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 _ENOUGH = 1 << 20
 _log = logging.getLogger(__name__)
@@ -57,6 +62,30 @@ def raise_file_limit() -> int:
         _log.info("this process can have only %d files open: %s", soft, error)
         return soft
     return wanted
+
+
+@contextlib.contextmanager
+def listening(host: str, port: int | None, option: str) -> Iterator[None]:
+    """Name the address and the option in the error of a port that cannot be bound.
+
+    Args:
+        host: The address; empty for all.
+        port: The port; None for the default one.
+        option: The program's option that sets the port.
+
+    Raises:
+        OSError: The port cannot be bound; its text is for the program's user.
+    """
+    try:
+        yield
+    except OSError as error:
+        known = error.errno is not None and error.errno > 0  # name lookups have negative numbers
+        reason = os.strerror(error.errno or 0) if known else error.strerror or str(error)
+        place = f"{host or 'all addresses'}, port {'(default)' if port is None else port}"
+        raise OSError(
+            f"cannot listen on {place}: {reason}; choose another with --bind or {option}, or end the program"
+            " that has it"
+        ) from error
 
 
 def cpu_seconds() -> float:

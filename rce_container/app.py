@@ -24,7 +24,7 @@ from rce.link.handover import LinkAcceptor
 from rce.link.listening import listen_on
 from rce.masters import Masters, split_addresses
 from rce.model import MEMORY_PER_SLOT
-from rce.own_process import end_signals, machine_memory
+from rce.own_process import end_signals, listening, machine_memory
 from rce.ros.packages import PackageIndex, installed_shares
 from rce.tls.choice import TlsChoice
 from rce.tls.identity import Context
@@ -132,7 +132,8 @@ class App:
             acceptor = LinkAcceptor(tls=self.settings.tls)
             async with contextlib.AsyncExitStack() as stack:
                 stack.push_async_callback(acceptor.close)
-                port = await listen_on(acceptor.listen, self.host, self.link_port)
+                with listening(self.host, self.link_port, "--link-port (rce up: --container-link-port)"):
+                    port = await listen_on(acceptor.listen, self.host, self.link_port)
                 limiter = await asyncio.to_thread(choose_limiter, state.token, state.cgroups)
                 stack.callback(limiter.close)
                 for one in runtimes.values():

@@ -13,6 +13,7 @@ from rce.control.messages import TYPED_REQUESTS
 from rce.control.model import PATCHES
 from rce.control.server import ControlServer
 from rce.guard.proxies import TrustedProxies
+from rce.own_process import listening
 from rce.tls.choice import plain_warning
 from rce.tls.expiry import watch_expiry
 from rce.web.origin import ServerNames
@@ -186,10 +187,12 @@ class Master:
                 _log.warning("%s", text)
         async with AsyncExitStack() as stack:
             try:
-                await stack.enter_async_context(control)
-                await stack.enter_async_context(http)
+                with listening(settings.bind, settings.control_port, "--control-port"):
+                    await stack.enter_async_context(control)
+                with listening(settings.bind, settings.http_port, "--http-port"):
+                    await stack.enter_async_context(http)
             except OSError as error:
-                raise MasterError(f"cannot listen: {error}") from error
+                raise MasterError(str(error)) from error
             on_ready(RunningMaster(http.url, control.port, services.state_service))
             await watch_expiry([one.files for one in (for_clients, for_task_sets) if one is not None])
 

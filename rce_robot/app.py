@@ -24,7 +24,7 @@ from rce.link.listening import listen_on
 from rce.link.unix import remove_stale_sockets, socket_name
 from rce.lookups import LOOKUPS
 from rce.masters import Masters, split_addresses
-from rce.own_process import end_signals, machine_memory
+from rce.own_process import end_signals, listening, machine_memory
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.tls.choice import TlsChoice, plain_warning
@@ -100,7 +100,8 @@ class App:
         hub = LinkHub(machine, tls=self.tls.enabled)
         try:
             address = await _listen(hub, machine, name, reach, settings, tls=self.tls.enabled)
-            listener = await _bind(settings.host, settings.ws_port)
+            with listening(settings.host, settings.ws_port, "--ws-port"):
+                listener = await _bind(settings.host, settings.ws_port)
             port: int = listener.getsockname()[1]
             scheme = "ws" if for_robots is None else "wss"
             url = settings.public_url or f"{scheme}://{in_url(reach)}:{port}/"
@@ -173,7 +174,9 @@ async def _listen(
     remove_stale_sockets(run_dir(), "robot_*.sock")
     path = run_dir() / socket_name(name)
     await hub.listen_unix(path)
-    port = await listen_on(hub.listen_secure if tls else hub.listen_tcp, settings.host, settings.link_port)
+    with listening(settings.host, settings.link_port, "--link-port (rce up: --robot-link-port)"):
+        listen = hub.listen_secure if tls else hub.listen_tcp
+        port = await listen_on(listen, settings.host, settings.link_port)
     return LinkAddress(machine=machine, unix=str(path), host=reach, port=port, tls=tls)
 
 

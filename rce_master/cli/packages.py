@@ -32,7 +32,7 @@ _CHUNK = 1 << 20
 _LISTED = 40
 """How many files of a package are shown, unless all are asked for."""
 
-OfUser = Annotated[str, typer.Option("--user", help="Whose; administrators only [yourself].")]
+OfUser = Annotated[str, typer.Option("--user", help="Whose; administrators only (default: yourself).")]
 
 
 @app.command("push")

@@ -16,7 +16,7 @@ from rce_master.cli.exceptions import NotLoggedInError
 tokens = typer.Typer(invoke_without_command=True, help="Print, list, make and revoke tokens.")
 robots = typer.Typer(no_args_is_help=True, help="Give robots credentials of their own, and take them back.")
 
-OfUser = Annotated[str, typer.Option("--user", help="Whose; administrators only [yourself].")]
+OfUser = Annotated[str, typer.Option("--user", help="Whose; administrators only (default: yourself).")]
 Label = Annotated[str, typer.Option(help="What you call it.")]
 Days = Annotated[float, typer.Option(help="Days for which it is good; 0: until it is revoked.", min=0)]
 
