@@ -55,7 +55,7 @@ async def execute(call: Call) -> web.StreamResponse:
             await _relay(call, user, machine)
     except (MasterError, ValueError, TimeoutError) as error:
         text = str(error) or f"no command came within {FIRST_MESSAGE_S:g} s"
-        with contextlib.suppress(ConnectionResetError):
+        with contextlib.suppress(ConnectionError):
             await user.send_bytes(ended_frame(NOT_RUN, text).encode())
     await user.close()
     return user
@@ -80,7 +80,7 @@ async def _first(user: web.WebSocketResponse) -> Command:
 
 async def _relay(call: Call, user: web.WebSocketResponse, machine: ServerConnection) -> None:
     """Pass frames on until either side disconnects, or the user loses the permission."""
-    with contextlib.suppress(ConnectionClosed, ConnectionResetError):  # either side may disconnect
+    with contextlib.suppress(ConnectionClosed, ConnectionError):  # either side may disconnect
         await run_until_first(_to_machine(user, machine), _to_user(machine, user), _watch(call))
 
 

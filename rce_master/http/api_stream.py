@@ -142,7 +142,7 @@ async def _stream(call: Call, scope: str | None, last: int) -> web.StreamRespons
             last = news[-1].id if news else last
             if len(news) == AT_ONCE:
                 await call.services.quotas.replay(call.caller)
-    except ConnectionResetError:
+    except ConnectionError:
         # The client disconnected: a stream does not end in another way from its side.
         return response
 

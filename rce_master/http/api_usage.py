@@ -60,7 +60,7 @@ async def _stream(call: Call, scope: str | None, interval: int) -> web.StreamRes
                 await response.write(b": %s\n\n" % ENDED.encode())
                 return response
             await response.write(_frame(_usage(call, scope)))
-    except ConnectionResetError:
+    except ConnectionError:
         # The client disconnected: a stream does not end in another way from its side.
         return response
 

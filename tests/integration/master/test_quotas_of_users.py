@@ -5,16 +5,20 @@ from __future__ import annotations
 import asyncio
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 import aiohttp
+from support.fuzzing import Tracebacks
 
 from rce.control.messages import LogChunk, ReadLog, ToTaskSet
 from rce_master.auth import client_digest
+from rce_master.http import api_stream
 from rce_master.quotas import QuotaSettings
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    import pytest
     from integration.master.conftest import RunSite, Site, TaskSet
 
 
@@ -132,3 +136,36 @@ async def test_events_of_a_flood_leave_others_theirs(run_site: RunSite) -> None:
                 lines = [await stream.content.readline() for _ in range(5)]
         assert b'"subject":"bert/mine"' in b"".join(lines)
         assert b"anna" not in b"".join(lines)
+
+
+async def test_streams_that_wait_for_a_client_end_with_it(
+    run_site: RunSite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The clients read nothing, and disappear while the master waits to send: that is not an error."""
+    frame = api_stream._frame
+    monkeypatch.setattr(api_stream, "_frame", lambda event: frame(event) + b":" + bytes(4 << 20) + b"\n\n")
+    async with two_users(run_site) as (site, anna, _):
+        for number in range(3):
+            await site.api("POST", "/containers", {"tag": f"c{number}"}, token=anna, status=204)
+        url = urlsplit(site.url)
+        with Tracebacks().watching() as log:
+            clients = []
+            for _ in range(SMALL.streams):
+                reader, writer = await asyncio.open_connection(url.hostname, url.port)
+                clients.append(writer)
+                writer.write(
+                    f"GET /api/v1/events?since=0 HTTP/1.1\r\nHost: {url.netloc}\r\n"
+                    f"Authorization: Bearer {anna}\r\n\r\n".encode()
+                )
+                assert b" 200 " in await reader.readline()
+            await asyncio.sleep(0.5)  # the master begins to wait meanwhile
+            for writer in clients:
+                writer.transport.abort()
+            status = 0
+            async with asyncio.timeout(20):
+                while status != 200:
+                    await asyncio.sleep(0.5)
+                    headers = {"Authorization": f"Bearer {anna}"}
+                    async with site.session.get(f"{site.url}api/v1/events", headers=headers) as stream:
+                        status = stream.status
+        assert not log.found
