@@ -83,7 +83,9 @@ def demo(
     container_link_port: Annotated[
         int | None, typer.Option(help="Port of links to containers [10031].")
     ] = None,
-    runtime: Annotated[Runtime | None, typer.Option(help="Runtime of the containers (default: auto).")] = None,
+    runtime: Annotated[
+        Runtime | None, typer.Option(help="Runtime of the containers (default: auto).")
+    ] = None,
     core_port: Annotated[
         int | None, typer.Option(help="Port of the ROS core of --mode single [11311].")
     ] = None,
