@@ -68,6 +68,9 @@ def demo(
         Path | None,
         typer.Option(help="Starts and goals on the map (MovingAI .scen).", exists=True, dir_okay=False),
     ] = None,
+    slam: Annotated[
+        bool, typer.Option("--slam", help="Begin without a map: the first robot explores and makes it.")
+    ] = False,
     auto: Annotated[
         bool, typer.Option("--auto/--no-auto", help="Send robots to random goals until you set a goal.")
     ] = True,
@@ -132,6 +135,7 @@ def demo(
                 core_uri=core_uri,
                 machines=machines,
                 blocked_cells=blocked_cells,
+                slam=slam,
             )
             show = typer.echo if verbose else _show_warning
             if headless:
@@ -167,7 +171,7 @@ async def _headless(
 
 async def _with_page(config: DemoConfig, show: Callable[[str], None], *, auto: bool) -> int:
     say(f"starting the fleet, mode {config.mode}")
-    async with start_demo(config, show) as demo, aiohttp.ClientSession() as session:
+    async with start_demo(config, show, say) as demo, aiohttp.ClientSession() as session:
         demo.group.enable_restarts(say)
         typer.echo(f"RCE demo: {demo.page}")
         station = StationClient(session, demo.page)

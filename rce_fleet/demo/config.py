@@ -65,6 +65,7 @@ class DemoConfig:
         core_uri: A running ROS master to use instead of that program; none if empty.
         machines: How the machines of the mode ``multi`` are represented.
         blocked_cells: Cells that a headless run blocks while robots drive.
+        slam: Whether there is no map at the start: the first robot makes it.
     """
 
     scenario: Scenario
@@ -78,6 +79,7 @@ class DemoConfig:
     core_uri: str = ""
     machines: MachineBackend = MachineBackend.AUTO
     blocked_cells: int = 1
+    slam: bool = False
 
     @property
     def account(self) -> FleetAccount:
@@ -95,15 +97,21 @@ class DemoConfig:
         return self.folder / "map.yaml"
 
     @property
+    def true_map_file(self) -> Path:
+        """The map of the true walls, to compare with."""
+        return self.folder / "true_map.yaml"
+
+    @property
     def report(self) -> Path:
         """File that the simulated world writes its reports to."""
         return self.folder / "world.json"
 
     @property
     def planner_parameters(self) -> dict[str, Any]:
-        """The planner's parameters: the map without hidden boxes."""
+        """The planner's parameters: the map without hidden boxes; without walls if there is no map yet."""
         scenario, grid = self.scenario, self.scenario.grid
-        cells = {"walls": sorted(grid.blocked), "blocked": list(scenario.known_boxes)}
+        walls = [] if self.slam else sorted(grid.blocked)
+        cells = {"walls": walls, "blocked": list(scenario.known_boxes)}
         known = {name: value for name, value in cells.items() if value}
         return {**self.map_parameters, "seed": self.seed, "robot_radius": ROBOT_RADIUS, **known}
 
@@ -119,4 +127,4 @@ class DemoConfig:
         if self.scenario.grid == FLOOR:
             scene = with_surroundings(scene)
         self.scene.write_text(scene.model_dump_json(indent=1), encoding="utf-8")
-        save_map(scene.draw(), self.map_file)
+        save_map(scene.draw(), self.true_map_file if self.slam else self.map_file)

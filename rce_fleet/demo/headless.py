@@ -13,6 +13,7 @@ import aiohttp
 
 from rce_fleet.demo.config import DemoConfig, Mode
 from rce_fleet.demo.exceptions import DemoError
+from rce_fleet.demo.exploration import Explored
 from rce_fleet.demo.judge import Judge, RobotScore
 from rce_fleet.demo.modes import RunningDemo, start_demo
 from rce_fleet.demo.scenario_run import ScenarioRun
@@ -39,6 +40,7 @@ class RunReport:
         problem: Why the run was stopped early; empty if it was not.
         mode: What carried the fleet's messages.
         scores: How well each robot localized; empty if the run did not begin.
+        explored: What the first robot explored; None if there was a map, or it was not complete.
     """
 
     scenario: Scenario
@@ -49,6 +51,7 @@ class RunReport:
     problem: str = ""
     mode: Mode = Mode.CLOUD
     scores: Mapping[str, RobotScore] = field(default_factory=dict)
+    explored: Explored | None = None
 
     @property
     def ok(self) -> bool:
@@ -78,6 +81,7 @@ class RunReport:
         return {
             "ok": self.ok,
             "mode": self.mode.value,
+            **({} if self.explored is None else {"exploration": self.explored.as_json()}),
             "duration_s": 0.0 if run is None else round(run.duration, 2),
             "collisions": None if truth is None else truth.collisions.total,
             "min_separation_m": None if truth is None else truth.min_separation_m,
@@ -122,7 +126,7 @@ async def run_headless(
     headless = _HeadlessRun(config, say)
     problem = ""
     try:
-        async with asyncio.timeout(timeout) as limit, start_demo(config, show) as demo:
+        async with asyncio.timeout(timeout) as limit, start_demo(config, show, say) as demo:
             await demo.group.run_while_alive(headless.perform(demo))
             limit.reschedule(None)  # stopping the programs has its own time limits
     except TimeoutError:
@@ -141,6 +145,7 @@ async def run_headless(
         problem,
         config.mode,
         headless.scores,
+        headless.explored,
     )
 
 
@@ -173,10 +178,12 @@ class _HeadlessRun:
         self.run: ScenarioRun | None = None
         self.totals: MessageTotals | None = None
         self.scores: Mapping[str, RobotScore] = {}
+        self.explored: Explored | None = None
         self._config = config
         self._say = say
 
     async def perform(self, demo: RunningDemo) -> None:
+        self.explored = demo.explored
         judge = Judge(demo.mode.graphs())
         self.scores = judge.scores
         async with aiohttp.ClientSession() as session, judge:

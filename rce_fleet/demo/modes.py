@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
+import aiohttp
+
 from rce.config.documents import write_items
 from rce_fleet.demo.config import DemoConfig, Mode
+from rce_fleet.demo.exploration import Explored, block_cells, explore
 from rce_fleet.demo.programs import RCE, START_TIMEOUT, Program, ProgramGroup
-from rce_fleet.demo.robots import RobotGraph, client_config, cloud_arguments, start_robot
+from rce_fleet.demo.robots import RobotGraph, client_config, cloud_arguments, start_robots
 from rce_fleet.demo.ros_modes import MultiCorePrograms, SingleCorePrograms
 from rce_fleet.demo.traffic import MessageTotals, read_engine_totals
 from rce_fleet.drivers.report import WorldReport, read_report
+from rce_fleet.station.client import StationClient
 from rce_fleet.wiring import fleet_config
 
 
@@ -24,6 +28,8 @@ class ModePrograms(Protocol):
     async def start(self, group: ProgramGroup) -> str:
         """Write the files and start all programs; return the URL of the page.
 
+        Without a map (``slam``), the nodes of the robots are left out.
+
         Raises:
             DemoError: A program ended, or was not ready in time.
             OSError: A program cannot be started, or a file cannot be written.
@@ -31,6 +37,9 @@ class ModePrograms(Protocol):
 
     def graphs(self) -> Sequence[RobotGraph]:
         """Return where the nodes of each robot are, once all programs are started."""
+
+    def launch_arguments(self, graph: RobotGraph) -> Mapping[str, object]:
+        """Return the arguments of the launch file of a robot's nodes."""
 
     async def read_totals(self) -> MessageTotals:
         """Return how many messages were received until now.
@@ -60,8 +69,8 @@ class CloudPrograms:
         station = await group.start("station", self._station_argv(), restartable=True)
         self._graphs = await self._find_graphs(group, world)
         page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)
-        for graph in self._graphs:
-            await start_robot(group, config, graph, cloud_arguments(config, graph.robot))
+        if not config.slam:
+            await start_robots(group, config, self)
         bridges = [
             await group.start(
                 f"robot{number}",
@@ -79,6 +88,10 @@ class CloudPrograms:
     def graphs(self) -> Sequence[RobotGraph]:
         """Return where the nodes of each robot are."""
         return self._graphs
+
+    def launch_arguments(self, graph: RobotGraph) -> Mapping[str, object]:
+        """Return the arguments of the launch file of a robot's nodes."""
+        return cloud_arguments(self._config, graph.robot)
 
     async def read_totals(self) -> MessageTotals:
         """Read the message totals from the master."""
@@ -144,12 +157,14 @@ class RunningDemo:
         config: What it runs.
         group: All programs.
         mode: The programs of the mode.
+        explored: What the first robot explored; None if there was a map.
     """
 
     page: str
     config: DemoConfig
     group: ProgramGroup
     mode: ModePrograms
+    explored: Explored | None = None
 
     def truth(self) -> WorldReport | None:
         """Return the newest report of the simulated world; None before the first."""
@@ -157,12 +172,15 @@ class RunningDemo:
 
 
 @asynccontextmanager
-async def start_demo(config: DemoConfig, show: Callable[[str], None]) -> AsyncIterator[RunningDemo]:
+async def start_demo(
+    config: DemoConfig, show: Callable[[str], None], say: Callable[[str], None]
+) -> AsyncIterator[RunningDemo]:
     """Start all programs; stop them when the block is left.
 
     Args:
         config: What to run.
         show: Called with every line that a program prints.
+        say: Prints a line for the user.
 
     Raises:
         DemoError: A program ended, or was not ready in time.
@@ -171,4 +189,20 @@ async def start_demo(config: DemoConfig, show: Callable[[str], None]) -> AsyncIt
     mode = _PROGRAMS[config.mode](config)
     async with ProgramGroup(config.folder, show) as group:
         page = await group.run_while_alive(mode.start(group))
-        yield RunningDemo(page, config, group, mode)
+        explored = None
+        if config.slam:
+            say(f"there is no map yet; see it grow at {page}")
+            explored = await group.run_while_alive(_explore(config, group, mode, page, say))
+        yield RunningDemo(page, config, group, mode, explored)
+
+
+async def _explore(
+    config: DemoConfig, group: ProgramGroup, mode: ModePrograms, page: str, say: Callable[[str], None]
+) -> Explored:
+    """Let the first robot make the map, and start all robots on it."""
+    first, *_ = mode.graphs()
+    explored = await explore(group, config, first, mode.launch_arguments(first), say)
+    async with aiohttp.ClientSession() as session:
+        await block_cells(StationClient(session, page), explored.blocked, say)
+    await start_robots(group, config, mode, {first.robot: explored.initial_pose})
+    return explored

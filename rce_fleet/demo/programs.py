@@ -44,6 +44,7 @@ class Program:
         stop_last: Other programs need it while they stop: it is stopped after them.
         restartable: It can be restarted while the others run.
         tail: The last lines that it printed.
+        is_done: Its work is done: it may end while the others run.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class Program:
         self.restartable = restartable
         self.tail: deque[str] = deque(maxlen=TAIL_LINES)
         self.keeper = Keeper(begin, self.add_line, RESTARTS)
+        self.is_done = False
         self._lines: deque[str] = deque(maxlen=1000)
         self._printed = asyncio.Event()
         self._show = show
@@ -162,6 +164,11 @@ class ProgramGroup:
             self._readers.create_task(self._supervise(program, stack.pop_all()), name=f"output of {name}")
         return program
 
+    async def end(self, program: Program) -> None:
+        """Stop a program whose work is done; the others go on."""
+        program.is_done = True
+        await program.keeper.stop(timeout=STOP_TIMEOUT)
+
     async def wait_line(self, program: Program, start: str, timeout: float) -> str:
         """Wait until a program prints a line that begins with ``start``; return the rest of the line.
 
@@ -206,7 +213,7 @@ class ProgramGroup:
             except OSError as error:  # it cannot be restarted
                 program.add_line(str(error))
                 code = program.child.returncode or 0
-        if not self._stopping.done() and not self._failure.done():
+        if not (program.is_done or self._stopping.done() or self._failure.done()):
             self._failure.set_result(ProgramEndedError(program.name, code, program.tail))
 
     async def _stop_all(self) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
 
 from rce.config.folders import configs_dir
@@ -61,6 +61,35 @@ def environment(config: DemoConfig, uri: str) -> dict[str, str]:
         "ROS_HOME": str(config.folder / "ros"),
         "RCE_COMPILED": os.environ.get("RCE_COMPILED", "no"),
     }
+
+
+class RobotGraphs(Protocol):
+    """Knows the robots' graphs, and how their launch files are started there."""
+
+    def graphs(self) -> Sequence[RobotGraph]:
+        """Return where the nodes of each robot are."""
+
+    def launch_arguments(self, graph: RobotGraph) -> Mapping[str, object]:
+        """Return the arguments of the launch file of a robot's nodes."""
+
+
+async def start_robots(
+    group: ProgramGroup,
+    config: DemoConfig,
+    robots: RobotGraphs,
+    more: Mapping[str, Mapping[str, object]] | None = None,
+) -> None:
+    """Start the nodes of all robots.
+
+    Args:
+        group: Gets the programs.
+        config: What the demo runs.
+        robots: Where they are.
+        more: More arguments of the launch files, by robot.
+    """
+    for graph in robots.graphs():
+        arguments = {**robots.launch_arguments(graph), **(more or {}).get(graph.robot, {})}
+        await start_robot(group, config, graph, arguments)
 
 
 async def start_robot(

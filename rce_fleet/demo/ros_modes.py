@@ -16,7 +16,7 @@ from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.network import DemoMachine, Network, create_network
 from rce_fleet.demo.programs import RCE, START_TIMEOUT, Program, ProgramGroup, rce_command
 from rce_fleet.demo.resources import LOOPBACK
-from rce_fleet.demo.robots import RobotGraph, start_robot
+from rce_fleet.demo.robots import RobotGraph, start_robots
 from rce_fleet.demo.traffic import MessageTotals, read_graph_totals
 
 PLANNER = "planner"
@@ -143,15 +143,18 @@ class SingleCorePrograms:
         for number, robot in enumerate(robots, start=1):
             await host.start(group, f"move_client{number}", move_client_argv(robot), restartable=True)
         page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)
-        for index, graph in enumerate(self._graphs):
-            arguments = {"tf_prefix": graph.prefix, "map_server": index == 0}
-            await start_robot(group, config, graph, arguments)
+        if not config.slam:
+            await start_robots(group, config, self)
         await group.wait_line(world, "simulation ready:", START_TIMEOUT)
         return page
 
     def graphs(self) -> Sequence[RobotGraph]:
         """Return where the nodes of each robot are: in its namespace."""
         return self._graphs
+
+    def launch_arguments(self, graph: RobotGraph) -> Mapping[str, object]:
+        """Return the arguments of the launch file of a robot's nodes; the first one's publish the map."""
+        return {"tf_prefix": graph.prefix, "map_server": graph == self._graphs[0]}
 
     async def read_totals(self) -> MessageTotals:
         """Read the message totals of all nodes."""
@@ -209,14 +212,18 @@ class MultiCorePrograms:
             await _host_of(machine).start(group, f"move_client{number}", argv, restartable=True)
         await _join_machines(network, robots, group)
         page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)
-        for graph in self._graphs:
-            await start_robot(group, config, graph, {"robot": graph.robot})
+        if not config.slam:
+            await start_robots(group, config, self)
         await group.wait_line(world, "simulation ready:", START_TIMEOUT)
         return page
 
     def graphs(self) -> Sequence[RobotGraph]:
         """Return where the nodes of each robot are: at its own core."""
         return self._graphs
+
+    def launch_arguments(self, graph: RobotGraph) -> Mapping[str, object]:
+        """Return the arguments of the launch file of a robot's nodes."""
+        return {"robot": graph.robot}
 
     async def read_totals(self) -> MessageTotals:
         """Read the message totals of all nodes."""

@@ -38,6 +38,7 @@ from rce_fleet.nodes.map_messages import map_fields
 from rce_fleet.nodes.mapped_robot import scan_record
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import pose_of
+from rce_fleet.nodes.pose_messages import pose_with_covariance_fields
 from rce_fleet.nodes.throttled_log import ThrottledLog
 
 if TYPE_CHECKING:
@@ -112,6 +113,7 @@ class SlamGmappingNode:
         self._map_at = -inf
         self._lasers: dict[str, Transform] = {}
         self._listener: TransformListener
+        self._poses: Publisher
         self._maps: Publisher
         self._metadata: Publisher
         self._entropies: Publisher
@@ -120,6 +122,7 @@ class SlamGmappingNode:
         """Make a map until the node is stopped."""
         node = self._node
         await asyncio.to_thread(compile_kernels)
+        self._poses = await node.advertise("pose", "geometry_msgs/PoseWithCovarianceStamped", latch=True)
         self._maps = await node.advertise("map", "nav_msgs/OccupancyGrid", latch=True)
         self._metadata = await node.advertise("map_metadata", "nav_msgs/MapMetaData", latch=True)
         self._entropies = await node.advertise("~entropy", "std_msgs/Float64", latch=True)
@@ -165,6 +168,7 @@ class SlamGmappingNode:
             self._refuse("map", f"a scan cannot be drawn: {error}")
             return
         self._fault, self._used_at = "", self._node.time()
+        self._publish_pose(stamp)
         if updated:
             self._publish(stamp)
 
@@ -203,6 +207,14 @@ class SlamGmappingNode:
         self._fault = text
 
     # What goes out
+
+    def _publish_pose(self, stamp: Time) -> None:
+        """Publish where the robot was at a scan, and how far the particles are apart."""
+        found = self._filter
+        spread = np.cov(found.poses.T, aweights=found.weights, ddof=0).reshape(3, 3)
+        frame = self._listener.resolve(self._parameters.map_frame)
+        pose = pose_with_covariance_fields(Pose.from_array(found.estimate), spread)
+        self._poses.publish(header={"stamp": stamp, "frame_id": frame}, pose=pose)
 
     def _publish(self, stamp: Time) -> None:
         self._entropies.publish(data=self._filter.entropy)
