@@ -98,7 +98,7 @@ class DemoConfig:
 
     @property
     def true_map_file(self) -> Path:
-        """The map of the true walls, to compare with."""
+        """The map of the true walls and boxes, to compare with."""
         return self.folder / "true_map.yaml"
 
     @property
@@ -127,4 +127,7 @@ class DemoConfig:
         if self.scenario.grid == FLOOR:
             scene = with_surroundings(scene)
         self.scene.write_text(scene.model_dump_json(indent=1), encoding="utf-8")
-        save_map(scene.draw(), self.true_map_file if self.slam else self.map_file)
+        if self.slam:
+            save_map(scene.draw(boxes=True), self.true_map_file)
+        else:
+            save_map(scene.draw(), self.map_file)

@@ -30,6 +30,7 @@ from rce_fleet.geometry.poses import Pose
 from rce_fleet.maps.ros_map import load_map
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map
+from rce_fleet.simulation.box import BoxSpec
 from rce_fleet.simulation.map_walls import draw_map, walls_of_map
 from rce_fleet.simulation.walls import Walls, grid_walls
 from rce_fleet.simulation.world import Dock, World, WorldSpec
@@ -167,11 +168,22 @@ class Scene(Strict):
         rows, columns = (max(1, ceil(length / self.cell_size - 1e-9)) for length in (height, width))
         return GridMap(rows, columns, self.cell_size, (drawn.origin.x, drawn.origin.y))
 
-    def draw(self, resolution: float = 0.05) -> OccupancyMap:
-        """Return the map that a perfect mapper would make of the walls; doors and boxes are not on it."""
+    def draw(self, resolution: float = 0.05, *, boxes: bool = False) -> OccupancyMap:
+        """Return the map that a perfect mapper would make of the walls; doors are not on it.
+
+        Args:
+            resolution: Edge of a cell, metres.
+            boxes: Whether the boxes that are there at the start are on it.
+        """
         floor = self.floor()
-        inside = [floor.grid.centre(cell) for cell in floor.grid.free]
-        return draw_map(floor.walls, inside, resolution=resolution)
+        grid, walls = floor.grid, floor.walls
+        if boxes:
+            size = WorldSpec().box_size
+            specs = [BoxSpec(Pose(*grid.centre(cell), 0.0), size, size) for cell in self.box_cells]
+            specs += [box.spec() for box in self.loose_boxes]
+            walls += Walls(tuple(spec.block for spec in specs if spec.is_due(0.0)))
+        inside = [grid.centre(cell) for cell in grid.free if not (boxes and cell in self.box_cells)]
+        return draw_map(walls, inside, resolution=resolution)
 
     def build(self, source: str = "scene") -> World:
         """Create the world.
