@@ -119,6 +119,8 @@ def demo(
     try:
         if offload and mode is not Mode.CLOUD:
             raise DemoError(f"--offload needs containers: use it with --mode cloud, not --mode {mode}")
+        if offload and slam:
+            raise DemoError("--slam maps on the robot: use it without --offload")
         count = robots or (DEFAULT_ROBOTS if scen is None else DEFAULT_ROBOTS_OF_SCEN)
         scenario = choose_scenario(count, seed, world=world, scen=scen)
         ports = _choose_ports(headless, given, _needed_ports(mode, core_uri))
