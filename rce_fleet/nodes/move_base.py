@@ -27,7 +27,7 @@ from rce_fleet.nodes.diagnostics import Diagnostics, Level
 from rce_fleet.nodes.move_base_goals import MoveBaseGoals
 from rce_fleet.nodes.move_base_parameters import read_settings, space_of
 from rce_fleet.nodes.observation_sources import ObservationSources
-from rce_fleet.nodes.planar import path_fields, read_map, twist_fields
+from rce_fleet.nodes.planar import fault_of_map_frame, path_fields, read_map, twist_fields
 from rce_fleet.nodes.robot_place import RobotPlace, full_name
 from rce_fleet.nodes.throttled_log import ThrottledLog
 
@@ -60,6 +60,7 @@ class MoveBaseNode:
         self._global_at = float("-inf")
         self._steps: deque[tuple[float, float]] = deque(maxlen=500)
         self._problem = ""
+        self._map_fault = ""
         self._plan_seconds = 0.0
         self._frames: tuple[str, ...] = ()
         self._place: RobotPlace
@@ -159,10 +160,17 @@ class MoveBaseNode:
         def take(message: Message) -> None:
             if layer.has_map and layer.parameters.first_map_only:
                 return
+            name = self._node.resolve(topic)
             try:
                 costmap.set_map(read_map(message))
             except ValueError as error:
-                self._throttled_log.warn("map", f"a map on {self._node.resolve(topic)} is ignored: {error}")
+                self._map_fault = f"a map on {name} is ignored: {error}"
+                self._throttled_log.warn("map", self._map_fault)
+                return
+            self._map_fault = ""
+            fault = fault_of_map_frame(message, self._frames[0])
+            if fault:
+                self._throttled_log.warn("map frame", f"the map on {name}: {fault}")
 
         def update(message: Message) -> None:
             try:
@@ -230,10 +238,13 @@ class MoveBaseNode:
         for costmap in (self.stack.global_costmap, self.stack.local_costmap):
             if not costmap.is_ready:
                 assert costmap.static is not None
-                return f"waiting for the map on {self._node.resolve(costmap.static.parameters.map_topic)}"
+                topic = self._node.resolve(costmap.static.parameters.map_topic)
+                return self._map_fault or f"waiting for the map on {topic}"
             late = costmap.obstacles.late_sources(now) if costmap.obstacles is not None else []
             if late:
-                return f"no recent message of source {', '.join(late)}"
+                faults = [text for one in self._sources for text in one.faults_of(late)]
+                why = f": {faults[0]}" if faults else ""
+                return f"no recent message of source {', '.join(late)}{why}"
         return ""
 
     def _note(self, problem: str, decision: Decision) -> None:

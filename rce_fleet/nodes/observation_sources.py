@@ -16,6 +16,8 @@ from rce_fleet.nodes.planar import pose_of
 from rce_fleet.nodes.robot_place import full_name, named_in_message
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
     from rce.ros.node import Node
@@ -62,6 +64,8 @@ class ObservationSources:
         self._costmap = costmap
         self._throttled_log = throttled_log
         self._waiting: dict[str, deque[Message]] = {}
+        self._faults: dict[str, str] = {}
+        """What was wrong with the last message of a source."""
         self.newest: Time | None = None
 
     async def start(self) -> None:
@@ -92,6 +96,10 @@ class ObservationSources:
                     break
                 waiting.popleft()
 
+    def faults_of(self, names: Iterable[str]) -> list[str]:
+        """Return what was wrong with the last messages of these sources."""
+        return [self._faults[name] for name in names if name in self._faults]
+
     def _try(self, name: str, message: Message, now: float) -> bool:
         """Use a message; return whether it need not wait any more."""
         source = self._costmap.parameters.sources[name]
@@ -106,6 +114,7 @@ class ObservationSources:
                 seen = _observe(message, source, found.transform, stamp.to_sec() if stamp else now)
                 if self._costmap.obstacles is not None:
                     self._costmap.obstacles.take(name, seen)
+                self._faults.pop(name, None)
                 if self.newest is None or stamp > self.newest:
                     self.newest = stamp
             except ExtrapolationError as error:
@@ -113,11 +122,13 @@ class ObservationSources:
                     return False
                 fault = str(error)
             except TransformError as error:
+                self._faults[name] = f"it waits for its transform: {error}"
                 self._throttled_log.warn(f"source {name}", f"source {name} waits for its transform: {error}")
                 return False
             except ValueError as error:
                 fault = str(error)
         if fault:
+            self._faults[name] = f"the last one is ignored: {fault}"
             self._throttled_log.warn(f"source {name}", f"a message of source {name} is ignored: {fault}")
         return True
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 from functools import partial
+from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +27,7 @@ from rce_fleet.navigation.obstacle_cells.watch import CellWatch, Findings, Watch
 from rce_fleet.navigation.scans import fault_of_scan, fault_of_stamp
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
 from rce_fleet.nodes.parameters import read_parameters
-from rce_fleet.nodes.planar import pose_of, read_map, read_pose
+from rce_fleet.nodes.planar import fault_of_map_frame, pose_of, read_map, read_pose
 from rce_fleet.nodes.robot_place import full_name, named_in_message
 from rce_fleet.nodes.throttled_log import ThrottledLog
 
@@ -43,6 +44,8 @@ FREED_FOR = 3.0
 """How long a freed cell is reported, seconds."""
 POSES_LAST = 2.0
 """How long another robot's pose counts, seconds."""
+QUIET = 3.0
+"""Without a usable scan for so long the node's state is a warning, seconds."""
 OLDEST = 2.0
 """Scans older than this are of no use, seconds."""
 
@@ -97,6 +100,9 @@ class ObstacleCellsNode:
         self._reported: set[int] = set()
         self._freed: dict[int, float] = {}
         self._sent_at = float("-inf")
+        self._used_at = -inf
+        self._fault = ""
+        """What was wrong with the last message that could not be used; empty once a scan was used."""
         self._waiting: deque[Message] = deque(maxlen=5)
         self._tf: TransformListener
         self._blocked_out: Publisher
@@ -114,8 +120,7 @@ class ObstacleCellsNode:
             await node.subscribe("/fleet/state", "fleet/FleetState", self._take_state)
             await node.subscribe("scan", "sensor_msgs/LaserScan", self._take_scan)
             while await node.sleep(1.0):
-                level = Level.OK if self._watch is not None else Level.WARN
-                text = "watching" if self._watch is not None else "waiting for /fleet/map"
+                level, text = self._state()
                 cells = ", ".join(map(str, sorted(self._reported))) or "none"
                 diagnostics.publish(level, text, {"blocked cells": cells})
 
@@ -125,8 +130,14 @@ class ObstacleCellsNode:
         try:
             picture = read_map(message)
         except ValueError as error:
-            self._throttled_log.warn("map", f"a map is ignored: {error}")
+            self._fault = (
+                f"a map on {'/fleet/map' if fleet else self._node.resolve('map')} is ignored: {error}"
+            )
+            self._throttled_log.warn("map", self._fault)
             return
+        fault = fault_of_map_frame(message, full_name(self._tf, self._parameters.map_frame))
+        if fault:
+            self._throttled_log.warn("map frame", f"{'/fleet/map' if fleet else 'the map'}: {fault}")
         if not fleet:
             self._known = picture
         elif self._fleet is not None and _same_place(self._fleet, picture):
@@ -172,15 +183,18 @@ class ObstacleCellsNode:
         stamp = message.header.stamp.to_sec()
         fault = fault_of_scan(len(message.ranges), angles, limits) or fault_of_stamp(stamp, now, OLDEST)
         if fault:
-            self._throttled_log.warn("scan", f"a scan is ignored: {fault}")
+            self._fault = f"a scan is ignored: {fault}"
+            self._throttled_log.warn("scan", self._fault)
             return True
         frame, when = named_in_message(message.header.frame_id), message.header.stamp
         try:
             found = self._tf.lookup(full_name(self._tf, self._parameters.map_frame), frame, when)
         except ExtrapolationError as error:
+            self._fault = f"scans wait for their transform: {error}"
             return not error.is_future
         except TransformError as error:
-            self._throttled_log.warn("tf", f"scans wait for their transform: {error}")
+            self._fault = f"scans wait for their transform: {error}"
+            self._throttled_log.warn("tf", self._fault)
             return True
         reach = self._parameters.sight + 1.0
         source = ObservationSource(
@@ -193,7 +207,17 @@ class ObstacleCellsNode:
         suspects = others.blocked | self._reported
         findings = watch.take(seen, now, robots=self._places(now), held=others.held, suspects=suspects)
         self._report(findings, now)
+        self._fault, self._used_at = "", now
         return True
+
+    def _state(self) -> tuple[Level, str]:
+        """Return level and text of the node's state."""
+        age = self._node.time() - self._used_at
+        if self._watch is None:
+            return Level.WARN, self._fault or "waiting for /fleet/map"
+        if 0 <= age <= QUIET:
+            return Level.OK, "watching"
+        return Level.WARN, self._fault or ("no scan yet" if age == inf else f"no scan for {age:.0f} s")
 
     def _places(self, now: float) -> NDArray[np.float64]:
         """Return the other robots' places and radii, shape (K, 3)."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rce_fleet.exceptions import MapError
 from rce_fleet.geometry.angles import quaternion_z, yaw_of
 from rce_fleet.geometry.poses import Pose, Twist
 from rce_fleet.maps.occupancy_map import OccupancyMap
@@ -76,5 +77,21 @@ def read_map(message: Message) -> OccupancyMap:
         ValueError: Its size, resolution, values or origin are not those of a map.
     """
     info = message.info
-    values = np.asarray(message.data, np.int16)
-    return OccupancyMap.from_message(info.width, info.height, values, info.resolution, read_pose(info.origin))
+    values, place = np.asarray(message.data, np.int16), read_pose(info.origin)
+    try:
+        return OccupancyMap.from_message(info.width, info.height, values, info.resolution, place)
+    except MapError as error:
+        raise ValueError(str(error)) from error
+
+
+def fault_of_map_frame(message: Message, expected: str) -> str:
+    """Return what is wrong with the frame of a map's header; empty if nothing is.
+
+    Args:
+        message: A ``nav_msgs/OccupancyGrid``.
+        expected: Full name of the frame that it should be in.
+    """
+    frame = message.header.frame_id.lstrip("/")
+    if not frame or frame == expected.lstrip("/"):
+        return ""
+    return f"it is in frame {frame!r}, expected {expected.lstrip('/')!r}; its poses are used as they are"

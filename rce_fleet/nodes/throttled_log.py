@@ -1,7 +1,8 @@
-"""Warnings that repeat: one for each subject in a while, so that a log stays readable."""
+"""Warnings that repeat: each only once in a while, so that a log stays readable."""
 
 from __future__ import annotations
 
+import re
 import time
 from typing import TYPE_CHECKING
 
@@ -9,11 +10,16 @@ if TYPE_CHECKING:
     from rce.ros.node import Node
 
 EVERY = 5.0
-"""Seconds after which a warning on the same subject is logged again."""
+"""Seconds after which the same warning on the same subject is logged again."""
+KEPT = 200
+"""Warnings that are remembered; with more of them, all are forgotten."""
+_NUMBER = re.compile(r"[-+0-9.]+(e[-+]?[0-9]+)?")
 
 
 class ThrottledLog:
-    """Logs warnings of a node, each subject at most once in ``EVERY`` seconds.
+    """Logs warnings of a node, each at most once in ``EVERY`` seconds.
+
+    Texts on one subject that differ in numbers only are the same warning.
 
     Args:
         node: The node; its log goes to ``/rosout`` too.
@@ -24,13 +30,15 @@ class ThrottledLog:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._logged: dict[str, float] = {}
+        self._logged: dict[tuple[str, str], float] = {}
         self.count = 0
 
     def warn(self, subject: str, text: str) -> None:
-        """Log a warning, unless one on the subject was logged a moment ago."""
+        """Log a warning, unless the same one on the subject was logged a moment ago."""
         self.count += 1
-        now = time.monotonic()
-        if now - self._logged.get(subject, float("-inf")) >= EVERY:
-            self._logged[subject] = now
+        now, warning = time.monotonic(), (subject, _NUMBER.sub("#", text))
+        if now - self._logged.get(warning, float("-inf")) >= EVERY:
+            if len(self._logged) >= KEPT:
+                self._logged.clear()
+            self._logged[warning] = now
             self._node.log.warning("%s", text)

@@ -16,6 +16,7 @@ from rce.ros.node import Node, run
 from rce.ros.tf import TransformListener
 from rce.ros.tf.exceptions import TransformError
 from rce_fleet.geometry.poses import Pose
+from rce_fleet.localization.jumps import OdometryWatch
 from rce_fleet.navigation.costmap.footprint import Footprint
 from rce_fleet.navigation.safety.limiter import STANDING, VelocityLimiter, Verdict
 from rce_fleet.navigation.safety.parameters import SafetyParameters
@@ -54,6 +55,9 @@ class VelocityLimiterNode:
         self._odometry: list[tuple[float, Pose]] = []
         self._last = Verdict(STANDING)
         self._limited = 0
+        self._watch = OdometryWatch()
+        self._faults: dict[str, str] = {}
+        """Why the last scan and the last odometry cannot be used."""
         self._tf: TransformListener
         self._out: Publisher
         self._stopped: Publisher
@@ -83,21 +87,30 @@ class VelocityLimiterNode:
     # What comes in
 
     def _take_command(self, message: Message) -> None:
-        self._limiter.take_command(read_twist(message), self._node.time())
+        twist = read_twist(message)
+        if not (isfinite(twist.speed) and isfinite(twist.turn_rate)):
+            self._throttled_log.warn(
+                "command", f"a command of {twist.speed} m/s and {twist.turn_rate} rad/s is taken for a stop"
+            )
+        self._limiter.take_command(twist, self._node.time())
         self._pass_on()
 
     def _take_odometry(self, message: Message) -> None:
         try:
             pose = read_pose(message.pose.pose)
         except ValueError as error:
-            self._throttled_log.warn("odom", f"odometry is ignored: {error}")
+            self._refuse("odom", f"odometry is ignored: {error}")
             return
         stamp, now = message.header.stamp.to_sec(), self._node.time()
         fault = fault_of_stamp(stamp, now, self._parameters.transform_timeout)
         if fault:
-            self._throttled_log.warn("odom", f"odometry is ignored: {fault}")
+            self._refuse("odom", f"odometry is ignored: {fault}")
             return
+        jump = self._watch.check(pose, stamp)
+        if jump:
+            self._throttled_log.warn("jump", f"{jump}; what was seen before is forgotten")
         self._limiter.take_pose(pose, stamp)
+        self._faults.pop("odom", None)
         self._odometry.append((stamp, pose))
         del self._odometry[:-200]
 
@@ -118,8 +131,9 @@ class VelocityLimiterNode:
         except TransformError as error:
             fault = fault or str(error)
         if fault:
-            self._throttled_log.warn("scan", f"a scan of {self._node.resolve('scan')} is ignored: {fault}")
+            self._refuse("scan", f"a scan of {self._node.resolve('scan')} is ignored: {fault}")
             return
+        self._faults.pop("scan", None)
         assert at is not None
         ranges = np.asarray(message.ranges, np.float64)
         with np.errstate(invalid="ignore"):
@@ -127,6 +141,10 @@ class VelocityLimiterNode:
             ranges = np.where(ranges < limits[0], np.nan, ranges)
         sensor = Pose.from_array(sensor_pose(at, pose_of(mounted.transform)))
         self._limiter.take_scan(Scan(stamp, sensor, ranges, angles[0], angles[2], limits[0]))
+
+    def _refuse(self, subject: str, text: str) -> None:
+        self._faults[subject] = text
+        self._throttled_log.warn(subject, text)
 
     def _pose_at(self, stamp: float) -> Pose | None:
         """Return the odometry nearest to a time."""
@@ -168,9 +186,12 @@ class VelocityLimiterNode:
         level = Level.OK if not verdict.stopped or idle else Level.ERROR
         scan = self._limiter.seen.newest
         age = self._node.time() - scan.stamp if scan is not None else float("inf")
+        reason = verdict.reason or "commands pass"
+        if verdict.stopped and not self._limiter.emergency:
+            reason = "; ".join((reason, *self._faults.values()))
         diagnostics.publish(
             level,
-            verdict.reason or "commands pass",
+            reason,
             {
                 "speed": f"{verdict.twist.speed:.3f}",
                 "turn rate": f"{verdict.twist.turn_rate:.3f}",
