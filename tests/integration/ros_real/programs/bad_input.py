@@ -1,5 +1,5 @@
 # ruff: noqa: ANN001, ANN003, ANN201, ANN204, T201, PLR0124 - runs with the Python of a real ROS, without types
-# mypy: ignore-errors  # for the same reason: a real ROS's messages have no stubs
+# mypy: ignore-errors
 """Sends a node's bad input from outside, and prints what the node says: rospy of a real ROS."""
 
 import json
