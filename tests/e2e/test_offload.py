@@ -82,8 +82,9 @@ class Judge:
 
     def _take_pose(self, message: Message) -> None:
         place, stamp = message.pose.pose.position, message.header.stamp.to_sec()
-        nearest = min(self._truth, key=lambda known: abs(known - stamp))
-        x, y = self._truth[nearest]
+        if not self._truth:  # the latched pose came first; the robot has not been driving yet
+            return
+        x, y = self._truth[min(self._truth, key=lambda known: abs(known - stamp))]
         self.localized.append((stamp, hypot(place.x - x, place.y - y)))
 
 
