@@ -207,3 +207,49 @@ async def test_bad_input_is_told_and_the_node_lives() -> None:
         await world.until(
             lambda: any("mapping" in status.name for state in world.states for status in state.status)
         )
+
+
+async def test_a_saved_map_is_loaded_again(tmp_path: Path) -> None:
+    """The map of one run: the next one localizes in it and leaves it as it is, or loads it on request."""
+    values: dict[str, Any] = {"map_file": str(tmp_path / "hall.npz"), "use_odom_topic": True}
+    async with AsyncExitStack() as stack:
+        world = World(stack)
+        await world.start(values)
+        robot = Robot(world.judge, "", ONE, 1)
+        await robot.start()
+        await world.drive(robot)
+        saved = (await world.call("/slam_graph/save_map")).message
+        assert "keyscans to" in saved
+    async with AsyncExitStack() as stack:
+        world = World(stack)
+        await world.start({**values, "localize_only": True, "initial_pose": [0.0, 0.0, 0.0]})
+        robot = Robot(world.judge, "", ONE, 3)
+        await robot.start()
+        await world.drive(robot)
+        assert await world.error_of(robot, ONE[0]) < 0.1
+        assert (await world.call("/slam_graph/save_map")).message == saved
+    async with AsyncExitStack() as stack:
+        world = World(stack)
+        await world.start(values)
+        assert not world.maps
+        loaded = await world.call("/slam_graph/load_map")
+        assert loaded.success, loaded.message
+        assert loaded.message.split()[1] == saved.split()[1]  # so many keyscans
+        await world.until(lambda: world.maps)
+        wall = compose(inverse(ONE[0]), (3.0, 0.0, 0.0))
+        grid = read_map(world.maps[-1])
+        row, column = grid.world_to_cell(wall[:2])
+        assert grid.data[row - 2 : row + 3, column].max() == 100
+
+
+async def test_a_new_map_can_begin_at_a_given_pose() -> None:
+    async with AsyncExitStack() as stack:
+        world = World(stack)
+        await world.start({"use_odom_topic": True, "initial_pose": [float(value) for value in ONE[0]]})
+        robot = Robot(world.judge, "", ONE[:20], 1)
+        await robot.start()
+        await world.drive(robot)
+        assert await world.error_of(robot, np.zeros(3)) < 0.1
+        await world.until(lambda: world.maps)
+        grid = read_map(world.maps[-1])
+        assert grid.values_at(ONE[:20, :2]).max() == 0
