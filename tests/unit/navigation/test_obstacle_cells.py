@@ -82,6 +82,15 @@ def test_another_robot_is_not_reported() -> None:
     assert watch_for(CellWatch(fleet(), WatchParameters()), seen, 1.0, held=(6,)).blocked == ()
 
 
+def test_a_robot_that_left_its_cell_unseen_is_not_reported() -> None:
+    """A box hides the cell when the other robot drives on; what was seen there was that robot."""
+    robot = np.array(((2.5, 1.5, 0.35),))
+    in_between = (1.2, 1.1, 1.4, 1.9)
+    watch = CellWatch(fleet(), WatchParameters())
+    watch_for(watch, look(HERE, discs=robot), 1.0, held=(6,))
+    assert 6 not in watch_for(watch, look(HERE, in_between), 3.0).blocked
+
+
 def test_what_is_on_the_map_is_not_reported() -> None:
     picture = np.zeros((80, 80), np.int8)
     picture[24:36, 44:56] = 100
