@@ -135,6 +135,7 @@ class ProgramGroup:
         stop_last: bool = False,
         restartable: bool = False,
         again: Sequence[str] | None = None,
+        again_after: str = "",
     ) -> Program:
         """Start a program.
 
@@ -145,16 +146,20 @@ class ProgramGroup:
             stop_last: Other programs need it while they stop: stop it after them.
             restartable: It can be restarted while the others run; see :meth:`enable_restarts`.
             again: Its command line when it is restarted; None: the same.
+            again_after: Text of a line that it must have printed before that, or its first command line counts.
         """
-        lines = iter([argv])
+        first_done = asyncio.Event()
         log = (self._folder / f"{name}.log").open("a", encoding="utf-8", buffering=1)
 
         def show(line: str) -> None:
             log.write(f"{line}\n")
             self._show(f"[{name}] {line}")
+            if again_after in line:
+                first_done.set()
 
         async def begin() -> Child:
-            return await Child.start(name, next(lines, again or argv), env=env)
+            words = again if again is not None and first_done.is_set() else argv
+            return await Child.start(name, words, env=env)
 
         program = Program(name, begin, show, stop_last=stop_last, restartable=restartable)
         with contextlib.ExitStack() as stack:

@@ -112,6 +112,7 @@ async def start_robot(
         env=environment(config, graph.uri),
         restartable=True,
         again=[*argv, "stored_pose:=true"],
+        again_after=": started",  # before that, the launch has set no parameters
     )
 
 
