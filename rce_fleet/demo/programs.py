@@ -146,7 +146,7 @@ class ProgramGroup:
             stop_last: Other programs need it while they stop: stop it after them.
             restartable: It can be restarted while the others run; see :meth:`enable_restarts`.
             again: Its command line when it is restarted; None: the same.
-            again_after: Text of a line that it must have printed before that, or its first command line counts.
+            again_after: Text of a line that it must have printed before; else its first command line counts.
         """
         first_done = asyncio.Event()
         log = (self._folder / f"{name}.log").open("a", encoding="utf-8", buffering=1)
