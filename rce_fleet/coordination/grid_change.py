@@ -78,7 +78,7 @@ def next_planner(planner: FleetPlanner, grid: GridMap, now: float) -> tuple[Flee
 
 def carried_cells(old: GridMap, new: GridMap, cells: Iterable[int]) -> set[int]:
     """Return the cells of a new grid that overlap cells of an old one."""
-    points = 2 * ceil(old.cell_size / new.cell_size) + 2
+    points = 4 * ceil(old.cell_size / new.cell_size) + 5
     inside = [-0.5 + _INSET + (1 - 2 * _INSET) * index / (points - 1) for index in range(points)]
     found = set()
     for cell in cells:

@@ -124,12 +124,15 @@ def test_every_point_of_a_blocked_cell_is_carried(
     """Points drawn within the cell, but not at its very edge, are in carried cells or outside of the grid."""
     old, new = GridMap(), GridMap(20, 20, size, origin=(x, -2.0), yaw=yaw)
     carried = carried_cells(old, new, [cell])
+    corners = [new.point(row, column) for row in (0, 20) for column in (0, 20)]
+    if any(old.cell_at(*corner) == cell for corner in corners):
+        return  # the tip of the grid may lie between two of the points that are looked at
     row, column = old.place(cell)
     reach = size / 4  # a corner of a new cell may reach between two of the points that are looked at
     for up, along in np.random.default_rng(seed).uniform(0, 1, (20, 2)):
         at = old.point(row + up, column + along)
         touched = new.cells_touched(*at, reach)
-        assert not touched or touched & carried
+        assert new.cell_at(*at) is None or touched & carried
 
 
 @pytest.mark.parametrize("size", [1.0, 0.5, 2.0])
