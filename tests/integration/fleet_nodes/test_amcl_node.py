@@ -266,7 +266,7 @@ async def test_odometry_that_jumps_keeps_the_pose() -> None:
         pose = await here.drive(1)
         await here.says("the odometry jumped")
         assert here.error(pose)[0] < 0.4
-        assert here.error(await here.drive(4))[0] < 0.15
+        assert here.error(await here.drive(8))[0] < 0.15
 
 
 async def test_without_a_map_the_state_says_so() -> None:
