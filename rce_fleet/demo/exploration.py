@@ -112,8 +112,7 @@ async def explore(
     made = await asyncio.to_thread(without_robots, drawn, others)
     await asyncio.to_thread(save_map, made, config.map_file.with_suffix(""))
     agreement = compare_maps(made, load_map(config.true_map_file))
-    # Robots stand at their docks: these cells are free, whatever the map shows of them.
-    blocked = tuple(sorted(grid_of(made, config).difference(config.scenario.starts)))
+    blocked = tuple(sorted(grid_of(made, config)))
     explored = Explored(listening.seconds, agreement, pose, blocked)
     say(
         f"the floor is explored in {explored.seconds:.0f} s: {100 * agreement.explored:.1f} % of it is known,"
@@ -123,9 +122,12 @@ async def explore(
 
 
 def grid_of(made: OccupancyMap, config: DemoConfig) -> frozenset[int]:
-    """Return the blocked cells of the fleet's grid over a map."""
+    """Return the blocked cells of the fleet's grid over a map.
+
+    Robots stand at their docks: these cells are free, whatever the map shows of them.
+    """
     grid = config.scenario.grid
-    return fleet_grid(
+    blocked = fleet_grid(
         made,
         grid.cell_size,
         origin=Pose(*grid.origin, grid.yaw),
@@ -133,6 +135,7 @@ def grid_of(made: OccupancyMap, config: DemoConfig) -> frozenset[int]:
         columns=grid.columns,
         blocked_share=BLOCKED_SHARE,
     ).blocked
+    return blocked.difference(config.scenario.starts)
 
 
 def without_robots(drawn: OccupancyMap, docks: Iterable[tuple[float, float]]) -> OccupancyMap:

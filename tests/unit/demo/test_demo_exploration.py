@@ -49,6 +49,15 @@ def test_the_grid_has_the_walls_and_boxes_of_the_map(tmp_path: Path) -> None:
     assert grid_of(OccupancyMap(noisy, made.resolution, made.origin), config) == expected
 
 
+def test_the_cell_of_a_dock_is_never_blocked(tmp_path: Path) -> None:
+    """A robot that hid its surroundings from the explorer can leave its dock."""
+    config = config_in(tmp_path)
+    data = np.full((160, 160), 100, np.int8)
+    data[:20, :20] = 0  # only one cell is free
+    blocked = grid_of(OccupancyMap(data, 0.05), config)
+    assert blocked == frozenset(range(1, 64)).difference(config.scenario.starts)
+
+
 def test_robots_at_their_docks_are_not_on_the_map() -> None:
     data = np.zeros((60, 60), np.int8)
     data[28:33, 28:33] = 100
