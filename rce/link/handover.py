@@ -17,6 +17,7 @@ import contextlib
 import logging
 import os
 import socket
+from functools import partial
 from typing import TYPE_CHECKING
 
 from rce.aio.tasks import BackgroundTasks
@@ -33,6 +34,8 @@ _log = logging.getLogger(__name__)
 
 _BUSY_PAUSE = 0.1
 """Seconds to wait after the system refused to accept, for example because file descriptors ran out."""
+_BACKLOG = 512
+"""Connections that the system keeps until they are accepted."""
 _FD = array.array("i")
 
 
@@ -191,6 +194,7 @@ class LinkAcceptor:
         self._routes: dict[str, HandoverSender] = {}
         self._assigned = asyncio.Condition()
         self._sockets: list[socket.socket] = []
+        self._pauses: dict[socket.socket, asyncio.TimerHandle] = {}
         self._scope = BackgroundTasks()
 
     async def listen(self, host: str, port: int) -> int:
@@ -203,10 +207,10 @@ class LinkAcceptor:
         Returns:
             The port taken.
         """
-        sock = socket.create_server((host, port), backlog=512)
+        sock = socket.create_server((host, port), backlog=_BACKLOG)
         sock.setblocking(False)
         self._sockets.append(sock)
-        self._scope.spawn(self._accept(sock), name=f"link acceptor on port {port}")
+        self._begin_accepting(sock)
         taken: int = sock.getsockname()[1]
         return taken
 
@@ -232,37 +236,53 @@ class LinkAcceptor:
 
     async def close(self) -> None:
         """Stop accepting; connections that were not handed over are closed."""
-        await self._scope.close()
+        for pause in self._pauses.values():
+            pause.cancel()
+        self._pauses.clear()
         for sock in self._sockets:
+            asyncio.get_running_loop().remove_reader(sock)
             sock.close()
         self._sockets.clear()
+        await self._scope.close()
 
     def _forget(self, sender: HandoverSender) -> None:
         for link in [link for link, target in self._routes.items() if target is sender]:
             del self._routes[link]
 
-    async def _accept(self, sock: socket.socket) -> None:
+    def _accept(self, sock: socket.socket) -> None:
+        """Accept the connections that wait; called by the event loop.
+
+        ``loop.sock_accept`` would lose a connection if it were cancelled just after it accepted.
+        """
         loop = asyncio.get_running_loop()
-        while True:
+        for _ in range(_BACKLOG):
             try:
-                connection, peer = await loop.sock_accept(sock)
+                connection, peer = sock.accept()
+            except (BlockingIOError, InterruptedError, ConnectionAbortedError):
+                return
             except OSError as error:
                 _log.warning("cannot accept a link: %s", error)
-                await asyncio.sleep(_BUSY_PAUSE)
-                continue
-            self._scope.spawn(self._receive(connection, address_of(peer)), name="link to hand over")
+                loop.remove_reader(sock)
+                self._pauses[sock] = loop.call_later(_BUSY_PAUSE, self._begin_accepting, sock)
+                return
+            connection.setblocking(False)
+            task = self._scope.spawn(self._receive(connection, address_of(peer)), name="link to hand over")
+            task.add_done_callback(partial(_close, connection))  # also if it is cancelled before it begins
+
+    def _begin_accepting(self, sock: socket.socket) -> None:
+        self._pauses.pop(sock, None)
+        asyncio.get_running_loop().add_reader(sock, self._accept, sock)
 
     async def _receive(self, connection: socket.socket, address: str) -> None:
         """Pass a connection on, if there is room for it; one that must make room is cancelled."""
         task = asyncio.current_task()
         assert task is not None
-        with connection:
-            guest = self.lobby.enter(address, task.cancel)
-            if guest is not None:
-                try:
-                    await self._pass_on(connection)
-                finally:
-                    guest.leave()
+        guest = self.lobby.enter(address, task.cancel)
+        if guest is not None:
+            try:
+                await self._pass_on(connection)
+            finally:
+                guest.leave()
 
     async def _pass_on(self, connection: socket.socket) -> None:
         try:
@@ -292,3 +312,7 @@ class LinkAcceptor:
                 return self._routes[link]
         except TimeoutError as error:
             raise LinkRefusedError(f"unknown link {link!r}") from error
+
+
+def _close(sock: socket.socket, _: asyncio.Task[None]) -> None:
+    sock.close()

@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 ADDRESS = "127.0.0.1"
 FEW = 8
 MANY = 40
-QUICK = LinkTimeouts(unknown_link=0.2)
+TIMEOUTS = LinkTimeouts(unknown_link=2.0)
+"""Refusals of unknown links come later than those for want of room."""
 GO = web.AppKey("go", asyncio.Event)
 
 
@@ -179,7 +180,7 @@ async def test_task_sets_come_in(monkeypatch: pytest.MonkeyPatch) -> None:
 async def test_links_are_answered(way: str, first: bytes) -> None:
     limits = LinkLimits(unauthenticated_per_address=FEW)
     async with AsyncExitStack() as stack:
-        hub = LinkHub("here", QUICK, limits)
+        hub = LinkHub("here", TIMEOUTS, limits)
         stack.push_async_callback(hub.close)
         if way == "hub":
             port = await hub.listen_tcp(ADDRESS, 0)
@@ -189,7 +190,7 @@ async def test_links_are_answered(way: str, first: bytes) -> None:
             sender, receiver = HandoverSender(ours), HandoverReceiver(theirs, hub.adopt)
             stack.callback(sender.close)
             stack.push_async_callback(receiver.close)
-            acceptor = LinkAcceptor(QUICK, limits)
+            acceptor = LinkAcceptor(TIMEOUTS, limits)
             stack.push_async_callback(acceptor.close)
             await acceptor.assign(sender, ["L"])
             port = await acceptor.listen(ADDRESS, 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import socket
 import stat
@@ -211,3 +212,17 @@ def test_links_work_under_uvloop(way: str, folder: Path) -> None:
                 assert await a.fakes["i3"].port.call(b"a" * size) == b"A" * size
 
     uvloop.run(run())
+
+
+@pytest.mark.parametrize("steps", range(5))
+async def test_acceptor_that_ends_closes_new_connections(steps: int) -> None:
+    """However far the event loop has come with a connection when the acceptor closes."""
+    acceptor = LinkAcceptor(TIMEOUTS)
+    port = await acceptor.listen("127.0.0.1", 0)
+    with socket.create_connection(("127.0.0.1", port)) as client:
+        for _ in range(steps):
+            await asyncio.sleep(0)
+        await acceptor.close()
+        client.setblocking(False)
+        with contextlib.suppress(ConnectionResetError):
+            assert await asyncio.wait_for(asyncio.get_running_loop().sock_recv(client, 1), 10) == b""
