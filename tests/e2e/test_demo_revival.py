@@ -29,9 +29,17 @@ async def reaches(station: StationClient, robot: str, cell: int) -> None:
             await asyncio.sleep(0.5)
 
 
+async def knows_robots(station: StationClient, count: int) -> bool:
+    with contextlib.suppress(StationError):
+        robots = (await station.fleet()).robots
+        return len([robot for robot in robots if robot.cell is not None]) == count
+    return False
+
+
 async def test_killed_parts_return_killed_world_is_named() -> None:
     async with running_demo("--robots", 2, "--no-auto") as demo, aiohttp.ClientSession() as session:
         station = StationClient(session, demo.page)
+        await until(lambda: knows_robots(station, 2), timeout=90, what="the planner knows the robots")
         fleet = await station.fleet()
         robot = fleet.robots[0]
         assert fleet.map is not None
