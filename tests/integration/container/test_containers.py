@@ -166,7 +166,7 @@ async def test_parameters_arguments_and_environment(machine: Machine) -> None:
     )
     async with machine.engine():
         await machine.put(BOX, nodes=(check,))
-        found = await machine.log_holds(BOX, "node", "hello")
+        found = await machine.log_holds(BOX, "node", "Robot1\n")
         assert found.split("\n")[0] == f"hello a b {machine.packages}/own __name:=talker __ns:=/Robot1"
 
 
