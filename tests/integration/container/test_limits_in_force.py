@@ -138,7 +138,8 @@ async def test_a_fork_bomb_stops_at_the_limit(packages: Machine) -> None:
     async with machine.engine(slot_processes=40):
         await machine.put(OTHER, nodes=(NodeSpec(tag="talk", pkg="own", exe="talk.py"),))
         await machine.put(BOX, nodes=(greedy("bomb"),))
-        text = await machine.log_holds(BOX, "bomb", "made")
+        await machine.log_holds(BOX, "bomb", "made")
+        text = await machine.log_holds(BOX, "bomb", "\n")
         assert 0 < int(text.split("made")[1].split()[0]) < 40
         text = "its limit of 40 processes and threads is reached"
         await until(lambda: any(text in fault for fault in machine.faults))
