@@ -35,6 +35,7 @@ async def run(plan: Plan, prepared: Mapping[str, Prepared]) -> int:
 
     for number in end_signals():
         asyncio.get_running_loop().add_signal_handler(number, stop)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, end_signals())
     for line in plan.warnings:
         _complain(line)
     faults: tuple[BaseException, ...] = ()
@@ -44,6 +45,8 @@ async def run(plan: Plan, prepared: Mapping[str, Prepared]) -> int:
                 await supervisor.run(lambda: _say("\n".join(plan.ready)))
         except* (StartError, OSError, CertificateError) as group:
             faults = group.exceptions
+        finally:
+            supervisor.drop_unused()
     for fault in faults:
         _complain(f"rce up: {fault}")
     return 1 if faults else 0
@@ -71,6 +74,8 @@ def _complain(line: str) -> None:
 def main() -> int:
     """Run the plan whose file is the first argument; returns the exit code."""
     try:
+        # Until the loop handles them: a signal would leave forks that end a moment after this process.
+        signal.pthread_sigmask(signal.SIG_BLOCK, end_signals())
         plan = Plan.take_over(int(sys.argv[1]))
         return uvloop.run(run(plan, prepare(plan.programs, plan.shared)))
     except KeyboardInterrupt:  # before signals are handled: nothing runs yet

@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import gc
 import os
+import signal
 import sys
 import threading
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from rce.own_process import end_signals
 from rce.supervision.process import MAX_LINE, VARIABLES, end_with
 from rce.supervision.title import set_title
 
@@ -42,8 +44,12 @@ class Prepared:
 
     def drop(self) -> None:
         """End it before it has begun. Blocks for a moment."""
-        os.close(self.go)
         os.close(self.output)
+        self.withdraw()
+
+    def withdraw(self) -> None:
+        """End it before it has begun; its output belongs to another owner. Blocks for a moment."""
+        os.close(self.go)
         os.waitpid(self.pid, 0)
 
 
@@ -105,6 +111,7 @@ def _fork(program: Program) -> Prepared:
 def _become(program: Program, parent: int, wait: int, print_: int) -> NoReturn:
     os.setsid()
     end_with(parent)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, end_signals())
     nothing = os.open(os.devnull, os.O_RDONLY)
     for fd, number in ((nothing, 0), (print_, 1), (print_, 2)):
         os.dup2(fd, number)
@@ -139,9 +146,15 @@ class ForkedProcess:
     async def begin(cls, prepared: Prepared) -> ForkedProcess:
         """Tell a fork to become its program."""
         stdout = asyncio.StreamReader(limit=MAX_LINE)
-        await asyncio.get_running_loop().connect_read_pipe(
-            lambda: asyncio.StreamReaderProtocol(stdout), os.fdopen(prepared.output, "rb", 0)
-        )
+        pipe = os.fdopen(prepared.output, "rb", 0)
+        try:
+            await asyncio.get_running_loop().connect_read_pipe(
+                lambda: asyncio.StreamReaderProtocol(stdout), pipe
+            )
+        except BaseException:
+            pipe.close()
+            prepared.withdraw()
+            raise
         process = cls(prepared.pid, stdout)
         with contextlib.suppress(BrokenPipeError):  # it was killed; its end is noticed as for all processes
             os.write(prepared.go, _GO)

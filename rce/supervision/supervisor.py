@@ -48,6 +48,11 @@ class Supervisor:
         for child in self._children():
             child.hurry()
 
+    def drop_unused(self) -> None:
+        """End the forks whose programs have not been started. Blocks for a moment."""
+        while self._prepared:
+            self._prepared.popitem()[1].drop()
+
     async def run(self, on_ready: Callable[[], None]) -> None:
         """Start all programs, call ``on_ready`` once all are up, and keep them up until cancelled.
 
