@@ -66,7 +66,7 @@ class PlannerListener(Protocol):
 
 
 Call: TypeAlias = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
-"""Calls a service of the planner; raises :class:`PlannerUnavailableError` if there is no answer."""
+"""Calls a service of the planner; raises :class:`PlannerUnavailableError` if none answers."""
 
 
 class PlannerClient(ABC):

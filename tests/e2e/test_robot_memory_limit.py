@@ -98,7 +98,7 @@ async def requests_without_answer(engine: Engine) -> None:
             task.cancel()
 
 
-async def topics_that_nobody_reads(engine: Engine) -> None:
+async def topics_without_readers(engine: Engine) -> None:
     """100 messages of 5 MB to each of five robots that read nothing."""
     async with contextlib.AsyncExitStack() as stack:
         source = await stack.enter_async_context(robot(engine, "source"))
@@ -196,7 +196,7 @@ def _established(engine: Engine) -> int:
     ("attack", "limit_mb"),
     [
         (requests_without_answer, LIMIT_MB),
-        (topics_that_nobody_reads, LIMIT_MB),
+        (topics_without_readers, LIMIT_MB),
         (halves, LIMIT_MB),
         (large_texts, LIMIT_MB),
         # Nothing is given up here, which would collect garbage: fewer than these are held.

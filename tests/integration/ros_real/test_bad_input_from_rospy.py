@@ -42,8 +42,6 @@ NODES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "slam_gmapping": ("gmapping", "slam_gmapping", {"particles": 2}),
     "slam_graph": ("slam_graph", "slam_graph", {}),
 }
-WRONG = {"amcl": "max_particles", "velocity_limiter": "frequency", "slam_gmapping": "particles"}
-"""Parameters that get a value out of range: the default is used."""
 
 
 @pytest.mark.parametrize("name", NODES)

@@ -34,7 +34,7 @@ def test_a_silent_node_is_stuck_until_it_beats_again() -> None:
     assert world.told == ["node a is stuck: no message on /beat any more"]
     assert world.core.is_degraded
     world.wait(100)
-    assert not world.halting, "nobody asked for it to be restarted"
+    assert not world.halting, "no restart was asked for"
     world.do(e.Beat("a"))
     assert (world.status().state, world.core.is_degraded) == (NodeState.RUNNING, False)
     world.wait(2.0)
