@@ -29,6 +29,7 @@ $(STAMP): requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	$(BIN)/rce compile
 	@touch $@
 
 demo: install
@@ -76,4 +77,5 @@ lock:
 
 clean:
 	rm -rf $(VENV) artifacts build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis benchmarks/results
+	rm -rf rce_fleet/__compiled__
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

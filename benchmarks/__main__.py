@@ -33,13 +33,16 @@ Rows = list[dict[str, Any]]
 
 ROOT = Path(__file__).resolve().parent.parent
 
-OF_ROBOTS = (
-    ("localization", "--only", "update"),
-    ("navigation", "--only", "plan"),
-    ("simulation", "--quick"),
-    ("mapping", "--only", "intel", "--scans", "400"),
-)
-"""Other programs with short figures of the part ``robots``; each prints and saves its own."""
+OTHERS = {
+    "robots": (
+        ("localization", "--only", "update"),
+        ("navigation", "--only", "plan"),
+        ("simulation", "--quick"),
+        ("mapping", "--only", "intel", "--scans", "400"),
+    ),
+    "fleet": (("light",), ("fleet",), ("traffic",), ("assignment",), ("planning",)),
+}
+"""Other programs by part; each prints and saves its own figures. ``fleet`` needs no engine."""
 
 
 def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awaitable[Rows]]]]:
@@ -85,22 +88,32 @@ def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awa
     }
 
 
-async def measure(names: list[str], *, quick: bool, runtime: str) -> None:
-    """Run the chosen suites on one engine."""
+async def measure_engine(
+    chosen: dict[str, tuple[str, Callable[[RunningEngine], Awaitable[Rows]]]], runtime: str
+) -> None:
+    """Run suites on one engine."""
     results: dict[str, Rows] = {}
-    chosen = suites(quick=quick)
     async with engine(runtime) as running:
-        for name in names or chosen:
-            title, suite = chosen[name]
+        for name, (title, suite) in chosen.items():
             rows = await suite(running)
             show(title, rows)
             results[name] = rows
             if name == "roundtrip":
                 print("plot:", plot_round_trips(rows))
     print("results:", save("engine", results))
-    if "robots" in results:
-        for program, *options in OF_ROBOTS:
-            argv = [sys.executable, "-m", f"benchmarks.{program}", *options]
+
+
+async def measure(names: list[str], *, quick: bool, runtime: str) -> None:
+    """Run the chosen suites, and the programs that belong to them."""
+    chosen = suites(quick=quick)
+    parts = names or [*chosen, "fleet"]
+    of_engine = [name for name in parts if name in chosen]
+    if of_engine:
+        await measure_engine({name: chosen[name] for name in of_engine}, runtime)
+    for part in parts:
+        for program, *options in OTHERS.get(part, ()):
+            short = ["--quick"] if quick and part == "fleet" else []
+            argv = [sys.executable, "-m", f"benchmarks.{program}", *options, *short]
             other = await asyncio.create_subprocess_exec(*argv, cwd=ROOT)
             if await other.wait():
                 print(f"benchmarks.{program} {' '.join(options)} failed", file=sys.stderr)
@@ -110,7 +123,9 @@ def main() -> None:
     """Read the command line and measure."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer sizes, clients and seconds")
-    parser.add_argument("--only", nargs="+", choices=suites(quick=True), default=[], metavar="NAME")
+    parser.add_argument(
+        "--only", nargs="+", choices=[*suites(quick=True), "fleet"], default=[], metavar="NAME"
+    )
     parser.add_argument("--runtime", default="auto", choices=("auto", "namespace", "process"))
     options = parser.parse_args()
     uvloop.run(measure(options.only, quick=options.quick, runtime=options.runtime))

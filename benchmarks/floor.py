@@ -20,14 +20,13 @@ from rce_fleet.localization.scan import LaserScan
 from rce_fleet.simulation.box import BoxSpec
 from rce_fleet.simulation.map_walls import draw_map
 from rce_fleet.simulation.walkers import WalkerSpec
-from rce_fleet.simulation.walls import Walls
+from rce_fleet.simulation.walls import Point, Walls
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
-    from rce_fleet.simulation.walls import Point
 
 TICK = 0.02
 """Step of the world, seconds."""

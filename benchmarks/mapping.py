@@ -4,7 +4,8 @@ Needs the folder of public logs (``RCE_DATA``). Scores are those of the data's `
 against published reference poses, with dead reckoning beside them. ``walls x`` is the number of occupied
 cells of 5 cm over that of the map drawn with the reference's poses. ``scans/s`` is by processor time, reading
 included. ``amcl`` follows the robot on the map that ``gmapping`` made of the same log. ``--figures DIR``
-draws the maps beside each other.
+draws the maps beside each other. ``--split N`` only maps each log as if N robots had driven its parts at
+the same time: ``slam_graph`` has to find where they meet, and their trajectories are scored as one.
 """
 
 from __future__ import annotations
@@ -128,6 +129,33 @@ def run(mapper: Mapper, records: list[LaserRecord]) -> tuple[Poses, float]:
     return mapper.trajectory(), process_time() - begin
 
 
+def measure_split(name: str, count: int, number: int | None) -> Row:
+    """Map one log with several robots, each of which drives a part of it; return the row."""
+    records = read_log(data() / "lidar" / f"{name}.raw.log.gz").records[:number]
+    parts = [part.tolist() for part in np.array_split(np.arange(len(records)), count)]
+    robots = [f"robot {index}" for index in range(count)]
+    mapper = GraphMapper()
+    begin = process_time()
+    joined_after = 0
+    for step in range(max(map(len, parts))):
+        for robot, part in zip(robots, parts, strict=True):
+            if step < len(part):
+                mapper.add(records[part[step]], robot)
+        if not all(map(mapper.is_joined, robots)):
+            joined_after = step + 1
+    mapper.finish()
+    seconds = process_time() - begin
+    poses = np.concatenate([mapper.trajectory(robot) for robot in robots])
+    return {
+        "log": name,
+        "robots": count,
+        "joined": sum(map(mapper.is_joined, robots)),
+        "joined after scans": joined_after,
+        **score(name, [record.time for record in records], poses, len(records)),
+        "scans/s": len(records) / seconds,
+    }
+
+
 def with_targets(rows: list[Row]) -> list[Row]:
     """Return the rows, and those of the targets below."""
     empty = dict.fromkeys(rows[0], "")
@@ -169,10 +197,17 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=LOGS, default=LOGS, metavar="LOG")
     parser.add_argument("--scans", type=int, help="only the first scans of each log; saves nothing")
     parser.add_argument("--figures", type=Path, help="folder for pictures of the maps")
+    parser.add_argument(
+        "--split", type=int, metavar="N", help="map with N robots that drive parts of the log"
+    )
     options = parser.parse_args()
     if not data().is_dir():
         parser.exit(1, f"the folder of public logs is absent: {data()}; set RCE_DATA\n")
     compile_kernels()
+    if options.split:
+        split = [measure_split(name, options.split, options.scans) for name in options.only]
+        show(f"Mapping with {options.split} robots", split)
+        return
     rows: list[Row] = []
     for name in options.only:
         found, maps = measure(name, options.scans)

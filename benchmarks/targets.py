@@ -43,11 +43,64 @@ def _column(column: str, **where: object) -> Callable[[Rows], float | None]:
     return read
 
 
+def _greatest(column: str, **where: object) -> Callable[[Rows], float | None]:
+    """Read the greatest value of a column in the rows in which other columns have these values."""
+
+    def read(rows: Rows) -> float | None:
+        found = [row for row in rows if all(row.get(key) == value for key, value in where.items())]
+        return max(
+            (number for row in found if (number := _number(row.get(column))) is not None), default=None
+        )
+
+    return read
+
+
 def _number(value: object) -> float | None:
     """Read a figure; texts such as ``7.6 s`` by their number."""
     return None if value is None else float(str(value).split()[0])
 
 
+_WAREHOUSE, _RANDOM = "warehouse-10-20-10-2-1", "random-32-32-20"
+_PLANS = [
+    *(
+        Target(
+            f"first plan for {robots} robots on {name}",
+            "planning.first",
+            _column("ms", map=name, robots=robots),
+            limit,
+            "ms",
+        )
+        for name, robots, limit in ((_WAREHOUSE, 1000, 150), (_WAREHOUSE, 400, 50), (_RANDOM, 400, 25))
+    ),
+    Target(
+        f"first plan for 1000 robots on {_WAREHOUSE}, cost over lower bound",
+        "planning.first",
+        _column("cost / bound, worst", map=_WAREHOUSE, robots=1000),
+        3.3,
+        "x bound",
+    ),
+    *(
+        Target(
+            f"plan for {robots} robots on {name} after 10 s, cost over lower bound",
+            "planning.anytime",
+            _column("cost / bound", map=name, robots=robots, seconds=10.0),
+            limit,
+            "x bound",
+        )
+        for name, robots, limit in ((_WAREHOUSE, 400, 1.08), (_WAREHOUSE, 1000, 1.9), (_RANDOM, 400, 2.26))
+    ),
+    *(
+        Target(
+            f"lifelong, {robots} robots on aisles-33-46, tasks by robots over distance, last seed",
+            "planning.lifelong",
+            _column("share of robots / distance", robots=robots),
+            limit,
+            "share",
+            at_least=True,
+        )
+        for robots, limit in ((100, 0.88), (140, 0.80))
+    ),
+]
 _ROUND_TRIPS = [
     Target(
         f"{path}, {size} bytes, p50",
@@ -91,6 +144,55 @@ _LOCALIZATION = [
         ("heading RMSE, median", "heading RMSE deg", 1.5, "degrees", False),
         ("NEES, most", "NEES", 6.0, "", False),
         ("NEES, least", "NEES", 1.0, "", True),
+    )
+]
+
+_MAPPING = [
+    Target(
+        f"mapping of {log} with {algorithm}: {what}",
+        "mapping.mapping",
+        _column(column, log=log, **{"with": algorithm}),
+        limit,
+        unit,
+        at_least=at_least,
+    )
+    for log in ("intel", "freiburg-079")
+    for algorithm, what, column, limit, unit, at_least in (
+        *(
+            (algorithm, what, column, limit, unit, at_least)
+            for algorithm, steps, steps_deg, revisits, revisits_deg in (
+                ("gmapping", 0.07, 1.5, 0.20, 2.0),
+                ("graph", 0.05, 1.0, 0.10, 1.0),
+            )
+            for what, column, limit, unit, at_least in (
+                ("steps", "steps m", steps, "m", False),
+                ("steps", "deg", steps_deg, "degrees", False),
+                ("revisits", "revisits m", revisits, "m", False),
+                ("revisits", "rev. deg", revisits_deg, "degrees", False),
+                ("occupied cells by those of the reference", "walls x", 1.05, "x", False),
+                ("scans a second on one core, reading included", "scans/s", 50, "/s", True),
+            )
+        ),
+        ("amcl", "aligned", "aligned m", 0.10, "m", False),
+        ("amcl", "heading over steps", "deg", 1.5, "degrees", False),
+    )
+]
+
+_EXPLORATION = [
+    Target(
+        f"exploration of the demo's floor with {algorithm}: {what}",
+        "exploration.exploration",
+        _column(column, **{"with": algorithm}),
+        limit,
+        unit,
+        at_least=at_least,
+    )
+    for algorithm in ("gmapping", "graph")
+    for what, column, limit, unit, at_least in (
+        ("free floor that is known, worst run", "explored %", 99, "%", True),
+        ("cells that are right, worst run", "right %", 99, "%", True),
+        ("error of walls, worst run", "walls mm", 25, "mm", False),
+        ("contacts", "contacts", 0, "contacts", False),
     )
 ]
 
@@ -145,6 +247,21 @@ TARGETS = [
         )
         for robots in (50, 2000)
     ),
+    *_PLANS,
+    Target(
+        "the planner's tick with 1000 robots, all in, CPU, p99",
+        "traffic.tick",
+        _column("p99 ms", robots=1000),
+        100,
+        "ms",
+    ),
+    Target(
+        "a cell is blocked: the last of 1000 robots has its new path, CPU, worst of 20",
+        "traffic.block",
+        _greatest("ms", robots=1000),
+        100,
+        "ms",
+    ),
     *(
         Target(
             f"simulated world, 100 robots with {sensor}s, one core",
@@ -155,6 +272,20 @@ TARGETS = [
             at_least=True,
         )
         for sensor in ("lidar", "camera")
+    ),
+    *(
+        Target(
+            f"1000 light robots without the engine, {what}, one core",
+            suite,
+            _column("x real time", robots=1000),
+            2.24,
+            "x real time",
+            at_least=True,
+        )
+        for what, suite in (
+            ("world alone", "light.world"),
+            ("with planner and move clients", "light.fleet"),
+        )
     ),
     Target(
         "simulated world with ROS nodes, 100 robots with lidars, one core",
@@ -191,6 +322,8 @@ TARGETS = [
         for form, limit in (("numpy", 0.8), ("compiled", 0.25))
     ),
     *_LOCALIZATION,
+    *_MAPPING,
+    *_EXPLORATION,
     Target(
         "amcl, global localization right within 30 s",
         "localization.global",

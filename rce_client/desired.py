@@ -17,6 +17,7 @@ from rce.model import (
     DestroyContainer,
     RemoveInterface,
     RemoveNode,
+    Request,
     ResizeContainer,
     SetParameter,
 )
@@ -24,7 +25,6 @@ from rce.model import (
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rce.model import Request
 
 Item = TypeVar("Item")
 

@@ -16,9 +16,16 @@ from websockets.exceptions import ConnectionClosed
 from rce.aio.backoff import Backoff
 from rce.dialing import open_url_socket
 from rce.masters import Masters
-from rce.protocol.http import FEATURES, FEATURES_HEADER, FEATURES_KEY, SINGLE_FRAME
-from rce.protocol.limits import Limits
-from rce.protocol.stream import ProtocolStream
+from rce.protocol import (
+    FEATURES,
+    FEATURES_HEADER,
+    FEATURES_KEY,
+    SINGLE_FRAME,
+    Event,
+    Frame,
+    Limits,
+    ProtocolStream,
+)
 from rce_client.discovery import VERSION, locate
 from rce_client.exceptions import ClientError, InUseError, LostError, RefusedError, UntrustedError
 from rce_client.failures import judge
@@ -29,8 +36,6 @@ if TYPE_CHECKING:
     import ssl
     from collections.abc import Callable, Sequence
 
-    from rce.protocol.codec import Frame
-    from rce.protocol.stream import Event
 
 _log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ import ssl
 
 from websockets.exceptions import InvalidHandshake, InvalidStatus, WebSocketException
 
-from rce.tls.faults import explain_to_client, find_tls_error
+from rce.tls import explain_to_client, find_tls_error
 from rce_client.exceptions import ClientError, InUseError, RefusedError, UnavailableError, UntrustedError
 
 RETRIED_STATUSES = frozenset((408, 425, 429, 500, 502, 503, 504))

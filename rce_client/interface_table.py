@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.protocol.messages import NO_ID
+from rce.protocol import NO_ID, CallId, DataMessage, ErrorReport
 from rce_client.exceptions import InterfaceError
 from rce_client.services import ServiceClient
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rce.protocol.messages import CallId, DataMessage, ErrorReport
     from rce_client.interfaces import ClientInterface
 
 _MOST_EARLY = 64

@@ -10,15 +10,12 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from rce.model import Form, InterfaceType, Role
-from rce.protocol.codec import encode_data
-from rce.protocol.messages import NO_ID
+from rce.protocol import NO_ID, DataMessage, Frame, encode_data
 
 if TYPE_CHECKING:
     import asyncio
     from collections.abc import Coroutine, Sequence
 
-    from rce.protocol.codec import Frame
-    from rce.protocol.messages import DataMessage
 
 M_contra = TypeVar("M_contra", contravariant=True)
 

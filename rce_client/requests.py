@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rce.model import (
@@ -19,13 +19,13 @@ from rce.model import (
     ParameterSpec,
     RemoveInterface,
     RemoveNode,
+    Request,
     ResizeContainer,
     SetParameter,
 )
 from rce.model.spelling import PLAIN
 
 if TYPE_CHECKING:
-    from rce.model import Request
     from rce.model.written import NetworkName, Quantity, RestartName, Value
 
 
@@ -58,6 +58,7 @@ class Requests(ABC):
         group_ip: str = "",
         image: str = "",
         special_features: Sequence[str] | str = (),
+        volumes: Sequence[Mapping[str, Quantity]] = (),
         wait: bool = False,
     ) -> None:
         """Create a container. Zero and empty values are not requested.
@@ -82,6 +83,9 @@ class Requests(ABC):
                 ``"10.0.0.2/24"``); a free one if empty.
             image: Root file system: an OCI image's name, or (administrators) the path of a folder.
             special_features: Labels that the machine must have: a sequence, or one text of words.
+            volumes: Folders that outlive the container: ``{"name": "journal", "path": "/data", "size":
+                "64M"}`` each. They are mounted read-write at ``path``; nodes also find it in the variable
+                ``RCE_VOLUME_JOURNAL``.
             wait: Wait if no machine has room; otherwise ``on_error`` gets an error text, and no container is
                 created.
 

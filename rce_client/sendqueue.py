@@ -13,7 +13,7 @@ from rce_client.exceptions import LostError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rce.protocol.codec import Frame
+    from rce.protocol import Frame
 
 
 @dataclass(frozen=True, slots=True)

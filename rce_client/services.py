@@ -9,14 +9,13 @@ import uuid
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from rce.model import Role
-from rce.protocol.messages import CallId
+from rce.protocol import CallId, DataMessage
 from rce_client.exceptions import CallError, CallTimeoutError, NotConnectedError
 from rce_client.interfaces import ClientInterface, InterfaceOwner
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rce.protocol.messages import DataMessage
 
 _log = logging.getLogger(__name__)
 
@@ -149,6 +148,9 @@ class ServiceProvider(ClientInterface, Generic[M]):
         try:
             made = self._handler(message.msg)
             answer: object = await made if inspect.isawaitable(made) else made
+        except CallError as error:  # the handler asked another service
+            _log.warning("service %s: %s", self.tag, error)
+            answer = str(error)
         except Exception as error:  # noqa: BLE001 - logged; it must not end anything else
             _log.exception("handler of service %s", self.tag)
             answer = f"{type(error).__name__}: {error}"  # a string is the engine's sign for a failure

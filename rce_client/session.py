@@ -15,17 +15,35 @@ from rce.model import (
     CreateContainer,
     DestroyContainer,
     RemoveInterface,
+    Request,
     ResizeContainer,
 )
-from rce.protocol.codec import encode
-from rce.protocol.http import LATCH, SINGLE_FRAME
-from rce.protocol.messages import DataMessage, ErrorReport, InterfaceStatus, LatchedSources
-from rce.protocol.stream import Fault, LargeData
+from rce.protocol import (
+    LATCH,
+    SINGLE_FRAME,
+    DataMessage,
+    ErrorReport,
+    Event,
+    Fault,
+    Frame,
+    InterfaceStatus,
+    LargeData,
+    LatchedSources,
+    encode,
+)
 from rce_client.desired import Desired
 from rce_client.engine_transport import EngineTransport, Target, Timing
-from rce_client.exceptions import InUseError, LostError, NotConnectedError, RefusedError, UntrustedError
+from rce_client.exceptions import (
+    ClientError,
+    InUseError,
+    LostError,
+    NotConnectedError,
+    RefusedError,
+    UntrustedError,
+)
 from rce_client.interface_table import InterfaceTable
 from rce_client.life import CONNECTION_LIFE, ConnectionEvent, State
+from rce_client.parts import parts_of
 from rce_client.reminder import Reminder
 from rce_client.sendqueue import QueueLimits
 
@@ -33,10 +51,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
     from types import TracebackType
 
-    from rce.model import Request
-    from rce.protocol.codec import Frame
-    from rce.protocol.stream import Event
-    from rce_client.exceptions import ClientError
     from rce_client.interfaces import ClientInterface
 
 _log = logging.getLogger(__name__)
@@ -132,9 +146,10 @@ class Session:
         """Send a request, and remember it for reconnects."""
         self.check_open()
         self.desired.apply(request)
-        sent = self.transport.deliver(encode(request))
-        sent.add_done_callback(partial(self._note_unsent, request))
-        await asyncio.wait((sent,))
+        for part in parts_of(request):
+            sent = self.transport.deliver(encode(part))
+            sent.add_done_callback(partial(self._note_unsent, part))
+            await asyncio.wait((sent,))
 
     def check_open(self) -> None:
         """Raise unless the program may use the connection.
@@ -233,7 +248,8 @@ class Session:
     def on_connected(self) -> None:
         """Ask again for everything that was made."""
         for request in (*self._backlog, *self.desired.restore()):
-            self.transport.post_request(encode(request))
+            for part in parts_of(request):
+                self.transport.post_request(encode(part))
         self._backlog.clear()
         event = ConnectionEvent.RESTORE if self._was_connected else ConnectionEvent.CONNECT
         self._was_connected = True

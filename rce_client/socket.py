@@ -9,7 +9,7 @@ from rce.tls.websocket import TlsClientConnection
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rce.protocol.codec import Frame
+    from rce.protocol import Frame
 
 JOIN_BELOW = 64 << 10
 """Below this many bytes a copy costs less than another system call and another packet."""

@@ -9,15 +9,13 @@ from collections import deque
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from rce.model import Role
-from rce.protocol.codec import encode
-from rce.protocol.messages import LatchedSources
+from rce.protocol import DataMessage, LatchedSources, encode
 from rce_client.exceptions import InterfaceError
 from rce_client.interfaces import ClientInterface, InterfaceOwner, LatchListener
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 
-    from rce.protocol.messages import DataMessage
 
 _log = logging.getLogger(__name__)
 

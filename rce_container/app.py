@@ -12,22 +12,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rce.config.exceptions import ShippedFileError
-from rce.config.folders import configs_dir, default_state_dir, examples_dir, run_dir
-from rce.config.secret import Secret
-from rce.control.channel import TaskSetChannel
-from rce.control.contents import ContentClient
-from rce.control.dialing import RunDialer
-from rce.control.messages import MachineInfo
-from rce.link.address import in_url, is_any, own_address
-from rce.link.handover import LinkAcceptor
-from rce.link.listening import listen_on
+from rce.config import Secret, ShippedFileError, configs_dir, default_state_dir, examples_dir, run_dir
+from rce.control import MachineInfo, VolumeLimit
+from rce.control_channel.channel import TaskSetChannel
+from rce.control_channel.contents import ContentClient
+from rce.control_channel.dialing import RunDialer
+from rce.link import LinkAcceptor, in_url, is_any, listen_on, own_address
 from rce.masters import Masters, split_addresses
 from rce.model import MEMORY_PER_SLOT
 from rce.own_process import end_signals, listening, machine_memory
 from rce.ros.packages import PackageIndex, installed_shares
+from rce.tls import Context
 from rce.tls.choice import TlsChoice
-from rce.tls.identity import Context
 from rce_container.exceptions import RuntimeUnavailableError, StateError
 from rce_container.folder import StateFolder
 from rce_container.limits import Limiter, choose_limiter
@@ -43,6 +39,7 @@ from rce_container.runtimes.podman import PodmanRuntime
 from rce_container.runtimes.process import ProcessRuntime
 from rce_container.settings import ContainerSettings
 from rce_container.uids import UidPool
+from rce_container.volumes.images import unavailable
 
 _log = logging.getLogger(__name__)
 
@@ -123,6 +120,9 @@ class App:
         if review := runtime.review(self.settings.packages):
             _log.warning("%s", review)
         detail = "; ".join(filter(None, (detail, review)))
+        limit, why = await asyncio.to_thread(find_volume_limit, runtime)
+        if why:
+            _log.info("volumes are folders that are watched: %s", why)
         offers = await asyncio.to_thread(find_offers, runtime, runtimes.values())
         await asyncio.to_thread(_compile_engine)
         keep = self.settings.log_days, self.settings.log_space
@@ -146,7 +146,7 @@ class App:
                     )
                 manager = Manager(
                     name=name,
-                    info=_machine(self.settings, offers, limiter, detail),
+                    info=_machine(self.settings, offers, limiter, detail, limit),
                     settings=self.settings,
                     runtimes=runtimes,
                     runtime=runtime,
@@ -279,7 +279,15 @@ class Quitting:
         self._let_go()
 
 
-def _machine(settings: ContainerSettings, offers: Offers, limiter: Limiter, detail: str) -> MachineInfo:
+def find_volume_limit(runtime: Runtime) -> tuple[VolumeLimit, str]:
+    """Find out how volumes are kept within their size, and why not better. Blocks."""
+    why = unavailable() if runtime.isolated else f"the runtime {runtime.name} makes no mounts"
+    return (VolumeLimit.WATCHED, why) if why else (VolumeLimit.IMAGE, "")
+
+
+def _machine(
+    settings: ContainerSettings, offers: Offers, limiter: Limiter, detail: str, volumes: VolumeLimit
+) -> MachineInfo:
     memory = machine_memory()
     cores = os.cpu_count() or 0
     ceiling = limiter.ceiling()
@@ -296,6 +304,7 @@ def _machine(settings: ContainerSettings, offers: Offers, limiter: Limiter, deta
         networks=offers.networks,
         labels=settings.labels,
         requirements=settings.requirements is not None,
+        volumes=volumes.value,
         slots=settings.slots or memory // MEMORY_PER_SLOT,
         limits=limiter.name,
         detail="; ".join(filter(None, (detail, limiter.detail, offers.detail))),

@@ -8,7 +8,7 @@ import typer
 
 from rce.cli.options import Verbose
 from rce.cli.settings import COMMON, SettingsOptions
-from rce.config.settings import EngineSettings
+from rce.config import EngineSettings
 from rce_container.program import run
 
 TLS = ("tls.enabled", "tls.certificates", "tls.name")

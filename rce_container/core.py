@@ -12,17 +12,22 @@ from typing import assert_never
 import msgspec
 
 from rce.aio.backoff import Backoff
-from rce.control.desired import DesiredState, Fit
-from rce.control.messages import Fault, Gone, PatchStatus, SpecWanted, Status
-from rce.control.model import (
+from rce.control import (
+    DesiredState,
     EndpointSpec,
     EndpointState,
     EndpointStatus,
+    Fault,
+    Fit,
+    Gone,
     LinkAddress,
+    ObservedStatus,
+    PatchStatus,
     SpecPatch,
+    SpecWanted,
+    Status,
     StatusPatch,
 )
-from rce.control.observed import ObservedStatus
 from rce.model import Resources
 from rce_container.events import (
     Adopted,

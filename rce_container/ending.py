@@ -8,12 +8,10 @@ import logging
 from collections.abc import AsyncIterator
 from pathlib import Path
 
-from rce.config.folders import run_dir
-from rce.control.contents import Piece
-from rce.control.exceptions import ContentError
-from rce.control.messages import MachineInfo
-from rce.link.handover import LinkAcceptor
-from rce.link.unix import remove_stale_sockets
+from rce.config import run_dir
+from rce.control import ContentError, MachineInfo
+from rce.control_channel.contents import Piece
+from rce.link import LinkAcceptor, remove_stale_sockets
 from rce_container.environment import proc
 from rce_container.exceptions import StateBusyError
 from rce_container.folder import StateFolder

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rce.control.messages import ToMaster
-from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, SpecPatch, StatusPatch
+from rce.control import EndpointSpec, EndpointStatus, LinkAddress, SpecPatch, StatusPatch, ToMaster
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 ContainerError
 ├── RuntimeUnavailableError   no runtime of that name works on this machine
 ├── StartError                a container could not be started
+│   └── VolumeError           a volume of it cannot be used
 ├── NetworkError              a container cannot be joined to its network
 ├── KillError                 a container could not be ended
 ├── LimitError                a limit of a container could not be put in force
@@ -32,6 +33,10 @@ class RuntimeUnavailableError(ContainerError):
 
 class StartError(ContainerError):
     """A container could not be started; the text says what to do."""
+
+
+class VolumeError(StartError):
+    """A volume of a container cannot be used; the text says what to do."""
 
 
 class NetworkError(ContainerError):

@@ -18,8 +18,8 @@ from rce_container.exceptions import ExecutionError
 if TYPE_CHECKING:
     from websockets.asyncio.client import ClientConnection
 
-    from rce.control.dialing import RunDialer
-    from rce.control.messages import Execute
+    from rce.control import Execute
+    from rce.control_channel.dialing import RunDialer
 
 _log = logging.getLogger(__name__)
 

@@ -50,6 +50,8 @@ class Record(Struct, frozen=True, kw_only=True):
     """The group whose private network it is in; empty without one."""
     address: str = ""
     """Its address there, with the prefix."""
+    volumes: dict[str, str] = {}
+    """Its volumes: where it sees them, by name."""
     revision: int = 0
     """The newest revision that its environment was given."""
 
@@ -139,11 +141,11 @@ class ContainerFolder:
         for path in (self.run, self.path):
             remove(path)
             if path.exists():
-                _make_accessible(path)
+                make_accessible(path)
                 remove(path)
 
 
-def _make_accessible(root: Path) -> None:
+def make_accessible(root: Path) -> None:
     """Undo a node's changes to the permissions of its folders. Does not follow links."""
     waiting = [str(root)]
     while waiting:
@@ -254,6 +256,11 @@ class StateFolder:
     def requirements(self) -> Path:
         """Where the requirements of those packages are kept."""
         return self._state / "requirements"
+
+    @property
+    def volumes(self) -> Path:
+        """Where the volumes of users are."""
+        return self._state / "volumes"
 
     @property
     def cgroups(self) -> Path:

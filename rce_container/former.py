@@ -8,6 +8,7 @@ import logging
 import time
 from typing import TYPE_CHECKING, Protocol
 
+from rce.model import EndpointId
 from rce_container.environment import messages as m
 from rce_container.environment import proc
 from rce_container.environment.channel import connect
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from rce_container.launcher import Launcher
     from rce_container.limits import Limiter
     from rce_container.settings import ContainerSettings
+    from rce_container.volumes.store import VolumeStore
 
 _log = logging.getLogger(__name__)
 
@@ -40,11 +42,18 @@ class FormerContainers:
         settings: How containers are run.
         limiter: Enforces the containers' limits.
         launcher: Removes what it made for a container.
+        volumes: Learns which volumes the containers have.
     """
 
     def __init__(
-        self, state: StateFolder, settings: ContainerSettings, limiter: Limiter, launcher: Launcher
+        self,
+        state: StateFolder,
+        settings: ContainerSettings,
+        limiter: Limiter,
+        launcher: Launcher,
+        volumes: VolumeStore,
     ) -> None:
+        self._volumes = volumes
         self._state = state
         self._settings = settings
         self._limiter = limiter
@@ -64,6 +73,9 @@ class FormerContainers:
         async with asyncio.TaskGroup() as tasks:
             for folder in folders:
                 record = folder.read_record()
+                if record is not None:
+                    user = EndpointId.parse(record.id).user
+                    self._volumes.adopt(user, folder.incarnation_id, record.volumes)
                 process = proc.read(record.pid) if record is not None else None
                 if (
                     record is None
@@ -97,6 +109,8 @@ class FormerContainers:
         await self._launcher.undo(folder.incarnation_id)
         await asyncio.to_thread(folder.remove)
         await asyncio.to_thread(self._state.archive.settle_one, folder.incarnation_id, time.time())
+        # What was to be removed meanwhile is asked for again when the master is connected again.
+        self._volumes.release(folder.incarnation_id)
 
     async def _sweep_control_groups(self, keep: set[str]) -> None:
         """Remove the control groups of containers that have no other remains."""

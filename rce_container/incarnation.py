@@ -14,18 +14,10 @@ from typing import assert_never
 import msgspec
 
 from rce.aio.tasks import BackgroundTasks
-from rce.control.desired import DesiredState
+from rce.control import PATCHES, DesiredState, EndpointSpec, EndpointStatus, SpecPatch, StatusPatch, Unknown
 from rce.control.execution import FEATURE as EXEC
 from rce.control.execution import Command
-from rce.control.model import (
-    PATCHES,
-    EndpointSpec,
-    EndpointStatus,
-    SpecPatch,
-    StatusPatch,
-)
-from rce.control.tags import Unknown
-from rce.link.handover import LinkAcceptor
+from rce.link import LinkAcceptor
 from rce.model import EndpointId, Resources
 from rce_container import events, intake
 from rce_container.archive import LogArchive
@@ -51,6 +43,7 @@ from rce_container.packages.shelf import Shelf
 from rce_container.packages.supply import Library, Supply
 from rce_container.runtimes.base import Handle
 from rce_container.settings import ContainerSettings
+from rce_container.volumes.store import VolumeStore
 
 _log = logging.getLogger(__name__)
 
@@ -69,6 +62,7 @@ class IncarnationContext:
     networks: Networks
     archive: LogArchive
     library: Library
+    volumes: VolumeStore
 
 
 class Incarnation:
@@ -141,6 +135,8 @@ class Incarnation:
     def apply(self, spec: EndpointSpec) -> None:
         """Give the environment its desired state."""
         self._desired = DesiredState(spec)
+        user = EndpointId.parse(self.id).user
+        self._context.volumes.note_sizes(user, self.incarnation_id, spec.resources.volumes)
         self._note_revision(spec.revision)
         self._supply.want(spec.packages)
         if self._channel is not None:
@@ -213,6 +209,12 @@ class Incarnation:
         if self._channel is not None:
             self._channel.send(m.encode(m.Stop()))
             self._limit(self._context.settings.stop_timeout)
+
+    def stop_over_limit(self, text: str) -> None:
+        """End, because a volume is too full; it is made again when the volume may hold more."""
+        if not self._stopping:
+            self._context.feed(events.Faulted(self.id, self.incarnation_id, text))
+            self.stop(text)
 
     def kill(self) -> None:
         """End at once."""
@@ -288,6 +290,7 @@ class Incarnation:
 
     async def _prepare(self, pid: int) -> None:
         await self._context.networks.attach(self.incarnation_id, pid)
+        await asyncio.to_thread(self._context.volumes.prepare, self.incarnation_id)
 
     async def _hang_up(self) -> None:
         self._deadline = None

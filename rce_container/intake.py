@@ -15,17 +15,17 @@ from typing import TypeVar
 import msgspec
 from msgspec.structs import asdict, replace
 
-from rce.control.model import (
+from rce.control import (
     EndpointState,
     EndpointStatus,
     InterfaceUsage,
     LinkAddress,
     NodeStatus,
     StatusPatch,
+    Unknown,
 )
-from rce.control.tags import Unknown
 from rce.model import is_name
-from rce.protocol.printable import one_line
+from rce.printable import one_line
 from rce_container.environment import messages as m
 
 T = TypeVar("T")

@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING, NamedTuple
 from rce.model import EndpointId, Network, Resources
 from rce_container.environment import messages as m
 from rce_container.environment import proc
-from rce_container.exceptions import ContainerError, StartError, StateError
+from rce_container.exceptions import ContainerError, StartError, StateError, VolumeError
 from rce_container.folder import ContainerFolder, Record
-from rce_container.limits import ControlGroup, limits_of
-from rce_container.runtimes.base import Handle, Order
+from rce_container.limits import ControlGroup, Limiter, limits_of
+from rce_container.runtimes.base import Handle, Order, Runtime
 
 if TYPE_CHECKING:
-    from rce_container.limits import Limiter
     from rce_container.network import Networks
     from rce_container.network.networks import Membership
-    from rce_container.runtimes.base import Runtime
     from rce_container.settings import ContainerSettings
+    from rce_container.volumes.store import VolumeStore
 
 _log = logging.getLogger(__name__)
 
@@ -50,6 +49,7 @@ class Launcher:
         offered: Names of the runtimes that work on this machine.
         limiter: Enforces the containers' limits.
         networks: The networks of groups.
+        volumes: The volumes of users.
     """
 
     def __init__(
@@ -61,7 +61,9 @@ class Launcher:
         offered: Collection[str],
         limiter: Limiter,
         networks: Networks,
+        volumes: VolumeStore,
     ) -> None:
+        self._volumes = volumes
         self._settings = settings
         self._runtimes = runtimes
         self._runtime = runtime
@@ -81,6 +83,9 @@ class Launcher:
             OSError: A resource of the machine is exhausted.
         """
         runtime = self._runtime_for(resources)
+        mounts = self._volumes.claim(EndpointId.parse(id_).user, folder.incarnation_id, resources.volumes)
+        if not runtime.isolated and any(mount.image for mount in mounts):
+            raise VolumeError(f"its volumes are file systems, which the runtime {runtime.name} cannot mount")
         control_group = self._limiter.create(folder.incarnation_id, limits_of(resources, self._settings))
         membership = self._enroll(id_, folder, resources)
         boot = self._boot(id_, folder, resources, runtime, control_group, membership)
@@ -96,6 +101,7 @@ class Launcher:
                 host_network=resources.network is Network.HOST,
                 switch=membership.path if membership else "",
                 image=resources.image or runtime.image,
+                volumes=mounts,
             )
             handle = runtime.start(order)
         process = handle.process
@@ -107,6 +113,7 @@ class Launcher:
             start=process.start,
             group=resources.group if membership else "",
             address=str(membership.address) if membership else "",
+            volumes={volume.name: volume.path for volume in resources.volumes},
         )
         try:
             folder.write_record(record)

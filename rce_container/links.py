@@ -7,13 +7,12 @@ import socket
 from typing import TYPE_CHECKING
 
 from rce.dialing import open_socket
-from rce.link.handover import HandoverSender
+from rce.link import HandoverSender, LinkAcceptor
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rce.control.model import EndpointSpec, LinkAddress, LinkSpec, SpecPatch
-    from rce.link.handover import LinkAcceptor
+    from rce.control import EndpointSpec, LinkAddress, LinkSpec, SpecPatch
     from rce_container.settings import ContainerSettings
 
 _DIAL_TIMEOUT_S = 5.0

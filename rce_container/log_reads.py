@@ -6,8 +6,8 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from rce.aio.tasks import BackgroundTasks
-from rce.control.messages import LogChunk, ReadLog
-from rce.guard.turns import CrowdedError, Turns
+from rce.control import LogChunk, ReadLog
+from rce.guard import CrowdedError, Turns
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -8,7 +8,7 @@ import stat
 from pathlib import Path
 from typing import NamedTuple
 
-from rce.protocol.printable import one_line
+from rce.printable import one_line
 from rce_container.environment.logs.files import ENVIRONMENT_LOG, ROSOUT_LOG, segments
 from rce_container.environment.logs.streams import FRAGMENT_BYTES, text_of
 

@@ -8,17 +8,19 @@ import logging
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from typing import TYPE_CHECKING, assert_never
 
-from rce.control.execution import FEATURE as EXEC
-from rce.control.execution import Command
-from rce.control.messages import (
+from rce.control import (
     CONTROL_VERSION,
+    PATCHES,
+    VOLUMES,
     ClientReply,
     Drop,
+    EndpointStatus,
     Execute,
     Hello,
+    LinkAddress,
     LogChunk,
     LoginReply,
     MachineInfo,
@@ -29,6 +31,7 @@ from rce.control.messages import (
     Put,
     ReadLog,
     Refused,
+    RemoveVolume,
     Status,
     StatusWanted,
     Sync,
@@ -36,35 +39,36 @@ from rce.control.messages import (
     ToMaster,
     ToTaskSet,
     Usage,
+    VolumeLimit,
     Welcome,
 )
-from rce.control.model import PATCHES, EndpointStatus, LinkAddress
+from rce.control.execution import FEATURE as EXEC
+from rce.control.execution import Command
 from rce.model import EndpointId
 from rce.own_process import cpu_seconds, resident_bytes
 from rce_container import core, events
 from rce_container.environment import proc
 from rce_container.exceptions import ContainerError, ExecutionError, NetworkError, StateError
 from rce_container.executions import Executions
-from rce_container.folder import ContainerFolder, Record
+from rce_container.folder import ContainerFolder, Record, StateFolder
 from rce_container.former import FormerContainers
 from rce_container.incarnation import Incarnation, IncarnationContext
 from rce_container.launcher import Launcher
 from rce_container.life import Phase
-from rce_container.limits import ControlGroup
+from rce_container.limits import ControlGroup, Limiter
 from rce_container.limits.enforcer import LimitEnforcer
 from rce_container.log_reads import LogReads
 from rce_container.network import Networks
 from rce_container.packages.supply import Library
 from rce_container.reading import read_for
-from rce_container.runtimes.base import Handle
+from rce_container.runtimes.base import Handle, Runtime
 from rce_container.usage import Subject, UsageMeter
+from rce_container.volumes.keeper import VolumeKeeper
+from rce_container.volumes.store import VolumeStore
 
 if TYPE_CHECKING:
-    from rce.control.dialing import RunDialer
-    from rce.link.handover import LinkAcceptor
-    from rce_container.folder import StateFolder
-    from rce_container.limits import Limiter
-    from rce_container.runtimes.base import Runtime
+    from rce.control_channel.dialing import RunDialer
+    from rce.link import LinkAcceptor
     from rce_container.settings import ContainerSettings
 
 _log = logging.getLogger(__name__)
@@ -115,6 +119,9 @@ class Manager:
         self._core = core.ManagerCore()
         self._master_features: frozenset[str] = frozenset()
         self._networks = Networks()
+        images = info.volumes == VolumeLimit.IMAGE.value
+        self._volumes = VolumeStore(state.volumes, images=images)
+        self._keeper = VolumeKeeper(self._volumes, lambda m: self.send(m), self._spawn)  # noqa: PLW0108 - set later
         self._launcher = Launcher(
             settings=settings,
             runtimes=runtimes,
@@ -122,8 +129,9 @@ class Manager:
             offered=info.runtimes,
             limiter=limiter,
             networks=self._networks,
+            volumes=self._volumes,
         )
-        self._former = FormerContainers(state, settings, limiter, self._launcher)
+        self._former = FormerContainers(state, settings, limiter, self._launcher, self._volumes)
         self._context = IncarnationContext(
             settings=settings,
             acceptor=acceptor,
@@ -131,6 +139,7 @@ class Manager:
             networks=self._networks,
             archive=state.archive,
             library=library,
+            volumes=self._volumes,
         )
         self._executions = Executions(dialer, self._execute) if dialer is not None else None
         self._incarnations: dict[str, Incarnation] = {}
@@ -154,7 +163,7 @@ class Manager:
             process=self._name,
             machine=self._info,
             endpoints=self._core.statuses,
-            features=(PATCHES, EXEC) if self._executions is not None else (PATCHES,),
+            features=(PATCHES, VOLUMES, *([EXEC] if self._executions is not None else [])),
         )
 
     async def handle(self, message: ToTaskSet) -> None:
@@ -162,18 +171,12 @@ class Manager:
         match message:
             case Welcome(features=features):
                 self._master_features = frozenset(features)
-            case Put(endpoint=spec):
-                self._feed(events.Put(spec))
-            case PatchSpec(patch=patch):
-                self._feed(events.Patch(patch))
-            case StatusWanted(id=id_):
-                self._feed(events.StatusWanted(id_))
-            case Drop(id=id_, revision=revision, reason=reason):
-                self._feed(events.Drop(id_, revision, reason))
-            case Sync(endpoints=specs):
-                self._feed(events.Sync(specs))
+            case Put() | PatchSpec() | StatusWanted() | Drop() | Sync():
+                self._feed(_event_of(message))
             case ReadLog():
                 self._log_reads.take(message)
+            case RemoveVolume(volume=volume):
+                self._keeper.remove(volume)
             case Execute(id=id_) if self._executions is not None:
                 self._tasks.create_task(self._executions.execute(message), name=f"command in {id_}")
             case Execute() | Notify() | Probe() | Welcome() | Refused() | LoginReply() | ClientReply():
@@ -209,6 +212,8 @@ class Manager:
                 await self._former.take_over(self, self._tasks)
                 ready()
                 usage = self._tasks.create_task(self._report_usage(), name="usage")
+                measuring = self._keeper.run(self._incarnations, self._settings.usage_interval)
+                volumes = self._tasks.create_task(measuring, name="volumes")
                 pruning = self._tasks.create_task(self._former.prune_logs(), name="old logs")
                 await quit_.wait()
                 self._feed(events.Quit())
@@ -217,6 +222,7 @@ class Manager:
                     await self._empty.wait()
                 usage.cancel()
                 pruning.cancel()
+                volumes.cancel()
                 await self._log_reads.close()
 
     def kill_all(self) -> None:
@@ -303,9 +309,7 @@ class Manager:
             ContainerError,
             OSError,
         ) as error:  # disk, descriptors or memory are exhausted
-            self._tasks.create_task(
-                self._launcher.undo(folder.incarnation_id), name=f"what was made of {id_}"
-            )
+            self._spawn(self._undo(folder.incarnation_id), name=f"what was made of {id_}")
             folder.remove()
             self._state.archive.end(id_, folder.incarnation_id, f"cannot be started: {error}", time.time())
             self._feed(events.Lost(id_, "", str(error)))
@@ -314,6 +318,13 @@ class Manager:
         self._starting.add(incarnation)
         self._tasks.create_task(self._await_start(incarnation), name=f"start of {id_}")
         self._feed(events.Made(id_, folder.incarnation_id, self._address(folder)))
+
+    def _spawn(self, work: Coroutine[None, None, None], name: str) -> None:
+        self._tasks.create_task(work, name=name)
+
+    async def _undo(self, incarnation_id: str) -> None:
+        await self._launcher.undo(incarnation_id)
+        self._keeper.release(incarnation_id)
 
     async def _await_start(self, incarnation: Incarnation) -> None:
         await incarnation.reported.wait()
@@ -338,6 +349,7 @@ class Manager:
     async def _run_incarnation(self, incarnation: Incarnation) -> None:
         await incarnation.run()
         del self._incarnations[incarnation.incarnation_id]
+        self._keeper.release(incarnation.incarnation_id)
         self._feed(events.Removed(incarnation.id, incarnation.incarnation_id))
         if not self._incarnations:
             self._empty.set()
@@ -377,4 +389,21 @@ class Manager:
                 for incarnation in self._incarnations.values()
             }
             usage = await asyncio.to_thread(self._meter.measure, wanted)
-            self.send(Usage(cpu_s=cpu_seconds(), memory=resident_bytes(), endpoints=usage))
+            held = dict(self._volumes.used)
+            self.send(Usage(cpu_s=cpu_seconds(), memory=resident_bytes(), endpoints=usage, volumes=held))
+
+
+def _event_of(message: Put | PatchSpec | StatusWanted | Drop | Sync) -> events.Event:
+    match message:
+        case Put(endpoint=spec):
+            return events.Put(spec)
+        case PatchSpec(patch=patch):
+            return events.Patch(patch)
+        case StatusWanted(id=id_):
+            return events.StatusWanted(id_)
+        case Drop(id=id_, revision=revision, reason=reason):
+            return events.Drop(id_, revision, reason)
+        case Sync(endpoints=specs):
+            return events.Sync(specs)
+        case _:
+            assert_never(message)

@@ -6,14 +6,12 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from rce.control.observed import ObservedStatus
+from rce.control import EndpointStatus, NodeStatus, ObservedStatus, StatusPatch
 from rce_container import intake
 from rce_container.environment import proc
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
-
-    from rce.control.model import EndpointStatus, NodeStatus, StatusPatch
 
 
 class OuterStatus:

@@ -5,25 +5,19 @@ from __future__ import annotations
 import shlex
 import socket
 import sys
-from typing import TYPE_CHECKING
 
 import uvloop
 
-from rce.config.exceptions import LogFileError, RunDirError, SecretError
-from rce.config.logs import log_as
-from rce.config.secret import load_secret
+from rce.config import EngineSettings, LogFileError, RunDirError, SecretError, load_secret, log_as
 from rce.own_process import raise_file_limit
+from rce.tls import CertificateError
 from rce.tls.choice import TlsChoice
-from rce.tls.faults import CertificateError
 from rce_container.app import App, package_path
 from rce_container.ending import end_containers
 from rce_container.exceptions import ContainerError
 from rce_container.packages.requirements import InstallerSettings
 from rce_container.renewal import renew
 from rce_container.settings import ContainerSettings
-
-if TYPE_CHECKING:
-    from rce.config.settings import EngineSettings
 
 
 def run(engine: EngineSettings, *, end: bool = False, check: bool = False, verbose: bool = False) -> int:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from rce.control.logs import LogStream
-from rce.control.messages import LogChunk, ReadLog
+from rce.control import LogChunk, LogStream, ReadLog
 from rce.model import EndpointId, is_name
 from rce_container.archive import Kept, LogArchive
 from rce_container.environment.logs.files import ENVIRONMENT_LOG, ROSOUT_LOG

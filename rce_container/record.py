@@ -7,13 +7,7 @@ from typing import Any, Self
 
 import msgspec
 
-from rce.control.desired import DesiredState
-from rce.control.model import (
-    EndpointState,
-    EndpointStatus,
-    LinkAddress,
-)
-from rce.control.observed import ObservedStatus
+from rce.control import DesiredState, EndpointState, EndpointStatus, LinkAddress, ObservedStatus
 from rce.lifecycle import StateMachine
 from rce_container.life import ALIVE, CONTAINER_LIFE, LifeEvent, Phase
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from rce.control.model import EndpointUsage, NodeUsage
+from rce.control import EndpointUsage, NodeUsage
 from rce_container.environment import proc
 from rce_container.environment.messages import Counters
 from rce_container.limits import ControlGroup

@@ -15,15 +15,21 @@ far; a node calls it while it starts, so that nothing compiles at a robot's firs
 
     compile_kernels()  # without this, total() is _sum_numpy()
 
-Compiled loops may call functions marked with :func:`helper`. They must not call themselves: numba's cache can
-end the process then.
+numba keeps compiled loops on disk. ``rce compile`` compiles all of them into :data:`INSTALLED`, beside this
+module; a process that may not write there, such as a node in a sandbox, copies them to a folder of its own.
+
+Compiled loops release the interpreter's lock, so that threads can run them side by side. They may call
+functions marked with :func:`helper`. They must not call themselves: numba's cache can end the process then.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import shutil
+import tempfile
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from time import perf_counter
 from types import FunctionType
 from typing import Any, Generic, ParamSpec, TypeVar
@@ -32,8 +38,11 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _log = logging.getLogger(__name__)
-_SWITCH = "RCE_COMPILED"
+COMPILED = "RCE_COMPILED"
+"""Variable that turns compiled loops off: ``no``."""
 _OFF = ("0", "no", "false", "off")
+INSTALLED = Path(__file__).with_name("__compiled__")
+"""Folder of numba's cache that ``rce compile`` fills."""
 _kernels: list[Kernel[..., Any]] = []
 _helpers: dict[Callable[..., Any], Any] = {}
 
@@ -107,7 +116,7 @@ def helper(function: Callable[P, R]) -> Callable[P, R]:
 
 def is_available() -> bool:
     """Return whether numba is installed and the variable ``RCE_COMPILED`` does not turn it off."""
-    if os.environ.get(_SWITCH, "").lower() in _OFF:
+    if os.environ.get(COMPILED, "").lower() in _OFF:
         return False
     try:
         import numba  # noqa: F401  # only whether it is there
@@ -131,14 +140,64 @@ def compile_kernels(kernels: Iterable[Kernel[..., Any]] | None = None) -> bool:
         _log.info(
             "%d inner loops run in numpy; 'pip install rce[compiled]' makes them faster%s",
             len(chosen),
-            f" ({_SWITCH} turns them off)" if _SWITCH in os.environ else "",
+            f" ({COMPILED} turns them off)" if COMPILED in os.environ else "",
         )
         return False
     begin = perf_counter()
+    _find_installed()
     for each in chosen:
         each.use_compiled()
     _log.info("%d inner loops compiled in %.1f s (numba)", len(chosen), perf_counter() - begin)
     return True
+
+
+def compile_for_all() -> bool:
+    """Compile the kernels of all imported modules into :data:`INSTALLED`, for all processes of this machine.
+
+    Returns:
+        Whether they are compiled; False without numba.
+
+    Raises:
+        OSError: The folder cannot be written to.
+    """
+    INSTALLED.mkdir(exist_ok=True)
+    return compile_kernels()
+
+
+def copy_compiled(source: Path, target: Path) -> None:
+    """Copy numba's files of one cache into another one, unless those there are as new.
+
+    An index comes after the loops that it names, so that a process that reads meanwhile finds them.
+    """
+    files = [path for path in source.rglob("*") if path.suffix in (".nbc", ".nbi")]
+    for path in sorted(files, key=lambda path: path.suffix):
+        copy = target / path.relative_to(source)
+        if copy.exists() and copy.stat().st_mtime >= path.stat().st_mtime:
+            continue
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=copy.parent)
+        os.close(handle)
+        shutil.copy2(path, name)
+        Path(name).replace(copy)
+
+
+def _find_installed() -> None:
+    """Have numba look where ``rce compile`` left its loops, if it did."""
+    import numba
+
+    config: Any = numba.config  # without types
+    if not INSTALLED.is_dir() or str(INSTALLED) == config.CACHE_DIR:
+        return
+    if not config.CACHE_DIR and os.access(INSTALLED, os.W_OK):
+        config.CACHE_DIR = str(INSTALLED)
+        return
+    folder = Path(config.CACHE_DIR or Path.home() / ".cache" / "rce" / "compiled")
+    try:
+        copy_compiled(INSTALLED, folder)
+    except OSError as error:
+        _log.info("cannot copy compiled loops to %s, they are compiled anew: %s", folder, error)
+    else:
+        config.CACHE_DIR = str(folder)
 
 
 def _jit(function: Callable[..., Any], signatures: list[str] | None) -> Any:
@@ -161,11 +220,11 @@ def _jit(function: Callable[..., Any], signatures: list[str] | None) -> Any:
         loop.__module__ = function.__module__
         loop.__qualname__ = function.__qualname__
     try:
-        return numba.njit(signatures, cache=True)(loop) if signatures else numba.njit(loop)
+        return numba.njit(signatures, cache=True, nogil=True)(loop) if signatures else numba.njit(loop)
     except RuntimeError as error:  # no folder can be written to for the cache
         if "cannot cache" not in str(error):
             raise
-        return numba.njit(signatures)(loop)
+        return numba.njit(signatures, nogil=True)(loop)
 
 
 def _compiled_helper(function: FunctionType) -> Any:

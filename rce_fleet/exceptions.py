@@ -5,15 +5,25 @@
     FleetError
     +-- MapError            a map or scenario file that cannot be read
     +-- LogError            a log of laser scans, or a trajectory, that cannot be read
+    +-- PlanningError       a planning problem that is not well formed, or has no solution
+    +-- PlannerError        a planner that is not installed or cannot be loaded
     +-- ScenarioError       no scenario of the requested size exists on the map
     +-- OccupiedError       a box cannot stand where a robot is
     +-- PlaceTakenError     a thing of the simulated world cannot stand where a robot or a walking person is
     +-- TransitionError     an event that the life cycle of a robot does not allow
     +-- InvariantError      the planner's records contradict each other: a bug
+    +-- ZoneError           a zone that cannot be on the map
     +-- PlanWorkerError     the process that makes plans ended twice over one plan
+    +-- TaskError           a request about a task that was not carried out
+    |   +-- TaskRefusedError           the task cannot be carried out, or not be changed now
+    |   +-- UnknownTaskError           there is no such task
+    |   +-- RevisionError              the task was changed meanwhile
+    |   +-- KeyReusedError             the requester's key belongs to another task
+    +-- JournalError        the journal of the fleet manager cannot be read or written
     +-- StationError        a request to the operator station was not carried out
     |   +-- StationUnavailableError    station or planner cannot be reached; try again later
     |   +-- RequestRefusedError        the station refused the request
+    |   +-- EventsRestartedError       the fleet manager lost its journal: its events are numbered anew
     +-- DemoError           errors of ``rce demo``, see rce_fleet.demo.exceptions
 """
 
@@ -42,8 +52,20 @@ class MapError(FleetError):
         return f"line {self.line}: {self.reason}" if self.line else self.reason
 
 
+class PlanningError(FleetError, ValueError):
+    """A planning problem is not well formed, or cannot be solved."""
+
+
+class PlannerError(FleetError):
+    """A planner is not installed or cannot be loaded."""
+
+
 class ScenarioError(FleetError):
     """No scenario of the requested size exists on the map."""
+
+
+class ZoneError(FleetError, ValueError):
+    """A zone cannot be on the map; the text says why."""
 
 
 class OccupiedError(FleetError):
@@ -90,6 +112,30 @@ class InvariantError(FleetError):
     """The planner's records contradict each other. Always a bug."""
 
 
+class TaskError(FleetError):
+    """A request about a task was not carried out; its text says why."""
+
+
+class TaskRefusedError(TaskError):
+    """The task cannot be carried out as it is described, or its state does not allow the request."""
+
+
+class UnknownTaskError(TaskError):
+    """There is no task, robot or other thing of this name."""
+
+
+class RevisionError(TaskError):
+    """The task was changed after the requester read it; read it again."""
+
+
+class KeyReusedError(TaskError):
+    """The requester used the key before, for a task with another content."""
+
+
+class JournalError(FleetError):
+    """The journal of the fleet manager cannot be read or written."""
+
+
 class StationError(FleetError):
     """A request to the operator station was not carried out."""
 
@@ -100,6 +146,24 @@ class StationUnavailableError(StationError):
 
 class RequestRefusedError(StationError):
     """The station refused a request; its text says why."""
+
+
+class EventsRestartedError(StationError):
+    """The fleet manager lost its journal, or has an older one: its events are numbered anew.
+
+    Attributes:
+        journal: Which journal numbers the events now.
+    """
+
+    def __init__(self, journal: str) -> None:
+        self.journal = journal
+        super().__init__(journal)
+
+    def __str__(self) -> str:
+        return (
+            "the fleet manager lost its journal: tasks and events from before are gone, and events are"
+            " numbered from 1 again; read tasks and events anew"
+        )
 
 
 class PlanWorkerError(FleetError):

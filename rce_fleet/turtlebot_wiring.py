@@ -13,15 +13,21 @@ from __future__ import annotations
 import shlex
 from typing import TYPE_CHECKING, Any
 
-from rce.config.folders import configs_dir
-from rce.ros.launch import MachineInputs, load_launch_files
+from rce.config import configs_dir
+from rce.ros.launch import LaunchPlan, MachineInputs, NodePlan, load_launch_files
 from rce.ros.packages import PackageIndex
-from rce_fleet.wiring import FLEET_CONTAINER, FleetAccount, layer_interfaces, robot_config
+from rce_fleet.station.commands.kinds import command_interfaces
+from rce_fleet.wiring import (
+    FLEET_CONTAINER,
+    FleetAccount,
+    layer_interfaces,
+    robot_config,
+    speed_limit_bridge,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from rce.ros.launch import LaunchPlan, NodePlan
 
 LAUNCH_FILE = "turtlebot/botmotion.launch"
 _MAP = "/map.yaml"
@@ -112,7 +118,11 @@ def offloaded_config(
     # What the container's nodes say does not show that the robot is there; its odometry does.
     client["args"] += " _alive_topic:=/odom"
     config["nodes"] = [*(_node(container, node) for node in moved), client]
-    config["interfaces"] = list(layer_interfaces(config["robotID"], namespace, container))
+    robot = config["robotID"]
+    config["interfaces"] = [
+        *layer_interfaces(robot, namespace, container, own_map=own_map),
+        *command_interfaces(robot, namespace),
+    ]
     config["bridges"] = list(_offload_bridges(container, namespace))
     if own_map:
         config["bridges"].append(_topic("/map", "nav_msgs/OccupancyGrid", "robot", container))
@@ -148,11 +158,14 @@ def _offload_bridges(container: str, namespace: str) -> Iterator[dict[str, Any]]
     # The robot keeps its pose for the next `amcl`, if this container is made again.
     yield _topic("/amcl_pose", pose, container, [f"{planner}:/{namespace}/amcl_pose", "robot"])
     yield {"service": "/last_pose", "type": "fleet/GetLastPose", "server": "robot", "clients": container}
+    battery = f"{planner}:/{namespace}/battery_state"
+    yield _topic("/battery_state", "sensor_msgs/BatteryState", "robot", battery)
     for name, kind in (("blockedCells", _CELLS), ("freedCells", _CELLS)):
         yield _topic(f"/{name}", kind, container, f"{planner}:/{namespace}/{name}")
     yield _topic(f"/{namespace}/moveClient/status", "fleet/MoveStatus", container, planner)
     yield _topic(f"/{namespace}/goalNodesList", _CELLS, planner, container)
     yield _topic(f"/{namespace}/cancelGoal", "std_msgs/Bool", planner, container)
+    yield speed_limit_bridge(container, namespace)
     for name, kind in (_GRID, _STATE):
         yield _topic(name, kind, planner, container)
 

@@ -4,11 +4,12 @@ Robot N has its own container ``cTag_0N``, in which a move client sends it from 
 in the operator's container ``cTag_fleet``, where the robots' topics are in namespaces. Robot N's config makes
 three groups of connections:
 
-* robot - own container: poses to the container; goals and states of its ``move_base``;
-* robot - planner: poses, and cells that the robot found blocked;
+* robot - own container: poses to the container; goals and states of its ``move_base``; limits of its speed;
+* robot - planner: poses, cells that the robot found blocked, and its battery;
 * own container - planner: granted cells, cancellations and the map; back, the move client's reports.
 
-The robot also offers the topics of the page's layers, which the station connects while a page shows them.
+The robot also offers the topics of the page's layers, which the station connects while a page shows them, and
+topics that the station publishes on without the planner: emergency stop, velocities by hand, initial pose.
 
 This module made ``fleet.config`` and ``robot1.config`` to ``robot3.config`` in ``configs``.
 ``robot1-long.config`` is the same as ``robot1.config`` without bridges, with the paper's names.
@@ -19,13 +20,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from rce_fleet.station.layers.kinds import SCAN, TF, TF_STATIC, TOPICS
+from rce_fleet.station.commands.kinds import LIGHT_COMMANDS, command_interfaces
+from rce_fleet.station.layers.kinds import MAP, SCAN, TF, TF_STATIC, TOPICS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
 FLEET_CONTAINER = "cTag_fleet"
 OPERATOR = "fleetOperator"
+VOLUME = {"name": "fleet", "path": "/volumes/fleet", "size": "128M"}
+"""The volume with the journal of the fleet manager, which finds it by its name."""
 FLOOR_PARAMETERS: dict[str, bool | int | float | str | list[Any]] = {
     "rows": 8,
     "columns": 8,
@@ -35,7 +39,9 @@ FLOOR_PARAMETERS: dict[str, bool | int | float | str | list[Any]] = {
 """The planner's parameters for the floor of ``configs/scene.yaml``."""
 
 _POSE = "geometry_msgs/PoseWithCovarianceStamped"
+_BATTERY = "sensor_msgs/BatteryState"
 _CELLS = "std_msgs/Int32MultiArray"
+_SPEED = "std_msgs/Float64"
 _OF_BASE = (SCAN, TF, TF_STATIC)
 """Topics of layers that come from the robot's sensors and wheels, wherever its other nodes run."""
 
@@ -74,21 +80,83 @@ def robot_config(number: int, account: FleetAccount | None = None) -> dict[str, 
                 "namespace": namespace,
             }
         ],
-        "interfaces": list(layer_interfaces(robot, namespace)),
+        "interfaces": [*layer_interfaces(robot, namespace), *command_interfaces(robot, namespace)],
         "bridges": list(_bridges(container, namespace)),
+    }
+
+
+def light_config(first: int, last: int, account: FleetAccount | None = None) -> dict[str, Any]:
+    """Return the config of light robots ``first`` to ``last`` that share a container and a bridge.
+
+    Their ROS graph has each robot's topics in its namespace. One process in the container,
+    ``move_clients.py``, sends all of them from cell to cell. The station sends emergency stops, and
+    velocities of robots that are driven by hand.
+
+    Args:
+        first: Number of the first robot, counted from 1.
+        last: Number of the last one.
+        account: Engine and user; None for those of a development engine.
+
+    Raises:
+        ValueError: There is no robot between the two.
+    """
+    if not 1 <= first <= last:
+        raise ValueError(f"robots are numbered from 1 on, first to last, not {first} to {last}")
+    account = account or FleetAccount()
+    container, planner = f"cTag_{first}_{last}", FLEET_CONTAINER
+    own = f"{account.robot_prefix}{first}_{last}"
+    robots = [f"Robot{number}" for number in range(first, last + 1)]
+    bridges = [_topic("/fleet/map", "nav_msgs/OccupancyGrid", planner, container)]
+    for robot in robots:
+        bridges += [
+            _topic(f"/{robot}/amcl_pose", _POSE, "robot", planner),
+            _topic(f"/{robot}/battery_state", _BATTERY, "robot", planner),
+            _topic(f"/{robot}/goalNodesList", _CELLS, planner, container),
+            _topic(f"/{robot}/cancelGoal", "std_msgs/Bool", planner, container),
+            _topic(f"/{robot}/moveClient/status", "fleet/MoveStatus", container, planner),
+            _topic(f"/{robot}/move_base/goal", "move_base_msgs/MoveBaseActionGoal", container, "robot"),
+            _topic(f"/{robot}/move_base/cancel", "actionlib_msgs/GoalID", container, "robot"),
+            _topic(f"/{robot}/move_base/status", "actionlib_msgs/GoalStatusArray", "robot", container),
+            _topic(f"/{robot}/speed_limit", _SPEED, container, "robot"),
+            _topic(f"/{robot}/move_base/result", "move_base_msgs/MoveBaseActionResult", "robot", container),
+        ]
+    return {
+        "url": account.url,
+        "userID": account.user,
+        "password": account.password,
+        "robotID": own,
+        "containers": [{"cTag": container}],
+        "parameters": [{"cTag": container, "name": "/move_clients/robots", "value": robots}],
+        "nodes": [
+            {
+                "cTag": container,
+                "nTag": "moveClients",
+                "pkg": "fleet",
+                "exe": "move_clients.py",
+                "name": "move_clients",
+            }
+        ],
+        "interfaces": [
+            interface
+            for robot in robots
+            for interface in command_interfaces(own, robot, LIGHT_COMMANDS, prefix=f"/{robot}")
+        ],
+        "bridges": bridges,
     }
 
 
 def fleet_config(
     account: FleetAccount | None = None,
     parameters: dict[str, bool | int | float | str | list[Any]] | None = None,
+    chargers: Sequence[int] = (),
 ) -> dict[str, Any]:
-    """Return the operator's config: the container with the planner.
+    """Return the operator's config: the container with planner and fleet manager.
 
     Args:
         account: Engine and user; None for those of a development engine.
         parameters: The planner's parameters by name, such as ``rows``; those of the floor of
             ``configs/scene.yaml`` if None.
+        chargers: Cells with chargers, which the manager has until people set others.
     """
     account = account or FleetAccount()
     given = FLOOR_PARAMETERS if parameters is None else parameters
@@ -97,28 +165,39 @@ def fleet_config(
         "userID": account.user,
         "password": account.password,
         "robotID": OPERATOR,
-        "containers": [{"cTag": FLEET_CONTAINER}],
+        "containers": [{"cTag": FLEET_CONTAINER, "volumes": [VOLUME]}],
         "parameters": [
             {"cTag": FLEET_CONTAINER, "name": f"/fleet/{name}", "value": value}
             for name, value in given.items()
-        ],
+        ]
+        + (
+            [{"cTag": FLEET_CONTAINER, "name": "/fleet_manager/chargers", "value": list(chargers)}]
+            if chargers
+            else []
+        ),
         "nodes": [
-            {"cTag": FLEET_CONTAINER, "nTag": "fleetPlanner", "pkg": "fleet", "exe": "fleet_planner.py"}
+            {"cTag": FLEET_CONTAINER, "nTag": tag, "pkg": "fleet", "exe": exe}
+            for tag, exe in (("fleetPlanner", "fleet_planner.py"), ("fleetManager", "fleet_manager.py"))
         ],
     }
 
 
-def layer_interfaces(robot: str, namespace: str, container: str = "") -> Iterator[dict[str, Any]]:
+def layer_interfaces(
+    robot: str, namespace: str, container: str = "", *, own_map: bool = False
+) -> Iterator[dict[str, Any]]:
     """Offer the topics of layers to the station, which connects them while a page shows them.
 
     Args:
         robot: The robot's ID in the engine.
         namespace: The robot's ID in the fleet.
         container: Container that localization and navigation run in; empty: they run on the robot.
+        own_map: The robot publishes the map. A container's interface does not receive what another of its
+            interfaces publishes.
     """
+    of_robot = (*_OF_BASE, MAP) if own_map else _OF_BASE
     for topic in TOPICS:
         ends = {robot: "SubscriberForwarder"}
-        if container and topic not in _OF_BASE:
+        if container and topic not in of_robot:
             ends = {container: "SubscriberInterface"}
         elif container and topic is TF:
             ends[container] = "SubscriberInterface"
@@ -137,6 +216,7 @@ def _bridges(container: str, namespace: str) -> Iterator[dict[str, Any]]:
     pose, cells = f"/{namespace}/amcl_pose", f"/{namespace}/blockedCells"
     yield _topic("/amcl_pose", _POSE, "robot", [f"{container}:{pose}", f"{planner}:{pose}"])
     yield _topic("/blockedCells", _CELLS, "robot", f"{planner}:{cells}")
+    yield _topic("/battery_state", _BATTERY, "robot", f"{planner}:/{namespace}/battery_state")
     yield {
         "action": "/move_base",
         "type": "move_base_msgs/MoveBase",
@@ -147,6 +227,12 @@ def _bridges(container: str, namespace: str) -> Iterator[dict[str, Any]]:
     yield _topic(f"/{namespace}/cancelGoal", "std_msgs/Bool", planner, container)
     yield _topic("/fleet/map", "nav_msgs/OccupancyGrid", planner, container)
     yield _topic(f"/{namespace}/moveClient/status", "fleet/MoveStatus", container, planner)
+    yield speed_limit_bridge(container, namespace)
+
+
+def speed_limit_bridge(container: str, namespace: str) -> dict[str, Any]:
+    """Return the bridge that tells a robot the greatest speed in slow zones."""
+    return _topic(f"/{namespace}/speed_limit", _SPEED, container, "robot:/speed_limit")
 
 
 def _topic(name: str, type_: str, source: str, to: str | list[str]) -> dict[str, Any]:

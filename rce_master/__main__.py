@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from rce.config.loading import handed_over
+from rce.config import handed_over
 
 
 def main() -> None:

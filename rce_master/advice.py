@@ -10,13 +10,12 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 from rce.model import MEGABYTE, MIN_MEMORY, Resources, write_cores, write_memory
-from rce_master.usage import STEP_S, WINDOW_S, rates_between
+from rce_master.usage import STEP_S, WINDOW_S, History, rates_between
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rce_master.state.placement import Room
-    from rce_master.usage import History
 
 THROTTLED = 0.1
 """A container that is held back by its CPU limit for more than this share of the time is too small."""

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import msgspec
 from msgspec import Struct
 
-from rce.config.logs import redact
-from rce.guard.rates import Rates
-from rce.protocol.printable import one_line
+from rce.config import redact
+from rce.guard import Rates
+from rce.printable import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -14,15 +14,14 @@ from typing import TYPE_CHECKING, TypeVar
 from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
 
-from rce.guard.turns import CrowdedError, Turns
+from rce.guard import CrowdedError, Turns
 from rce_master.exceptions import TooManyFailuresError, TooManyLoginsError, WrongCredentialsError
-from rce_master.state.records import KnownLogin
+from rce_master.state.records import KnownLogin, User
 from rce_master.throttle import MAX_DELAY_S, FailureThrottle
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rce_master.state.records import User
     from rce_master.state.tables import Tables
 
 T = TypeVar("T")

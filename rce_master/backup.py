@@ -18,7 +18,7 @@ import tarfile
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
@@ -108,23 +108,39 @@ def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -
         BackupError: The copy is incomplete or was made by a newer program, or the folder already has state.
     """
     master = folders[MASTER]
-    lock = FolderLock(master)
-    try:
+    with _locked(master):
         there = [folder for folder in folders.values() if _holds_state(folder)]
         if there and not replace:
             raise BackupError(f"there is state in {there[0]}; to move it aside, give --replace")
-        with tempfile.TemporaryDirectory(dir=master.parent, prefix=".rce-restore-") as name:
-            found = _extract(file, Path(name))
-            _check_store(Path(name) / MASTER / FILE_NAME)
-            stamp = time.strftime("%Y%m%d-%H%M%S")
-            aside = [_move_aside(folder, stamp) for folder in there]
-            for part, folder in folders.items():
-                _move(Path(name) / part, folder)
-    except (OSError, tarfile.TarError) as error:
-        raise BackupError(f"cannot restore {file}: {error}") from error
+        try:
+            with tempfile.TemporaryDirectory(dir=master.parent, prefix=".rce-restore-") as name:
+                found = _extract(file, Path(name))
+                _check_store(Path(name) / MASTER / FILE_NAME)
+                stamp = time.strftime("%Y%m%d-%H%M%S")
+                aside = [_move_aside(folder, stamp) for folder in there]
+                for part, folder in folders.items():
+                    _move(Path(name) / part, folder)
+        except (OSError, tarfile.TarError) as error:
+            raise BackupError(f"cannot restore {file}: {error}") from error
+    return found, aside
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the lock on a state folder. After an error, remove the folders that were made for it."""
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    lock = FolderLock(folder)
+    try:
+        yield
+    except BaseException:
+        if made:
+            lock.remove()
+        for path in made:
+            with suppress(OSError):  # it is used by others meanwhile
+                path.rmdir()
+        raise
     finally:
         lock.close()
-    return found, aside
 
 
 class _PackageRemovedError(BackupError):

@@ -7,7 +7,7 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, assert_never
 
-from rce.control.messages import (
+from rce.control import (
     ClientReply,
     ClientRequest,
     Fault,
@@ -21,10 +21,12 @@ from rce.control.messages import (
     RequestFault,
     SpecWanted,
     Status,
+    ToMaster,
     Usage,
+    VolumeRemoved,
 )
 from rce_master import requests
-from rce_master.audit import describe
+from rce_master.audit import AuditLog, describe
 from rce_master.exceptions import (
     ForbiddenError,
     MasterError,
@@ -41,8 +43,6 @@ from rce_master.tokens import Tokens
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from rce.control.messages import ToMaster
-    from rce_master.audit import AuditLog
     from rce_master.auth import Authenticator
     from rce_master.reconciler import Peer, Reconciler
     from rce_master.state_service import Outcome, StateService
@@ -123,6 +123,7 @@ class ControlHandler:
                 | Gone()
                 | Fault()
                 | Usage()
+                | VolumeRemoved()
                 | Left()
                 | Hello()
                 | LogChunk()

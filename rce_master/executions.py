@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from websockets.exceptions import ConnectionClosed
 
-from rce.control.execution import FEATURE
-from rce.control.messages import Execute
+from rce.control import Execute
+from rce.control.execution import FEATURE, Command
 from rce_master.exceptions import LimitReachedError, TaskSetAwayError
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from websockets.asyncio.server import ServerConnection
 
-    from rce.control.execution import Command
     from rce_master.reconciler import Peer
 
 DIAL_S = 10.0

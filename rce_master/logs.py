@@ -8,9 +8,7 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
-from rce.control.exceptions import ControlError
-from rce.control.logs import LogQuery
-from rce.control.messages import LogChunk, TaskSetKind
+from rce.control import ControlError, LogChunk, LogQuery, TaskSetKind
 from rce.model import EndpointId, is_name
 from rce_master.exceptions import NotFoundError, TaskSetAwayError
 from rce_master.state.records import Container

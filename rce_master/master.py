@@ -7,25 +7,25 @@ import logging
 import time
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
-from rce.control.messages import TYPED_REQUESTS
-from rce.control.model import PATCHES
-from rce.control.server import ControlServer
-from rce.guard.proxies import TrustedProxies
+from rce.control import PATCHES, TYPED_REQUESTS
+from rce.control_channel.server import ControlServer
+from rce.guard import TrustedProxies
 from rce.own_process import listening
 from rce.tls.choice import plain_warning
 from rce.tls.expiry import watch_expiry
 from rce.web.origin import ServerNames
-from rce.web.server import HttpServer
+from rce.web.server import HttpServer, LateApplication
 from rce_master.audit import AuditLog
 from rce_master.auth import Authenticator, client_digest
 from rce_master.control_handler import ControlHandler
 from rce_master.events import EventLog
 from rce_master.exceptions import MasterError
 from rce_master.executions import Executions
+from rce_master.http.entry import Entry
 from rce_master.http.routes import Services
-from rce_master.http.server import make_app
 from rce_master.packages.contents import ContentStore
 from rce_master.packages.service import PackageService
 from rce_master.quotas import Quotas
@@ -38,9 +38,10 @@ from rce_master.tokens import Tokens
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from aiohttp import web
     from argon2 import PasswordHasher
 
-    from rce.config.secret import Secret
+    from rce.config import Secret
     from rce_master.settings import MasterSettings
     from rce_master.state.changes import Changes
     from rce_master.store import Store
@@ -165,7 +166,14 @@ class Master:
             await make_dev_user(services)
         for_clients, for_task_sets = settings.tls.for_clients(), settings.tls.for_task_sets()
         names = ServerNames(settings.bind, settings.public_names)
-        app = make_app(services, allowed_origins=settings.allowed_origins, names=names)
+        entry = Entry(services.state_service.tables, asyncio.get_running_loop().time)
+
+        def load() -> Callable[[], web.Application]:
+            from rce_master.http.server import make_app  # takes 12 MB, which robots do not need
+
+            return partial(make_app, services, entry, allowed_origins=settings.allowed_origins, names=names)
+
+        app = LateApplication(load, entry.answer)
         control = ControlServer(
             self._secret,
             on_hello=control_handler.on_hello,

@@ -5,25 +5,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import sys
-from typing import TYPE_CHECKING
 
 import uvloop
 
-from rce.config.exceptions import LogFileError, RunDirError, SecretError
-from rce.config.logs import log_as
-from rce.config.secret import load_secret
+from rce.config import EngineSettings, LogFileError, RunDirError, Secret, SecretError, load_secret, log_as
 from rce.own_process import end_signals, raise_file_limit
+from rce.tls import CertificateError
 from rce.tls.choice import TlsChoice
-from rce.tls.faults import CertificateError
 from rce_master.exceptions import MasterError
 from rce_master.master import Master, RunningMaster
 from rce_master.quotas import QuotaSettings
 from rce_master.settings import MasterSettings, state_settings
 from rce_master.store import SqliteStore
-
-if TYPE_CHECKING:
-    from rce.config.secret import Secret
-    from rce.config.settings import EngineSettings
 
 
 def run(engine: EngineSettings, *, verbose: bool = False) -> int:

@@ -13,15 +13,13 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rce.guard.rates import Rates
-from rce.guard.turns import CrowdedError, Turns
+from rce.guard import CrowdedError, Rates, Turns
 from rce_master.exceptions import TooMuchError
-from rce_master.state.records import UserRole
+from rce_master.state.records import User, UserRole
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
 
-    from rce_master.state.records import User
 
 READS_AT_ONCE = 32
 READS_WAITING = 512

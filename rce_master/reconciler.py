@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Protocol, assert_never
 
-from rce.control.exceptions import PeerRefusedError
-from rce.control.logs import LogQuery
-from rce.control.messages import (
+from rce.control import (
+    PATCHES,
+    VOLUMES,
     ClientRequest,
     Drop,
     Fault,
@@ -16,11 +16,14 @@ from rce.control.messages import (
     Left,
     LogChunk,
     Login,
+    LogQuery,
     Notify,
     PatchSpec,
     PatchStatus,
+    PeerRefusedError,
     Probe,
     Put,
+    RemoveVolume,
     SpecWanted,
     Status,
     StatusWanted,
@@ -28,8 +31,8 @@ from rce.control.messages import (
     ToMaster,
     ToTaskSet,
     Usage,
+    VolumeRemoved,
 )
-from rce.control.model import PATCHES
 from rce_master.exceptions import NotFoundError, RefusedError, TaskSetAwayError
 from rce_master.logs import LogReader, LogRequest, read_log
 from rce_master.state import commands
@@ -40,13 +43,14 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rce_master.state.changes import Changes, Notice, Touched
+    from rce_master.state.records import VolumeRemoval
     from rce_master.state_service import StateService
 
 _log = logging.getLogger(__name__)
 
 
 class Peer(LogReader, Protocol):
-    """A connected task set; in a running master an :class:`rce.control.peer.Peer`."""
+    """A connected task set; in a running master an :class:`rce.control_channel.peer.Peer`."""
 
     @property
     def process(self) -> str:
@@ -114,6 +118,8 @@ class Reconciler:
                 command = commands.EndpointGone(process=process, id=message.id)
             case Fault():
                 command = commands.FaultReported(id=message.id, text=message.text, robot=message.robot)
+            case VolumeRemoved():
+                command = commands.VolumeRemoved(process=process, volume=message.volume)
             case Left():
                 command = commands.RobotLeft(process=process, id=message.id, reason=message.reason)
             case Usage():
@@ -195,6 +201,8 @@ class Reconciler:
             self._ask_status(process, id_)
         if changes.arrived:
             self._sync(changes.arrived)
+        for removal in changes.volume_removals:
+            self._remove_volume(removal)
         for notice in changes.notices:
             self._notify(notice)
 
@@ -238,6 +246,13 @@ class Reconciler:
         specs = tuple(self._state_service.spec(endpoint.id) for endpoint in placed)
         self._sent[process] = {spec.id: spec.revision for spec in specs}
         peer.send(Sync(endpoints=specs))
+        for removal in self._state_service.tables.volume_removals.by("process", process):
+            self._remove_volume(removal)
+
+    def _remove_volume(self, removal: VolumeRemoval) -> None:
+        peer = self._peers.get(removal.process)
+        if peer is not None and VOLUMES in peer.features:
+            peer.send(RemoveVolume(volume=removal.volume))
 
     def _forget(self, process: str) -> None:
         """Forget the revisions of a connection that ended."""

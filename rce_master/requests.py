@@ -5,16 +5,14 @@ from __future__ import annotations
 from functools import singledispatch
 from typing import TYPE_CHECKING, Any, assert_never
 
-from rce.model import requests
-from rce.protocol.exceptions import MessageError
-from rce.protocol.requests import read_request
+from rce.model import Component, Request, requests
+from rce.protocol import MessageError, read_request
 from rce_master.state import commands
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rce.control.messages import ClientRequest
-    from rce.model import Component, Request
+    from rce.control import ClientRequest
 
 
 def count_items(request: ClientRequest) -> int:

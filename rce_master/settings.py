@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rce.config.folders import default_state_dir
-from rce.config.settings import ANYWHERE
+from rce.config import ANYWHERE, EngineSettings, default_state_dir
 from rce.tls.choice import TlsChoice
 from rce_master.quotas import QuotaSettings
 from rce_master.state.settings import StateSettings
@@ -15,7 +14,6 @@ from rce_master.tokens import TOKEN_LIFETIME_S
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rce.config.settings import EngineSettings
 
 HTTP_PORT = 9000
 CONTROL_PORT = 8080

@@ -9,15 +9,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rce_master.exceptions import MasterError, RefusedError, StoreError
-from rce_master.state.changes import make_row
+from rce_master.state.changes import Changes, Touched, make_row
 from rce_master.state.core import State
 from rce_master.state.migration import conversion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rce.control.model import EndpointSpec, SpecPatch
-    from rce_master.state.changes import Changes, Touched
+    from rce.control import EndpointSpec, SpecPatch
     from rce_master.state.commands import Command
     from rce_master.state.settings import StateSettings
     from rce_master.state.tables import Tables

@@ -16,7 +16,7 @@ import contextlib
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from rce.guard.rates import Rates
+from rce.guard import Rates
 from rce_master.exceptions import TooManyFailuresError
 
 if TYPE_CHECKING:

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Protocol
 
 from rce_master.exceptions import WrongCredentialsError
 from rce_master.state import commands
-from rce_master.state.records import Token
+from rce_master.state.records import Token, User
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rce_master.state.records import User
     from rce_master.state.tables import Tables
 
 TOKEN_LIFETIME_S = 30 * 24 * 3600.0

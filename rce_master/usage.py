@@ -11,12 +11,11 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from rce.control.model import EndpointUsage, NodeUsage
+from rce.control import EndpointUsage, NodeUsage, Usage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
 
-    from rce.control.messages import Usage
 
 STEP_S = 10.0
 WINDOW_S = 600.0

@@ -12,16 +12,11 @@ import socket
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rce.config.exceptions import ShippedFileError
-from rce.config.folders import examples_dir, run_dir
-from rce.control.channel import TaskSetChannel
-from rce.control.messages import MachineInfo
-from rce.control.model import LinkAddress
-from rce.guard.lobby import Lobby
-from rce.link import LinkHub
-from rce.link.address import in_url, is_any, own_address
-from rce.link.listening import listen_on
-from rce.link.unix import remove_stale_sockets, socket_name
+from rce.config import Secret, ShippedFileError, examples_dir, run_dir
+from rce.control import LinkAddress, MachineInfo
+from rce.control_channel.channel import TaskSetChannel
+from rce.guard import Lobby
+from rce.link import LinkHub, in_url, is_any, listen_on, own_address, remove_stale_sockets, socket_name
 from rce.lookups import LOOKUPS
 from rce.masters import Masters, split_addresses
 from rce.own_process import end_signals, listening, machine_memory
@@ -39,7 +34,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Sequence
     from pathlib import Path
 
-    from rce.config.secret import Secret
     from rce_robot.doors.base import Door
 
 _log = logging.getLogger(__name__)

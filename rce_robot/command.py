@@ -6,7 +6,7 @@ import typer
 
 from rce.cli.options import Verbose
 from rce.cli.settings import COMMON, SettingsOptions
-from rce.config.settings import EngineSettings
+from rce.config import EngineSettings
 from rce_robot.program import run
 
 OPTIONS = SettingsOptions(

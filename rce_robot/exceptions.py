@@ -14,12 +14,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.protocol.calls import call_at
+from rce.protocol import CallId, call_at
 
 if TYPE_CHECKING:
     from typing import Self
-
-    from rce.protocol.messages import CallId
 
 
 class RobotError(Exception):

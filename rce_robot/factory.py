@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from rce.link import InterfaceError
 from rce.model import Form as FormName
-from rce.model import InterfaceType, Role
-from rce.ros.types import TypesError
+from rce.model import InterfaceSpec, InterfaceType, Role
+from rce.ros.types import MessageType, TypeRegistry, TypesError
 from rce_robot.converters import Converters
-from rce_robot.forms import ConverterForm, ForwarderForm
-
-if TYPE_CHECKING:
-    from rce.model import InterfaceSpec
-    from rce.ros.types import MessageType, TypeRegistry
-    from rce_robot.forms import Form
+from rce_robot.forms import ConverterForm, Form, ForwarderForm
 
 
 class FormFactory:

@@ -6,17 +6,16 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
-from rce.protocol.codec import encode_data
+from rce.protocol import encode_data
 from rce.ros.types.fields import element_min_size
 from rce_robot.exceptions import UnreadableError
-from rce_robot.outgoing import Outgoing, Serialized
+from rce_robot.outgoing import Buffer, Outgoing, Rendered, Serialized
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rce.ros.types import MessageType
     from rce_robot.converters import Converter
-    from rce_robot.outgoing import Buffer, Rendered
 
 _encoder = msgspec.json.Encoder()
 _json, _json_into = _encoder.encode, _encoder.encode_into

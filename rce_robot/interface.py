@@ -6,17 +6,15 @@ from abc import abstractmethod
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rce.aio.queues import OverflowPolicy
-from rce.link import Interface
+from rce.link import Interface, Port
 from rce_robot.exceptions import MisdirectedError, RobotError, UnreadableError
 from rce_robot.offload import Offload, Read
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
-    from rce.guard.holdings import Holding
-    from rce.link import Port
-    from rce.protocol.messages import CallId, DataMessage
-    from rce.protocol.stream import LargeData
+    from rce.guard import Holding
+    from rce.protocol import CallId, DataMessage, LargeData
     from rce_robot.conversion import Result
     from rce_robot.conversion.jobs import Job
     from rce_robot.doors.base import Queued

@@ -14,10 +14,18 @@ from typing import TYPE_CHECKING, Any, Protocol
 import msgspec
 
 from rce.aio.queues import OverflowPolicy
-from rce.control.model import EndpointUsage, InterfaceUsage
-from rce.guard.holdings import Holdings
-from rce.link import Endpoint, InterfaceError
-from rce.model import EndpointId, InterfaceType
+from rce.control import (
+    EndpointSpec,
+    EndpointStatus,
+    EndpointUsage,
+    InterfaceUsage,
+    LinkAddress,
+    SpecPatch,
+    StatusPatch,
+)
+from rce.guard import Holding, Holdings, Ledger
+from rce.link import Endpoint, Interface, InterfaceError, LinkHub, Port
+from rce.model import EndpointId, InterfaceSpec, InterfaceType, Request
 from rce_robot.exceptions import MisdirectedError
 from rce_robot.interfaces import make_interface
 from rce_robot.reporting import RobotReporter
@@ -25,13 +33,7 @@ from rce_robot.reporting import RobotReporter
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
-    from rce.control.model import EndpointSpec, EndpointStatus, LinkAddress, SpecPatch, StatusPatch
-    from rce.guard.budget import Ledger
-    from rce.guard.holdings import Holding
-    from rce.link import Interface, LinkHub, Port
-    from rce.model import InterfaceSpec, Request
-    from rce.protocol.messages import CallId, DataMessage, ErrorReport
-    from rce.protocol.stream import LargeData
+    from rce.protocol import CallId, DataMessage, ErrorReport, LargeData
     from rce_robot.conversion import ConversionPool, Result
     from rce_robot.conversion.jobs import Job
     from rce_robot.doors.base import DoorSession, Queued

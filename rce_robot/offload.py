@@ -6,18 +6,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
-from rce_robot.conversion import ConversionFailedError, ReadText, ReadValue, Show
+from rce_robot.conversion import ConversionFailedError, ReadText, ReadValue, Result, Show
 from rce_robot.exceptions import UnreadableError
-from rce_robot.outgoing import Outgoing
+from rce_robot.outgoing import Buffer, Outgoing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rce.model import InterfaceSpec
-    from rce.protocol.stream import LargeData
-    from rce_robot.conversion import Result
+    from rce.protocol import LargeData
     from rce_robot.interface import RobotSide
-    from rce_robot.outgoing import Buffer
 
 
 class Read(NamedTuple):

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
 
 import uvloop
 
-from rce.config.exceptions import LogFileError, RunDirError, SecretError
-from rce.config.logs import log_as
-from rce.config.secret import load_secret
+from rce.config import EngineSettings, LogFileError, RunDirError, SecretError, load_secret, log_as
 from rce.own_process import raise_file_limit
 from rce.ros.tcpros.allocator import keep_large_blocks
+from rce.tls import CertificateError
 from rce.tls.choice import TlsChoice
-from rce.tls.faults import CertificateError
 from rce_robot.app import App
 from rce_robot.settings import RobotSettings
-
-if TYPE_CHECKING:
-    from rce.config.settings import EngineSettings
 
 
 def run(engine: EngineSettings, *, verbose: bool = False) -> int:

@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.control.model import EndpointState, EndpointStatus, StatusPatch
+from rce.control import EndpointState, EndpointStatus, LinkAddress, StatusPatch
 
 if TYPE_CHECKING:
-    from rce.control.model import LinkAddress
     from rce.link import Endpoint
     from rce_robot.doors.base import DoorSession
 

@@ -7,21 +7,17 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING, Any
 
-from rce.link import CallError, CallTimeoutError, OverloadedError, PeerFaultError, PeerLostError
+from rce.link import CallError, CallTimeoutError, OverloadedError, PeerFaultError, PeerLostError, Port
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
-from rce_robot.interface import RobotInterface
+from rce_robot.interface import RobotInterface, RobotSide
 from rce_robot.offload import Read, pack_value
-from rce_robot.outgoing import fresh_id
+from rce_robot.outgoing import Buffer, fresh_id
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Iterator
 
-    from rce.link import Port
-    from rce.protocol.messages import DataMessage
-    from rce.protocol.stream import LargeData
+    from rce.protocol import DataMessage, LargeData
     from rce_robot.forms import Form
-    from rce_robot.interface import RobotSide
-    from rce_robot.outgoing import Buffer
 
 
 _log = logging.getLogger(__name__)

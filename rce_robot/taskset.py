@@ -9,19 +9,22 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
-from typing import TYPE_CHECKING, Protocol, assert_never
+from typing import TYPE_CHECKING, assert_never
 
-from rce.control.exceptions import ControlError
-from rce.control.messages import (
+from rce.control import (
     CONTROL_VERSION,
+    PATCHES,
     TYPED_REQUESTS,
     ClientReply,
+    ControlError,
     Drop,
+    EndpointSpec,
     Execute,
     Fault,
     Gone,
     Hello,
     Left,
+    LinkAddress,
     LoginReply,
     MachineInfo,
     Notify,
@@ -31,62 +34,35 @@ from rce.control.messages import (
     Put,
     ReadLog,
     Refused,
+    RemoveVolume,
+    SpecPatch,
     SpecWanted,
     Status,
+    StatusPatch,
     StatusWanted,
     Sync,
     TaskSetKind,
+    ToTaskSet,
     Usage,
     Welcome,
 )
-from rce.control.model import PATCHES, StatusPatch
-from rce.guard.budget import Ledger
-from rce.model import EndpointId
+from rce.guard import Ledger, Lobby
+from rce.model import EndpointId, Request
 from rce.own_process import cpu_seconds, machine_memory, resident_bytes
-from rce.protocol.exceptions import HandshakeError
-from rce.protocol.messages import ErrorReport, type_of
-from rce.protocol.requests import write_request
+from rce.protocol import Credentials, ErrorReport, HandshakeError
 from rce.ros.tcpros.allocator import give_back_free_memory
+from rce_robot.master_requests import MasterChannel, ask_master
 from rce_robot.memory import UnusedMemory
-from rce_robot.namespace import Namespace
-from rce_robot.refusals import reports_of
+from rce_robot.namespace import Forms, Namespace
 
 if TYPE_CHECKING:
-    from rce.control.messages import ToMaster, ToTaskSet
-    from rce.control.model import EndpointSpec, LinkAddress, SpecPatch
-    from rce.guard.lobby import Lobby
     from rce.link import LinkHub
-    from rce.model import Request
-    from rce.protocol.http import Credentials
     from rce_robot.conversion import ConversionPool
-    from rce_robot.namespace import Forms
     from rce_robot.settings import RobotSettings
 
 _log = logging.getLogger(__name__)
 
 _OK, _UNAVAILABLE = 200, 503
-
-
-class Channel(Protocol):
-    """The used part of :class:`rce.control.channel.TaskSetChannel`."""
-
-    def send(self, message: ToMaster) -> None:
-        """Send, or drop while the master is away."""
-
-    async def login(
-        self, user: str, robot: str, password: str, address: str = "", token: str = ""
-    ) -> LoginReply:
-        """Ask whether a robot may log in; raise :class:`ControlError` if the master stays away."""
-
-    async def client_request(
-        self,
-        id: str,  # noqa: A002 - wire names
-        type: str,  # noqa: A002
-        data: object = None,
-        *,
-        content: Request | None = None,
-    ) -> ClientReply:
-        """Have a client's request carried out; raise :class:`ControlError` likewise."""
 
 
 class RobotTaskSet:
@@ -126,7 +102,7 @@ class RobotTaskSet:
         self._machine = machine
         self._url = url
         self._address = address
-        self._channel: Channel
+        self._channel: MasterChannel
         self._namespaces: dict[EndpointId, Namespace] = {}
         self._closing: dict[EndpointId, asyncio.Event] = {}
         self._changed: set[Namespace] = set()
@@ -142,7 +118,7 @@ class RobotTaskSet:
 
     # Messages of the master
 
-    def use(self, channel: Channel) -> None:
+    def use(self, channel: MasterChannel) -> None:
         """Set the channel, which was made with :meth:`hello` and :meth:`handle`."""
         self._channel = channel
 
@@ -180,7 +156,9 @@ class RobotTaskSet:
                 self._notify(message)
             case Probe():
                 self._probe(EndpointId.parse(message.id))
-            case Welcome() | Refused() | LoginReply() | ClientReply() | ReadLog() | Execute():
+            case (
+                Welcome() | Refused() | LoginReply() | ClientReply() | ReadLog() | RemoveVolume() | Execute()
+            ):
                 _log.debug("not for a robot task set: %s", type(message).__name__)
             case _:
                 assert_never(message)
@@ -274,16 +252,7 @@ class RobotTaskSet:
 
     async def ask_master(self, id: EndpointId, request: Request) -> tuple[ErrorReport, ...]:  # noqa: A002
         """Have a client's request carried out; return the faults."""
-        type_ = type_of(request)
-        try:
-            if TYPED_REQUESTS in self._master_features:
-                reply = await self._channel.client_request(str(id), type_, content=request)
-            else:
-                data = write_request(request)
-                reply = await self._channel.client_request(str(id), type_, data=data)
-        except ControlError as error:
-            return (ErrorReport(problem=f"{type_}: not done: {error}"),)
-        return reports_of(reply)
+        return await ask_master(self._channel, id, request, typed=TYPED_REQUESTS in self._master_features)
 
     # Private
 

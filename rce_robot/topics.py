@@ -6,23 +6,19 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rce.aio.queues import OverflowPolicy
-from rce.protocol.messages import NO_ID
+from rce.protocol import NO_ID, DataMessage, LargeData
 from rce_robot.conversion import ConversionQueue
 from rce_robot.exceptions import BusyError, MisdirectedError, UnreadableError
-from rce_robot.interface import Delivery, RobotInterface
+from rce_robot.interface import Delivery, RobotInterface, RobotSide
 from rce_robot.offload import Read, pack_value
-from rce_robot.outgoing import Outgoing
+from rce_robot.outgoing import Buffer, Outgoing
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Coroutine, Sequence
 
-    from rce.guard.holdings import Holding
+    from rce.guard import Holding
     from rce.link import Port
-    from rce.protocol.messages import DataMessage
-    from rce.protocol.stream import LargeData
     from rce_robot.forms import Form
-    from rce_robot.interface import RobotSide
-    from rce_robot.outgoing import Buffer
 
 
 class _Converted(NamedTuple):

@@ -41,7 +41,7 @@ if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
 
 def _runs(*argv: str) -> bool:
     try:
-        return subprocess.run(argv, capture_output=True, timeout=30, check=False).returncode == 0
+        return subprocess.run(argv, capture_output=True, timeout=120, check=False).returncode == 0
     except OSError:
         return False
 
@@ -328,7 +328,7 @@ def _leaks(fds: dict[int, str], children: set[int], threads: set[threading.Threa
 @pytest.fixture(autouse=True)
 def _no_leaks(request: pytest.FixtureRequest) -> Iterator[None]:
     """Fail a test that leaves a descriptor, a process or a thread behind."""
-    if "shared_engine" in request.fixturenames:
+    if {"shared_engine", "shared_demo"} & set(request.fixturenames):
         yield
         return
     fds, threads = _descriptors(), set(threading.enumerate())

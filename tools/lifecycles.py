@@ -19,6 +19,7 @@ import rce_container.life
 import rce_fleet.coordination.move_client
 import rce_fleet.coordination.robot
 import rce_fleet.navigation.move_base.core
+import rce_fleet.tasks.task
 import rce_master.state.lifecycle
 from rce.lifecycle import LifeCycle
 from tools.state_diagram import draw, word
@@ -90,6 +91,12 @@ CYCLES = (
         "fleet-robot",
         "A robot as the planner sees it.",
         rce_fleet.coordination.robot.ROBOT_LIFE,
+    ),
+    Cycle(
+        "Task of the fleet",
+        "fleet-task",
+        "What `GET /api/v1/tasks` shows. [Tasks of a fleet](tasks.md) describes what leads to each.",
+        rce_fleet.tasks.task.TASK_LIFE,
     ),
     Cycle(
         "Move client",

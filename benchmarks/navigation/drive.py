@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import hypot, pi
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -17,10 +16,7 @@ from rce_fleet.navigation.costmap.costs import FREE, INSCRIBED
 from rce_fleet.navigation.move_base.core import Ending
 from rce_fleet.navigation.planners.global_planner import make_plan
 from rce_fleet.simulation.map_walls import draw_map
-from rce_fleet.simulation.walls import Walls
-
-if TYPE_CHECKING:
-    from rce_fleet.simulation.walls import Point
+from rce_fleet.simulation.walls import Point, Walls
 
 BOXES, UNMAPPED, WALKERS = 10, 3, 3
 GIVE_UP = 180.0

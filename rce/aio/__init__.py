@@ -1,1 +1,1 @@
-"""Additions to asyncio: backoff, owners of tasks, bounded queues."""
+"""Additions to asyncio: backoff, owners of tasks, bounded queues, closing of servers."""

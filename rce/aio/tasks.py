@@ -126,6 +126,25 @@ async def cancel_and_wait(*tasks: asyncio.Future[Any]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
+async def finish(work: Coroutine[Any, Any, T]) -> T:
+    """Run ``work`` to its end, also if the caller is cancelled meanwhile: for cleaning up.
+
+    Raises:
+        asyncio.CancelledError: The caller was cancelled; ``work`` has ended.
+    """
+    task = asyncio.create_task(work)
+    cancelled: asyncio.CancelledError | None = None
+    while not task.done():
+        try:
+            await asyncio.wait((task,))
+        except asyncio.CancelledError as error:
+            cancelled = error
+    result = task.result()
+    if cancelled is not None:
+        raise cancelled
+    return result
+
+
 async def run_until_first(*works: Coroutine[Any, Any, object]) -> None:
     """Run coroutines side by side until one ends; then cancel the others and wait until they have ended.
 

@@ -1,4 +1,4 @@
-"""The ``rce`` program."""
+"""The ``rce`` program, with ``up`` and the commands for secrets, certificates and services."""
 
 from rce.cli.main import main
 

@@ -9,9 +9,9 @@ from typing import Annotated, TypeVar
 import typer
 
 from rce.cli.options import Certificates
+from rce.tls import CertificateError
 from rce.tls.authority import AUTHORITY_DAYS, CERTIFICATE_DAYS, RENEWAL_DAYS, Details
 from rce.tls.choice import default_folder
-from rce.tls.faults import CertificateError
 from rce.tls.folder import AUTHORITY, CertificateFolder
 
 T = TypeVar("T")

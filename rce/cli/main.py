@@ -75,7 +75,7 @@ def _add_unavailable(app: typer.Typer, name: str, problem: str) -> None:
 
     @app.command(
         name,
-        help=f"Not available: {problem}.",
+        help=f"Not available: {problem}.".replace("[", r"\["),  # typer reads brackets as markup
         context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
     )
     def unavailable() -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from rce.config.settings import EngineSettings
+    from rce.config import EngineSettings
 
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Log more: --log-level debug.")]
 

@@ -19,10 +19,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rce.config import ConfigError, EngineSettings, Fault, load_settings
 from rce.config.documents import parse, read_file
-from rce.config.exceptions import ConfigError, Fault
-from rce.config.loading import load_settings
-from rce.config.settings import EngineSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -25,10 +25,10 @@ _ROLES = {
     "rce_master": SERVER,
     "rce_robot": SERVER,
     "rce_container": SERVER,
-    "rce_fleet.station": FLEET,
-    "rce_fleet.drivers": FLEET,
     "rce_fleet.demo": ALL,
+    "rce_fleet": FLEET,
 }
+"""Extras of packages; the first one that fits counts."""
 
 
 def master() -> None:

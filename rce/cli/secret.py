@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rce.config.exceptions import SecretError
-from rce.config.secret import default_secret_file, new_secret, retire_secrets, rotate_secret
+from rce.config import SecretError, default_secret_file, new_secret, retire_secrets, rotate_secret
 
 app = typer.Typer(no_args_is_help=True, help="Create or change the secret of the engine's programs.")
 

@@ -16,10 +16,7 @@ import platformdirs
 import typer
 from msgspec.structs import replace
 
-from rce.config.exceptions import ConfigError
-from rce.config.loading import load_settings
-from rce.config.secret import default_secret_file
-from rce.config.settings import EngineSettings
+from rce.config import ConfigError, EngineSettings, default_secret_file, load_settings
 from rce.services.units import SYSTEM_STATE, Role, Service, unit
 
 SYSTEM_UNITS = Path("/etc/systemd/system")
@@ -73,7 +70,9 @@ def install_service(
     _systemctl(system, ["daemon-reload"], ["enable", "--now", service.name])
 
 
-def uninstall_service(role: Role, *, user_unit: UserUnit = None) -> None:
+def uninstall_service(
+    role: Annotated[Role, typer.Argument(help="Program of the unit.")], *, user_unit: UserUnit = None
+) -> None:
     """Stop and remove a systemd service; keep state and settings."""
     system = _is_system(user_unit)
     path = _units(system=system) / f"rce-{role}.service"

@@ -22,10 +22,17 @@ from typing import Annotated, Any
 
 import typer
 
-from rce.config.exceptions import ConfigError, Fault
-from rce.config.fields import Field, SettingError, fields_of, sections_of
-from rce.config.loading import load_settings, read_document
-from rce.config.settings import EngineSettings
+from rce.config import (
+    ConfigError,
+    EngineSettings,
+    Fault,
+    Field,
+    SettingError,
+    fields_of,
+    load_settings,
+    read_document,
+    sections_of,
+)
 
 COMMON = ("dev", "secret_file", "machine", "log_level", "log_dir", "log_size", "log_count")
 """Settings that are options of every program of the engine."""

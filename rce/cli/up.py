@@ -11,9 +11,7 @@ import typer
 from msgspec.structs import replace
 
 from rce.cli.settings import SettingsOptions
-from rce.config.fields import SettingError, fields_of
-from rce.config.loading import as_document
-from rce.config.settings import LOOPBACK, EngineSettings, MasterSettings
+from rce.config import LOOPBACK, EngineSettings, MasterSettings, SettingError, as_document, fields_of
 from rce.supervision.plan import Plan, Program
 from rce.tls.choice import WARNED_VARIABLE, plain_warning
 
@@ -26,7 +24,7 @@ SHARED = (
     "rce.config.loading",
     "rce.config.logs",
     "rce.config.secret",
-    "rce.control.channel",
+    "rce.control_channel.channel",
     "rce.link.hub",
     "rce.ros.packages",
     "rce.own_process",

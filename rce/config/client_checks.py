@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from rce.config.exceptions import Fault
-from rce.config.items import SPELLING
+from rce.config.items import SPELLING, ItemOf
 from rce.model import (
     AddInterface,
     AddNode,
@@ -31,8 +31,6 @@ from rce.model import (
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Iterator, Mapping
     from typing import Self
-
-    from rce.config.items import ItemOf
 
 
 @dataclass

@@ -26,10 +26,11 @@ from rce.model import (
     Item,
     NodeSpec,
     SetParameter,
+    join_path,
     written,
 )
-from rce.model.spelling import Field, Spelling, camel, fields_of
-from rce.model.written import HUMAN_PATTERNS
+from rce.model.spelling import Field, Spelling, camel, fault_of, fields_of
+from rce.model.written import HUMAN_PATTERNS, AsWritten
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -115,6 +116,8 @@ def _annotation(field: Field) -> Any:
     rule = field.rule
     if field.choices:
         return Annotated[Any, BeforeValidator(_one_of(field.choices))]
+    if get_origin(rule.type) is list:
+        return Annotated[Any, AfterValidator(_specs(rule))]
     if rule.words:
         return Annotated[Any, AfterValidator(_fitting(rule.type, rule.words))]
     if get_origin(rule.type) is tuple:
@@ -162,6 +165,20 @@ def _checked(read: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
     def check(value: Any) -> Any:
         read(value)
+        return value
+
+    return check
+
+
+def _specs(rule: AsWritten) -> Callable[[Any], Any]:
+    """Check a list of specs, such as volumes; the list stays as it was written."""
+
+    def check(value: Any) -> Any:
+        try:
+            rule.read(msgspec.convert(value, rule.type))
+        except msgspec.ValidationError as error:
+            fault = fault_of(str(error), value)
+            raise ValueError(f"{join_path(fault.path)} {fault.problem}".strip()) from error
         return value
 
     return check

@@ -6,12 +6,18 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, TypeVar
 
-from rce.control.model import EndpointContents, EndpointKind, EndpointSpec
+from rce.control.model import (
+    ConnectionSpec,
+    EndpointContents,
+    EndpointKind,
+    EndpointSpec,
+    LinkSpec,
+    SpecPatch,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping
 
-    from rce.control.model import ConnectionSpec, LinkSpec, SpecPatch
     from rce.model import InterfaceSpec
 
 K = TypeVar("K", bound="Hashable")

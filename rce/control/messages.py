@@ -42,6 +42,19 @@ TYPED_REQUESTS = "typed-requests"
 """A feature of masters: they take :attr:`ClientRequest.content`."""
 
 
+VOLUMES = "volumes"
+"""A feature of container task sets: they take :class:`RemoveVolume`."""
+
+
+class VolumeLimit(Enum):
+    """How a machine keeps volumes within their size."""
+
+    IMAGE = "image"
+    """Each is a file system of its size: a write beyond it fails with ENOSPC."""
+    WATCHED = "watched"
+    """They are folders that are measured; a container whose volume is too large is ended."""
+
+
 class TaskSetKind(Enum):
     """Which kind of task set dials."""
 
@@ -71,6 +84,8 @@ class MachineInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_fie
     """It takes no new containers: its operator said so where it runs."""
     requirements: bool = False
     """Whether it installs what packages that users bring ask for in their ``requirements.txt``."""
+    volumes: str = ""
+    """How the size of volumes is enforced, a :class:`VolumeLimit`; empty: containers cannot have any."""
     detail: str = ""
     """Text on what is missing on this machine."""
 
@@ -149,6 +164,14 @@ class Usage(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """How often a user held too much, and lost the oldest of it."""
     turned_away: int = 0
     """Connections that were closed because too many had not authenticated."""
+    volumes: dict[str, int] = {}
+    """Bytes that volumes hold, by ``user/name``, as far as they were measured."""
+
+
+class VolumeRemoved(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """Answer to :class:`RemoveVolume`: the files are gone."""
+
+    volume: str
 
 
 class Login(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -312,6 +335,16 @@ class ReadLog(_Message, frozen=True, kw_only=True, omit_defaults=True):
     query: LogQuery = field(default=LogQuery(), name="wish")
 
 
+class RemoveVolume(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """Remove a volume that no container has; sent again after each ``Sync`` until it is answered.
+
+    Only to task sets with the feature :data:`VOLUMES`.
+    """
+
+    volume: str
+    """``user/name``."""
+
+
 class Execute(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Run a command in a container, and dial for it (:mod:`rce.control.execution`)."""
 
@@ -323,7 +356,18 @@ class Execute(_Message, frozen=True, kw_only=True, omit_defaults=True):
 
 
 ToMaster = (
-    Hello | Status | PatchStatus | SpecWanted | Gone | Fault | Usage | Login | Left | ClientRequest | LogChunk
+    Hello
+    | Status
+    | PatchStatus
+    | SpecWanted
+    | Gone
+    | Fault
+    | Usage
+    | VolumeRemoved
+    | Login
+    | Left
+    | ClientRequest
+    | LogChunk
 )
 ToTaskSet = (
     Welcome
@@ -338,6 +382,7 @@ ToTaskSet = (
     | LoginReply
     | ClientReply
     | ReadLog
+    | RemoveVolume
     | Execute
 )
 

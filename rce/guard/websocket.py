@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING, TypeVar
 from websockets.asyncio.server import ServerConnection
 from websockets.protocol import State
 
-from rce.guard.lobby import address_of
+from rce.guard.lobby import Guest, Lobby, address_of
 from rce.guard.plain import PlainPort
 
 if TYPE_CHECKING:
     import asyncio
-
-    from rce.guard.lobby import Guest, Lobby
 
 
 class GuardedConnection(ServerConnection):

@@ -8,14 +8,13 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from rce.aio.tasks import BackgroundTasks
-from rce.guard.holdings import Holdings
+from rce.guard import Holding, Holdings
 from rce.link.exceptions import NotConnectedError, OverloadedError
 from rce.link.frames import MAX_ID
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rce.guard.holdings import Holding
     from rce.link.channel import Channel
     from rce.link.interface import Buffer
     from rce.link.settings import LinkLimits

@@ -19,15 +19,14 @@ from rce.link.exceptions import (
 )
 from rce.link.frames import LATCHED, OVERLOADED, Frame, FrameType, encode_sources, parse_sources
 from rce.link.handshake import LATCH
-from rce.link.queues import OutgoingQueue
+from rce.link.queues import Backlog, OutgoingQueue
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from rce.control.model import ConnectionSpec
+    from rce.control import ConnectionSpec
     from rce.link.interface import Buffer
     from rce.link.link import Link
-    from rce.link.queues import Backlog
     from rce.link.slot import InterfaceSlot
 
 _log = logging.getLogger(__name__)

@@ -10,9 +10,16 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rce.aio.tasks import BackgroundTasks
-from rce.control.desired import DesiredState, Difference
-from rce.control.model import EndpointKind, EndpointSpec
-from rce.guard.holdings import Holdings
+from rce.control import (
+    ConnectionSpec,
+    DesiredState,
+    Difference,
+    EndpointKind,
+    EndpointSpec,
+    InterfaceUsage,
+    SpecPatch,
+)
+from rce.guard import Holdings
 from rce.link.channel import Channel
 from rce.link.links import EndpointLinks, is_same_link
 from rce.link.queues import Backlog
@@ -22,7 +29,6 @@ from rce.link.wiring import ChannelTable, Refusals, WiringNews
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from rce.control.model import ConnectionSpec, InterfaceUsage, SpecPatch
     from rce.link.hub import LinkHub
     from rce.link.interface import InterfaceFactory
     from rce.link.link import Link

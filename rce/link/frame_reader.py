@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING
 
 from rce.buffers import unfilled
 from rce.link.exceptions import ProtocolError
 from rce.link.frames import HEADER, HEADER_SIZE, Frame, FrameType
-from rce.link.settings import KIB
-
-if TYPE_CHECKING:
-    from rce.link.settings import LinkLimits
+from rce.link.settings import KIB, LinkLimits
 
 _TYPES = {int(t): t for t in FrameType}
 _CARRIERS = frozenset({FrameType.DATA, FrameType.CALL, FrameType.REPLY})

@@ -21,7 +21,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from rce.aio.tasks import BackgroundTasks
-from rce.guard.lobby import Lobby, address_of
+from rce.guard import Lobby, address_of
 from rce.link.exceptions import LinkError, LinkRefusedError
 from rce.link.frames import HANDSHAKE_SIZE, HEADER_SIZE, Frame, FrameType, encode
 from rce.link.opening import LinkSender, PlainLinkRefusedError, read_hello

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 from rce.aio.servers import close_servers
 from rce.aio.tasks import BackgroundTasks
 from rce.dialing import open_socket
-from rce.guard.lobby import Lobby, address_of
+from rce.guard import Guest, Lobby, address_of
 from rce.link.carrier import Carrier, LocalCarrier
 from rce.link.exceptions import LinkError, LinkLostError, LinkRefusedError
 from rce.link.frames import Frame, FrameType, encode
 from rce.link.handover import LinkAcceptor
-from rce.link.handshake import check_answer, encode_hello, encode_welcome, parse_hello
+from rce.link.handshake import Hello, check_answer, encode_hello, encode_welcome, parse_hello
 from rce.link.opening import secured_link
 from rce.link.secure import Adopter, accept_secure, dial_secure
 from rce.link.settings import LinkLimits, LinkTimeouts
@@ -28,9 +28,7 @@ from rce.link.unix import bind_private, unlink_own
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rce.control.model import LinkAddress, LinkSpec
-    from rce.guard.lobby import Guest
-    from rce.link.handshake import Hello
+    from rce.control import LinkAddress, LinkSpec
     from rce.link.link import Link
 
 _log = logging.getLogger(__name__)

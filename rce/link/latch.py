@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
 
-    from rce.guard.holdings import Holding, Holdings
+    from rce.guard import Holding, Holdings
 
 MAX_SOURCES = 1024
 """Publishers of one topic whose latched messages are kept."""

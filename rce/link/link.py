@@ -6,15 +6,14 @@ import logging
 from typing import TYPE_CHECKING
 
 from rce.link.exceptions import ProtocolError
-from rce.link.frames import FrameType
+from rce.link.frames import Frame, FrameType
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.control.model import LinkSpec
+    from rce.control import LinkSpec
     from rce.link.carrier import Carrier
     from rce.link.channel import Channel
-    from rce.link.frames import Frame
     from rce.link.pacing import Pacer
     from rce.link.settings import LinkLimits
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.link.carrier import LocalCarrier
+from rce.link.carrier import Carrier, LocalCarrier
 from rce.link.exceptions import LinkError
 from rce.link.link import Link, add_traffic
 from rce.link.pacing import Pacer
@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rce.aio.tasks import BackgroundTasks
-    from rce.control.model import LinkAddress, LinkSpec
-    from rce.link.carrier import Carrier
+    from rce.control import LinkAddress, LinkSpec
     from rce.link.hub import LinkHub
     from rce.model import EndpointId
 

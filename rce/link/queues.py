@@ -7,15 +7,14 @@ from enum import Enum
 from typing import TYPE_CHECKING
 
 from rce.aio.queues import BoundedQueue, OverflowPolicy
-from rce.control.model import InterfaceUsage
+from rce.control import InterfaceUsage
 from rce.link.exceptions import OverloadedError
-from rce.link.frames import FRAGMENT_SIZE, LATCHED, FrameType
+from rce.link.frames import FRAGMENT_SIZE, LATCHED, Frame, FrameType
 from rce.link.settings import KIB
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.link.frames import Frame
 
 SMALL_MESSAGE = 4 * KIB
 """Messages up to this size are urgent.

@@ -14,7 +14,7 @@ from rce.link.handshake import encode_secure
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rce.control.model import LinkSpec
+    from rce.control import LinkSpec
     from rce.link.socket_carrier import SocketCarrier
 
 

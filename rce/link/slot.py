@@ -5,21 +5,19 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from rce.guard.holdings import Holdings
+from rce.guard import Holdings
 from rce.link.calls import CallServer
-from rce.link.channel import as_payload
+from rce.link.channel import Channel, as_payload
 from rce.link.exceptions import MessageTooLargeError, NotConnectedError
 from rce.link.latch import HeardSources, LatchedMessages
 from rce.link.queues import Counters
-from rce.model import InterfaceType, Role
+from rce.model import InterfaceSpec, InterfaceType, Role
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from rce.link.channel import Channel
     from rce.link.interface import Buffer, Interface, InterfaceFactory
     from rce.link.settings import LinkLimits, LinkTimeouts
-    from rce.model import InterfaceSpec
 
 _log = logging.getLogger(__name__)
 

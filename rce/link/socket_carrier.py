@@ -13,16 +13,14 @@ from rce.link.exceptions import LinkLostError, ProtocolError
 from rce.link.flow_control import FlowControl
 from rce.link.frame_reader import FrameReader
 from rce.link.frames import FRAGMENT_SIZE, HANDSHAKE_SIZE, Frame, FrameType, encode
-from rce.link.lanes import Lanes, frame_chunk
-from rce.link.settings import KIB, MIB
+from rce.link.lanes import Chunk, Lanes, frame_chunk
+from rce.link.settings import KIB, MIB, LinkLimits, LinkTimeouts
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.link.lanes import Chunk
     from rce.link.pacing import Pacer
     from rce.link.queues import OutgoingQueue
-    from rce.link.settings import LinkLimits, LinkTimeouts
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)

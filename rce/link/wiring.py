@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from rce.control.desired import DesiredState
-    from rce.control.model import ConnectionSpec
+    from rce.control import ConnectionSpec, DesiredState
     from rce.link.channel import Channel
     from rce.model import InterfaceSpec
 

@@ -55,6 +55,7 @@ from rce.model.specs import (
     Resources,
     RestartPolicy,
 )
+from rce.model.volumes import Volume
 
 __all__ = [
     "DEFAULT_PREFIX",
@@ -93,6 +94,7 @@ __all__ = [
     "Role",
     "SetParameter",
     "SpecError",
+    "Volume",
     "about",
     "faults_of",
     "find_circle",

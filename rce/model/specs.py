@@ -22,6 +22,7 @@ from rce.model.quantities import (
     read_memory,
     write_plain_memory,
 )
+from rce.model.volumes import Volume, WrittenVolume, read_volumes, write_volumes
 from rce.model.written import AsWritten
 
 ParameterValue = bool | int | float | str | list[bool | int | float | str]
@@ -74,6 +75,7 @@ _GIVEN_SLOTS = AsWritten(Annotated[int, Meta(ge=1, le=_MAX_SLOTS)])
 _LABELS = AsWritten(list[str] | str, _read_features, list, words="must be a string or a list of strings")
 _NETWORK = AsWritten(written.NetworkName, Network, _value_of, blank="")
 _RESTART = AsWritten(written.RestartName, RestartPolicy, _value_of)
+_VOLUMES = AsWritten(list[WrittenVolume], read_volumes, write_volumes)
 _TAGS = AsWritten(tuple[written.Name, ...])
 _TIMES = AsWritten(Annotated[int, Meta(ge=0, le=2**31 - 1)])
 _TIMEOUT = AsWritten(Annotated[float, Meta(ge=0.1, le=86400.0)])
@@ -98,6 +100,8 @@ class Resources(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """IPv4, with or without ``/NN``."""
     image: Annotated[str, AsWritten(written.Text, read_image)] = ""
     """Root file system: an OCI image's name, or a folder of the machine; needs the runtime ``podman``."""
+    volumes: Annotated[tuple[Volume, ...], _VOLUMES] = ()
+    """Folders of the user's on its machine that outlive it."""
 
 
 class ResourceChanges(Struct, frozen=True, kw_only=True, omit_defaults=True):

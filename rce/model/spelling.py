@@ -25,16 +25,14 @@ from typing import (
 import msgspec
 from msgspec import NODEFAULT, UNSET, Struct, UnsetType
 
-from rce.model.faults import FaultCode, FieldFault, SpecError
-from rce.model.requests import faults_of
+from rce.model.faults import FaultCode, FieldFault, Path, SpecError
+from rce.model.requests import Item, Request, faults_of
 from rce.model.specs import Network, Resources
 from rce.model.written import HUMAN_PATTERNS, AsWritten
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from rce.model.faults import Path
-    from rce.model.requests import Item, Request
 
 S = TypeVar("S", bound=Struct)
 T = TypeVar("T", bound="Request | Item")

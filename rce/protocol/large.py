@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.protocol.assembler import Assembler
+from rce.protocol.assembler import Assembler, Binary
 from rce.protocol.exceptions import MessageError
 from rce.protocol.limits import DEFAULT_LIMITS, Limits
 from rce.protocol.messages import DataMessage
 from rce.protocol.reading import check_depth, message_from_json, parse_json
-from rce.protocol.weight import check_elements
+from rce.protocol.weight import Address, check_elements
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from rce.protocol.assembler import Binary
-    from rce.protocol.weight import Address
 
 
 def read_large(

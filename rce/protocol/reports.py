@@ -12,14 +12,11 @@ Engines of the release before send the text only, and clients of it read the tex
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rce.model import FaultCode, FieldFault
+from rce.model import FaultCode, FieldFault, Path
 from rce.protocol.calls import call_at
 from rce.protocol.messages import ErrorReport
-
-if TYPE_CHECKING:
-    from rce.model import Path
 
 
 def write_report(report: ErrorReport) -> dict[str, Any]:

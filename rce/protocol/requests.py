@@ -68,7 +68,7 @@ _LISTS: dict[type[Request], dict[str, type[Item]]] = {
 }
 """The lists of items that a request has, by their attributes."""
 
-_MAX_ITEMS = 512
+MAX_ITEMS = 512
 """Items of all lists of one ``CN`` or ``CX``: each is read on its own."""
 _MAX_FAULTS = 32
 """Wrong items of one ``CN`` or ``CX`` after which no more are read."""
@@ -112,10 +112,10 @@ def kind_of(value: Any) -> str:
 def _read_lists(data: dict[str, Any], lists: dict[str, type[Item]]) -> dict[str, Any]:
     """Read each item of each list on its own, so that a wrong one does not affect the others."""
     count = sum(len(items) for name in lists if isinstance(items := data.get(camel(name)), list))
-    if count > _MAX_ITEMS:
+    if count > MAX_ITEMS:
         raise MessageError(
             "data",
-            f"{count} items are over the limit of {_MAX_ITEMS}; send them in several messages",
+            f"{count} items are over the limit of {MAX_ITEMS}; send them in several messages",
             FaultCode.LIMIT,
         )
     read: dict[str, Any] = {}

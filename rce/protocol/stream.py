@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from msgspec import Struct
 
 from rce.model import FieldFault
-from rce.protocol.assembler import Assembler, Binary
+from rce.protocol.assembler import Assembler, Binary, Dropped
 from rce.protocol.calls import call_at, call_of
 from rce.protocol.exceptions import MessageError, ProtocolError
 from rce.protocol.limits import DEFAULT_LIMITS, Limits
@@ -33,8 +33,6 @@ from rce.protocol.weight import Address, find_address, is_light
 if TYPE_CHECKING:
     from collections.abc import Collection
     from typing import Self
-
-    from rce.protocol.assembler import Dropped
 
 
 class Fault(Struct, frozen=True):

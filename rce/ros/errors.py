@@ -77,6 +77,10 @@ class RpcUnreachableError(XmlRpcError):
         return f"no answer from {self.uri}: {self.reason}"
 
 
+class RpcTimeoutError(RpcUnreachableError):
+    """A server did not answer in time: it may be slow, stopped, or gone without a word."""
+
+
 class MasterError(RosError):
     """The ROS master could not be used."""
 

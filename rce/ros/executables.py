@@ -10,12 +10,9 @@ import logging
 import os
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-from rce.ros.package_tree import stamp_of
-
-if TYPE_CHECKING:
-    from rce.ros.package_tree import Stamp
+from rce.ros.package_tree import Stamp, stamp_of
 
 _log = logging.getLogger(__name__)
 

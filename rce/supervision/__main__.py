@@ -14,7 +14,7 @@ from rce.own_process import end_signals
 from rce.supervision.plan import Plan
 from rce.supervision.prefork import Prepared, prepare
 from rce.supervision.supervisor import StartError, Supervisor
-from rce.tls.faults import CertificateError
+from rce.tls import CertificateError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -56,7 +56,7 @@ def _certificates(plan: Plan) -> AbstractAsyncContextManager[None]:
     if not plan.certified:
         return contextlib.nullcontext()
     # Takes 10 MB, which only engines with TLS spend.
-    from rce.config.loading import load_settings, read_document
+    from rce.config import load_settings, read_document
     from rce.tls.keeping import keep_certificates
 
     settings = load_settings(None, read_document(plan.certified, "the plan"))

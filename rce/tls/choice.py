@@ -7,14 +7,13 @@ import os
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rce.config.folders import default_state_dir
+from rce.config import EngineSettings, default_state_dir
 from rce.tls.faults import CertificateError
 from rce.tls.identity import TlsFiles, TlsIdentity
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rce.config.settings import EngineSettings
 
 ENGINE = "engine"
 """Name of the certificate that an engine's programs use by default."""

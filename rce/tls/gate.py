@@ -15,13 +15,11 @@ import socket
 from typing import TYPE_CHECKING, cast
 
 from rce.aio.tasks import BackgroundTasks
-from rce.guard.lobby import address_of
-from rce.guard.rates import LogThrottle
+from rce.guard import Lobby, LogThrottle, address_of
 from rce.tls.alerts import alert_of
 from rce.tls.faults import CertificateError, explain_to_server
 
 if TYPE_CHECKING:
-    from rce.guard.lobby import Lobby
     from rce.tls.identity import Context
 
 _log = logging.getLogger(__name__)

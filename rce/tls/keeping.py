@@ -15,7 +15,7 @@ from rce.tls.faults import CertificateError
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
 
-    from rce.config.settings import EngineSettings
+    from rce.config import EngineSettings
 
 CHECK_EVERY_S = 6 * 3600.0
 

@@ -1,1 +1,1 @@
-"""Shared code of the engine's HTTP servers."""
+"""Shared parts of the HTTP servers: route table, OpenAPI, origin check, server."""

@@ -55,6 +55,10 @@ class Operation:
     """None: no content, unless ``media`` says that something is streamed."""
     media: str = "application/json"
     status: int = 200
+    also: tuple[int, ...] = ()
+    """Other statuses of a success, with the same content."""
+    other_media: tuple[str, ...] = ()
+    """Other media types of a success, which the request chooses; they are texts."""
     open: bool = False
     """Whether it can be used without a token."""
     query: tuple[Query, ...] = ()
@@ -104,6 +108,7 @@ def _describe(known: Operation, error: type[BaseModel]) -> dict[str, Any]:
         "parameters": [_path_parameter(name) for name in re.findall(r"{(\w+)}", known.path)]
         + [_query_parameter(query) for query in known.query],
         "responses": {str(known.status): _success(known)}
+        | {str(status): _success(known) for status in known.also}
         | {str(status): _failure(status, error) for status in sorted(known.errors)}
         | ({} if known.errors else {"default": _failure(0, error)}),
     }
@@ -137,6 +142,8 @@ def _success(known: Operation) -> dict[str, Any]:
         answer["content"] = _content(known.reply)
     elif known.media != "application/json":
         answer["content"] = {known.media: {"schema": {"type": "string"}}}
+    for media in known.other_media:
+        answer.setdefault("content", {})[media] = {"schema": {"type": "string"}}
     return answer
 
 

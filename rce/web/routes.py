@@ -35,6 +35,10 @@ class Route(Generic[H]):
     """None: no content, unless ``media`` says that the handler streams something."""
     media: str = "application/json"
     status: int = 200
+    also: tuple[int, ...] = ()
+    """Other statuses of a success, with the same content."""
+    other_media: tuple[str, ...] = ()
+    """Other media types of a success, which the request chooses; they are texts."""
     open: bool = False
     """Whether it can be used without a token."""
     query: tuple[Query, ...] = ()

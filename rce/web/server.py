@@ -3,31 +3,44 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self, cast
 
-from aiohttp import web
-from yarl import URL
-
 from rce.aio.servers import close_servers
-from rce.guard.lobby import Guest, Lobby, address_of
+from rce.aio.tasks import BackgroundTasks
+from rce.guard import Guest, Lobby, address_of
 from rce.guard.plain import PlainPort
 from rce.tls.gate import TlsGate
-from rce.web.faults import refuse_expectations, request_log
+from rce.web.early import EarlyConnection
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Callable
 
-    from rce.tls.identity import Context
+    from aiohttp import web
 
-SHUTDOWN_S = 0.5
-"""How long open requests may continue when the server ends."""
+    from rce.tls import Context
+    from rce.web.entry import EntryAnswer
+    from rce.web.serving import RunningApplication
+
 IDLE_S = 30.0
 """A connection that sends no request, or does not come to its end, for so long is closed."""
 
 _BACKLOG = 512
-_FIRST_ERROR = 400
 _SWEEP_EVERY = 32
 """Connections after which those that have ended are forgotten."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class LateApplication:
+    """An application that is loaded with the first request that is not for the entry of its server."""
+
+    load: Callable[[], Callable[[], web.Application]]
+    """Imports what the application needs, in a thread; returns what makes it, in the event loop."""
+    entry: Callable[[str], EntryAnswer]
+    """Answers ``GET /`` until then, from the query of the request."""
 
 
 class HttpServer:
@@ -51,7 +64,7 @@ class HttpServer:
 
     def __init__(
         self,
-        app: web.Application,
+        app: web.Application | LateApplication,
         host: str,
         port: int,
         tls: Context | None = None,
@@ -61,18 +74,14 @@ class HttpServer:
     ) -> None:
         self.lobby = Lobby("HTTP") if lobby is None else lobby
         self._guests: dict[asyncio.BaseTransport, Guest] = {}
-        self._handled: set[Guest] = set()
-        """Those whose request a handler works on."""
         self._arrivals = 0
-        app.middlewares.insert(0, self._track)
-        app.on_response_prepare.append(self._grant)
-        self._runner = web.AppRunner(
-            app,
-            access_log=None,
-            logger=request_log,
-            shutdown_timeout=SHUTDOWN_S,
-            keepalive_timeout=idle_timeout,
-        )
+        self._app = app
+        self._idle_timeout = idle_timeout
+        self._running: RunningApplication | None = None
+        self._loading = BackgroundTasks()
+        self._is_loading = False
+        self._early: set[EarlyConnection] = set()
+        """Connections without the application."""
         self._host = host
         self._port = port
         self._gate = None if tls is None else TlsGate("HTTPS", tls, self.lobby)
@@ -81,20 +90,19 @@ class HttpServer:
         self.url = ""
 
     async def __aenter__(self) -> Self:
-        await self._runner.setup()
-        assert self._runner.server is not None
-        self._runner.server.request_handler = refuse_expectations(self._runner.server.request_handler)
+        if not isinstance(self._app, LateApplication):
+            self._running = await self._start(self._app)
         try:
             self._server = await asyncio.get_running_loop().create_server(
                 self._make_arrival, self._host or None, self._port, backlog=_BACKLOG
             )
         except BaseException:
-            await self._runner.cleanup()
+            await self._end_application()
             raise
         port = self._server.sockets[0].getsockname()[1]
         host = "127.0.0.1" if self._host in ("", "0.0.0.0", "::") else self._host  # noqa: S104 - compared, not bound
         scheme = "http" if self._gate is None else "https"
-        self.url = str(URL.build(scheme=scheme, host=host, port=port, path="/"))
+        self.url = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -102,8 +110,52 @@ class HttpServer:
         await close_servers([self._server])
         if self._gate is not None:
             await self._gate.close()
-        await self._runner.cleanup()
+        await self._end_application()
         await self._server.wait_closed()
+
+    # The application
+
+    async def _start(self, app: web.Application) -> RunningApplication:
+        from rce.web.serving import RunningApplication  # loads aiohttp
+
+        running = RunningApplication(app, self._guests, self._idle_timeout)
+        await running.start()
+        return running
+
+    async def _load(self, late: LateApplication) -> None:
+        """Start the application, and give it the connections that wait for it."""
+        try:
+            make = await asyncio.to_thread(late.load)  # robots and task sets do not wait for it
+            self._running = await self._start(make())
+        except Exception:  # noqa: BLE001 - the next request tries again
+            _log.exception("the application cannot be loaded; its clients are sent away")
+        finally:
+            self._is_loading = False
+            for early in [early for early in self._early if early.waits]:
+                self._pass_on(early)
+
+    async def _end_application(self) -> None:
+        await self._loading.close()
+        for early in tuple(self._early):
+            early.close()
+        if self._running is not None:
+            await self._running.close()
+
+    def _want_application(self, early: EarlyConnection) -> None:
+        """Give a connection to the application, once this is loaded."""
+        if self._running is not None:
+            self._pass_on(early)
+        elif not self._loading.closed and not self._is_loading:
+            assert isinstance(self._app, LateApplication)
+            self._is_loading = True
+            self._loading.spawn(self._load(self._app), name="load the application")
+
+    def _pass_on(self, early: EarlyConnection) -> None:
+        protocol = None if self._running is None else self._running.make_protocol()
+        if protocol is None:
+            early.close()
+        else:
+            early.pass_on(protocol)
 
     # Connections
 
@@ -117,11 +169,20 @@ class HttpServer:
         if self._arrivals % _SWEEP_EVERY == 0:
             self._forget_ended()
         guest = self.lobby.enter(address_of(transport.get_extra_info("peername")), transport.abort)
-        if guest is None or self._runner.server is None:
+        if guest is None:
             transport.abort()
             return
         self._guests[transport] = guest
-        protocol = cast("asyncio.Protocol", self._runner.server())
+        if self._running is None:
+            assert isinstance(self._app, LateApplication)
+            entry = self._app.entry
+            early = EarlyConnection(entry, self._want_application, self._early, self._idle_timeout)
+            protocol: asyncio.Protocol | None = early
+        else:
+            protocol = self._running.make_protocol()
+        if protocol is None:
+            transport.abort()
+            return
         transport.set_protocol(
             protocol if self._plain is None else _FirstWords(self._plain, protocol, transport)
         )
@@ -130,28 +191,6 @@ class HttpServer:
     def _forget_ended(self) -> None:
         for transport in [transport for transport in self._guests if transport.is_closing()]:
             self._guests.pop(transport).leave()
-
-    @web.middleware
-    async def _track(
-        self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
-    ) -> web.StreamResponse:
-        """Keep a connection's place in the lobby while its request is handled."""
-        guest = None if request.transport is None else self._guests.get(request.transport)
-        if guest is None:
-            return await handler(request)
-        guest.speak()
-        self._handled.add(guest)
-        try:
-            return await handler(request)
-        finally:
-            self._handled.discard(guest)
-            guest.rest()
-
-    async def _grant(self, request: web.Request, response: web.StreamResponse) -> None:
-        """Take note that a handler began to stream: the connection no longer counts as unauthenticated."""
-        guest = None if request.transport is None else self._guests.get(request.transport)
-        if guest in self._handled and response.status < _FIRST_ERROR:
-            guest.leave()
 
 
 class _Arrival(asyncio.Protocol):

@@ -16,22 +16,19 @@ import uvloop
 
 from rce.aio.tasks import TaskScope
 from rce.cli.options import Authority
+from rce.config import ConfigError, ShippedFileError, examples_dir, start_logging
 from rce.config.documents import read_file
-from rce.config.exceptions import ConfigError, ShippedFileError
-from rce.config.folders import examples_dir
-from rce.config.logs import start_logging
 from rce.own_process import open_missing_streams
 from rce.ros.errors import RosError
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
-from rce.tls.faults import CertificateError
-from rce.tls.identity import client_contexts
+from rce.tls import CertificateError, Context, client_contexts
 from rce_client.connection import Connection, State
 from rce_client.exceptions import ClientError
 from rce_client.reminder import Reminder
 from rce_client.ros_bridge.bridge import build, joined_graph, wait_ready
 from rce_client.ros_bridge.explain import dot, long_form, picture
-from rce_client.ros_bridge.plan import make_plan
+from rce_client.ros_bridge.plan import Plan, make_plan
 from rce_client.ros_bridge.robot_file import RobotFile
 from rce_client.session import CONNECTING
 
@@ -40,8 +37,6 @@ if TYPE_CHECKING:
 
     from rce.config.client import ClientConfig
     from rce.ros.node import Node
-    from rce.tls.identity import Context
-    from rce_client.ros_bridge.plan import Plan
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 

@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING, assert_never
 
 from rce.model import Role
 from rce.ros.closing import release
-from rce.ros.errors import MasterError, RosError
-from rce.ros.node import Node
+from rce.ros.node import MasterError, Node, RosError, TypeRegistry
+from rce.ros.node import Publisher as RosPublisher
+from rce_client.exceptions import CallError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Sequence
 
     from rce.aio.tasks import TaskScope
-    from rce.ros.node import Publisher as RosPublisher
-    from rce.ros.types import TypeRegistry
     from rce_client.connection import Connection
     from rce_client.own_interfaces import Serialized
     from rce_client.ros_bridge.plan import Plan, Span
@@ -98,7 +97,10 @@ async def lay(span: Span, conn: Connection, node: Node, tasks: TaskScope) -> Non
             service = node.service_client(span.addr, span.message_type)
 
             async def ask_robot(request: Serialized) -> bytes:
-                return bytes(await service.call_serialized(request, timeout=CALL_TIMEOUT))
+                try:
+                    return bytes(await service.call_serialized(request, timeout=CALL_TIMEOUT))
+                except RosError as error:  # its node is not there yet, or refuses the request
+                    raise CallError(str(error)) from error
 
             await conn.service_provider(span.tag, span.message_type, ask_robot, raw=True)
         case _:

@@ -6,13 +6,12 @@ import json
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rce.config.documents import write_items
-from rce.model import Role
+from rce.model import InterfaceSpec, Role
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rce.config.client import ClientConfig
-    from rce.model import InterfaceSpec
 
 _FORWARD = (Role.SUBSCRIBER, Role.SERVICE_PROVIDER)
 """Roles at the end where a message, or a service's request, comes from."""

@@ -11,14 +11,12 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from rce.config.exceptions import ConfigError, Fault
-from rce.model import ConfigureComponents, Form, InterfaceType, Role
-from rce.ros.types import TypesError
+from rce.config import ConfigError, Fault
+from rce.model import ConfigureComponents, Form, InterfaceType, Request, Role
+from rce.ros.types import TypeRegistry, TypesError
 
 if TYPE_CHECKING:
     from rce.config.client import ClientConfig
-    from rce.model import Request
-    from rce.ros.types import TypeRegistry
 
 
 @dataclass(frozen=True, slots=True)

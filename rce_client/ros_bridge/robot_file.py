@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.config.client import loads
+from rce.config.client import ClientConfig, loads
 from rce_client.ros_bridge.bridge import joined_graph
 from rce_client.ros_bridge.plan import check
 from rce_client.ros_bridge.type_lookup import find_types
@@ -12,7 +12,6 @@ from rce_client.ros_bridge.type_lookup import find_types
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.config.client import ClientConfig
     from rce.ros.node import Node
     from rce.ros.types import TypeRegistry
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, assert_never
 
-from rce.config.bridges import action_of
-from rce.config.exceptions import ConfigError, Fault
+from rce.config import ConfigError, Fault
+from rce.config.bridges import Bridge, action_of
 from rce.ros.errors import RosError, ToolError
 from rce.ros.node.master import MasterClient
 from rce.ros.tools.graph import service_type
@@ -15,7 +15,6 @@ from rce.ros.xmlrpc import RpcClient
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from rce.config.bridges import Bridge
     from rce.ros.node import Node
 
 TIMEOUT_S = 10.0

@@ -7,31 +7,28 @@ import contextlib
 import logging
 import os
 import socket
-from collections import deque
 from pathlib import Path
 from typing import assert_never
 
-import msgspec
-
-from rce.control.desired import DesiredState, Fit
-from rce.control.model import (
+from rce.control import (
+    DesiredState,
     EndpointKind,
     EndpointSpec,
     EndpointState,
     EndpointStatus,
+    Fit,
     InterfaceUsage,
     SpecPatch,
+    Unknown,
 )
-from rce.control.tags import Unknown
-from rce.link import Endpoint, LinkHub
-from rce.link.handover import HandoverReceiver
+from rce.link import Endpoint, HandoverReceiver, LinkHub
 from rce.model import EndpointId
 from rce_container.environment import messages as m
-from rce_container.environment.channel import Channel, accept
-from rce_container.environment.exceptions import ChannelError
+from rce_container.environment.channel import Channel
 from rce_container.environment.executions import Executions
 from rce_container.environment.graph import Graph
 from rce_container.environment.logs.rosout import RosoutLog
+from rce_container.environment.managers import Managers
 from rce_container.environment.nodes.causes import Causes
 from rce_container.environment.nodes.fork_server import NodeForkServer
 from rce_container.environment.nodes.heartbeats import Heartbeats
@@ -47,7 +44,6 @@ from rce_container.environment.user_packages import UserPackages
 
 _log = logging.getLogger(__name__)
 
-_MAX_UNTOLD = 100
 _UNUSED = InterfaceUsage()
 
 
@@ -72,7 +68,7 @@ class Environment:
         node_server: NodeForkServer | None = None,
     ) -> None:
         self._boot = boot
-        self._control = control
+        self._managers = Managers(control, boot.grace, self)
         self._links = links
         self._node_server = node_server
         self._loop = asyncio.get_running_loop()
@@ -88,15 +84,12 @@ class Environment:
         self._news = asyncio.Event()
         self._parameters: Values = {}
         self._faulty: set[str] = set()
-        self._channel: Channel | None = None
-        self._grace: asyncio.TimerHandle | None = None
-        self._untold: deque[str] = deque(maxlen=_MAX_UNTOLD)
         self._report_due: asyncio.Handle | None = None
         self._handover: HandoverReceiver | None = None
         self._user_packages = UserPackages(boot.user_packages, boot.packages)
         self._packages = self._user_packages.index
-        self._dial_proxy = DialProxy(self._ask)
-        self._causes = Causes(self._ask)
+        self._dial_proxy = DialProxy(self._managers.send)
+        self._causes = Causes(self._managers.send)
 
     async def run(self) -> None:
         """Run the container; return when all its processes, sockets and tasks have ended."""
@@ -114,7 +107,6 @@ class Environment:
             await hub.listen_socket(self._links)
             self._hub = hub
             async with asyncio.TaskGroup() as tasks:
-                self._tasks = tasks
                 self._nodes = NodeSet(self._context(reaper), tasks)
                 self._rosout = stack.enter_context(contextlib.closing(self._keep_records()))
                 await graph.follow_records(self._rosout.take)
@@ -128,9 +120,8 @@ class Environment:
                 )
                 self._reporter = Reporter(self._endpoint)
                 applying = tasks.create_task(self._apply_changes(), name="endpoint")
-                serving = tasks.create_task(self._accept_managers(), name="control socket")
+                serving = tasks.create_task(self._managers.serve(tasks), name="control socket")
                 watching = tasks.create_task(graph.watch_nodes(self), name="graph")
-                self._wait_for_manager()
                 await self._ending.wait()
                 applying.cancel()
                 await self._close()
@@ -143,6 +134,7 @@ class Environment:
         _log.info("ending: %s", reason)
         self._end_reason = self._end_reason or reason
         self._ending.set()
+        self._managers.stop_waiting()
 
     async def _close(self) -> None:
         await self._executions.close()
@@ -153,11 +145,9 @@ class Environment:
         self._report()
         if self._handover is not None:
             await self._handover.close()
-        for timer in (self._grace, self._report_due):
-            if timer is not None:
-                timer.cancel()
-        if self._channel is not None:
-            self._channel.close()
+        if self._report_due is not None:
+            self._report_due.cancel()
+        self._managers.close()
 
     def _keep_records(self) -> RosoutLog:
         return RosoutLog(Path(self._boot.logs), self._nodes.log_of, self._loop.time)
@@ -277,7 +267,8 @@ class Environment:
 
     def _report(self) -> None:
         self._report_due = None
-        if self._channel is None:
+        channel = self._managers.channel
+        if channel is None:
             return
         header = EndpointStatus(
             id=self._boot.id,
@@ -285,7 +276,7 @@ class Environment:
             state=self._state,
             nodes=self._nodes.statuses,
         )
-        self._reporter.report(self._channel, header)
+        self._reporter.report(channel, header)
 
     @property
     def _state(self) -> EndpointState:
@@ -295,10 +286,7 @@ class Environment:
 
     def _fault(self, text: str) -> None:
         _log.warning("%s", text)
-        if self._channel is not None:
-            self._channel.send(m.encode(m.Fault(text=text)))
-        else:
-            self._untold.append(text)
+        self._managers.tell_fault(text)
 
     # rce_container.environment.graph.NodeListener
 
@@ -314,43 +302,15 @@ class Environment:
         if self._nodes.registered_process(name, pid):
             self._rosout.known(name)
 
-    # Managers
+    # rce_container.environment.managers.ManagerListener
 
-    def _wait_for_manager(self) -> None:
-        reason = f"no manager for {self._boot.grace:g} s"
-        self._grace = self._loop.call_later(self._boot.grace, self.end, reason)
-
-    async def _accept_managers(self) -> None:
-        with self._control:
-            await accept(self._control, self._greet)
-
-    def _greet(self, sock: socket.socket) -> None:
-        """Replace the current manager by a new one."""
-        if self._channel is not None:
-            self._channel.close()
-        elif self._grace is not None:
-            self._grace.cancel()
-        self._channel = Channel(sock)
+    def manager_arrived(self, _: Channel) -> None:
+        """Report the whole state to a new manager."""
         self._reporter.begin()
         self._report()
-        while self._untold:
-            self._channel.send(m.encode(m.Fault(text=self._untold.popleft())))
-        self._tasks.create_task(self._converse(self._channel), name="manager")
 
-    async def _converse(self, channel: Channel) -> None:
-        try:
-            while (line := await channel.receive()) is not None:
-                await self._handle(channel, m.decode_to_environment(line))
-        except (ChannelError, msgspec.DecodeError) as error:
-            _log.error("the manager is not understood: %s", error)
-        finally:
-            channel.close()
-            if self._channel is channel:
-                self._channel = None
-                if not self._ending.is_set():
-                    self._wait_for_manager()
-
-    async def _handle(self, channel: Channel, message: m.ToEnvironment | Unknown) -> None:
+    async def handle(self, channel: Channel, message: m.ToEnvironment | Unknown) -> None:
+        """Carry out a manager's request."""
         match message:
             case m.Apply(spec=spec):
                 self._apply(spec)
@@ -386,9 +346,3 @@ class Environment:
                 _log.info("the manager sent a %s, which this release does not know", name)
             case _:
                 assert_never(message)
-
-    def _ask(self, message: m.Dial | m.Killed) -> bool:
-        if self._channel is None:
-            return False
-        self._channel.send(m.encode(message))
-        return True

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING
 
 from rce.aio.tasks import cancel_and_wait
 from rce.link import Buffer, CallError, Interface, InterfaceError, Port
-from rce.model import Form, InterfaceType, Role
+from rce.model import Form, InterfaceSpec, InterfaceType, Role
 from rce.ros import names
 from rce.ros.errors import RosError
 
 if TYPE_CHECKING:
-    from rce.model import InterfaceSpec
     from rce.ros.node import Node, Publisher, Service, ServiceClient, Subscriber
     from rce.ros.types import TypeRegistry
 

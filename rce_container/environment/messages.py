@@ -11,16 +11,16 @@ from __future__ import annotations
 import msgspec
 from msgspec import Struct, field
 
-from rce.control.execution import Command
-from rce.control.model import (
+from rce.control import (
     EndpointSpec,
     EndpointStatus,
     InterfaceUsage,
     LinkAddress,
     SpecPatch,
     StatusPatch,
+    TaggedReader,
 )
-from rce.control.tags import TaggedReader
+from rce.control.execution import Command
 
 
 class Boot(Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -10,7 +10,7 @@ import socket
 from collections.abc import Callable
 from itertools import count
 
-from rce.control.model import LinkAddress
+from rce.control import LinkAddress
 from rce_container.environment.messages import Dial
 
 _TIMEOUT_S = 10.0

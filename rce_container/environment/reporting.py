@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
+from rce.control import PATCHES, EndpointStatus, StatusPatch
 from rce.control.execution import FEATURE as EXEC
-from rce.control.model import PATCHES, StatusPatch
 from rce_container.environment import messages as m
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from rce.control.model import EndpointStatus
     from rce.link import Endpoint
     from rce_container.environment.channel import Channel
 

@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING
 from rce.ros.core import Core
 from rce.ros.core.events import Change
 from rce.ros.core.rosout import AGGREGATE
-from rce.ros.errors import RosError
 from rce.ros.logrecord import KIND, MD5SUM
-from rce.ros.node import Node
+from rce.ros.node import Node, RosError, TypeRegistry
 from rce.ros.node.runtime import TypeName
 from rce.ros.node.settings import is_loopback
 from rce.ros.tcpros.header import ANY
-from rce.ros.types import TypeRegistry
 from rce.ros.xmlrpc import RpcClient
-from rce_container.environment.graph import GraphError
+from rce_container.environment.graph import GraphError, NodeListener, Subscription
 from rce_container.environment.interfaces import InterfaceMaker, Readiness
 from rce_container.environment.nodes.launch import OWN_NODE
 
@@ -28,7 +26,6 @@ if TYPE_CHECKING:
     from rce.link import Interface, Port
     from rce.model import ParameterValue
     from rce.ros.packages import PackageIndex
-    from rce_container.environment.graph import NodeListener, Subscription
 
 _log = logging.getLogger(__name__)
 

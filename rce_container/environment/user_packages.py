@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from rce.control.model import EndpointSpec, PackageSpec
+from rce.control import EndpointSpec, PackageSpec
 from rce.model import InterfaceSpec, NodeSpec, newest, split_package
 from rce.ros.packages import PATH_VARIABLES, PackageIndex
 

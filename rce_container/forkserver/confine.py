@@ -18,6 +18,7 @@ from rce_container.environment.process import set_rlimits
 from rce_container.forkserver import kernel, mounts
 from rce_container.forkserver.kernel import Namespaces
 from rce_container.forkserver.messages import Descriptors, SpawnRequest
+from rce_container.forkserver.volumes import attached, mount_volumes
 
 USER_ID = 1000
 """User and group inside."""
@@ -59,8 +60,10 @@ def confine(request: SpawnRequest, descriptors: Descriptors, program: bytes) -> 
     for file in request.join:
         Path(file).write_text(str(os.getpid()))
     procfs = os.open("/proc", os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
-    _enter(descriptors.holder, procfs, request)
-    owner = request.uid or os.geteuid()
+    with attached(request.volumes) as volumes:
+        _enter(descriptors.holder, procfs, request)
+        owner = request.uid or os.geteuid()
+        mount_volumes(volumes, procfs, owner)
     mounts.limit(mounts.HOME, request.home_bytes, owner, 0o700)
     for path in mounts.TEMPORARY:
         mounts.limit(path, request.tmp_bytes, owner, 0o1777)

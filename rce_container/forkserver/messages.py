@@ -16,6 +16,15 @@ MAX_PACKET = 1 << 18
 """Bytes."""
 
 
+class VolumeOrder(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A volume of the container."""
+
+    path: str
+    """Where it is in the container; the folder exists."""
+    image: str = ""
+    """The machine's file that is mounted there; empty: what is there already."""
+
+
 class SpawnRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """An environment to be made. Comes with the descriptors of :class:`Descriptors`."""
 
@@ -31,6 +40,7 @@ class SpawnRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
     host_network: bool = False
     join: tuple[str, ...] = ()
     """See :attr:`rce_container.runtimes.base.Order.join`."""
+    volumes: tuple[VolumeOrder, ...] = ()
     check: tuple[str, ...] = ()
     """A command that must succeed in the container before the answer reports success."""
 

@@ -14,14 +14,10 @@ from collections import defaultdict
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
-from rce.control.contents import Piece
-from rce.control.exceptions import ContentError
-from rce.control.model import PackageSpec
-from rce.guard.turns import CrowdedError, Turns
-from rce.packages.exceptions import ArchiveError
-from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
-from rce.packages.signing import statement, verify
-from rce.packages.unpacking import unpack
+from rce.control import ContentError, PackageSpec
+from rce.control_channel.contents import Piece
+from rce.guard import CrowdedError, Turns
+from rce.packages import DEFAULT_LIMITS, ArchiveError, ArchiveLimits, statement, verify
 from rce_container.files import remove, size_of
 from rce_container.packages.disk import Locks, forget_before_boot, in_thread, scratch_aside
 from rce_container.packages.exceptions import FetchError, NoSpaceError, PackageTroubleError, VerificationError
@@ -156,6 +152,8 @@ class PackageCache:
             )
 
     def _unpack(self, package: PackageSpec, archive: Path, tree: Path) -> int:
+        from rce.packages.unpacking import unpack  # takes 1 MB, which engines without packages do not need
+
         tree.mkdir(mode=0o755)
         with archive.open("rb") as file:
             try:

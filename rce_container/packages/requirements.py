@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from rce.guard.turns import CrowdedError, Turns
+from rce.guard import CrowdedError, Turns
 from rce.packages.requirements import FILE_NAME, read_requirements
 from rce.ros.errors import BadPackageError
 from rce.ros.packages import MANIFESTS, parse_manifest

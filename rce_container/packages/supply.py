@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rce.aio.backoff import Backoff
 from rce.aio.tasks import BackgroundTasks
-from rce.control.model import PackageSpec
+from rce.control import PackageSpec
 from rce.packages.requirements import FILE_NAME as REQUIREMENTS_FILE
 from rce_container.packages.cache import PackageCache, trouble_of
 from rce_container.packages.disk import in_thread

@@ -1,1 +1,1 @@
-"""How a container's processes are made: with namespaces, or without any isolation."""
+"""How a container's processes are made: with namespaces, from an image with podman, or without isolation."""

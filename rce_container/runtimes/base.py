@@ -23,6 +23,7 @@ from rce_container.environment.messages import Boot, encode
 from rce_container.exceptions import KillError
 from rce_container.folder import ContainerFolder, Record
 from rce_container.runtimes.shim import spawn_shim
+from rce_container.volumes.store import VolumeMount
 
 _KILL_PAUSE_S = 0.01
 _KILL_TIMEOUT_S = 10.0
@@ -48,6 +49,12 @@ class Order(NamedTuple):
     """See :attr:`rce.model.specs.Resources.image`."""
     switch: str = ""
     """A file of the network namespace of its group; it stays as long as the container."""
+    volumes: tuple[VolumeMount, ...] = ()
+
+    @property
+    def volume_variables(self) -> dict[str, str]:
+        """The environment variables with the paths of the volumes in the container."""
+        return {volume.variable: volume.path for volume in self.volumes}
 
 
 Prepare = Callable[[int], Awaitable[None]]

@@ -21,13 +21,14 @@ import threading
 from collections.abc import Iterable
 from pathlib import Path
 
+from rce.model.volumes import overlap
 from rce.ros.packages import distributed_folders
 from rce_container.environment.logs.files import ENVIRONMENT_LOG, segment_path
 from rce_container.environment.messages import Boot
-from rce_container.exceptions import ContainerError, RuntimeUnavailableError, StartError
+from rce_container.exceptions import ContainerError, RuntimeUnavailableError, StartError, VolumeError
 from rce_container.folder import ContainerFolder, Record
 from rce_container.forkserver.confine import USER_ID
-from rce_container.forkserver.messages import SpawnRequest
+from rce_container.forkserver.messages import SpawnRequest, VolumeOrder
 from rce_container.forkserver.mounts import HOME, LOGS, TEMPORARY
 from rce_container.forkserver.process import ForkServer
 from rce_container.network.addresses import hostname, hosts_text
@@ -35,6 +36,7 @@ from rce_container.runtimes.base import Order, Runtime, clean_environ, source_ro
 from rce_container.runtimes.held import HOLDER, HeldHandle
 from rce_container.seccomp.library import FilterUnavailableError, make_filter
 from rce_container.uids import FIRST_UID, UIDS, UidPool
+from rce_container.volumes.store import VolumeMount
 
 USER = "rce"
 BUNDLES = "/opt/rce/bundles"
@@ -53,7 +55,7 @@ _ETC = (
     "python3",
     "ros",
 )
-_PROBE_TIMEOUT_S = 20.0
+_PROBE_TIMEOUT_S = 60.0
 _NO_USER_NAMESPACES = (
     " (a normal user needs user namespaces for that; see the sysctls user.max_user_namespaces, "
     "kernel.unprivileged_userns_clone and kernel.apparmor_restrict_unprivileged_userns)"
@@ -141,6 +143,7 @@ class NamespaceRuntime(Runtime):
         return self._start(order)
 
     def _start(self, order: Order, check: tuple[str, ...] = ()) -> HeldHandle:
+        check_volumes(order)
         try:
             write_etc(order)
         except OSError as error:
@@ -148,12 +151,16 @@ class NamespaceRuntime(Runtime):
         uid, lock = self._uids.take() if self._root else (0, -1)
         request = SpawnRequest(
             boot=order.boot,
-            environ={**clean_environ(HOME), "USER": USER, "LOGNAME": USER},
+            environ={**clean_environ(HOME), "USER": USER, "LOGNAME": USER, **order.volume_variables},
             uid=uid,
             home_bytes=self._home_bytes,
             tmp_bytes=TMP_BYTES,
             host_network=order.host_network,
             join=order.join,
+            volumes=tuple(
+                VolumeOrder(path=one.path, image=str(one.source) if one.image else "")
+                for one in order.volumes
+            ),
             check=check,
         )
         try:
@@ -260,6 +267,7 @@ def _mounts(order: Order) -> list[str]:
         *("--dir", "/opt", "--dir", "/opt/rce", "--ro-bind", str(folder.user_packages), BUNDLES),
         *read_only_mounts([*interpreter_paths(), *order.packages]),
         *("--dir", "/run", "--symlink", "../run", "/var/run"),
+        *volume_mounts(order.volumes),
         *("--symlink", "../tmp", "/var/tmp", "--remount-ro", "/"),  # noqa: S108 - the container's own
     ]
 
@@ -283,6 +291,32 @@ def read_only_mounts(paths: Iterable[Path]) -> list[str]:
             options += ["--dir", str(parent)]  # by itself bubblewrap makes them for its own user only
         options += ["--ro-bind", str(path), str(path)]
     return options
+
+
+def volume_mounts(volumes: Iterable[VolumeMount]) -> list[str]:
+    """Bind the folders of volumes, and make the places where images are mounted."""
+    options: list[str] = []
+    for volume in volumes:
+        for parent in reversed(Path(volume.path).parents[:-1]):
+            options += ["--dir", str(parent)]
+        bind = ["--dir", volume.path] if volume.image else ["--bind", str(volume.source), volume.path]
+        options += bind
+    return options
+
+
+def check_volumes(order: Order) -> None:
+    """Refuse volumes that would hide what the engine needs in a container.
+
+    Raises:
+        VolumeError: One would.
+    """
+    for volume in order.volumes:
+        for path in (*interpreter_paths(), *order.packages):
+            if overlap(volume.path, str(path)):
+                raise VolumeError(
+                    f"a volume at {volume.path} would hide {path}, which containers need on this machine; "
+                    "use another path, such as /data"
+                )
 
 
 def _is_closed(folder: Path) -> bool:

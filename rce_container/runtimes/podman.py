@@ -22,6 +22,7 @@ from itertools import chain
 from pathlib import Path
 
 from rce_container.exceptions import RuntimeUnavailableError, StartError
+from rce_container.folder import ContainerFolder
 from rce_container.forkserver.mounts import HOME, LOGS
 from rce_container.network.addresses import hostname
 from rce_container.runtimes.base import Order
@@ -35,6 +36,7 @@ from rce_container.runtimes.namespace import (
 )
 from rce_container.runtimes.shim import SHELL
 from rce_container.uids import UidPool
+from rce_container.volumes.store import VolumeMount
 
 _IMAGE = re.compile(
     r"[a-z0-9][\w.-]*(:[0-9]+)?(/[\w.-]+)*(:[\w.-]+)?(@sha256:[0-9a-f]{64})?", re.ASCII | re.IGNORECASE
@@ -45,7 +47,8 @@ _TRANSPORTS = (
 )
 STATE = Path("/run/rce/podman")
 """Where podman keeps its state; each running podman sees its own state there."""
-_TIMEOUT_S = 20.0
+_TIMEOUT_S = 60.0
+"""How long podman may take to say what it is, seconds: a busy machine must not look like one without it."""
 _DRIVER = "overlay"
 
 # Podman's own state is in memory, its locks in files, because those in memory are the whole machine's. crun
@@ -208,7 +211,17 @@ class PodmanRuntime(NamespaceRuntime):
         else:
             raise StartError(f"{image!r} is neither the name of an image nor the path of a folder")
         options = [f"--volume={source}:{target}:ro" for source, target in mounts]
+        options += [f"--volume={_point(folder, one)}:{one.path}:rw" for one in order.volumes]
         return [*options, f"--volume={folder.logs}:{LOGS}:rw", *last]
+
+
+def _point(folder: ContainerFolder, volume: VolumeMount) -> Path:
+    """Return what podman mounts at the path of a volume: its folder, or a place to mount its image."""
+    if not volume.image:
+        return volume.source
+    point = folder.path / "volumes" / volume.variable
+    point.mkdir(mode=0o700, parents=True, exist_ok=True)
+    return point
 
 
 def is_image_name(text: str) -> bool:

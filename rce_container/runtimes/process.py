@@ -29,4 +29,6 @@ class ProcessRuntime(ExecRuntime):
 
         The shim itself does not carry the mark: it searches for it.
         """
-        return [_ENV, f"{MARK}={order.folder.incarnation_id}", *argv], clean_environ(str(order.folder.home))
+        variables = {volume.variable: str(volume.source) for volume in order.volumes}
+        environ = {**clean_environ(str(order.folder.home)), **variables}
+        return [_ENV, f"{MARK}={order.folder.incarnation_id}", *argv], environ

@@ -1,1 +1,1 @@
-"""Grants cells to robots, so that no two of them ever claim the same one. Pure."""
+"""The planner's and the move client's cores: cells granted to one robot each, zones, modes. Pure."""

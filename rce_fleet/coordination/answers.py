@@ -10,6 +10,7 @@ fourth part, cells that the robot saw free again, is there only if there are suc
 from __future__ import annotations
 
 from itertools import accumulate, pairwise
+from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rce_fleet.coordination.move_client import ClientReport, ClientState
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 _MARK = "answer="
 _NUMBER = "revision="
 _GRID = "grid="
+_SPEED = "speed="
 _AGE = "robot_age="
 _POSE = "pose="
 _NONE = -1
@@ -108,23 +110,38 @@ def _read_sign(label: str) -> RobotSign:
     return RobotSign(age, pose)
 
 
-def numbered_array(cells: Sequence[int], revision: int, grid: str = "") -> dict[str, Any]:
+def numbered_array(cells: Sequence[int], revision: int, grid: str = "", speed: float = inf) -> dict[str, Any]:
     """Return the fields of a ``std_msgs/Int32MultiArray`` for a numbered list of cells.
 
     Args:
         cells: The cells.
         revision: Number of the list.
         grid: Names the grid that the cells belong to; empty: not said.
+        speed: Greatest speed in the cells, metres per second; infinity: not limited.
     """
     dimensions = [{"label": f"{_NUMBER}{revision}", "size": len(cells), "stride": len(cells)}]
     if grid:
         dimensions.append({"label": f"{_GRID}{grid}", "size": 0, "stride": 0})
+    if speed < inf:
+        dimensions.append({"label": f"{_SPEED}{speed!r}", "size": 0, "stride": 0})
     return {"layout": {"dim": dimensions, "data_offset": 0}, "data": list(cells)}
 
 
 def grid_of(labels: Sequence[str]) -> str:
     """Return the grid that a list belongs to; empty if it does not say."""
     return next((label.removeprefix(_GRID) for label in labels if label.startswith(_GRID)), "")
+
+
+def speed_of(labels: Sequence[str]) -> float:
+    """Return the greatest speed that a list allows, metres per second; infinity without a limit."""
+    for label in labels:
+        text = label.removeprefix(_SPEED)
+        if text != label:
+            try:
+                return float(text)
+            except ValueError:
+                return inf
+    return inf
 
 
 def revision_of(labels: Sequence[str]) -> int | None:

@@ -1,7 +1,8 @@
-"""Cells that people or robots' sensors block and free."""
+"""Cells that people, zones or robots' sensors block and free."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from rce_fleet.coordination.events import (
@@ -11,13 +12,20 @@ from rce_fleet.coordination.events import (
     ObstacleGone,
     ObstacleSeen,
     Reply,
+    ZonesSet,
 )
-from rce_fleet.coordination.refusals import refuse_block
+from rce_fleet.coordination.refusals import describe_zone, refuse_block
 from rce_fleet.coordination.robot import Phase
+from rce_fleet.coordination.zones import ZoneKind
+from rce_fleet.exceptions import ZoneError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from rce_fleet.coordination.dispatcher import Dispatcher
     from rce_fleet.coordination.fleet_state import FleetState
+    from rce_fleet.coordination.robot import RobotRecord
+    from rce_fleet.coordination.zones import Zone
 
 
 class CellBlocking:
@@ -53,13 +61,13 @@ class CellBlocking:
     def take_gone(self, event: ObstacleGone) -> None:
         """Free those of the cells that sensors found blocked."""
         for cell in event.cells:
-            if cell in self._state.sensed:
-                self._open(cell)
+            self.take_robot(cell)
 
     def take_robot(self, cell: int) -> None:
         """Free a cell that sensors found blocked and that a robot is in: they saw that robot."""
         if cell in self._state.sensed:
-            self._open(cell)
+            self._state.sensed.discard(cell)
+            self._release([cell])
 
     # Requests
 
@@ -71,43 +79,134 @@ class CellBlocking:
             return Reply(False, refusal)
         self._shut(cell)
         self._state.sensed.discard(cell)  # Sensors do not free what a person blocked.
+        self._state.requested.add(cell)
         owner = self._state.ledger.owner(cell)
         if owner is None:
             return Reply(True, f"cell {cell} is blocked")
         return Reply(True, f"cell {cell} will be blocked when {owner} has left it")
 
     def free_cell(self, event: CellFreed) -> Reply:
-        """Free a cell, regardless of who blocked it."""
+        """Free a cell, regardless of who blocked it; a zone that blocks it has to be removed instead."""
         cell = event.cell
         refusal = refuse_block(self._state, cell)
         if refusal:
             return Reply(False, refusal)
-        if cell not in self._state.blocked and cell not in self._state.pending:
+        zone = self._state.zones.blocks(cell)
+        if zone is not None:
+            return Reply(False, f"cell {cell} is blocked by {describe_zone(zone)}: remove the zone")
+        if not self._state.has_reason(cell):
             return Reply(True, f"cell {cell} is not blocked")
-        self._open(cell)
+        self._state.sensed.discard(cell)
+        self._state.requested.discard(cell)
+        self._release([cell])
         return Reply(True, f"cell {cell} is free")
+
+    def set_zones(self, event: ZonesSet) -> Reply:
+        """Make, replace and remove zones."""
+        book = self._state.zones
+        if event.revision is not None and event.revision != book.revision:
+            return Reply(
+                False,
+                f"the zones have revision {book.revision}, not {event.revision}: read them and try again",
+            )
+        names = [zone.id for zone in event.zones]
+        if len(set(names)) != len(names):
+            return Reply(False, f"zones {sorted(names)} do not all have different ids")
+        try:
+            for zone in event.zones:
+                zone.check(self._state.grid)
+        except ZoneError as error:
+            return Reply(False, str(error))
+        remove = set(event.remove) | (book.zones.keys() - set(names) if event.replace else set())
+        made = self._change_zones(event.zones, remove)
+        return Reply(True, f"{made} zones changed; their revision is {book.revision}")
+
+    def end_expired(self, now: float) -> None:
+        """Remove the zones that have ended."""
+        expired = self._state.zones.expired(now)
+        if expired:
+            self._change_zones((), expired)
+
+    # Zones
+
+    def _change_zones(self, zones: Iterable[Zone], remove: Iterable[str]) -> int:
+        """Change zones and what follows from them; return how many changed."""
+        state = self._state
+        gone, made = state.zones.put(zones, remove)
+        if not gone and not made:
+            return 0
+        state.map_version += 1
+        self._release(cell for zone in gone for cell in zone.cells if state.is_shut(cell))
+        for zone in made:
+            if zone.kind is ZoneKind.BLOCKED and not zone.robots:
+                for cell in zone.cells:
+                    self._shut(cell)
+        self._redirect()
+        self._dispatcher.require(record.id for record in state.robots.values() if record.unreachable)
+        for zone in (*gone, *made):
+            if zone.kind is ZoneKind.SLOW:
+                self._dispatcher.send_again(state.zone_users(zone))
+        return len({zone.id for zone in (*gone, *made)})
+
+    def _redirect(self) -> None:
+        """Take from robots the parts of their paths that zones do not allow any more."""
+        state = self._state
+        closed = state.zones.closed(state.grid)
+        for record in sorted(state.robots.values(), key=lambda record: record.id):
+            route = state.ledger.route(record.id)
+            if record.phase is not Phase.ACTIVE or len(route) < 2:  # noqa: PLR2004 - a path has two cells
+                continue
+            forbidden = state.forbidden(record.id)
+            wrong = [
+                index
+                for index, (before, cell) in enumerate(pairwise(route), start=1)
+                if (before, cell) in closed or (cell in forbidden and before not in forbidden)
+            ]
+            if not wrong:
+                continue
+            record.replans += 1
+            self._take_path(record, wrong[0], "a zone on its path changed")
 
     # Both
 
     def _shut(self, cell: int) -> None:
-        """Block a cell once no robot claims it; stop robots whose paths lead through it."""
+        """Block a cell once no robot claims it; take their paths from robots that it is on."""
         state = self._state
-        if state.is_shut(cell):
+        if cell in state.grid.blocked or state.is_shut(cell):
             return
         state.want_blocked(cell)
         self._dispatcher.left.add(cell)
-        self._dispatcher.outdated = True
+        self._dispatcher.require(())
         for robot in sorted(state.ledger.visitors(cell)):
             record = state.robots[robot]
-            if record.phase is Phase.ACTIVE and cell in state.ledger.route(robot)[1:]:
+            route = state.ledger.route(robot)
+            if record.phase is Phase.ACTIVE and cell in route[1:]:
                 record.replans += 1
-                self._dispatcher.hold(record, f"cell {cell} on its path is blocked")
+                self._take_path(record, route.index(cell, 1), f"cell {cell} on its path is blocked")
+        owner = state.ledger.owner(cell)
+        if owner is not None:
+            self._dispatcher.require([owner])
 
-    def _open(self, cell: int) -> None:
-        """Let robots enter a cell again."""
-        was_blocked = cell in self._state.blocked
-        self._state.free(cell)
-        self._dispatcher.to_settle |= self._state.index.hindered_at([cell])
+    def _take_path(self, record: RobotRecord, index: int, reason: str) -> None:
+        """Take a robot's path from cell number ``index`` on; stop it if that is granted already."""
+        ledger = self._state.ledger
+        if index < len(ledger.granted(record.id)) or not self._dispatcher.settings.repairs:
+            self._dispatcher.hold(record, reason)
+            return
+        ledger.truncate(record.id, keep=index)
+        self._state.touch(record)
+        self._dispatcher.require([record.id])
+
+    def _release(self, cells: Iterable[int]) -> None:
+        """Let robots enter cells again that are not blocked for another reason."""
+        state = self._state
+        opened = [cell for cell in cells if not state.has_reason(cell)]
+        if not opened:
+            return
+        was_blocked = not state.blocked.isdisjoint(opened)
+        for cell in opened:
+            state.free(cell)
+        self._dispatcher.to_settle.update(state.index.hindered_at(opened))
         if was_blocked:
-            self._dispatcher.out.append(BlockedChanged(tuple(sorted(self._state.blocked))))
-        self._dispatcher.outdated = True
+            self._dispatcher.out.append(BlockedChanged(tuple(sorted(state.blocked))))
+        self._dispatcher.require(record.id for record in state.robots.values() if record.unreachable)

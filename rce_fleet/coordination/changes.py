@@ -10,9 +10,10 @@ from math import nan
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from rce_fleet.coordination.snapshot import RobotSnapshot
+    from rce_fleet.coordination.zones import Zone
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,8 @@ class FleetChanges:
         blocked: Cells that became blocked, ascending; walls never change.
         pending: Cells that will be blocked once the robots in them have left, ascending.
         freed: Cells that are not blocked or pending any more, ascending.
+        zones: Zones that are new or changed, by id.
+        removed_zones: Ids of removed zones, ascending.
     """
 
     sequence: int
@@ -34,6 +37,8 @@ class FleetChanges:
     blocked: tuple[int, ...] = ()
     pending: tuple[int, ...] = ()
     freed: tuple[int, ...] = ()
+    zones: tuple[Zone, ...] = ()
+    removed_zones: tuple[str, ...] = ()
 
 
 class ChangeLog:
@@ -49,6 +54,7 @@ class ChangeLog:
         self._cells: set[int] = set()
         self._told: dict[str, RobotSnapshot] = {}
         self._told_cells: dict[int, bool] = {}
+        self._told_zones: dict[str, Zone] = {}
 
     def note_robot(self, robot: str) -> None:
         """Note that a robot may have changed, come or gone."""
@@ -59,13 +65,17 @@ class ChangeLog:
         self._cells.add(cell)
 
     def take(
-        self, describe: Callable[[str], RobotSnapshot | None], is_blocked: Callable[[int], bool | None]
+        self,
+        describe: Callable[[str], RobotSnapshot | None],
+        is_blocked: Callable[[int], bool | None],
+        zones: Mapping[str, Zone] | None = None,
     ) -> FleetChanges | None:
         """Return what changed since the last call; None if nothing did.
 
         Args:
             describe: Returns the state of a robot; None if it was removed.
             is_blocked: Returns whether a cell is blocked (True), pending (False) or neither (None).
+            zones: All zones, by id.
         """
         noted, self._robots = sorted(self._robots), set()
         cells, self._cells = sorted(self._cells), set()
@@ -82,7 +92,13 @@ class ChangeLog:
                     del self._told_cells[cell]
                 else:
                     self._told_cells[cell] = now
-        if not (robots or removed or any(parts.values())):
+        all_zones = {} if zones is None else zones
+        new_zones = tuple(
+            all_zones[name] for name in sorted(all_zones) if self._told_zones.get(name) != all_zones[name]
+        )
+        removed_zones = tuple(sorted(self._told_zones.keys() - all_zones.keys()))
+        self._told_zones = dict(all_zones)
+        if not (robots or removed or any(parts.values()) or new_zones or removed_zones):
             return None
         self.sequence += 1
         return FleetChanges(
@@ -92,6 +108,8 @@ class ChangeLog:
             blocked=tuple(parts[True]),
             pending=tuple(parts[False]),
             freed=tuple(parts[None]),
+            zones=new_zones,
+            removed_zones=removed_zones,
         )
 
     def _tell(self, robot: str, now: RobotSnapshot | None) -> RobotSnapshot | None:
@@ -111,5 +129,5 @@ def _told(robot: RobotSnapshot | None) -> tuple[object, ...] | None:
         return None
     return (
         *(robot.state, robot.reason, robot.cell, robot.goal),
-        *(robot.plan, robot.granted, robot.replans),
+        *(robot.plan, robot.granted, robot.replans, robot.mode, robot.pose_only),
     )

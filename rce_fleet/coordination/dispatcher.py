@@ -7,17 +7,24 @@ depend on the number of robots.
 
 from __future__ import annotations
 
+from itertools import islice
+from math import isnan
 from typing import TYPE_CHECKING
 
-from rce_fleet.coordination.events import BlockedChanged, Instruction, MakePlan, SendCancel, SendCells
-from rce_fleet.coordination.fleet_state import FleetState
-from rce_fleet.coordination.progress import arrived_index, standing_cell
-from rce_fleet.coordination.refusals import hindrance
-from rce_fleet.coordination.replanning import PlanAdoption, PlanRequest, PlanResult, request_plan
+from rce_fleet.coordination.events import BlockedChanged, Instruction, SendCancel, SendCells
+from rce_fleet.coordination.modes import RobotMode
+from rce_fleet.coordination.move_client import ClientState
+from rce_fleet.coordination.path_supply import PathSupply
+from rce_fleet.coordination.placement import Placement
+from rce_fleet.coordination.progress import arrived_index
 from rce_fleet.coordination.robot import Cause, Phase, RobotRecord
 from rce_fleet.exceptions import InvariantError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rce_fleet.coordination.fleet_state import FleetState
+    from rce_fleet.coordination.replanning import PlanResult
     from rce_fleet.coordination.settings import FleetSettings
 
 
@@ -27,9 +34,9 @@ class Dispatcher:
     Attributes:
         now: Time of the current event, seconds.
         out: Its instructions so far.
-        outdated: Whether the state changed since the newest plan or plan request.
-        to_settle: Robots that may stand still now.
+        is_tick: Whether the current event is a tick.
         left: Pending cells that may be free of robots now.
+        expected: Robots that no cells are granted before, until they have sent a pose, and until when.
 
     Args:
         state: The fleet.
@@ -41,35 +48,57 @@ class Dispatcher:
         self.settings = settings
         self.now = 0.0
         self.out: list[Instruction] = []
-        self.outdated = False
-        self.to_settle: set[str] = set()
+        self.is_tick = False
         self.left: set[int] = set()
-        self._partial = False
-        self._asked: PlanRequest | None = None
-        self._plans = 0
-        self._adoption: PlanAdoption | None = None
-        self._ripe: set[str] = set()
-        """Robots that may be granted further cells, and had no turn yet."""
+        self.expected: dict[str, float] = {}
+        self._placement = Placement(state, settings, self)
+        self._paths = PathSupply(state, settings)
+        self._ripe: dict[str, None] = {}
+        """Robots that may be granted further cells, and had no turn yet, in the order of their turns."""
+
+    @property
+    def to_settle(self) -> set[str]:
+        """Robots that may stand still now; to be added to."""
+        return self._placement.to_settle
 
     def advance(self) -> None:
         """Do everything that has become possible."""
-        self._settle_standing()
+        for freed in self._placement.settle_standing():
+            self.left |= freed
         self._block_left_cells()
-        if self._adoption is not None:
-            self._take_over(self._adoption)
+        if self._paths.continue_plan(self.now):
+            self._grant()
         self.state.refresh()
-        if self._asked is None:
-            if self._partial and not self.state.index.under_way:
-                self.outdated = True
-            if not self.outdated:
-                self._grant()
-                self.state.refresh()
-            elif not self._awaited():
-                self._ask_for_plan()
+        if self._expects():
+            return
+        request = self._paths.supply(self.now, is_tick=self.is_tick)
+        if request is not None:
+            self.out.append(request)
+        elif self._paths.is_quiet:
+            self._grant()
+            self.state.refresh()
+
+    def _expects(self) -> bool:
+        """Return whether robots exist whose places are not known yet."""
+        robots = self.state.robots
+        self.expected = {
+            robot: until
+            for robot, until in self.expected.items()
+            if until > self.now and (robot not in robots or isnan(robots[robot].x))
+        }
+        return bool(self.expected)
 
     def is_taking_over(self) -> bool:
         """Return whether the rest of a plan, or of its first grants, follows with the next events."""
-        return self._adoption is not None or bool(self._ripe)
+        return self._paths.is_taking_over or bool(self._ripe)
+
+    def take_plan(self, result: PlanResult) -> None:
+        """Begin to take over the requested plan; ignore any other."""
+        self._paths.take_plan(result, self.now)
+
+    def require(self, robots: Iterable[str]) -> None:
+        """Note that robots need new paths, and that the state changed since the newest plan request."""
+        self._paths.require(robots)
 
     def hold(self, record: RobotRecord, reason: str) -> None:
         """Stop a robot, to take its cells back once it stands still."""
@@ -79,53 +108,51 @@ class Dispatcher:
         self.state.change(record, Cause.HELD, reason)
         if self.state.ledger.length(record.id):
             self.state.ledger.truncate(record.id)
-        self.outdated = True
+        self.require([record.id])
         self.send(record, ())
 
-    def _settle_standing(self) -> None:
-        """Place robots that stand still, and then those that waited for one of their cells."""
-        while True:
-            freed = self.state.ledger.take_freed()
-            self.left |= freed
-            candidates = self.to_settle | self.state.index.hindered_at(freed)
-            self.to_settle = set()
-            if not candidates:
-                return
-            for robot in sorted(candidates):
-                record = self.state.robots.get(robot)
-                if record is None or record.phase is not Phase.HOLDING:
-                    continue
-                if record.stands(self.settings):
-                    self._settle(record)
-                else:
-                    self.state.index.set_hindered(robot, ())
+    def avoid(self, record: RobotRecord) -> None:
+        """Have all others plan around the cells that a robot claims."""
+        cells = self.state.ledger.claims(record.id)
+        self.require({robot for cell in cells for robot in self.state.ledger.visitors(cell)} - {record.id})
 
-    def _settle(self, record: RobotRecord) -> None:
-        """Place a robot that stands still in its cell."""
-        state = self.state
-        cell, own, reason = self._place_of(record)
-        state.index.set_hindered(record.id, self.touched(record) if reason else ())
-        if cell is None or reason:
-            if record.reason != reason:
-                record.reason = reason
-                state.touch(record)
-            return
-        state.change(record, Cause.SETTLED, "")
-        record.centred = False
-        # A blocked cell is not claimed: the robot only touches the margin around the box.
-        state.ledger.place(record.id, cell, {other for other in own if not state.is_blocked(other)})
-        self.outdated = True
-        self.send(record, (cell,))
-        self.arrive(record)
+    def watch(self, record: RobotRecord) -> None:
+        """Claim the cells that a robot without a cell overlaps, and stop robots that would drive there.
 
-    def _place_of(self, record: RobotRecord) -> tuple[int | None, set[int], str]:
-        """Return the cell for a robot that stands still, its other cells too, and why it cannot have them."""
-        state = self.state
-        touched = self.touched(record)
-        own = {cell for cell in touched if state.ledger.owner(cell) in (None, record.id)}
-        shut = {cell for cell in own if state.is_shut(cell)}
-        cell = standing_cell(state.grid, own, record.x, record.y, shut)
-        return cell, own, hindrance(state, record, touched, own, cell)
+        A robot that drives was granted cells by an earlier planner: they are claimed until it stands. A robot
+        that lies dead on the floor does not reach them.
+        """
+        ledger = self.state.ledger
+        before = ledger.claims(record.id)
+        cells = set(before) if isnan(record.x) else self._placement.touched(record)
+        if isnan(record.x) or self.state.mode_of(record) is not RobotMode.DEAD:
+            cells |= self._may_reach(record)
+        ledger.overlap(record.id, cells)
+        if ledger.claims(record.id) != before:
+            self.avoid(record)
+            self.require(other.id for other in self.state.robots.values() if other.unreachable)
+        self.make_room(record)
+
+    def _may_reach(self, record: RobotRecord) -> frozenset[int]:
+        """Return the cells that an earlier planner granted a robot, and that it may still drive to."""
+        report = record.report
+        if report is None:
+            return record.earlier
+        if isnan(record.x) or report.state is ClientState.DRIVING:
+            return frozenset(cell for cell in report.cells if cell in self.state.grid)
+        # While it brakes it keeps what it has.
+        is_braking = report.state is ClientState.CANCELLING
+        return self.state.ledger.claims(record.id) if is_braking else frozenset()
+
+    def make_room(self, record: RobotRecord) -> None:
+        """Stop robots that were granted cells which another robot overlaps."""
+        for cell in () if isnan(record.x) else sorted(self._placement.touched(record)):
+            owner = self.state.ledger.owner(cell)
+            other = self.state.robots.get(owner) if owner is not None else None
+            if other is None or other is record or other.phase is not Phase.ACTIVE:
+                continue
+            if cell in self.state.ledger.granted(other.id)[1:]:
+                self.hold(other, f"{record.id} is in its way")
 
     def _block_left_cells(self) -> None:
         left, self.left = self.left & self.state.pending, set()
@@ -138,74 +165,62 @@ class Dispatcher:
     def _grant(self) -> None:
         """Grant cells to robots whose turn it may be; to some of them, if there are many."""
         ledger = self.state.ledger
-        self._ripe |= ledger.take_ripe()
-        turn = sorted(self._ripe)[: self.settings.robots_per_step]
-        self._ripe.difference_update(turn)
-        for robot in turn:
+        self._ripe |= dict.fromkeys(sorted(ledger.take_ripe()))
+        for robot in list(islice(self._ripe, self.settings.robots_per_step)):
+            del self._ripe[robot]
             record = self.state.robots.get(robot)
             if record is None or record.phase is not Phase.ACTIVE:
                 continue
             if ledger.grant(robot, self.settings.ahead):
                 self.send(record, tuple(ledger.granted(robot)))
 
-    # Plans
-
-    def _awaited(self) -> bool:
-        """Return whether a plan has to wait for a robot that is stopping."""
-        told_at = self.state.index.last_stop()
-        return told_at is not None and self.now - told_at < self.settings.hold_timeout
-
-    def _ask_for_plan(self) -> None:
-        self._asked = request_plan(self.state, self.settings, self._plans)
-        self._plans += 1
-        self.outdated = self._partial = False
-        self.out.append(MakePlan(self._asked))
-
-    def take_plan(self, result: PlanResult) -> None:
-        """Begin to take over the requested plan; ignore any other."""
-        request = self._asked
-        if request is None or request.number != result.number or self._adoption is not None:
-            return
-        if self.outdated and self._awaited():
-            self._asked = None
-            return
-        self._adoption = PlanAdoption(self.state, request, result)
-        # After a plan that makes progress, request another; otherwise wait for a change.
-        self._partial = not result.complete and bool(result.cells)
-
-    def _take_over(self, adoption: PlanAdoption) -> None:
-        """Take over the next part of a plan; the part after it follows with the next event."""
-        if not adoption.step(self.settings.visits_per_step):
-            return
-        self._asked = self._adoption = None
-        if self.outdated and not self._awaited():
-            self._grant()
-
     # One robot
 
-    def arrive(self, record: RobotRecord) -> bool:
-        """Release the cells that a robot has left; return whether it is on its path."""
+    def arrive(self, record: RobotRecord, *, is_standing: bool = False) -> bool:
+        """Release the cells that a robot has left; return whether it is on its path.
+
+        A robot that is judged by its poses alone keeps one cell more behind it, unless it ``is_standing``.
+        """
         granted = self.state.ledger.granted(record.id)
         index = arrived_index(self.state.grid, granted, record.x, record.y, self.settings)
         if index is None:
             return False
-        if index > 0 or not record.centred:
+        if record.pose_only and not is_standing:
+            index = max(index - 1, 0)
+        hull = self._placement.hull(record) if index else set()
+        while index and granted[index - 1] in hull:
+            index -= 1  # It cuts a corner, and is still partly in the cell before.
+        extra = self.state.ledger.overlapped(record.id)
+        if index > 0 or extra or not record.centred:
             record.centred = True
             self.state.touch(record)
-            self.state.ledger.arrive(record.id, index)
+            still = extra and extra & self._placement.hull(record)
+            self.state.ledger.arrive(record.id, index, still)
         return True
+
+    def arrive_by_pose(self, record: RobotRecord, now: float) -> None:
+        """Release the last cell behind a robot that is judged by its poses, once it has stood for a while."""
+        if now - record.still_since() >= self.settings.pose_only_settle:
+            self.arrive(record, is_standing=True)
 
     def send(self, record: RobotRecord, cells: tuple[int, ...]) -> None:
         """Send a robot its cells; stop it first if it must stand still."""
         record.sent_at = self.now
         if record.phase is Phase.HOLDING:
             self.out.append(SendCancel(record.id))
-        self.out.append(SendCells(record.id, record.next_revision(), cells))
+        speed = self.state.zones.speed_limit(record.id, cells)
+        self.out.append(SendCells(record.id, record.next_revision(), cells, speed))
 
-    def touched(self, record: RobotRecord) -> set[int]:
-        """Return the cells that a robot overlaps at its last pose."""
-        reach = self.settings.robot_radius + self.settings.clearance
-        return self.state.grid.cells_touched(record.x, record.y, reach)
+    def send_again(self, robots: Iterable[str]) -> None:
+        """Send active robots their granted cells again, because a limit of their speed changed."""
+        for robot in sorted(robots):
+            record = self.state.robots[robot]
+            if record.phase is Phase.ACTIVE:
+                self.send(record, tuple(self.state.ledger.granted(robot)))
+
+    def _is_granting(self) -> bool:
+        """Return whether everything that can be granted was granted with the last event."""
+        return self._paths.is_quiet and not self._ripe and not self.expected
 
     def validate(self) -> None:
         """Check that everything that is possible was done.
@@ -213,13 +228,10 @@ class Dispatcher:
         Raises:
             InvariantError: Something was not done.
         """
-        state, quiet = self.state, not self.outdated and self._asked is None and not self._ripe
-        for record in state.robots.values():
-            stands = record.phase is Phase.HOLDING and record.stands(self.settings)
-            if stands and not self._place_of(record)[2]:
-                raise InvariantError(f"{record.id} stands still and was not placed in its cell")
-            is_granted_cells = quiet and record.phase is Phase.ACTIVE
-            if is_granted_cells and state.ledger.may_grant(record.id, self.settings.ahead):
+        state = self.state
+        self._placement.validate()
+        for record in state.robots.values() if self._is_granting() else ():
+            if record.phase is Phase.ACTIVE and state.ledger.may_grant(record.id, self.settings.ahead):
                 raise InvariantError(f"{record.id} was not granted a cell that is free for it")
         undone = [cell for cell in state.pending if state.ledger.owner(cell) is None]
         if undone:

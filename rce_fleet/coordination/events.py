@@ -3,23 +3,37 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rce_fleet.coordination.modes import RobotMode
     from rce_fleet.coordination.move_client import ClientReport
     from rce_fleet.coordination.replanning import PlanRequest, PlanResult
+    from rce_fleet.coordination.zones import Zone
 
 # Events
 
 
 @dataclass(frozen=True, slots=True)
 class PoseSeen:
-    """A robot reported its pose: metres and radians in the map."""
+    """A robot reported its pose: metres and radians in the map.
+
+    Attributes:
+        robot: Its name.
+        x, y, yaw: The pose.
+        spread: Standard deviation of the place in its worst direction, metres; None: not told.
+        yaw_spread: Standard deviation of the heading, radians; None: not told.
+    """
 
     robot: str
     x: float
     y: float
     yaw: float
+    spread: float | None = None
+    yaw_spread: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +50,18 @@ class ReportSeen:
 
     robot: str
     report: ClientReport
+
+
+@dataclass(frozen=True, slots=True)
+class RobotsExpected:
+    """Robots exist that may not have been heard yet; no cells are granted until they are, for a while.
+
+    Attributes:
+        robots: By name the cells that a robot may be in, because an earlier planner granted them to it;
+            empty: not known.
+    """
+
+    robots: Mapping[str, tuple[int, ...]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +110,40 @@ class RobotRemoved:
 
 
 @dataclass(frozen=True, slots=True)
+class ZonesSet:
+    """Zones are made, replaced and removed, all or none of it. Answered by :class:`Reply`.
+
+    Attributes:
+        zones: New zones, and new versions of zones with the same ids.
+        remove: Ids of zones to remove; unknown ones are ignored.
+        replace: Whether all other zones are removed.
+        revision: The revision of the zones that the sender knows; None: whatever it is.
+    """
+
+    zones: tuple[Zone, ...]
+    remove: tuple[str, ...] = ()
+    replace: bool = False
+    revision: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ModeSet:
+    """A robot, or (without one) the fleet, gets a mode. Answered by :class:`Reply`.
+
+    Attributes:
+        robot: Id of the robot; None: the fleet, with robots that join later.
+        mode: The mode.
+        reason: Why, for people.
+        by: Who asked.
+    """
+
+    robot: str | None
+    mode: RobotMode
+    reason: str = ""
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class PlanMade:
     """The plan that :class:`MakePlan` requested is ready."""
 
@@ -99,12 +159,15 @@ Event = (
     PoseSeen
     | RobotHeard
     | ReportSeen
+    | RobotsExpected
     | ObstacleSeen
     | ObstacleGone
     | GoalSet
     | CellBlocked
     | CellFreed
     | RobotRemoved
+    | ZonesSet
+    | ModeSet
     | PlanMade
     | Tick
 )
@@ -120,11 +183,13 @@ class SendCells:
         robot: Id of the robot.
         revision: Number of the list; grows from list to list of a robot.
         cells: The granted cells.
+        speed: Greatest speed in them, metres per second; infinity: as fast as the robot drives.
     """
 
     robot: str
     revision: int
     cells: tuple[int, ...]
+    speed: float = inf
 
 
 @dataclass(frozen=True, slots=True)

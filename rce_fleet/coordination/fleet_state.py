@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 from rce_fleet.coordination.changes import ChangeLog, FleetChanges
 from rce_fleet.coordination.indexes import FleetIndex
 from rce_fleet.coordination.ledger import CellLedger
+from rce_fleet.coordination.modes import RobotMode, effective_mode
 from rce_fleet.coordination.robot import Cause, Phase, RobotRecord
 from rce_fleet.coordination.snapshot import FleetSnapshot, RobotSnapshot, RobotState
+from rce_fleet.coordination.zones import Zone, ZoneBook
 from rce_fleet.exceptions import InvariantError
 
 if TYPE_CHECKING:
@@ -29,7 +31,12 @@ class FleetState:
         ledger: Which robot claims which cell.
         blocked: Cells that were blocked; no robot claims one.
         pending: Cells that will be blocked once no robot claims them; no robot may enter one.
-        sensed: Those of both that only robots' sensors found blocked.
+        sensed: Those of both that robots' sensors found blocked, and people did not.
+        requested: Those of both that people blocked one by one.
+        zones: Zones of the map.
+        mode: The fleet's mode; counts for robots whose own mode is automatic.
+        mode_reason: Why the fleet has its mode, and who set it.
+        map_version: Changes when cells or zones do.
         index: Indexes of the robots.
         log: Changes that are not published yet.
     """
@@ -40,6 +47,11 @@ class FleetState:
     blocked: set[int] = field(default_factory=set)
     pending: set[int] = field(default_factory=set)
     sensed: set[int] = field(default_factory=set)
+    requested: set[int] = field(default_factory=set)
+    zones: ZoneBook = field(default_factory=ZoneBook)
+    mode: RobotMode = RobotMode.AUTOMATIC
+    mode_reason: str = ""
+    map_version: int = 0
     index: FleetIndex = field(default_factory=FleetIndex)
     log: ChangeLog = field(default_factory=ChangeLog)
     _touched: set[str] = field(default_factory=set)
@@ -56,6 +68,36 @@ class FleetState:
     def is_blocked(self, cell: int) -> bool:
         """Return whether a cell is a wall or blocked already."""
         return cell in self.grid.blocked or cell in self.blocked
+
+    def forbidden(self, robot: str) -> frozenset[int]:
+        """Return the cells that one robot may not enter, of those that are open to others."""
+        zones = self.zones
+        return zones.forbidden(robot) | zones.full(robot, self.zone_users) if zones.zones else frozenset()
+
+    def zone_users(self, zone: Zone) -> set[str]:
+        """Return the robots that claim a cell of a zone or have a path into it."""
+        found: set[str] = set()
+        for cell in zone.cells:
+            found |= self.ledger.visitors(cell)
+            owner = self.ledger.owner(cell)
+            if owner is not None:
+                found.add(owner)
+        return found
+
+    def has_reason(self, cell: int) -> bool:
+        """Return whether there is a reason to keep a cell blocked."""
+        return cell in self.sensed or cell in self.requested or self.zones.blocks(cell) is not None
+
+    def mode_of(self, record: RobotRecord) -> RobotMode:
+        """Return the mode of a robot that counts."""
+        mode = effective_mode(self.mode, record.mode)
+        return RobotMode.LOST if record.lost and mode is RobotMode.AUTOMATIC else mode
+
+    def reason_of(self, record: RobotRecord) -> str:
+        """Return why a robot has the mode that counts, for people."""
+        if self.mode_of(record) is RobotMode.LOST:
+            return record.lost
+        return record.mode_reason if self.mode_of(record) is record.mode else self.mode_reason
 
     # Changes
 
@@ -82,12 +124,14 @@ class FleetState:
     def want_blocked(self, cell: int) -> None:
         """Make a cell pending: no robot may enter it from now on."""
         self.pending.add(cell)
+        self.map_version += 1
         self.log.note_cell(cell)
 
     def block(self, cell: int) -> None:
         """Block a cell that no robot claims."""
         self.pending.discard(cell)
         self.blocked.add(cell)
+        self.map_version += 1
         self.log.note_cell(cell)
 
     def free(self, cell: int) -> None:
@@ -95,6 +139,8 @@ class FleetState:
         self.pending.discard(cell)
         self.blocked.discard(cell)
         self.sensed.discard(cell)
+        self.requested.discard(cell)
+        self.map_version += 1
         self.log.note_cell(cell)
 
     def refresh(self) -> None:
@@ -117,7 +163,7 @@ class FleetState:
 
     def take_changes(self) -> FleetChanges | None:
         """Return the changes that are not published yet; None if there are none."""
-        return self.log.take(self.describe, self._cell_state)
+        return self.log.take(self.describe, self._cell_state, self.zones.zones)
 
     def snapshot(self) -> FleetSnapshot:
         """Return the state for publishing."""
@@ -150,7 +196,7 @@ class FleetState:
                 raise InvariantError(f"the route of {record.id} is not a path: {route}")
             if route and claims & self.blocked:
                 raise InvariantError(f"{record.id} claims blocked cells: {claims & self.blocked}")
-            if record.phase is not Phase.ACTIVE:
+            if record.phase not in (Phase.ACTIVE, Phase.STANDING):
                 continue
             if not route:
                 raise InvariantError(f"{record.id} is active without a cell")
@@ -175,13 +221,24 @@ class FleetState:
             plan=tuple(route),
             granted=tuple(self.ledger.granted(record.id)),
             replans=record.replans,
+            mode=effective_mode(self.mode, record.mode).value,
+            pose_only=record.pose_only,
         )
 
     def _state_of(self, record: RobotRecord, route: list[int]) -> RobotState:
+        mode = self.mode_of(record)
+        is_followed = mode.is_followed and not route
+        if record.phase is Phase.STANDING or (is_followed and record.phase is Phase.HOLDING):
+            return RobotState(mode.value)
+        if record.phase is Phase.HOLDING and mode is RobotMode.LOST:
+            return RobotState.LOST
         if record.phase is Phase.SILENT:
-            return RobotState.SILENT
+            return RobotState.DEAD if mode is RobotMode.DEAD else RobotState.SILENT
         if record.phase is Phase.HOLDING:
             return RobotState.STOPPING if route else RobotState.JOINING
+        return self._state_of_active(record, route)
+
+    def _state_of_active(self, record: RobotRecord, route: list[int]) -> RobotState:
         if len(self.ledger.granted(record.id)) > 1 or not record.centred:
             return RobotState.DRIVING
         if len(route) > 1:

@@ -14,6 +14,7 @@ from rce_fleet.coordination.events import Instruction, PoseSeen
 from rce_fleet.coordination.move_client import ClientState
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.robot import Phase, RobotRecord
+from rce_fleet.coordination.zones import ZoneKind, carried_zones
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -62,17 +63,26 @@ def next_planner(planner: FleetPlanner, grid: GridMap, now: float) -> tuple[Flee
     old = planner.state
     newest = max((record.revision for record in old.robots.values()), default=0)
     made = FleetPlanner(grid, planner.settings, first_revision=newest)
-    by_people = carried_cells(old.grid, grid, (old.blocked | old.pending) - old.sensed)
+    by_people = carried_cells(old.grid, grid, old.requested)
+    zones = carried_zones(old.zones.zones.values(), lambda cells: carried_cells(old.grid, grid, cells))
+    made.state.zones.put(zones)
+    made.state.mode = old.mode
+    by_zones = {
+        cell for zone in zones if zone.kind is ZoneKind.BLOCKED and not zone.robots for cell in zone.cells
+    }
     sensed = carried_cells(old.grid, grid, old.sensed) - by_people
-    for cell in sorted((by_people | sensed) - grid.blocked):
+    for cell in sorted((by_people | by_zones | sensed) - grid.blocked):
         made.state.block(cell)
+    made.state.requested |= by_people - grid.blocked
     made.state.sensed |= sensed - grid.blocked
-    instructions = [
-        instruction
-        for record in old.robots.values()
-        if not isnan(record.x)
-        for instruction in made.handle(PoseSeen(record.id, record.x, record.y, record.yaw), now)
-    ]
+    instructions = []
+    for record in old.robots.values():
+        if not isnan(record.x):
+            instructions += made.handle(PoseSeen(record.id, record.x, record.y, record.yaw), now)
+        if record.id in made.state.robots:
+            kept = made.state.robots[record.id]
+            kept.mode, kept.mode_reason = record.mode, record.mode_reason
+            kept.lost = record.lost
     return made, instructions
 
 
@@ -99,9 +109,12 @@ def _under_way(state: FleetState, record: RobotRecord, settings: FleetSettings) 
     if record.phase is Phase.HOLDING:
         waits = not state.ledger.length(robot) and (isnan(record.x) or record.stands(settings))
         return "" if waits else f"{robot} is stopping: try again when it stands"
+    if record.phase is Phase.STANDING:
+        return ""
     if len(state.ledger.granted(robot)) > 1 or not record.centred:
         return f"{robot} is driving: remove its goal, or try again when it has arrived"
-    if report is None or report.revision != record.revision or report.state not in _AT_REST:
+    has_finished = report is not None and report.revision == record.revision and report.state in _AT_REST
+    if not has_finished and not record.pose_only:
         return f"the move client of {robot} has not finished its last list of cells: try again in a second"
     return ""
 

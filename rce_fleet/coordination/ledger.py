@@ -4,6 +4,13 @@ A joint plan says at which step robots enter cells. Real robots do not keep thes
 carried out in order: a robot is granted a cell only once every robot that uses the cell before it has left
 it. Robots never follow each other in a circle, so one of them can always drive, however slow the others are.
 
+Each visit has a *step*: its time in the plan. Steps grow along a route and along a cell's queue, so a path
+that keeps to the steps between others' visits can be added to a plan without changing it (see
+:mod:`rce_fleet.coordination.repair`).
+
+A ledger that is not ``ordered`` grants a cell to whichever robot asks first. Robots still never meet, but
+they can wait for each other in a circle (see :mod:`rce_fleet.coordination.waiting`).
+
 The cost of an operation depends on what it changes, not on the ledger's size: cells have an owner and a
 queue, and the ledger records what became possible (:meth:`CellLedger.take_freed`,
 :meth:`CellLedger.take_ripe`).
@@ -12,105 +19,18 @@ queue, and the ledger records what became possible (:meth:`CellLedger.take_freed
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
-from itertools import count
 from typing import TYPE_CHECKING
 
+from rce_fleet.coordination.ledger_view import Account, LedgerView
 from rce_fleet.exceptions import InvariantError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
+    from collections.abc import Set as AbstractSet
 
 
-@dataclass(slots=True)
-class _Account:
-    """One robot's part of the ledger.
-
-    Attributes:
-        route: The cell that it is in, then those it will enter. Empty for a robot without a cell.
-        granted: How many cells of the route it may use; the first always.
-        extra: Further cells that it overlaps.
-        passed: Number of cells that it has left so far; numbers its visits.
-        owned: The cells whose owner it is.
-        version: Changes whenever the route changes otherwise than by a plan, or by the robot's progress.
-    """
-
-    route: list[int] = field(default_factory=list)
-    granted: int = 0
-    extra: frozenset[int] = frozenset()
-    passed: int = 0
-    owned: set[int] = field(default_factory=set)
-    version: int = 0
-
-    @property
-    def claims(self) -> set[int]:
-        return {*self.route[: self.granted], *self.extra}
-
-
-class CellLedger:
-    """The record of claims and turns.
-
-    Invariants, checked by :meth:`validate`:
-
-    - the claims of two robots are disjoint;
-    - a robot's granted cells are different from each other;
-    - a cell's queue begins with the visit of the robot that was granted it;
-    - queues hold the visits of all routes, and nothing else.
-    """
-
-    def __init__(self) -> None:
-        self._accounts: dict[str, _Account] = {}
-        self._owners: dict[int, str] = {}
-        self._queues: dict[int, deque[tuple[str, int]]] = {}
-        self._changed: set[str] = set()
-        self._freed: set[int] = set()
-        self._ripe: set[str] = set()
-        self._versions = count(1)
-
-    # Reading
-
-    def claims(self, robot: str) -> frozenset[int]:
-        """Return the cells that the robot claims."""
-        account = self._accounts.get(robot)
-        return frozenset(account.claims) if account else frozenset()
-
-    def owner(self, cell: int) -> str | None:
-        """Return the robot that claims a cell."""
-        return self._owners.get(cell)
-
-    def route(self, robot: str) -> list[int]:
-        """Return the robot's cell and all cells that it will enter."""
-        account = self._accounts.get(robot)
-        return list(account.route) if account else []
-
-    def granted(self, robot: str) -> list[int]:
-        """Return the robot's cell and the cells that it may enter now."""
-        account = self._accounts.get(robot)
-        return account.route[: account.granted] if account else []
-
-    def visitors(self, cell: int) -> set[str]:
-        """Return the robots whose routes lead through a cell or begin there."""
-        return {robot for robot, _ in self._queues.get(cell, ())}
-
-    def length(self, robot: str) -> int:
-        """Return the number of cells of the robot's route; 0 for a robot without a cell."""
-        account = self._accounts.get(robot)
-        return len(account.route) if account else 0
-
-    def end_of_grant(self, robot: str) -> int | None:
-        """Return the last cell that the robot may enter; None for a robot without a cell."""
-        account = self._accounts.get(robot)
-        return account.route[account.granted - 1] if account and account.granted else None
-
-    def version(self, robot: str) -> int:
-        """Return a number that changes when the robot is placed or removed, or its route is cut."""
-        account = self._accounts.get(robot)
-        return account.version if account else 0
-
-    def extra(self, robot: str) -> frozenset[int]:
-        """Return cells that the robot overlaps outside its route."""
-        account = self._accounts.get(robot)
-        return account.extra if account else frozenset()
+class CellLedger(LedgerView):
+    """The record of claims and turns; see :class:`~rce_fleet.coordination.ledger_view.LedgerView`."""
 
     # What became possible
 
@@ -146,6 +66,8 @@ class CellLedger:
         account.passed += len(account.route)
         account.version = next(self._versions)
         account.route, account.granted, account.extra = [cell], 1, frozenset(wanted - {cell})
+        following = [enters for enters, _ in self.occupied(cell, robot)]
+        account.steps = [min([self.clock, *(enters - 1.0 for enters in following)])]
         self._queues.setdefault(cell, deque()).appendleft((robot, account.passed))
         self._changed.add(robot)
         self._settle_owners(robot, account)
@@ -162,29 +84,41 @@ class CellLedger:
         """Remove a robot; its cells are free."""
         account = self._account(robot)
         self._withdraw(robot, account)
-        account.route, account.granted, account.extra = [], 0, frozenset()
+        account.route, account.steps, account.granted, account.extra = [], [], 0, frozenset()
         self._changed.add(robot)
         self._settle_owners(robot, account)
         del self._accounts[robot]
 
+    def unplace(self, robot: str) -> None:
+        """Take a robot's cells from it; it stays in the ledger, and can claim cells by :meth:`overlap`."""
+        account = self._account(robot)
+        self._withdraw(robot, account)
+        account.passed += len(account.route)
+        account.version = next(self._versions)
+        account.route, account.steps, account.granted, account.extra = [], [], 0, frozenset()
+        self._changed.add(robot)
+        self._settle_owners(robot, account)
+
     # Plans
 
-    def truncate(self, robot: str) -> None:
-        """Drop the cells of a route that are not granted yet."""
+    def truncate(self, robot: str, keep: int = 0) -> None:
+        """Drop the end of a route: all but the first ``keep`` cells and those that are granted."""
         account = self._account(robot)
-        if account.granted == len(account.route):
+        keep = max(keep, account.granted)
+        if keep >= len(account.route):
             return
-        for index in range(account.granted, len(account.route)):
+        for index in range(keep, len(account.route)):
             self._drop_visit(account.route[index], (robot, account.passed + index))
-        del account.route[account.granted :]
+        del account.route[keep:], account.steps[keep:]
         account.version = next(self._versions)
         self._changed.add(robot)
 
-    def begin_plan(self, starts: Mapping[str, int]) -> None:
+    def begin_plan(self, starts: Mapping[str, int], *, ordered: bool = True) -> None:
         """Begin a new plan where the granted cells end; the rest of older plans is dropped.
 
         Args:
             starts: For every robot with a plan its last granted cell.
+            ordered: Whether the plan's order is kept.
 
         Raises:
             InvariantError: A robot's start is not its last granted cell; nothing was changed.
@@ -192,20 +126,35 @@ class CellLedger:
         for robot, start in starts.items():
             if self.end_of_grant(robot) != start:
                 raise InvariantError(f"the plan of {robot} does not begin where its granted cells end")
-        for robot in self._accounts:
-            self.truncate(robot)
+        self._drop_horizons()
+        self.ordered = ordered
+        self.clock = self._last_step = self._last_step + 1.0
         self._changed.update(starts)
         self._ripe.update(starts)
 
-    def extend_plan(self, visits: Iterable[tuple[str, int]]) -> None:
+    def _drop_horizons(self) -> None:
+        """End all routes with their granted cells. Each granted cell is in one route, so queues are short."""
+        self._queues.clear()
+        for robot, account in self._accounts.items():
+            granted = account.granted
+            if granted < len(account.route):
+                del account.route[granted:], account.steps[granted:]
+                account.version = next(self._versions)
+                self._changed.add(robot)
+            for index, cell in enumerate(account.route):
+                self._queues[cell] = deque(((robot, account.passed + index),))
+
+    def extend_plan(self, visits: Iterable[tuple[str, int, int]]) -> None:
         """Add to a plan that was begun.
 
         Args:
-            visits: The cells that robots enter next, in the order of the plan: ``(robot, cell)``.
+            visits: The cells that robots enter next, in the order of the plan: ``(robot, cell, step)``, with
+                steps counted from the plan's beginning.
         """
-        accounts, queues = self._accounts, self._queues
+        accounts, queues, begin = self._accounts, self._queues, self.clock
         extended: set[str] = set()
-        for robot, cell in visits:
+        last = self._last_step
+        for robot, cell, step in visits:
             account = accounts[robot]
             route = account.route
             visit = robot, account.passed + len(route)
@@ -215,9 +164,49 @@ class CellLedger:
             else:
                 queue.append(visit)
             route.append(cell)
+            account.steps.append(begin + step)
             extended.add(robot)
+            last = max(last, begin + step)
+        self._last_step = last
         self._changed |= extended
         self._ripe |= extended
+
+    def insert(self, robot: str, visits: Iterable[tuple[int, float]]) -> None:
+        """Add cells to the end of one robot's route, between the visits of the others.
+
+        Args:
+            robot: The robot.
+            visits: ``(cell, step)`` in order, with steps of the ledger.
+
+        Raises:
+            InvariantError: A step is not greater than the one before it.
+        """
+        account = self._account(robot)
+        for cell, step in visits:
+            if account.steps and step <= account.steps[-1]:
+                raise InvariantError(
+                    f"{robot} enters cell {cell} at step {step}, not after {account.steps[-1]}"
+                )
+            visit = robot, account.passed + len(account.route)
+            queue = self._queues.setdefault(cell, deque())
+            queue.insert(self._position(queue, step), visit)
+            account.route.append(cell)
+            account.steps.append(step)
+            self._last_step = max(self._last_step, step)
+        account.version = next(self._versions)
+        self._changed.add(robot)
+        self._ripe.add(robot)
+
+    def _position(self, queue: deque[tuple[str, int]], step: float) -> int:
+        """Return the place in a queue of a visit at ``step``: behind granted and earlier ones."""
+        if not self.ordered:
+            return len(queue)
+        for place, (robot, number) in enumerate(queue):
+            account = self._accounts[robot]
+            index = number - account.passed
+            if index >= account.granted and account.steps[index] > step:
+                return place
+        return len(queue)
 
     def grant(self, robot: str, ahead: int) -> bool:
         """Grant a robot the next cells of its route, at most ``ahead`` beyond its own.
@@ -229,6 +218,10 @@ class CellLedger:
         before = account.granted
         while self._may_enter_next(robot, account, ahead):
             cell = account.route[account.granted]
+            if not self.ordered:
+                visit = robot, account.passed + account.granted
+                self._queues[cell].remove(visit)
+                self._queues[cell].appendleft(visit)
             account.granted += 1
             account.owned.add(cell)
             self._owners[cell] = robot
@@ -239,12 +232,18 @@ class CellLedger:
         """Return whether :meth:`grant` would grant a robot a further cell."""
         return self._may_enter_next(robot, self._account(robot), ahead)
 
-    def arrive(self, robot: str, index: int) -> None:
-        """Record that a robot has fully arrived in granted cell number ``index`` and overlaps no other."""
+    def arrive(self, robot: str, index: int, still: AbstractSet[int] = frozenset()) -> None:
+        """Record that a robot has fully arrived in granted cell number ``index``.
+
+        Args:
+            robot: The robot.
+            index: Number of the cell on its route.
+            still: Cells that it still overlaps outside of its route.
+        """
         account = self._account(robot)
         if not 0 <= index < account.granted:
             raise InvariantError(f"{robot} arrived in a cell that it was not granted")
-        if index == 0 and not account.extra:
+        if index == 0 and account.extra <= still:
             return
         for cell in account.route[:index]:
             queue = self._queues[cell]
@@ -253,58 +252,29 @@ class CellLedger:
             if not queue:
                 del self._queues[cell]
             account.passed += 1
-        del account.route[:index]
+        self.clock = max(self.clock, account.steps[index])
+        del account.route[:index], account.steps[:index]
         account.granted -= index
-        account.extra = frozenset()
+        account.extra &= still
         if index:
             self._changed.add(robot)
             self._ripe.add(robot)
         self._settle_owners(robot, account)
 
-    # Consistency
+    def _account(self, robot: str) -> Account:
+        return self._accounts.setdefault(robot, Account())
 
-    def validate(self) -> None:
-        """Check the invariants.
-
-        Raises:
-            InvariantError: An invariant does not hold.
-        """
-        owners: dict[int, str] = {}
-        for robot, account in self._accounts.items():
-            granted = account.route[: account.granted]
-            if len(set(granted)) != len(granted):
-                raise InvariantError(f"{robot} was granted a cell twice: {granted}")
-            for index, cell in enumerate(granted):
-                if self._queues[cell][0] != (robot, account.passed + index):
-                    raise InvariantError(f"{robot} was granted cell {cell} out of turn")
-            for cell in account.claims:
-                if owners.setdefault(cell, robot) != robot:
-                    raise InvariantError(f"cell {cell} is claimed by {robot} and {owners[cell]}")
-            if account.owned != account.claims:
-                raise InvariantError(f"{robot} owns {account.owned}, but claims {account.claims}")
-        if owners != self._owners:
-            raise InvariantError(f"the owners {self._owners} are not the claims {owners}")
-        visits = {
-            (cell, (robot, account.passed + index))
-            for robot, account in self._accounts.items()
-            for index, cell in enumerate(account.route)
-        }
-        queued = [(cell, visit) for cell, queue in self._queues.items() for visit in queue]
-        if len(queued) != len(visits) or set(queued) != visits or not all(self._queues.values()):
-            raise InvariantError(f"the queues {self._queues} are not the visits {visits}")
-
-    def _account(self, robot: str) -> _Account:
-        return self._accounts.setdefault(robot, _Account())
-
-    def _may_enter_next(self, robot: str, account: _Account, ahead: int) -> bool:
+    def _may_enter_next(self, robot: str, account: Account, ahead: int) -> bool:
         if account.granted >= min(len(account.route), ahead + 1):
             return False
         cell = account.route[account.granted]
+        if not self.ordered:
+            return cell not in self._owners
         is_first = self._queues[cell][0] == (robot, account.passed + account.granted)
         # A robot can drive over a cell twice; it is granted it again once it has left it.
         return is_first and self._owners.get(cell, robot) == robot
 
-    def _withdraw(self, robot: str, account: _Account) -> None:
+    def _withdraw(self, robot: str, account: Account) -> None:
         """Remove all visits of a robot from the queues."""
         for index, cell in enumerate(account.route):
             self._drop_visit(cell, (robot, account.passed + index))
@@ -316,16 +286,22 @@ class CellLedger:
         if not queue:
             del self._queues[cell]
         elif was_first:
-            self._ripe.add(queue[0][0])
+            self._ripen(cell)
 
-    def _settle_owners(self, robot: str, account: _Account) -> None:
+    def _ripen(self, cell: int) -> None:
+        """Note the robots that may be granted a cell now."""
+        queue = self._queues.get(cell)
+        if queue and self.ordered:
+            self._ripe.add(queue[0][0])
+        elif queue:
+            self._ripe.update(robot for robot, _ in queue)
+
+    def _settle_owners(self, robot: str, account: Account) -> None:
         """Make a robot the owner of exactly the cells that it claims."""
         claims = account.claims
         for cell in account.owned - claims:
             del self._owners[cell]
             self._freed.add(cell)
-            queue = self._queues.get(cell)
-            if queue:
-                self._ripe.add(queue[0][0])
+            self._ripen(cell)
         self._owners.update(dict.fromkeys(claims, robot))
         account.owned = claims

@@ -14,7 +14,7 @@ The cost of an event depends on what it changes: records that depend on other ro
 
 from __future__ import annotations
 
-from math import inf, isfinite, isnan
+from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from rce_fleet.coordination.blocking import CellBlocking
@@ -26,6 +26,7 @@ from rce_fleet.coordination.events import (
     Event,
     GoalSet,
     Instruction,
+    ModeSet,
     ObstacleGone,
     ObstacleSeen,
     PlanMade,
@@ -34,13 +35,16 @@ from rce_fleet.coordination.events import (
     ReportSeen,
     RobotHeard,
     RobotRemoved,
-    SendCancel,
-    SendCells,
+    RobotsExpected,
     Tick,
+    ZonesSet,
 )
 from rce_fleet.coordination.fleet_state import FleetState
+from rce_fleet.coordination.localization import is_lost
+from rce_fleet.coordination.mode_control import ModeControl
 from rce_fleet.coordination.refusals import refuse_goal
-from rce_fleet.coordination.robot import Cause, Phase, RobotRecord
+from rce_fleet.coordination.robot import Phase, RobotRecord
+from rce_fleet.coordination.robot_watch import NO_POSE, RobotWatch
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.exceptions import InvariantError
 
@@ -50,8 +54,6 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.changes import FleetChanges
     from rce_fleet.coordination.snapshot import FleetSnapshot
     from rce_fleet.planning.grid import GridMap
-
-NO_POSE = "it has sent no pose yet: its localization does not run, or has no map or scans"
 
 
 class FleetPlanner:
@@ -74,16 +76,21 @@ class FleetPlanner:
         self._deadlines = Deadlines()
         self._dispatcher = Dispatcher(self.state, self.settings)
         self._blocking = CellBlocking(self.state, self._dispatcher)
+        self._modes = ModeControl(self.state, self._dispatcher)
+        self._watch = RobotWatch(self.state, self.settings, self._dispatcher)
         self._now = 0.0
         self._handlers: dict[type, Callable[[Any], Reply | None]] = {
             PoseSeen: self._take_pose,
             RobotHeard: self._take_sign,
             ReportSeen: self._take_report,
+            RobotsExpected: self._expect,
             ObstacleSeen: self._blocking.take_obstacle,
             ObstacleGone: self._blocking.take_gone,
             GoalSet: self._set_goal,
             CellBlocked: self._blocking.block_cell,
             CellFreed: self._blocking.free_cell,
+            ZonesSet: self._blocking.set_zones,
+            ModeSet: self._modes.set_mode,
             RobotRemoved: self._remove_robot,
             PlanMade: lambda event: self._dispatcher.take_plan(event.result),
             Tick: self._take_tick,
@@ -96,6 +103,7 @@ class FleetPlanner:
         dispatcher = self._dispatcher
         self._now = dispatcher.now = now
         dispatcher.out = []
+        dispatcher.is_tick = False
         reply = self._handlers[type(event)](event)
         if reply is not None:
             dispatcher.out.append(reply)
@@ -128,7 +136,7 @@ class FleetPlanner:
         self.state.validate()
         self._dispatcher.validate()
         for record in self.state.robots.values():
-            if self._deadlines[record.id] > self._due(record) + ROUNDING:
+            if self._deadlines[record.id] > self._watch.due(record) + ROUNDING:
                 raise InvariantError(f"{record.id} is looked at too late, at {self._deadlines[record.id]}")
 
     # What robots say
@@ -138,21 +146,33 @@ class FleetPlanner:
             return
         record = self._record(event.robot)
         record.see(event.x, event.y, event.yaw, self._now, self.settings)
-        if self.state.sensed:
-            here = self.state.grid.cell_at(event.x, event.y)
-            if here is not None:
-                self._blocking.take_robot(here)
+        why = is_lost(record, event, self.settings)
+        if why != record.lost:
+            self._modes.set_lost(record, why)
+        if not record.lost:
+            self._clear_cell(event)
+        elif record.phase is Phase.STANDING:
+            return
         if record.reason == NO_POSE:
             record.reason = "new"
             self.state.touch(record)
         self._look_soon_if_silent(record)
-        if record.phase is Phase.ACTIVE:
-            self._follow(record)
+        if record.phase in (Phase.ACTIVE, Phase.STANDING):
+            if record.jumped_at == self._now:
+                self._distrust(record)
+            else:
+                self._follow(record)
             return
         if not self.state.ledger.length(record.id):
-            self._watch_newcomer(record)
+            self._dispatcher.watch(record)
         if record.phase is Phase.HOLDING:
             self._dispatcher.to_settle.add(record.id)
+
+    def _clear_cell(self, event: PoseSeen) -> None:
+        """Free the cell that a robot is in, if sensors found it blocked."""
+        here = self.state.grid.cell_at(event.x, event.y) if self.state.sensed else None
+        if here is not None:
+            self._blocking.take_robot(here)
 
     def _take_sign(self, event: RobotHeard) -> None:
         if self._gone(event.robot):
@@ -168,10 +188,14 @@ class FleetPlanner:
             return
         record = self._record(event.robot)
         known, report = record.report, event.report
+        if record.pose_only:
+            self.state.touch(record)
         record.take(report, self._now)
         self._look_soon_if_silent(record)
         if record.phase is Phase.HOLDING:
             self._dispatcher.to_settle.add(record.id)
+            if not self.state.ledger.length(record.id):
+                self._dispatcher.watch(record)
         if report.revision > record.revision:
             record.revision = report.revision
             self._dispatcher.hold(record, "its move client knows an earlier planner")
@@ -179,6 +203,20 @@ class FleetPlanner:
             if record.phase is Phase.ACTIVE:
                 self._dispatcher.hold(record, "its move client was restarted")
             self._deadlines.hasten(record.id, self._now)
+
+    def _expect(self, event: RobotsExpected) -> None:
+        """Wait for robots before any cell is granted, and claim the cells that they may be in."""
+        for robot in sorted(event.robots):
+            if robot in self.state.robots or self._gone(robot):
+                continue
+            self._dispatcher.expected[robot] = self._now + self.settings.expect_timeout
+            cells = [cell for cell in event.robots[robot] if cell in self.state.grid]
+            if not cells:
+                continue
+            record = self._record(robot)
+            record.earlier = frozenset(cells)
+            self.state.ledger.overlap(robot, cells)
+            self._dispatcher.avoid(record)
 
     def _look_soon_if_silent(self, record: RobotRecord) -> None:
         if record.phase is Phase.SILENT:
@@ -191,25 +229,13 @@ class FleetPlanner:
             if here not in self.state.ledger.claims(record.id):
                 record.rest = None  # It was carried away: it stays where it was put.
                 self._dispatcher.hold(record, "it left its path")
-                self._make_room(record)
+                self._dispatcher.make_room(record)
 
-    def _watch_newcomer(self, record: RobotRecord) -> None:
-        """Stop robots whose cells a robot without a cell overlaps."""
-        before = self.state.ledger.claims(record.id)
-        self.state.ledger.overlap(record.id, self._dispatcher.touched(record))
-        if self.state.ledger.claims(record.id) != before:
-            self._dispatcher.outdated = True
-        self._make_room(record)
-
-    def _make_room(self, record: RobotRecord) -> None:
-        """Stop robots that were granted cells which another robot overlaps."""
-        for cell in self._dispatcher.touched(record):
-            owner = self.state.ledger.owner(cell)
-            other = self.state.robots.get(owner) if owner is not None else None
-            if other is None or other is record or other.phase is not Phase.ACTIVE:
-                continue
-            if cell in self.state.ledger.granted(other.id)[1:]:
-                self._dispatcher.hold(other, f"{record.id} is in its way")
+    def _distrust(self, record: RobotRecord) -> None:
+        """Stop a robot whose pose jumped; it keeps its cells until its poses have agreed for a while."""
+        record.rest = None
+        self._dispatcher.hold(record, "its pose jumped farther than it can drive: localize it")
+        self._dispatcher.make_room(record)
 
     # Requests
 
@@ -222,9 +248,9 @@ class FleetPlanner:
             if refusal:
                 return Reply(False, refusal)
         if record.goal != event.cell:
-            record.goal, record.rest = event.cell, None
+            record.goal, record.rest, record.goal_at = event.cell, None, self._now
             self.state.touch(record)
-            self._dispatcher.outdated = True
+            self._dispatcher.require([record.id])
             if record.phase is Phase.ACTIVE and len(self.state.ledger.granted(record.id)) > 1:
                 self._dispatcher.hold(record, "it has a new goal")
         if event.cell is None:
@@ -237,86 +263,20 @@ class FleetPlanner:
         # Messages that are still on the way must not add it again.
         self._deaf_until[event.robot] = self._now + self.settings.silence_timeout
         self._deadlines.forget(event.robot)
+        self._dispatcher.expected.pop(event.robot, None)
         self.state.remove(event.robot)
-        self._dispatcher.outdated = True
+        self._dispatcher.require(other.id for other in self.state.robots.values() if other.unreachable)
         return Reply(True, f"{event.robot} was removed")
 
     # Time
 
     def _take_tick(self, _event: Tick) -> None:
+        self._dispatcher.is_tick = True
+        self._blocking.end_expired(self._now)
         for robot in self._deadlines.take_due(self._now):
             record = self.state.robots[robot]
-            self._check_timeouts(record)
-            self._deadlines.set(robot, self._due(record))
-
-    def _check_timeouts(self, record: RobotRecord) -> None:
-        """Handle timeouts of one robot."""
-        heard = record.heard(self._now, self.settings)
-        if record.phase is Phase.SILENT:
-            if heard:
-                self.state.change(record, Cause.HEARD, "it sends messages again")
-                self._dispatcher.hold(record, "it sends messages again")
-        elif not heard:
-            self._lose(record)
-        elif isnan(record.x) and record.reason != NO_POSE:
-            record.reason = NO_POSE
-            self.state.touch(record)
-        elif record.phase is Phase.ACTIVE and self._stalled(record):
-            self._dispatcher.hold(record, "it did not move")
-        elif self._now - record.sent_at >= self.settings.repeat_after:
-            self._repeat(record)
-
-    def _due(self, record: RobotRecord) -> float:
-        """Return when to check a robot next, if no message from it or to it comes before.
-
-        A message that is sent later is also repeated later, so a check every ``repeat_after`` seconds is
-        enough.
-        """
-        if record.phase is Phase.SILENT:
-            return inf
-        sent = record.sent_at if self._is_unconfirmed(record) else self._now
-        times = [
-            max(sent, self._now - self.settings.repeat_after) + self.settings.repeat_after,
-            min(record.alive_at, record.reported_at) + self.settings.silence_timeout,
-        ]
-        if self._is_busy(record):
-            times.append(max(record.still_since(), record.sent_at) + self.settings.stall_timeout)
-        return min(times)
-
-    def _lose(self, record: RobotRecord) -> None:
-        robot_first = record.alive_at < record.reported_at
-        reason = (
-            "the robot sends neither poses nor states of its goals"
-            if robot_first
-            else "its move client sends no reports"
-        )
-        self.state.change(record, Cause.LOST, reason)
-        self.state.ledger.truncate(record.id)
-        self._dispatcher.outdated = True
-
-    def _is_busy(self, record: RobotRecord) -> bool:
-        """Return whether a robot has cells to drive to."""
-        granted = self.state.ledger.granted(record.id)
-        return record.phase is Phase.ACTIVE and (len(granted) > 1 or not record.centred)
-
-    def _stalled(self, record: RobotRecord) -> bool:
-        """Return whether a robot has had cells to drive to for long and has not moved."""
-        since = max(record.still_since(), record.sent_at)
-        return self._is_busy(record) and self._now - since > self.settings.stall_timeout
-
-    def _is_unconfirmed(self, record: RobotRecord) -> bool:
-        """Return whether a move client has not acknowledged the last list."""
-        return record.report is None or record.report.revision != record.revision
-
-    def _repeat(self, record: RobotRecord) -> None:
-        """Send unacknowledged messages again."""
-        if not self._is_unconfirmed(record):
-            return
-        if record.phase is Phase.HOLDING:
-            record.sent_at = self._now
-            self._dispatcher.out += [SendCancel(record.id), SendCells(record.id, record.revision, ())]
-        elif record.phase is Phase.ACTIVE:
-            self._dispatcher.send(record, tuple(self.state.ledger.granted(record.id)))
+            self._watch.check(record)
+            self._deadlines.set(robot, self._watch.due(record))
 
     # Small things
 

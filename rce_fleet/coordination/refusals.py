@@ -4,21 +4,37 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rce_fleet.coordination.modes import WORDS
+
 if TYPE_CHECKING:
     from collections.abc import Set as AbstractSet
 
     from rce_fleet.coordination.fleet_state import FleetState
     from rce_fleet.coordination.robot import RobotRecord
+    from rce_fleet.coordination.zones import Zone
 
 
 def refuse_goal(state: FleetState, record: RobotRecord, cell: int) -> str:
     """Return why a robot cannot be sent to a cell; empty if it can."""
     if cell not in state.grid:
         return f"cell {cell} is not on the map of {len(state.grid)} cells"
+    if not record.mode.takes_goals:
+        return f"{record.id} is {WORDS[record.mode]}: set its mode to automatic first"
+    zone = state.zones.blocks(cell)
+    if zone is not None:
+        return f"cell {cell} is blocked by {describe_zone(zone)}; choose another goal"
+    if cell in state.zones.forbidden(record.id):
+        return f"cell {cell} is blocked for {record.id} by a zone; choose another goal"
     if state.is_shut(cell):
         return f"cell {cell} is blocked; choose another goal"
     holder = state.index.goals.get(cell, record.id)
     return "" if holder == record.id else f"cell {cell} is the goal of {holder}; choose another goal"
+
+
+def describe_zone(zone: Zone) -> str:
+    """Return a zone's name, with its reason and author, for people."""
+    details = ", ".join(filter(None, (zone.reason, f"by {zone.by}" if zone.by else "")))
+    return f"zone {zone.id!r}" + (f" ({details})" if details else "")
 
 
 def refuse_block(state: FleetState, cell: int) -> str:
@@ -29,21 +45,21 @@ def refuse_block(state: FleetState, cell: int) -> str:
 
 
 def hindrance(
-    state: FleetState, record: RobotRecord, touched: AbstractSet[int], own: AbstractSet[int], cell: int | None
+    state: FleetState, record: RobotRecord, hull: AbstractSet[int], own: AbstractSet[int], cell: int | None
 ) -> str:
     """Return why a robot that stands still cannot be placed in a cell; empty if it can.
 
     Args:
         state: The fleet.
         record: The robot.
-        touched: Cells that it overlaps.
-        own: Those of them that no other robot claims.
+        hull: Cells that its hull overlaps.
+        own: Cells that it overlaps, with a margin, and that no other robot claims.
         cell: The cell to place it in; None if there is none.
     """
-    if not touched:
+    if not hull:
         return "it is outside the map"
-    if cell is None or (own != touched and not state.ledger.length(record.id)):
-        other = min(touched - own)
+    if cell is None or (not hull <= own and not state.ledger.length(record.id)):
+        other = min(hull - own)
         return f"cell {other} is held by {state.ledger.owner(other)}"
     if state.is_blocked(cell):
         return "it stands in a blocked cell"

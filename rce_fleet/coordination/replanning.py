@@ -8,21 +8,31 @@ the result into the ledger, as far as the robots are still where the plan begins
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import atan2
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from rce_fleet.coordination.rerouting import NO_CELL, LedgerCopy, Rerouting, compute_rerouting, copy_ledger
 from rce_fleet.coordination.robot import Phase
+from rce_fleet.coordination.starvation import urgency_of
 from rce_fleet.coordination.targets import assign_targets
+from rce_fleet.coordination.zones import ZoneKind
+from rce_fleet.planning.graph import PlanningGraph
 from rce_fleet.planning.grid import GridMap
-from rce_fleet.planning.lacam import plan
+from rce_fleet.planning.motion import Motion, heading_of
+from rce_fleet.planning.planner import DEFAULT_PLANNER, PlanningProblem, load_planner
+from rce_fleet.planning.straightening import ends_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from rce_fleet.coordination.fleet_state import FleetState
     from rce_fleet.coordination.settings import FleetSettings
+    from rce_fleet.planning.planner import Planner
 
-NO_CELL = -1
-"""In a request: the robot has no such cell."""
+MOVE = 2
+"""Cells of a move."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +48,16 @@ class PlanRequest:
         goals: Goal of each robot, or -1.
         rests: Cell that each robot returns to without a goal, or -1.
         seed: Breaks ties.
-        effort: Work spent at most, see :func:`rce_fleet.planning.lacam.plan`.
+        effort: Work spent at most, see :class:`rce_fleet.planning.planner.PlanningProblem`.
+        planner: Name of the planner.
+        closed: Moves ``(from, to)`` that no robot may make.
+        costs: ``(cell, cost of entering it)`` where it is not 1.
+        forbidden: ``(index of a robot, cells that it may not enter)``.
+        headings: Heading of each robot at its start, see :mod:`rce_fleet.planning.motion`.
+        quarter_turn: Time of a quarter turn, in steps; 0: turns are not counted.
+        stop: Time lost by stopping and starting, in steps; 0: not counted.
+        urgency: How urgent each robot is, see :mod:`rce_fleet.coordination.starvation`.
+        copy: Where only some robots need new paths: the paths of all; None: one plan is made for all.
     """
 
     number: int
@@ -51,6 +70,15 @@ class PlanRequest:
     rests: tuple[int, ...]
     seed: int
     effort: int
+    planner: str = DEFAULT_PLANNER
+    closed: tuple[tuple[int, int], ...] = ()
+    costs: tuple[tuple[int, int], ...] = ()
+    forbidden: tuple[tuple[int, tuple[int, ...]], ...] = ()
+    headings: tuple[int, ...] = ()
+    quarter_turn: float = 0.0
+    stop: float = 0.0
+    urgency: tuple[int, ...] = ()
+    copy: LedgerCopy | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +91,9 @@ class PlanResult:
         cells: Cell of each visit.
         unreachable: Robots, as indexes of ``robots``, whose goal cannot be reached.
         complete: Whether the plan ends with all robots at their targets.
+        steps: Step of each visit, from 1 on.
+        ordered: Whether robots that keep the plan's order never wait for each other in a circle.
+        rerouting: The new paths, where only some robots need one; then there are no visits.
     """
 
     number: int
@@ -70,9 +101,14 @@ class PlanResult:
     cells: tuple[int, ...]
     unreachable: tuple[int, ...]
     complete: bool
+    steps: tuple[int, ...] = ()
+    ordered: bool = True
+    rerouting: Rerouting | None = None
 
 
-def request_plan(state: FleetState, settings: FleetSettings, number: int) -> PlanRequest:
+def request_plan(
+    state: FleetState, settings: FleetSettings, number: int, now: float, members: Sequence[str] = ()
+) -> PlanRequest:
     """Return the input of a plan from the fleet's state.
 
     Cells claimed by robots that are not active are obstacles. Cells granted already are driven through in any
@@ -82,6 +118,8 @@ def request_plan(state: FleetState, settings: FleetSettings, number: int) -> Pla
         state: The fleet; ``rest`` of robots without a target is set.
         settings: Seed and effort.
         number: Number of the plan; changes how ties are broken.
+        now: Time, seconds.
+        members: Robots that need new paths, the first ones first; none: one plan is made for all.
     """
     robots, starts, goals, rests = [], [], [], []
     blocked = set(state.shut)
@@ -107,39 +145,116 @@ def request_plan(state: FleetState, settings: FleetSettings, number: int) -> Pla
         rests=tuple(rests),
         seed=settings.seed + number,
         effort=settings.effort,
+        planner=DEFAULT_PLANNER if settings.planner == "dijkstra" else settings.planner,
+        closed=tuple(sorted(state.zones.closed(state.grid))),
+        costs=tuple(sorted(state.zones.costs().items())),
+        forbidden=tuple(_forbidden(state, robots)),
+        headings=() if members else tuple(_heading(state, robot) for robot in robots),
+        quarter_turn=settings.quarter_turn,
+        stop=settings.stop,
+        urgency=(
+            ()
+            if members
+            else tuple(urgency_of(state, state.robots[robot], settings, now) for robot in robots)
+        ),
+        copy=copy_ledger(state, robots, members) if members else None,
     )
 
 
-def compute_plan(request: PlanRequest) -> PlanResult:
-    """Return the plan. The same request always gives the same plan."""
+def _heading(state: FleetState, robot: str) -> int:
+    """Return the heading that a robot has at the end of its granted cells."""
+    granted, grid = state.ledger.granted(robot), state.grid
+    if len(granted) < MOVE:
+        return heading_of(state.robots[robot].yaw - grid.yaw)
+    (row, column), (row_before, column_before) = grid.place(granted[-1]), grid.place(granted[-2])
+    return heading_of(atan2(row - row_before, column - column_before))
+
+
+def _forbidden(state: FleetState, robots: list[str]) -> Iterator[tuple[int, tuple[int, ...]]]:
+    """Yield the cells that single robots may not enter.
+
+    Robots that claim cells of a limited zone are in it; then those with a goal in it are let in, as long as
+    there is room, in the order of their names.
+    """
+    if not state.zones.zones:
+        return
+    full: dict[str, set[int]] = {}
+    for zone in state.zones.of_kind(ZoneKind.LIMITED):
+        cells = set(zone.cells)
+        inside = {owner for cell in cells if (owner := state.ledger.owner(cell)) is not None}
+        room = zone.capacity - sum(1 for robot in inside if zone.applies_to(robot))
+        for robot in sorted(robots, key=lambda robot: (state.robots[robot].goal not in cells, robot)):
+            if robot in inside or not zone.applies_to(robot):
+                continue
+            room -= 1
+            if room < 0:
+                full.setdefault(robot, set()).update(cells)
+    for index, robot in enumerate(robots):
+        barred = state.zones.forbidden(robot) | full.get(robot, set())
+        if barred:
+            yield index, tuple(sorted(barred))
+
+
+def compute_plan(request: PlanRequest, planner: Planner | None = None) -> PlanResult:
+    """Return the plan. The same request to a new planner always gives the same plan.
+
+    Args:
+        request: What to plan.
+        planner: Makes the plan; by default a new one of the request's name.
+
+    Raises:
+        PlannerError: There is no planner of this name.
+    """
+    if request.copy is not None:
+        rerouting = compute_rerouting(request)
+        return PlanResult(request.number, (), (), (), complete=True, rerouting=rerouting)
     grid = GridMap(request.rows, request.columns, blocked=frozenset(request.blocked))
+    forbidden = {index: frozenset(cells) for index, cells in request.forbidden}
     starts = dict(zip(request.robots, request.starts, strict=True))
     targets = assign_targets(
         grid,
         starts,
         goals={robot: cell for robot, cell in zip(request.robots, request.goals, strict=True) if cell >= 0},
         rests={robot: cell for robot, cell in zip(request.robots, request.rests, strict=True) if cell >= 0},
+        closed=frozenset(request.closed),
+        forbidden={request.robots[index]: cells for index, cells in forbidden.items()},
     )
-    joint = plan(
-        grid,
+    costs = None
+    if request.costs:
+        costs = np.ones(len(grid), dtype=np.int32)
+        for cell, cost in request.costs:
+            costs[cell] = cost
+    problem = PlanningProblem.of(
+        PlanningGraph.from_grid(grid, costs=costs, closed=request.closed),
         request.starts,
         [targets.cells[robot] for robot in request.robots],
         seed=request.seed,
         effort=request.effort,
+        forbidden=forbidden or None,
+        motion=(
+            Motion(request.quarter_turn, request.stop, request.headings)
+            if request.quarter_turn or request.stop
+            else None
+        ),
+        urgency=request.urgency or None,
+        lifelong=True,
     )
-    visits = sorted(
-        (step, request.robots[index], index, cell)
-        for index in range(len(request.robots))
-        for step, cell in joint.route(index)[1:]
-    )
+    joint = (planner or load_planner(request.planner)).plan(problem)
+    steps, visitors, cells = joint.visits()
+    # Robots that have arrived soon have another goal: the others wait for that, and not they for the others.
+    ends = ends_of(joint.cells, np.array(request.goals, np.int32), lifelong=True)
+    counts = steps <= ends[visitors]
+    steps, visitors, cells = steps[counts], visitors[counts], cells[counts]
     return PlanResult(
         number=request.number,
-        visitors=tuple(index for _, _, index, _ in visits),
-        cells=tuple(cell for *_, cell in visits),
+        visitors=tuple(visitors.tolist()),
+        cells=tuple(cells.tolist()),
+        steps=tuple(steps.tolist()),
         unreachable=tuple(
             index for index, robot in enumerate(request.robots) if robot in targets.unreachable
         ),
         complete=joint.complete,
+        ordered=joint.conflict_free,
     )
 
 
@@ -150,6 +265,9 @@ class PlanAdoption:
     any more, was granted other cells or has another goal gets no route, or no more of it, and a route ends
     before a cell that no robot may enter any more. That is safe, because robots drive only on granted cells,
     and the ledger checks each grant; but robots may not reach their goals, so another plan has to follow.
+
+    Attributes:
+        was_cut: Whether a route ended before a blocked cell.
 
     Args:
         state: The fleet; its ledger and the robots' ``unreachable`` are changed.
@@ -163,6 +281,7 @@ class PlanAdoption:
         self._result = result
         self._next = 0
         self._present: list[str | None] = []
+        self.was_cut = False
         unreachable = frozenset(result.unreachable)
         starts = {}
         for index, robot in enumerate(request.robots):
@@ -175,7 +294,7 @@ class PlanAdoption:
             if record.unreachable != (index in unreachable):
                 record.unreachable = index in unreachable
                 state.touch(record)
-        state.ledger.begin_plan(starts)
+        state.ledger.begin_plan(starts, ordered=result.ordered)
         self._versions = [state.ledger.version(robot) for robot in request.robots]
 
     def step(self, visits: int) -> bool:
@@ -199,12 +318,15 @@ class PlanAdoption:
         robot = self._request.robots[index]
         return self._wants(index) and self._state.ledger.version(robot) == self._versions[index]
 
-    def _visits(self, begin: int, end: int) -> Iterator[tuple[str, int]]:
+    def _visits(self, begin: int, end: int) -> Iterator[tuple[str, int, int]]:
         """Yield visits in order, as far as they are still possible."""
         shut, present, result = self._state.shut, self._present, self._result
-        for index, cell in zip(result.visitors[begin:end], result.cells[begin:end], strict=True):
+        steps = result.steps or range(1, len(result.cells) + 1)
+        parts = (result.visitors[begin:end], result.cells[begin:end], steps[begin:end])
+        for index, cell, step in zip(*parts, strict=True):
             robot = present[index]
             if robot is not None and cell in shut:
                 present[index] = robot = None  # Its route ends here.
+                self.was_cut = True
             if robot is not None:
-                yield robot, cell
+                yield robot, cell, step

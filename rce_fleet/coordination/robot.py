@@ -8,6 +8,7 @@ from math import hypot, inf
 from typing import TYPE_CHECKING
 
 from rce.lifecycle import LifeCycle, remember
+from rce_fleet.coordination.modes import RobotMode
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.exceptions import TransitionError
 
@@ -22,6 +23,8 @@ class Phase(Enum):
     """It is stopped, and gets a cell once it stands still. Every robot begins here."""
     ACTIVE = "active"
     """It has a cell, takes part in plans and is granted cells."""
+    STANDING = "standing"
+    """It has a cell and stays there, because it is not in automatic mode. The others plan around it."""
     SILENT = "silent"
     """It gives no sign of life, or its move client no report. It keeps its cells: it may stand in each."""
 
@@ -31,6 +34,10 @@ class Cause(Enum):
 
     SETTLED = "settled"
     """It stands still, and has a cell."""
+    STAYED = "stayed"
+    """It stands still and has a cell, and its mode keeps it there."""
+    RESUMED = "resumed"
+    """It is in automatic mode again."""
     HELD = "held"
     """It is ordered to stop."""
     LOST = "lost"
@@ -44,10 +51,16 @@ ROBOT_LIFE: LifeCycle[Phase, Cause] = LifeCycle(
     {
         Phase.HOLDING: {
             Cause.SETTLED: Phase.ACTIVE,
+            Cause.STAYED: Phase.STANDING,
             Cause.HELD: Phase.HOLDING,
             Cause.LOST: Phase.SILENT,
         },
         Phase.ACTIVE: {
+            Cause.HELD: Phase.HOLDING,
+            Cause.LOST: Phase.SILENT,
+        },
+        Phase.STANDING: {
+            Cause.RESUMED: Phase.ACTIVE,
             Cause.HELD: Phase.HOLDING,
             Cause.LOST: Phase.SILENT,
         },
@@ -72,15 +85,22 @@ class RobotRecord:
         alive_at: When the robot last gave a sign of life: a pose, or what its move client heard of it. At
             first, when the robot's first message came.
         report: Last report of its move client.
+        earlier: Cells that an earlier planner may have granted it, until its move client tells which.
         reported_at: When that came, likewise.
         obeyed_at: When its move client first reported to be at the end of the last list.
         goal: Its goal cell.
+        goal_at: When it was sent there.
         rest: The cell it returns to when it has no goal.
         unreachable: Whether no path leads to its goal.
         centred: Whether it has been at the centre of its cell since it was placed there.
         replans: How often it lost its path because a cell on it was blocked.
         held_at: When it was last told to stand still.
         sent_at: When it was last sent a message.
+        pose_only: Whether its move client answers nothing, so that its progress is judged by its poses.
+        jumped_at: When a pose came that cannot be true.
+        mode: Its own mode; the fleet's may count instead.
+        mode_reason: Why it has this mode, and who set it.
+        lost: Why it is lost, for people; empty: it is not.
         reason: Why it is not active, in words.
         recent: The last causes of phase changes.
     """
@@ -94,15 +114,22 @@ class RobotRecord:
     posed_at: float = -inf
     alive_at: float = -inf
     report: ClientReport | None = None
+    earlier: frozenset[int] = frozenset()
     reported_at: float = -inf
     obeyed_at: float = inf
     goal: int | None = None
+    goal_at: float = inf
     rest: int | None = None
     unreachable: bool = False
     centred: bool = False
     replans: int = 0
     held_at: float = -inf
     sent_at: float = -inf
+    pose_only: bool = False
+    jumped_at: float = -inf
+    mode: RobotMode = RobotMode.AUTOMATIC
+    mode_reason: str = ""
+    lost: str = ""
     reason: str = "new"
     recent: tuple[Cause, ...] = ()
     _anchor: tuple[float, float] = (inf, inf)
@@ -119,6 +146,10 @@ class RobotRecord:
 
     def see(self, x: float, y: float, yaw: float, now: float, settings: FleetSettings) -> None:
         """Update the pose."""
+        if self.posed_at > -inf:
+            possible = settings.jump_distance + settings.top_speed * (now - self.posed_at)
+            if hypot(x - self.x, y - self.y) > possible:
+                self.jumped_at = now
         self.x, self.y, self.yaw, self.posed_at, self.alive_at = x, y, yaw, now, now
         if hypot(x - self._anchor[0], y - self._anchor[1]) > settings.still_distance:
             self._anchor, self._anchored_at = (x, y), now
@@ -132,12 +163,26 @@ class RobotRecord:
         return self._anchored_at
 
     def heard(self, now: float, settings: FleetSettings) -> bool:
-        """Return whether robot and move client sent messages recently."""
-        return now - min(self.alive_at, self.reported_at) <= settings.silence_timeout
+        """Return whether robot and move client sent messages recently.
+
+        Nothing is expected of a robot that is driven by its poses only: localization may send none at rest.
+        """
+        return self.pose_only or self.heartbeat_age(now) <= settings.silence_timeout
+
+    def heartbeat_age(self, now: float) -> float:
+        """Return how long ago robot or move client last gave a sign of life, the one that was silent longer.
+
+        A robot that is driven by its poses only has no move client that reports.
+
+        Returns:
+            Seconds.
+        """
+        return now - (self.alive_at if self.pose_only else min(self.alive_at, self.reported_at))
 
     def take(self, report: ClientReport, now: float) -> None:
         """Update the move client's report."""
-        self.report, self.reported_at = report, now
+        self.report, self.reported_at, self.pose_only = report, now, False
+        self.earlier = frozenset()
         if report.revision != self.revision or report.state not in (ClientState.IDLE, ClientState.FAILED):
             self.obeyed_at = inf
         elif self.obeyed_at == inf:
@@ -152,9 +197,16 @@ class RobotRecord:
     def stands(self, settings: FleetSettings) -> bool:
         """Whether it was told to stand still, acknowledged it, and its poses stay in one place.
 
-        A robot that sends poses shows that by them. Localization may send none while the robot stands; then
-        the robot must have lived so long without one that no pose of the drive before is still on its way.
+        A robot that sends poses shows that by one that is later than its move client's report by more than
+        messages are late. Localization may send none while the robot stands; then the robot must have lived
+        so long without one that no pose of the drive before is still on its way.
+
+        After a pose that cannot be true it takes longer: where the robot is, is known once its poses agree.
         """
-        if self.posed_at >= self.obeyed_at and self.posed_at - self._anchored_at >= settings.settle_time:
+        if self.alive_at - self.jumped_at < settings.jump_settle_time:
+            return False
+        if self.pose_only:
+            return self.alive_at - max(self.held_at, self._anchored_at) >= settings.pose_only_settle
+        if self.posed_at - max(self.obeyed_at, self._anchored_at) >= settings.settle_time:
             return True
         return self.alive_at - max(self.obeyed_at, self._anchored_at) >= settings.pose_timeout

@@ -25,6 +25,18 @@ class RobotState(Enum):
     """It is at its goal."""
     IDLE = "idle"
     """It has no goal."""
+    PAUSED = "paused"
+    """It stands until it is automatic again."""
+    STOPPED = "stopped"
+    """It stands after an emergency stop."""
+    MANUAL = "manual"
+    """A person drives it."""
+    OUT_OF_SERVICE = "out_of_service"
+    """It stands on the floor and takes no goals."""
+    DEAD = "dead"
+    """It lies dead on the floor."""
+    LOST = "lost"
+    """Its localization does not know where it is; it stands."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,13 +46,15 @@ class RobotSnapshot:
     Attributes:
         id: Name of the robot.
         state: Its state.
-        reason: Why it is joining, stopping or silent, for people; else empty.
+        reason: Why it is not driving, for people; else empty.
         x, y, yaw: Last pose, metres and radians; not a number before the first.
         cell: Its cell.
         goal: Its goal cell.
         plan: Its cell and all cells that it will enter.
-        granted: Those of them that are its own now.
+        granted: The base: those of them that are its own now. The rest is the horizon, which may change.
         replans: How often it lost its path because a cell of it was blocked.
+        pose_only: Whether its move client answers nothing, so that its progress is judged by its poses.
+        mode: Its mode; see :class:`rce_fleet.coordination.modes.RobotMode`.
     """
 
     id: str
@@ -54,6 +68,8 @@ class RobotSnapshot:
     plan: tuple[int, ...]
     granted: tuple[int, ...]
     replans: int
+    mode: str = "automatic"
+    pose_only: bool = False
 
 
 @dataclass(frozen=True, slots=True)

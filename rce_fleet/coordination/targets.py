@@ -26,7 +26,13 @@ class Targets:
 
 
 def assign_targets(
-    grid: GridMap, starts: Mapping[str, int], goals: Mapping[str, int], rests: Mapping[str, int]
+    grid: GridMap,
+    starts: Mapping[str, int],
+    goals: Mapping[str, int],
+    rests: Mapping[str, int],
+    *,
+    closed: frozenset[tuple[int, int]] = frozenset(),
+    forbidden: Mapping[str, frozenset[int]] | None = None,
 ) -> Targets:
     """Give every robot a target.
 
@@ -38,12 +44,16 @@ def assign_targets(
         starts: Cells of the robots.
         goals: Goals of some robots, all different.
         rests: Cells where robots without a goal rest; the start by default.
+        closed: Moves ``(from, to)`` that no robot may make.
+        forbidden: Cells that some robots may not enter.
     """
     cells: dict[str, int] = {}
     unreachable = set()
-    reach = _Reach(grid)
+    reach = _Reach(grid, closed)
+    barred = forbidden or {}
     for robot, goal in goals.items():
-        if goal not in grid.blocked and goal in reach.of(starts[robot]):
+        own = barred.get(robot, frozenset())
+        if goal not in grid.blocked and goal not in own and goal in reach.of(starts[robot], own):
             cells[robot] = goal
         else:
             unreachable.add(robot)
@@ -51,26 +61,41 @@ def assign_targets(
     for robot, start in starts.items():
         if robot not in cells:
             rest = start if robot in unreachable else rests.get(robot, start)
-            cells[robot] = _refuge(grid, reach.of(start), start, rest, taken)
+            own = barred.get(robot, frozenset())
+            cells[robot] = _refuge(grid, reach.of(start, own) - own, start, rest, taken)
             taken.add(cells[robot])
     return Targets(cells, frozenset(unreachable))
 
 
 class _Reach:
-    """Cells that can be reached from a start; each connected part is searched once."""
+    """Cells that can be reached from a start; without one-way moves each connected part is searched once."""
 
-    def __init__(self, grid: GridMap) -> None:
+    def __init__(self, grid: GridMap, closed: frozenset[tuple[int, int]]) -> None:
         self._grid = grid
+        self._closed = closed
         self._known: dict[int, set[int]] = {}
 
-    def of(self, start: int) -> set[int]:
+    def of(self, start: int, forbidden: frozenset[int] = frozenset()) -> set[int]:
         """Return the cells that can be reached from ``start``, with ``start`` itself."""
+        if self._closed or forbidden:
+            return self._search(start, forbidden)
         found = self._known.get(start)
         if found is None:
             found = self._grid.reachable(start)
             if start not in self._grid.blocked:
                 self._known.update(dict.fromkeys(found, found))
         return found
+
+    def _search(self, start: int, forbidden: frozenset[int]) -> set[int]:
+        seen = {start}
+        queue = deque(seen)
+        while queue:
+            cell = queue.popleft()
+            for other in self._grid.neighbours[cell]:
+                if other not in seen and other not in forbidden and (cell, other) not in self._closed:
+                    seen.add(other)
+                    queue.append(other)
+        return seen
 
 
 def _refuge(grid: GridMap, within: set[int], start: int, rest: int, taken: set[int]) -> int:

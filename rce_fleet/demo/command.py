@@ -5,31 +5,35 @@ from __future__ import annotations
 import asyncio
 import signal
 from collections.abc import Callable, Coroutine, Iterable
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from random import Random
-from typing import Annotated, Any, TypeVar, assert_never
+from typing import Annotated, Any, NamedTuple, TypeVar, assert_never
 
 import aiohttp
 import typer
 import uvloop
 
 from rce.cli.program_files import from_file
-from rce.config.settings import Runtime
+from rce.config import Runtime
 from rce.own_process import end_signals
-from rce_fleet.demo.config import CoreProgram, DemoConfig, MachineBackend, Mode
+from rce_fleet.demo.config import CoreProgram, DemoConfig, MachineBackend, Mode, TaskSource
 from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.headless import run_headless
 from rce_fleet.demo.modes import start_demo
 from rce_fleet.demo.random_goals import send_random_goals
 from rce_fleet.demo.resources import ANY, Ports, run_folder
-from rce_fleet.demo.scenario import choose_scenario
+from rce_fleet.demo.scenario import MANY, choose_scenario
+from rce_fleet.demo.worlds import NamedWorld, find_world
 from rce_fleet.exceptions import FleetError
+from rce_fleet.planning.scenario import Scenario
 from rce_fleet.station.client import StationClient
 
 DEFAULT_ROBOTS, DEFAULT_ROBOTS_OF_SCEN = 3, 4
-MAX_ROBOTS = 99
+MAX_ROBOTS = 1000
 TIMEOUT = 180.0
+TIMEOUT_PER_ROBOT = 1.0
+"""Seconds that a run with many robots may take longer, for each of them."""
 
 T = TypeVar("T")
 
@@ -50,20 +54,40 @@ def demo(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of starts, goals, boxes and sensor noise.")] = 0,
     timeout: Annotated[
-        float, typer.Option(min=1, help="Maximum duration of a headless run, seconds.")
-    ] = TIMEOUT,
+        float | None,
+        typer.Option(min=1, help="Maximum duration of a headless run, seconds [180, more for many robots]."),
+    ] = None,
+    duration: Annotated[
+        float | None,
+        typer.Option(min=1, help="Stream tasks for so many seconds in a headless run, and kill the planner."),
+    ] = None,
+    tasks: Annotated[
+        TaskSource,
+        typer.Option(help="With --duration: tasks for the fleet manager, or goals for each robot."),
+    ] = TaskSource.MANAGER,
     report: Annotated[
         Path | None, typer.Option(help="Write the report of a headless run to this file (JSON).")
     ] = None,
     blocked_cells: Annotated[
-        int,
+        int | None,
         typer.Option(
-            min=0, help="Number of cells to block in a headless run; fewer if goals would be cut off."
+            min=0,
+            help="Cells to block in a headless run [1; 0 with light robots]; fewer if goals are cut off.",
         ),
-    ] = 1,
-    world: Annotated[
-        Path | None, typer.Option(help="Map to drive on (MovingAI .map).", exists=True, dir_okay=False)
     ] = None,
+    world: Annotated[
+        str, typer.Option(metavar="NAME|FILE", help="Floor or warehouse, or a map (MovingAI .map) [floor].")
+    ] = "",
+    full_stack: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Number of robots with AMCL and move_base; others are light [all; 0 above 20 robots].",
+        ),
+    ] = None,
+    robots_per_container: Annotated[
+        int, typer.Option(min=1, max=MAX_ROBOTS, help="Light robots that share a container and processes.")
+    ] = 50,
     scen: Annotated[
         Path | None,
         typer.Option(help="Starts and goals on the map (MovingAI .scen).", exists=True, dir_okay=False),
@@ -97,7 +121,7 @@ def demo(
     ] = CoreProgram.RCE,
     core_uri: Annotated[str, typer.Option(help="Use this running ROS master in --mode single.")] = "",
     machines: Annotated[
-        MachineBackend, typer.Option(help="What stands for a machine in --mode multi.")
+        MachineBackend, typer.Option(help="How --mode multi represents machines.")
     ] = MachineBackend.AUTO,
     state_dir: Annotated[
         Path | None, typer.Option(help="Keep configs, logs and state in a new subfolder of this folder.")
@@ -122,11 +146,15 @@ def demo(
         if offload and slam:
             raise DemoError("--slam maps on the robot: use it without --offload")
         count = robots or (DEFAULT_ROBOTS if scen is None else DEFAULT_ROBOTS_OF_SCEN)
-        scenario = choose_scenario(count, seed, world=world, scen=scen)
+        fleet = _choose_fleet(count, full_stack, find_world(world), seed, scen)
+        _refuse_light_robots(mode, offload=offload, slam=slam, light=fleet.has_light)
+        _check_duration(duration, mode, headless=headless)
+        if timeout is None:
+            timeout = TIMEOUT + TIMEOUT_PER_ROBOT * max(0, count - MANY) + (duration or 0.0)
         ports = _choose_ports(headless, given, _needed_ports(mode, core_uri))
         with run_folder(state_dir) as folder:
             config = DemoConfig(
-                scenario,
+                fleet.scenario,
                 seed,
                 ports,
                 folder,
@@ -136,8 +164,13 @@ def demo(
                 core=core,
                 core_uri=core_uri,
                 machines=machines,
-                blocked_cells=blocked_cells,
+                blocked_cells=int(not fleet.has_light) if blocked_cells is None else blocked_cells,
                 slam=slam,
+                full_stack=fleet.full_stack,
+                robots_per_container=robots_per_container,
+                duration=duration,
+                tasks=tasks,
+                world=fleet.world,
             )
             show = typer.echo if verbose else _show_warning
             if headless:
@@ -148,6 +181,60 @@ def demo(
         typer.echo(f"rce demo: {error}", err=True)
         raise typer.Exit(1) from None
     raise typer.Exit(code)
+
+
+class _Fleet(NamedTuple):
+    """The robots of a demo, and where they are."""
+
+    scenario: Scenario
+    full_stack: int
+    world: NamedWorld
+
+    @property
+    def has_light(self) -> bool:
+        return self.full_stack < len(self.scenario.robots)
+
+
+def _choose_fleet(
+    count: int, full_stack: int | None, world: NamedWorld, seed: int, scen: Path | None
+) -> _Fleet:
+    """Choose scenario and kinds of robots; as the options say.
+
+    Raises:
+        DemoError: The scenario cannot be made.
+    """
+    if full_stack is None:
+        full_stack = count if count <= MANY else 0
+    scenario = choose_scenario(count, seed, grid=world.grid, scen=scen)
+    if full_stack < count and scenario.hidden_boxes:
+        # Light robots have no sensors: the planner is told of all boxes.
+        scenario = replace(scenario, known_boxes=tuple(sorted(scenario.boxes)), hidden_boxes=())
+    return _Fleet(scenario, full_stack, world)
+
+
+def _check_duration(duration: float | None, mode: Mode, *, headless: bool) -> None:
+    """Raise DemoError if tasks cannot be streamed."""
+    if duration is not None and not headless:
+        raise DemoError("--duration is for headless runs: add --headless")
+    if duration is not None and mode is not Mode.CLOUD:
+        raise DemoError(f"--duration kills the planner's container: use --mode cloud, not --mode {mode}")
+
+
+def _refuse_light_robots(mode: Mode, *, offload: bool, slam: bool, light: bool) -> None:
+    """Raise DemoError for options that need robots with localization and navigation of their own."""
+    if not light:
+        return
+    reasons = {
+        "--offload": offload,
+        "--slam": slam,
+        f"--mode {mode}": mode is not Mode.CLOUD,
+    }
+    given = ", ".join(name for name, is_given in reasons.items() if is_given)
+    if given:
+        raise DemoError(
+            f"{given}: needs robots that run localization and navigation; take fewer robots, or set"
+            " --full-stack to their number"
+        )
 
 
 def say(text: str) -> None:
@@ -167,7 +254,7 @@ async def _headless(
     for fault in result.faults:
         typer.echo(f"rce demo: {fault}", err=True)
     if result.ok:
-        say(f"all robots reached their goals in {result.as_json()['duration_s']} s")
+        say(result.summary)
     return 0 if result.ok else 1
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from rce_fleet.demo.floor import FLOOR, with_surroundings
 from rce_fleet.demo.resources import LOOPBACK, Ports
+from rce_fleet.demo.worlds import NamedWorld
 from rce_fleet.drivers.scene import scene_of
 from rce_fleet.maps.ros_map import save_map
 from rce_fleet.planning.scenario import Scenario
@@ -49,6 +50,15 @@ class MachineBackend(StrEnum):
     """Ports of the loopback interface."""
 
 
+class TaskSource(StrEnum):
+    """What gives robots something to do while tasks are streamed."""
+
+    MANAGER = "manager"
+    """The fleet manager: tasks with two stops are sent to its API."""
+    GOALS = "goals"
+    """The station: each robot that has reached its goal gets another one."""
+
+
 @dataclass(frozen=True, slots=True)
 class DemoConfig:
     """Configuration of the demo.
@@ -66,6 +76,12 @@ class DemoConfig:
         machines: How the machines of the mode ``multi`` are represented.
         blocked_cells: Cells that a headless run blocks while robots drive.
         slam: Whether there is no map at the start: the first robot makes it.
+        full_stack: So many robots, the first ones, run localization and navigation; the others are light
+            ones, which localize and drive by themselves. None: all.
+        robots_per_container: How many light robots share a container, a bridge and a ROS graph, at most.
+        duration: Seconds for which tasks are streamed; None: one goal for each robot.
+        tasks: What is streamed.
+        world: What the world has besides cells.
     """
 
     scenario: Scenario
@@ -80,6 +96,23 @@ class DemoConfig:
     machines: MachineBackend = MachineBackend.AUTO
     blocked_cells: int = 1
     slam: bool = False
+    full_stack: int | None = None
+    robots_per_container: int = 50
+    duration: float | None = None
+    tasks: TaskSource = TaskSource.MANAGER
+    world: NamedWorld | None = None
+
+    @property
+    def full(self) -> int:
+        """Number of robots that run localization and navigation."""
+        count = len(self.scenario.robots)
+        return count if self.full_stack is None else min(self.full_stack, count)
+
+    @property
+    def light_groups(self) -> list[tuple[int, int]]:
+        """First and last number of the light robots that share a container; robots count from 1."""
+        first, last, share = self.full + 1, len(self.scenario.robots), self.robots_per_container
+        return [(start, min(start + share - 1, last)) for start in range(first, last + 1, share)]
 
     @property
     def account(self) -> FleetAccount:
@@ -116,6 +149,11 @@ class DemoConfig:
         return {**self.map_parameters, "seed": self.seed, "robot_radius": ROBOT_RADIUS, **known}
 
     @property
+    def chargers(self) -> tuple[int, ...]:
+        """Cells with a charger."""
+        return () if self.world is None else self.world.chargers
+
+    @property
     def map_parameters(self) -> dict[str, Any]:
         """Parameters for the size of the map and its cells."""
         grid = self.scenario.grid
@@ -123,11 +161,17 @@ class DemoConfig:
 
     def write_scene(self) -> None:
         """Write the file that the simulated world reads, and the map of its walls."""
-        scene = scene_of(self.scenario, self.seed)
+        scene = scene_of(
+            self.scenario,
+            self.seed,
+            full=self.full,
+            light_per_graph=self.robots_per_container,
+            chargers=self.chargers,
+        )
         if self.scenario.grid == FLOOR:
             scene = with_surroundings(scene)
         self.scene.write_text(scene.model_dump_json(indent=1), encoding="utf-8")
         if self.slam:
             save_map(scene.draw(boxes=True), self.true_map_file)
-        else:
+        elif self.full:
             save_map(scene.draw(), self.map_file)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from rce.config.folders import configs_dir
-from rce.ros.node import Node
+from rce.config import configs_dir
+from rce.ros.node import Message, Node
 from rce.ros.tf import TransformError, TransformListener
 from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.programs import Program, ProgramGroup, rce_command
@@ -29,7 +29,6 @@ from rce_fleet.nodes.planar import pose_of, read_map
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rce.ros.types import Message
     from rce_fleet.demo.config import DemoConfig
     from rce_fleet.station.client import StationClient
 

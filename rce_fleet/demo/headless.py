@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import aiohttp
 
-from rce_fleet.demo.config import DemoConfig, Mode
+from rce_fleet.demo.config import DemoConfig, Mode, TaskSource
 from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.exploration import Explored
+from rce_fleet.demo.goal_tasks import GoalTasks
 from rce_fleet.demo.judge import Judge, RobotScore
+from rce_fleet.demo.manager_tasks import ManagerTasks
 from rce_fleet.demo.modes import RunningDemo, start_demo
 from rce_fleet.demo.scenario_run import ScenarioRun
+from rce_fleet.demo.task_run import TaskRun, kill_container
+from rce_fleet.demo.task_stream import TaskStream
 from rce_fleet.demo.traffic import MessageTotals
 from rce_fleet.drivers.report import WorldReport, read_report
 from rce_fleet.exceptions import FleetError
@@ -41,6 +47,7 @@ class RunReport:
         mode: What carried the fleet's messages.
         scores: How well each robot localized; empty if the run did not begin.
         explored: What the first robot explored; None if there was a map, or it was not complete.
+        tasks: The run, if tasks were streamed; then there is no ``run``.
     """
 
     scenario: Scenario
@@ -52,51 +59,62 @@ class RunReport:
     mode: Mode = Mode.CLOUD
     scores: Mapping[str, RobotScore] = field(default_factory=dict)
     explored: Explored | None = None
+    tasks: TaskRun | None = None
 
     @property
     def ok(self) -> bool:
-        """Whether every robot reached its goal without a collision."""
+        """Whether every robot reached its goal, or did tasks, without a collision."""
         return not self.faults
 
     @property
     def faults(self) -> list[str]:
         """What went wrong, in words."""
         faults = [self.problem] if self.problem else []
-        reached = self.run.reached if self.run is not None else set()
-        missing = [robot for robot in self.scenario.robots if robot not in reached]
-        if missing:
-            faults.append(f"not at their goals: {', '.join(missing)}")
+        if self.tasks is not None:
+            faults += self.tasks.faults
+        else:
+            reached = self.run.reached if self.run is not None else set()
+            missing = [robot for robot in self.scenario.robots if robot not in reached]
+            if missing:
+                faults.append(f"not at their goals: {', '.join(missing)}")
         if self.truth is None:
             faults.append("the simulated world wrote no report")
         elif self.truth.collisions.total:
-            faults.append(f"robots collided {self.truth.collisions.total} times")
+            places = "; ".join(
+                f"{contact.robots[0]} and {contact.robots[1] or 'another'} at {contact.time_s:.1f} s in cell"
+                f" {contact.cell}"
+                for contact in self.truth.contacts
+            )
+            faults.append(
+                f"robots collided {self.truth.collisions.total} times{f': {places}' if places else ''}"
+            )
         return faults
+
+    @property
+    def summary(self) -> str:
+        """What a good run did, in words."""
+        if self.tasks is not None:
+            return self.tasks.summary
+        return f"all robots reached their goals in {self._duration:.2f} s"
+
+    @property
+    def _duration(self) -> float:
+        run = self.run or self.tasks
+        return 0.0 if run is None else round(run.duration, 2)
 
     def as_json(self) -> dict[str, Any]:
         """Return the report as it is written to the file."""
         truth, run, totals = self.truth, self.run, self.totals
-        scenario = self.scenario
         blocked = [] if run is None else run.blocker.done
-        distances = {} if truth is None else {robot.id: robot.distance_m for robot in truth.robots}
         return {
             "ok": self.ok,
             "mode": self.mode.value,
             **({} if self.explored is None else {"exploration": self.explored.as_json()}),
-            "duration_s": 0.0 if run is None else round(run.duration, 2),
+            "duration_s": self._duration,
+            **({} if self.tasks is None else self.tasks.as_json()),
             "collisions": None if truth is None else truth.collisions.total,
             "min_separation_m": None if truth is None else truth.min_separation_m,
-            "robots": [
-                {
-                    "id": robot,
-                    "start_cell": start,
-                    "goal_cell": goal,
-                    "reached": run is not None and robot in run.reached,
-                    "replans": 0 if run is None else run.replans[robot],
-                    "distance_m": distances.get(robot, 0.0),
-                    **_localization(self.scores.get(robot, RobotScore())),
-                }
-                for robot, start, goal in zip(scenario.robots, scenario.starts, scenario.goals, strict=True)
-            ],
+            "robots": list(self._robots()),
             "engine": {
                 "messages": None if totals is None else totals.messages,
                 "dropped": None if totals is None else totals.dropped,
@@ -106,6 +124,24 @@ class RunReport:
             "seed": self.seed,
             "faults": self.faults,
         }
+
+    def _robots(self) -> Iterator[dict[str, Any]]:
+        """Return what the report says of each robot."""
+        scenario, run, truth = self.scenario, self.run, self.truth
+        distances = {} if truth is None else {robot.id: robot.distance_m for robot in truth.robots}
+        for robot, start, goal in zip(scenario.robots, scenario.starts, scenario.goals, strict=True):
+            goals = {
+                "goal_cell": goal,
+                "reached": run is not None and robot in run.reached,
+                "replans": 0 if run is None else run.replans[robot],
+            }
+            yield {
+                "id": robot,
+                "start_cell": start,
+                **(goals if self.tasks is None else {}),
+                "distance_m": distances.get(robot, 0.0),
+                **_localization(self.scores.get(robot, RobotScore())),
+            }
 
     def write(self, path: Path) -> None:
         """Write the report to a file, as JSON."""
@@ -146,6 +182,7 @@ async def run_headless(
         config.mode,
         headless.scores,
         headless.explored,
+        headless.tasks,
     )
 
 
@@ -176,6 +213,7 @@ class _HeadlessRun:
 
     def __init__(self, config: DemoConfig, say: Callable[[str], None]) -> None:
         self.run: ScenarioRun | None = None
+        self.tasks: TaskRun | None = None
         self.totals: MessageTotals | None = None
         self.scores: Mapping[str, RobotScore] = {}
         self.explored: Explored | None = None
@@ -188,13 +226,41 @@ class _HeadlessRun:
         self.scores = judge.scores
         async with aiohttp.ClientSession() as session, judge:
             station = StationClient(session, demo.page)
-            self.run = ScenarioRun(
-                station, self._config.scenario, demo.truth, self._say, self._config.blocked_cells
-            )
+            work = self._stream_tasks(station, demo) if self._config.duration else self._drive(station, demo)
             try:
-                await self.run.run()
+                await work
             finally:
                 self.totals = await self._read_totals(demo)
+
+    async def _drive(self, station: StationClient, demo: RunningDemo) -> None:
+        """Send each robot to its goal."""
+        self.run = ScenarioRun(
+            station, self._config.scenario, demo.truth, self._say, self._config.blocked_cells
+        )
+        await self.run.run()
+
+    async def _stream_tasks(self, station: StationClient, demo: RunningDemo) -> None:
+        """Give the fleet tasks for some time."""
+        config, world = self._config, self._config.world
+        cells: Sequence[int] = [] if world is None else [*world.docks, *world.shelves]
+        rng = Random(config.seed)  # noqa: S311 - for tasks, not for secrets
+        cells, robots = cells or config.scenario.grid.free, len(config.scenario.robots)
+        stream: TaskStream = (
+            ManagerTasks(demo.page, cells, rng, robots)
+            if config.tasks is TaskSource.MANAGER
+            else GoalTasks(station, cells, rng)
+        )
+        async with stream:
+            self.tasks = TaskRun(
+                station,
+                robots,
+                stream,
+                config.duration or 0.0,
+                demo.truth,
+                partial(kill_container, config.account.user),
+                self._say,
+            )
+            await self.tasks.run()
 
     async def _read_totals(self, demo: RunningDemo) -> MessageTotals | None:
         try:

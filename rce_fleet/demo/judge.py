@@ -13,14 +13,13 @@ from functools import partial
 from math import hypot, sqrt
 from typing import TYPE_CHECKING
 
-from rce.ros.node import Node
+from rce.ros.node import Message, Node
 from rce.ros.tf import TransformError, TransformListener
 
 if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-    from rce.ros.types import Message
     from rce_fleet.demo.robots import RobotGraph
 
 NODE = "rce_demo_judge"

@@ -19,7 +19,10 @@ from rce_fleet.demo.ros_modes import MultiCorePrograms, SingleCorePrograms
 from rce_fleet.demo.traffic import MessageTotals, read_engine_totals
 from rce_fleet.drivers.report import WorldReport, read_report
 from rce_fleet.station.client import StationClient
-from rce_fleet.wiring import fleet_config
+from rce_fleet.wiring import fleet_config, light_config
+
+START_PER_ROBOT = 0.5
+"""Seconds that the start may take longer for each robot: each has some ten connections in the engine."""
 
 
 class ModePrograms(Protocol):
@@ -66,22 +69,26 @@ class CloudPrograms:
         engine = await group.start("engine", self._engine_argv(), stop_last=True)
         world = await group.start("world", self._world_argv())
         await group.wait_line(engine, "RCE ready:", START_TIMEOUT)
-        station = await group.start("station", self._station_argv(), restartable=True)
         self._graphs = await self._find_graphs(group, world)
+        light = await self._find_light_graphs(group, world)
+        truth = await group.wait_line(world, "world ROS_MASTER_URI=", START_TIMEOUT)
+        station = await group.start("station", self._station_argv(truth), restartable=True)
         page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)
         if not config.slam:
             await start_robots(group, config, self)
+        named = {f"robot{number}": graph.uri for number, graph in enumerate(self._graphs, start=1)}
         bridges = [
             await group.start(
-                f"robot{number}",
-                [sys.executable, "-m", "rce_client.ros_bridge", str(config.folder / f"robot{number}.config")],
-                env={"ROS_MASTER_URI": graph.uri},
+                name,
+                [sys.executable, "-m", "rce_client.ros_bridge", str(config.folder / f"{name}.config")],
+                env={"ROS_MASTER_URI": uri},
                 restartable=True,
             )
-            for number, graph in enumerate(self._graphs, start=1)
+            for name, uri in {**named, **light}.items()
         ]
+        timeout = START_TIMEOUT + START_PER_ROBOT * len(config.scenario.robots)
         for bridge in bridges:
-            await group.wait_line(bridge, "rce-ros ready:", START_TIMEOUT)
+            await group.wait_line(bridge, "rce-ros ready:", timeout)
         await group.wait_line(world, "simulation ready:", START_TIMEOUT)
         return page
 
@@ -101,11 +108,12 @@ class CloudPrograms:
     def _write_files(self) -> None:
         config, account, folder = self._config, self._config.account, self._config.folder
         config.write_scene()
-        fleet = fleet_config(account, config.planner_parameters)
+        fleet = fleet_config(account, config.planner_parameters, config.chargers)
         (folder / "fleet.config").write_text(write_items(fleet), encoding="utf-8")
-        for number in range(1, len(config.scenario.robots) + 1):
-            text = write_items(client_config(config, number))
-            (folder / f"robot{number}.config").write_text(text, encoding="utf-8")
+        files = {f"robot{number}": client_config(config, number) for number in range(1, config.full + 1)}
+        files |= {_light_name(*ends): light_config(*ends, account) for ends in config.light_groups}
+        for name, content in files.items():
+            (folder / f"{name}.config").write_text(write_items(content), encoding="utf-8")
 
     async def _find_graphs(self, group: ProgramGroup, world: Program) -> list[RobotGraph]:
         """Return each robot's graph, as the world prints it."""
@@ -115,8 +123,16 @@ class CloudPrograms:
                 await group.wait_line(world, f"robot {robot} ROS_MASTER_URI=", START_TIMEOUT),
                 offloaded=self._config.offload,
             )
-            for robot in self._config.scenario.robots
+            for robot in self._config.scenario.robots[: self._config.full]
         ]
+
+    async def _find_light_graphs(self, group: ProgramGroup, world: Program) -> dict[str, str]:
+        """Return the ROS masters of the graphs that light robots share, by the name of their bridge."""
+        found = {}
+        for first, last in self._config.light_groups:
+            line = f"robots Robot{first} to Robot{last} ROS_MASTER_URI="
+            found[_light_name(first, last)] = await group.wait_line(world, line, START_TIMEOUT)
+        return found
 
     def _engine_argv(self) -> list[str]:
         config, ports = self._config, self._config.ports
@@ -131,14 +147,20 @@ class CloudPrograms:
         }
         return [*RCE, "up", "--dev", *(str(part) for item in options.items() for part in item)]
 
-    def _station_argv(self) -> list[str]:
-        config = str(self._config.folder / "fleet.config")
-        return [sys.executable, "-m", "rce_fleet.station", config, "--port", str(self._config.ports.page)]
+    def _station_argv(self, world: str) -> list[str]:
+        folder, page = self._config.folder, str(self._config.ports.page)
+        options = ["--port", page, "--world", world, "--state-dir", str(folder / "station")]
+        return [sys.executable, "-m", "rce_fleet.station", str(folder / "fleet.config"), *options]
 
     def _world_argv(self) -> list[str]:
         config, account = self._config, self._config.account
-        program = [sys.executable, "-m", "rce_fleet.drivers", str(config.scene)]
+        program = [sys.executable, "-m", "rce_fleet.drivers", str(config.scene), "--services"]
         return [*program, "--report", str(config.report), "--master", account.url, "--user", account.user]
+
+
+def _light_name(first: int, last: int) -> str:
+    """Return the name of the bridge of light robots."""
+    return f"robots{first}-{last}"
 
 
 _PROGRAMS: dict[Mode, Callable[[DemoConfig], ModePrograms]] = {

@@ -7,12 +7,13 @@ import contextlib
 import sys
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from rce.aio.backoff import Backoff
-from rce.aio.tasks import cancel_and_wait
+from rce.aio.tasks import cancel_and_wait, finish
 from rce.supervision.keeper import Keeper, RestartPolicy
 from rce.supervision.process import Child
 from rce_fleet.demo.exceptions import NotReadyError, ProgramEndedError, describe_exit
@@ -23,7 +24,9 @@ RCE = (sys.executable, "-c", "from rce.cli import main; main()")
 
 def rce_command(name: str) -> list[str]:
     """Return the command line of one command of ``rce``; it starts faster than all of them."""
-    return [sys.executable, "-c", f"import typer; from rce.cli.{name} import {name}; typer.run({name})"]
+    (command,) = entry_points(group="rce.commands", name=name)
+    code = f"import typer; from {command.module} import {command.attr}; typer.run({command.attr})"
+    return [sys.executable, "-c", code]
 
 
 START_TIMEOUT = 90.0
@@ -118,7 +121,7 @@ class ProgramGroup:
     ) -> None:
         self._stopping.set_result(None)
         try:
-            await self._stop_all()
+            await finish(self._stop_all())  # a signal may cancel a run whose time is up
         finally:
             await self._readers.__aexit__(None, None, None)
 

@@ -8,15 +8,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
 
-from rce.config.folders import configs_dir
+from rce.config import configs_dir
 from rce.ros.tf import frames
-from rce_fleet.demo.programs import rce_command
+from rce_fleet.demo.programs import Program, ProgramGroup, rce_command
 from rce_fleet.demo.resources import LOOPBACK
 from rce_fleet.turtlebot_wiring import LAUNCH_FILE, offloaded_config, onboard_config
 
 if TYPE_CHECKING:
     from rce_fleet.demo.config import DemoConfig
-    from rce_fleet.demo.programs import Program, ProgramGroup
 
 DOCK_VARIANCE = 0.05**2
 """How well a robot stands at its dock: square metres, square radians."""
@@ -124,8 +123,7 @@ def launch_argv(config: DemoConfig, robot: str, arguments: Mapping[str, object])
         robot: Name of the robot.
         arguments: More arguments of the launch file.
     """
-    # Where many robots stand around one, it must not take them for another place.
-    given = {"map": config.map_file, "recovery": False, **dict(_initial_pose(config, robot)), **arguments}
+    given = {"map": config.map_file, **dict(_initial_pose(config, robot)), **arguments}
     words = (f"{name}:={value}" for name, value in given.items())
     options = ("--one-process", "--wait", "--no-log", "--screen")
     return [*rce_command("launch"), *options, str(configs_dir() / LAUNCH_FILE), *words]

@@ -81,10 +81,17 @@ def move_client_argv(robot: str, *, namespace: bool = True, **parameters: Any) -
     return [*_executable("move_client.py"), f"__ns:={robot}", *remappings, *_parameters(parameters)]
 
 
-def station_argv(config: DemoConfig, planner_core: str) -> list[str]:
-    """Return the command of the operator station, in the planner's graph."""
+def station_argv(config: DemoConfig, planner_core: str, world: str = "") -> list[str]:
+    """Return the command of the operator station, in the planner's graph.
+
+    Args:
+        config: What the demo runs.
+        planner_core: URI of the planner's master.
+        world: URI of the master with the world's services; empty: the station does not reach it.
+    """
     station = [sys.executable, "-m", "rce_fleet.station"]
-    return [*station, "--ros-master", planner_core, "--port", str(config.ports.page)]
+    options = ["--port", str(config.ports.page), "--state-dir", str(config.folder / "station")]
+    return [*station, "--ros-master", planner_core, *options, *(["--world", world] if world else [])]
 
 
 def world_argv(
@@ -137,9 +144,11 @@ class SingleCorePrograms:
             await self._start_core(group)
         host = RosHost("here", uri)
         robots = config.scenario.robots
-        world = await host.start(group, "world", world_argv(config, uri, dict.fromkeys(robots, uri)))
+        argv = [*world_argv(config, uri, dict.fromkeys(robots, uri)), "--services"]
+        world = await host.start(group, "world", argv)
         await host.start(group, "planner", planner_argv(config), restartable=True)
-        station = await host.start(group, "station", station_argv(config, uri), restartable=True)
+        truth = await group.wait_line(world, "world ROS_MASTER_URI=", START_TIMEOUT)
+        station = await host.start(group, "station", station_argv(config, uri, truth), restartable=True)
         for number, robot in enumerate(robots, start=1):
             await host.start(group, f"move_client{number}", move_client_argv(robot), restartable=True)
         page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)

@@ -12,34 +12,32 @@ from rce_fleet.demo.floor import FLOOR
 from rce_fleet.exceptions import FleetError
 from rce_fleet.planning.dijkstra import shortest_path
 from rce_fleet.planning.grid import GridMap
-from rce_fleet.planning.movingai import read_map, read_scenario
-from rce_fleet.planning.scenario import Scenario, given_scenario, make_scenario
+from rce_fleet.planning.movingai import read_scenario
+from rce_fleet.planning.scenario import Scenario, given_scenario, make_scenario, spread_scenario
 
 MIN_LONGEST_PATH = 6
 """Cells on the longest path, at least, so that a cell in its middle can be blocked on the way."""
+MANY = 20
+"""Scenarios of more robots have no boxes, and no joint plan is made to see whether they can be solved."""
 _MAX_DRAWS = 1000
 
 
-def choose_scenario(
-    robots: int, seed: int, *, world: Path | None = None, scen: Path | None = None
-) -> Scenario:
+def choose_scenario(robots: int, seed: int, *, grid: GridMap = FLOOR, scen: Path | None = None) -> Scenario:
     """Return the scenario of a demo.
 
     Args:
         robots: Number of robots.
         seed: The same seed draws the same scenario.
-        world: A map in MovingAI format; None for the demo's own floor.
+        grid: The cells.
         scen: Starts and goals on that map; the first ``robots`` rows are used.
 
     Raises:
         DemoError: A file cannot be read, or the robots do not fit on the map.
     """
-    grid = FLOOR
-    if world is not None:
-        with _name_source(world):
-            grid = read_map(world)
     if scen is None:
         with _name_source("scenario"):
+            if robots > MANY:
+                return spread_scenario(grid, robots, seed=seed)
             return _draw_with_long_path(grid, robots, seed)
     with _name_source(scen):
         rows = read_scenario(scen, grid, limit=robots)

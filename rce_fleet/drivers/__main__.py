@@ -11,8 +11,7 @@ from typing import Annotated
 import typer
 import uvloop
 
-from rce.config.exceptions import ConfigError
-from rce.config.logs import start_logging
+from rce.config import ConfigError, start_logging
 from rce.own_process import end_signals
 from rce.ros.core.server import DEFAULT_PORT
 from rce.ros.errors import MasterError
@@ -54,6 +53,9 @@ def simulate(
     namespaces: Annotated[
         bool, typer.Option(help="Join the ROS masters in namespaces, with prefixes of frames.")
     ] = True,
+    services: Annotated[
+        bool, typer.Option("--services", help="Provide the world's services on a ROS core of their own.")
+    ] = False,
 ) -> None:
     """Simulate a world with robots in real time; each robot has its own ROS graph unless --core names one."""
     start_logging(logging.WARNING)
@@ -64,8 +66,11 @@ def simulate(
     elif master:
         watch = EngineCellWatch(WorldAccount(master, user, password, robot_id), container)
     cores = Cores.read(core or (), namespaces=namespaces)
+    options = RunOptions(world_port=0 if services else None)
     try:
-        simulation = Simulation(load_scene(scene), types, typer.echo, report=report, watch=watch, cores=cores)
+        simulation = Simulation(
+            *(load_scene(scene), types, typer.echo), report=report, watch=watch, cores=cores, options=options
+        )
     except ConfigError as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(BAD_SCENE) from None

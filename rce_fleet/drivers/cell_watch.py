@@ -1,23 +1,28 @@
 """Watches the cells that people block, so that the world puts boxes there.
 
 Cells that a robot's sensors found blocked get no box: there is something already, or the sensor was wrong.
+The fleet's grid may be changed while it drives: a message tells where its cells are.
 """
 
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
-from rce.ros.node import Node
+from rce.ros.node import Message, Node, TypeRegistry
+from rce_fleet.planning.grid import GridMap
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Sequence
 
-    from rce.ros.types import Message, TypeRegistry
 
 CELLS = "std_msgs/Int32MultiArray"
 TOPIC = "/fleet/requestedCells"
 NODE = "world"
+
+
+Follow: TypeAlias = "Callable[[list[int], GridMap | None], None]"
+"""Called with all blocked cells and their grid, whenever they change; None: the planner does not tell."""
 
 
 class CellWatch(Protocol):
@@ -26,8 +31,8 @@ class CellWatch(Protocol):
     joined: asyncio.Event
     """Set once the planner is connected."""
 
-    async def run(self, follow: Callable[[list[int]], None]) -> None:
-        """Watch until cancelled; ``follow`` is called with all blocked cells whenever they change."""
+    async def run(self, follow: Follow) -> None:
+        """Watch until cancelled; ``follow`` is called whenever the blocked cells or their grid change."""
 
 
 class GraphCellWatch:
@@ -44,11 +49,11 @@ class GraphCellWatch:
         )
         self.joined = asyncio.Event()
 
-    async def run(self, follow: Callable[[list[int]], None]) -> None:
-        """Watch until cancelled; ``follow`` is called with all blocked cells whenever they change."""
+    async def run(self, follow: Follow) -> None:
+        """Watch until cancelled; ``follow`` is called whenever the blocked cells or their grid change."""
 
         def take(message: Message) -> None:
-            follow(cells_of(message.data))
+            follow([int(cell) for cell in message.data], grid_of([each.label for each in message.layout.dim]))
             self.joined.set()
 
         async with self._node as node:
@@ -56,6 +61,9 @@ class GraphCellWatch:
             await asyncio.Event().wait()
 
 
-def cells_of(data: Iterable[int]) -> list[int]:
-    """Return the cells of a message's array."""
-    return [int(cell) for cell in data]
+def grid_of(labels: Sequence[str]) -> GridMap | None:
+    """Return the grid that a message's labels tell; None if they tell none, as planners before."""
+    try:
+        return GridMap.from_layout(labels[0]) if labels else None
+    except ValueError:
+        return None

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from rce_client.connection import Connection
-from rce_fleet.drivers.cell_watch import CELLS, TOPIC, cells_of
+from rce_fleet.drivers.cell_watch import CELLS, TOPIC, grid_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from rce_fleet.drivers.cell_watch import Follow
 
 OWN_TAG = "requestedCells"
 JOIN_TIMEOUT = 3.0
@@ -53,11 +53,11 @@ class EngineCellWatch:
         self.joined = asyncio.Event()
         """Set once the interface was connected."""
 
-    async def run(self, follow: Callable[[list[int]], None]) -> None:
+    async def run(self, follow: Follow) -> None:
         """Watch until cancelled, then remove the interface.
 
         Args:
-            follow: Called with all blocked cells whenever they change.
+            follow: Called whenever the blocked cells or their grid change.
 
         Raises:
             RefusedError: The engine refused the client.
@@ -65,7 +65,8 @@ class EngineCellWatch:
         account = self._account
 
         def take(message: dict[str, Any]) -> None:
-            follow(cells_of(message["data"]))
+            labels = [str(each["label"]) for each in message["layout"]["dim"]]
+            follow([int(cell) for cell in message["data"]], grid_of(labels))
 
         connection = Connection(
             account.url, account.user, account.password, account.robot, on_error=lambda _: None

@@ -10,7 +10,7 @@ from rce_fleet.geometry.angles import quaternion_z
 
 if TYPE_CHECKING:
     from rce_fleet.geometry.poses import Pose, Twist
-    from rce_fleet.simulation.battery import Battery
+    from rce_fleet.simulation.battery import Battery, BatterySpec
     from rce_fleet.simulation.lidar import Floats, LidarSpec
 
 _CHARGING, _DISCHARGING, _FULL = 1, 2, 4
@@ -52,17 +52,31 @@ def scan_fields(spec: LidarSpec, ranges: Floats) -> dict[str, Any]:
 
 def battery_fields(battery: Battery) -> dict[str, Any]:
     """Return the fields of a ``sensor_msgs/BatteryState`` without its header."""
-    capacity = battery.spec.capacity / battery.spec.voltage_full
+    return charge_fields(battery.spec, battery.share, battery.power, charging=battery.charging)
+
+
+def charge_fields(spec: BatterySpec, share: float, power: float, *, charging: bool) -> dict[str, Any]:
+    """Return the same of a battery that is one of many.
+
+    Args:
+        spec: What it is like.
+        share: What is left of its capacity, 0 .. 1.
+        power: Watts that flow out.
+        charging: Whether it is charged.
+    """
+    capacity = spec.capacity / spec.voltage_full
     known = math.isfinite(capacity)
-    discharging = _FULL if battery.full else _DISCHARGING
+    voltage = spec.voltage_empty + share * (spec.voltage_full - spec.voltage_empty)
+    is_full = share >= 1.0
+    discharging = _FULL if is_full else _DISCHARGING
     return {
-        "voltage": battery.voltage,
-        "current": -battery.power / battery.voltage,
-        "charge": battery.share * capacity if known else math.nan,
+        "voltage": voltage,
+        "current": -power / voltage,
+        "charge": share * capacity if known else math.nan,
         "capacity": capacity if known else math.nan,
         "design_capacity": capacity if known else math.nan,
-        "percentage": battery.share,
-        "power_supply_status": _CHARGING if battery.charging and not battery.full else discharging,
+        "percentage": share,
+        "power_supply_status": _CHARGING if charging and not is_full else discharging,
         "power_supply_health": 1,
         "power_supply_technology": _LITHIUM_ION,
         "present": True,

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rce.ros.core import Core
-from rce.ros.node import Node
+from rce.ros.node import Node, TypeRegistry
 from rce.ros.node.clock import PARAMETER as USE_SIM_TIME
 from rce.ros.tf import frames
+from rce_fleet.drivers.light_driver import LightDriver
 from rce_fleet.drivers.report import look_at, write_report
 from rce_fleet.drivers.robot_driver import RobotDriver
 from rce_fleet.drivers.runner import WorldRunner, run_world
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping
     from pathlib import Path
 
-    from rce.ros.types import TypeRegistry
     from rce_fleet.drivers.cell_watch import CellWatch
     from rce_fleet.drivers.scene import RobotStart, Scene
     from rce_fleet.simulation.world import World
@@ -145,6 +145,7 @@ class Simulation:
                 stack.push_async_callback(self._stop_graphs)
                 for robot in self._scene.robots:
                     await self._start_graph(robot.id)
+                await self._start_light_robots(stack)
                 await self._start_services(stack)
                 work = [tasks.create_task(self._runner.run()), tasks.create_task(self._keep_report())]
                 if self._watch is not None:
@@ -158,15 +159,15 @@ class Simulation:
 
     # Robots that come and go
 
-    async def add_robot(self, start: RobotStart) -> None:
-        """Put a robot into the world, and start its node.
+    async def add_robot(self, start: RobotStart) -> str:
+        """Put a robot into the world, and start its node; return the URI of its ROS master.
 
         Raises:
             ConfigError: Its model is not known.
             FleetError: It has no room.
         """
         self._scene.place(start, self._world)
-        await self._start_graph(start.id)
+        return await self._start_graph(start.id)
 
     async def remove_robot(self, robot: str) -> None:
         """Stop a robot's node, and take the robot out of the world."""
@@ -175,19 +176,19 @@ class Simulation:
 
     # Inside
 
-    async def _start_graph(self, robot: str) -> None:
+    async def _start_graph(self, robot: str) -> str:
         assert self._tasks is not None, "robots start while the simulation runs"
         graph = self._graphs[robot] = _RobotGraph(robot)
         graph.task = self._tasks.create_task(graph.keep(self._enter_graph), name=f"robot {robot}")
-        await graph.started
+        return await graph.started
 
     async def _stop_graphs(self) -> None:
         for graph in list(self._graphs.values()):
             await graph.stop()
         self._graphs.clear()
 
-    async def _enter_graph(self, robot: str, stack: AsyncExitStack) -> None:
-        """Start a robot's core and node; the stack ends them."""
+    async def _enter_graph(self, robot: str, stack: AsyncExitStack) -> str:
+        """Start a robot's core and node, which the stack ends; return the core's URI."""
         uri = self._cores.of(robot)
         if uri is None:
             uri = await self._start_core(stack, self._next_port(), f"robot {robot}")
@@ -210,6 +211,32 @@ class Simulation:
         self._runner.drivers[robot] = driver
         stack.callback(self._runner.drivers.pop, robot, None)
         self._say(f"robot {robot} ROS_MASTER_URI={uri}")
+        return uri
+
+    async def _start_light_robots(self, stack: AsyncExitStack) -> None:
+        """Start the graphs of light robots: many robots share one, by namespaces."""
+        light, share = self._world.light, self._scene.light_per_graph
+        if light is None:
+            return
+        drivers = []
+        for first in range(0, len(light), share):
+            rows = range(first, min(first + share, len(light)))
+            names = f"{light.names[rows[0]]} to {light.names[rows[-1]]}"
+            uri = self._cores.default or await self._start_core(stack, self._next_port(), f"robots {names}")
+            node = await stack.enter_async_context(self._node(f"light_robots_{first + 1}", uri))
+            await self._runner.publish_clock(node)
+            driver = LightDriver(node, light, rows, self._runner.stamp)
+            await driver.start()
+            drivers.append(driver)
+            self._say(f"robots {names} ROS_MASTER_URI={uri}")
+
+        def update() -> None:
+            ended = light.take_ended()
+            for driver in drivers:
+                driver.update(ended)
+
+        self._runner.on_update.append(update)
+        self._runner.on_reset.extend(driver.reset for driver in drivers)
 
     def _next_port(self) -> int:
         """Return the port of the next robot's core."""
@@ -245,7 +272,8 @@ class Simulation:
     async def _announce(self) -> None:
         if self._watch is not None:
             await self._watch.joined.wait()
-        self._say(f"simulation ready: {len(self._scene.robots)} robots, {len(self._scene.boxes)} boxes")
+        robots = len(self._scene.robots) + len(self._scene.light_robots)
+        self._say(f"simulation ready: {robots} robots, {len(self._scene.boxes)} boxes")
 
     def _update_boxes(self) -> None:
         self._boxes.update()
@@ -268,16 +296,15 @@ class _RobotGraph:
 
     def __init__(self, robot: str) -> None:
         self.robot = robot
-        self.started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.started: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self.task: asyncio.Task[None] | None = None
         self._stop = asyncio.Event()
 
-    async def keep(self, enter: Callable[[str, AsyncExitStack], Awaitable[None]]) -> None:
+    async def keep(self, enter: Callable[[str, AsyncExitStack], Awaitable[str]]) -> None:
         """Start, wait until :meth:`stop` is called, end."""
         try:
             async with AsyncExitStack() as stack:
-                await enter(self.robot, stack)
-                self.started.set_result(None)
+                self.started.set_result(await enter(self.robot, stack))
                 await self._stop.wait()
         except Exception as error:
             if self.started.done():

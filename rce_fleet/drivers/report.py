@@ -42,6 +42,17 @@ class RobotTruth(BaseModel):
     """Distance driven so far."""
 
 
+class ContactTruth(BaseModel):
+    """A contact of a light robot with another robot."""
+
+    time_s: float
+    """Simulated time."""
+    robots: tuple[str, str]
+    """The second is empty if it is not a light robot."""
+    cell: int | None
+    """Where the first one was."""
+
+
 class WorldReport(BaseModel):
     """The world at one time, and all collisions until then."""
 
@@ -52,6 +63,8 @@ class WorldReport(BaseModel):
     """Smallest distance between the hulls of two robots so far; None with fewer than two robots."""
     boxes: list[int]
     robots: list[RobotTruth]
+    contacts: list[ContactTruth] = []
+    """The first contacts of light robots."""
 
     def robot(self, robot: str) -> RobotTruth:
         """Return a robot by id; raise KeyError if it does not exist."""
@@ -77,6 +90,7 @@ def look_at(world: World) -> WorldReport:
                 distance_m=round(robot.distance, 3),
             )
         )
+    robots += _light_robots(world)
     return WorldReport(
         time_s=round(world.time, 3),
         collisions=Contacts(
@@ -91,7 +105,40 @@ def look_at(world: World) -> WorldReport:
         min_separation_m=round(apart, 4) if math.isfinite(apart) else None,
         boxes=list(world.boxes),
         robots=robots,
+        contacts=_contacts(world),
     )
+
+
+def _contacts(world: World) -> list[ContactTruth]:
+    known = [] if world.light is None else world.light.contacts
+    return [
+        ContactTruth(
+            time_s=round(contact.time, 2),
+            robots=(contact.robot, contact.other),
+            cell=world.grid.cell_at(contact.x, contact.y),
+        )
+        for contact in known
+    ]
+
+
+def _light_robots(world: World) -> list[RobotTruth]:
+    light = world.light
+    if light is None:
+        return []
+    found = []
+    for row, name in enumerate(light.names):
+        pose = light.pose(row)
+        found.append(
+            RobotTruth(
+                id=name,
+                cell=world.grid.cell_at(pose.x, pose.y),
+                x=round(pose.x, 4),
+                y=round(pose.y, 4),
+                yaw=round(pose.yaw, 4),
+                distance_m=round(float(light.bodies.distances[row]), 3),
+            )
+        )
+    return found
 
 
 def write_report(report: WorldReport, path: Path) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from rce.ros.tf import StampedTransform, Transform, frames
 from rce.ros.tf.broadcaster import KIND, TF, TF_STATIC
-from rce.ros.types import Time
+from rce.ros.types import Message, Time
 from rce_fleet.drivers.fields import (
     ERROR,
     OK,
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rce.ros.node import Node, Publisher
-    from rce.ros.types import Message
     from rce_fleet.navigation.navigation import DriveLimits
     from rce_fleet.simulation.lidar import Floats
     from rce_fleet.simulation.world import World

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from rce.config import ConfigError, Fault
 from rce.config.documents import join, parse, read_file
-from rce.config.exceptions import ConfigError, Fault
 from rce_fleet.simulation.models import RobotModel
 
 if TYPE_CHECKING:

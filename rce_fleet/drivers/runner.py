@@ -40,6 +40,7 @@ class WorldRunner:
     Attributes:
         drivers: The robots in the world by id; they may be changed at any time.
         on_update: Functions that are called after each step.
+        on_reset: Functions that are called when the world begins anew.
         on_slow: Called with the reached speed when it is below the wanted one.
     """
 
@@ -49,6 +50,7 @@ class WorldRunner:
         self.simulated_clock = simulated_clock
         self.drivers: dict[str, RobotDriver] = {}
         self.on_update: list[Callable[[], None]] = []
+        self.on_reset: list[Callable[[], None]] = []
         self.on_slow: Callable[[float], None] | None = None
         self._clocks: dict[str, Publisher] = {}
         self._before = 0.0
@@ -99,6 +101,8 @@ class WorldRunner:
         self.world.reset()
         for driver in self.drivers.values():
             driver.reset()
+        for call in self.on_reset:
+            call()
 
     def tick(self) -> None:
         """Advance by one time step."""

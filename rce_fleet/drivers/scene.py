@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import replace
 from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pydantic import Field, ValidationError, model_validator
 
+from rce.config import ConfigError, Fault
 from rce.config.documents import parse, read_file
-from rce.config.exceptions import ConfigError, Fault
 from rce.config.validation import Strict, faults_of
 from rce_fleet.drivers.robot_models import DEFAULT_MODEL, ModelShelf
 from rce_fleet.drivers.scene_items import (
@@ -19,6 +21,7 @@ from rce_fleet.drivers.scene_items import (
     DockItem,
     DoorItem,
     Length,
+    LightStart,
     Place,
     RobotStart,
     WalkerItem,
@@ -31,6 +34,7 @@ from rce_fleet.maps.ros_map import load_map
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map
 from rce_fleet.simulation.box import BoxSpec
+from rce_fleet.simulation.light.robots import TIME_STEP
 from rce_fleet.simulation.map_walls import draw_map, walls_of_map
 from rce_fleet.simulation.walls import Walls, grid_walls
 from rce_fleet.simulation.world import Dock, World, WorldSpec
@@ -42,6 +46,8 @@ if TYPE_CHECKING:
     from rce_fleet.planning.scenario import Scenario
 
 MAX_CELLS = 1_000_000
+CHARGER_REACH = 0.25
+"""Robots that stand so near to the middle of a cell with a charger are charged, metres."""
 
 __all__ = ["Floor", "RobotStart", "Scene", "load_scene", "scene_of"]
 
@@ -80,6 +86,10 @@ class Scene(Strict):
     model: str = DEFAULT_MODEL
     """Model of the robots that name none."""
     robots: tuple[RobotStart, ...] = Field(default=(), strict=False)
+    light_robots: tuple[LightStart, ...] = Field(default=(), strict=False)
+    """Robots that advance together, without a physics engine; they localize and drive by themselves."""
+    light_per_graph: int = Field(default=50, ge=1)
+    """How many light robots share a ROS graph, at most."""
     stand_ins: bool = True
     """Whether robots run what stands for ``amcl`` and ``move_base``."""
     seed: int = Field(default=0, ge=0)
@@ -92,14 +102,16 @@ class Scene(Strict):
         if self.rows * self.columns > MAX_CELLS:
             raise ValueError(f"{self.rows} x {self.columns} is more than {MAX_CELLS} cells")
         starts = [robot.cell for robot in self.robots if robot.cell is not None]
+        starts += [robot.cell for robot in self.light_robots]
         if not self._cells_from_map:
             _check_inside((*self.wall_cells, *self.box_cells, *starts), self.rows * self.columns)
         ids = [robot.id for robot in self.robots] + [door.id for door in self.doors]
+        ids += [robot.id for robot in self.light_robots]
         ids += [walker.id for walker in self.walkers] + [box.id for box in self.loose_boxes]
         if len({robot.id for robot in self.robots}) < len(self.robots) or len(set(starts)) < len(starts):
             raise ValueError("two robots have the same id or the same cell")
         if len(set(ids)) < len(ids):
-            twice = sorted({name for name in ids if ids.count(name) > 1})
+            twice = sorted(name for name, count in Counter(ids).items() if count > 1)
             raise ValueError(f"two things have the same id: {', '.join(twice)}")
         taken = sorted({*self.wall_cells, *self.box_cells}.intersection(starts))
         if taken:
@@ -196,7 +208,10 @@ class Scene(Strict):
         """
         floor = self.floor()
         default = ModelShelf(self.models, source).model(self.model, {}, place="model")
-        spec = WorldSpec(model=default, docks=tuple(Dock(*dock.at, dock.reach) for dock in self.docks))
+        docks = tuple(Dock(*dock.at, dock.reach) for dock in self.docks)
+        spec = WorldSpec(model=default, docks=docks)
+        if self.light_robots and not self.robots:
+            spec = replace(spec, time_step=TIME_STEP)  # nothing else needs shorter ones
         world = World(floor.grid, spec, seed=self.seed, walls=floor.walls)
         faults: list[Fault] = []
         for index, robot in enumerate(self.robots):
@@ -205,6 +220,7 @@ class Scene(Strict):
             except ConfigError as error:
                 faults += error.faults
         self._furnish(world, faults)
+        self._place_light_robots(world, faults)
         if faults:
             raise ConfigError(source, faults)
         return world
@@ -232,6 +248,20 @@ class Scene(Strict):
         except (FleetError, ValueError) as error:
             raise ConfigError(source, [Fault(place, str(error))]) from error
 
+    def _place_light_robots(self, world: World, faults: list[Fault]) -> None:
+        """Put light robots into a world; note if one has no room."""
+        outside = [start.cell for start in self.light_robots if start.cell not in world.grid]
+        if outside:
+            text = f"cells {outside} are not on the map of {len(world.grid)} cells"
+            faults.append(Fault("light_robots", text))
+        elif self.light_robots:
+            centre = world.grid.centre
+            starts = {start.id: Pose(*centre(start.cell), start.yaw) for start in self.light_robots}
+            try:
+                world.add_light_robots(starts)
+            except (FleetError, ValueError) as error:
+                faults.append(Fault("light_robots", str(error)))
+
     def _furnish(self, world: World, faults: list[Fault]) -> None:
         """Add boxes, doors and walkers; note what has no room."""
         for index, box in enumerate(self.boxes):
@@ -254,13 +284,28 @@ def _check_inside(cells: Iterable[int], count: int) -> None:
         raise ValueError(f"cells {outside} are not on the map of {count} cells")
 
 
-def scene_of(scenario: Scenario, seed: int = 0) -> Scene:
+def scene_of(
+    scenario: Scenario,
+    seed: int = 0,
+    *,
+    full: int | None = None,
+    light_per_graph: int = 50,
+    chargers: Iterable[int] = (),
+) -> Scene:
     """Return the initial state of a scenario, with known and hidden boxes.
 
     Its robots are TurtleBots with a lidar; localization and navigation are for other programs.
+
+    Args:
+        scenario: The scenario.
+        seed: Seed of all noise.
+        full: So many robots, the first ones, are in the physics engine, the others are light ones; None: all.
+        light_per_graph: How many light robots share a ROS graph, at most.
+        chargers: Cells in which robots are charged.
     """
     grid = scenario.grid
-    starts = zip(scenario.robots, scenario.starts, scenario.headings, strict=True)
+    starts = list(zip(scenario.robots, scenario.starts, scenario.headings, strict=True))
+    full = len(starts) if full is None else full
     return Scene(
         rows=grid.rows,
         columns=grid.columns,
@@ -268,7 +313,12 @@ def scene_of(scenario: Scenario, seed: int = 0) -> Scene:
         walls=tuple(sorted(grid.blocked)),
         boxes=tuple(sorted(scenario.boxes)),
         model="turtlebot2",
-        robots=tuple(RobotStart(id=robot, cell=cell, yaw=yaw, sensor="lidar") for robot, cell, yaw in starts),
+        robots=tuple(
+            RobotStart(id=robot, cell=cell, yaw=yaw, sensor="lidar") for robot, cell, yaw in starts[:full]
+        ),
+        light_robots=tuple(LightStart(id=robot, cell=cell, yaw=yaw) for robot, cell, yaw in starts[full:]),
+        light_per_graph=light_per_graph,
+        docks=tuple(DockItem(at=grid.centre(cell), reach=CHARGER_REACH) for cell in chargers),
         stand_ins=False,
         seed=seed,
     )

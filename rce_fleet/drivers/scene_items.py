@@ -167,6 +167,15 @@ class RobotStart(Strict):
         return self
 
 
+class LightStart(Strict):
+    """A light robot, and the cell in whose middle it starts."""
+
+    id: Id
+    cell: int = Field(ge=0)
+    yaw: Metres = 0.0
+    """Heading, radians counter-clockwise from x."""
+
+
 Wall = Annotated[
     Annotated[int, Tag(_CELL)] | Annotated[WallItem, Tag(_ITEM)],
     Discriminator(_form),

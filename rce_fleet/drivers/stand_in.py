@@ -1,8 +1,8 @@
 """What stands for a robot's localization and ``move_base``, for fleets without the real ones.
 
 Topics, relative to the node's namespace: publishes ``amcl_pose``, ``blockedCells``, ``move_base/status`` and
-``move_base/result``; subscribes to ``move_base/goal`` and ``move_base/cancel``. On ``/tf`` it publishes the
-frame ``odom`` below ``map``.
+``move_base/result``; subscribes to ``move_base/goal``, ``move_base/cancel`` and ``speed_limit``. On ``/tf``
+it publishes the frame ``odom`` below ``map``.
 """
 
 from __future__ import annotations
@@ -14,19 +14,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rce.ros.tf import StampedTransform
-from rce.ros.types import Time
+from rce.ros.types import Message, Time
 from rce_fleet.drivers.fields import pose_fields, transform_of
 from rce_fleet.geometry.poses import Twist
-from rce_fleet.navigation.navigation import DriveLimits
+from rce_fleet.navigation.navigation import DriveLimits, read_speed_limit
 from rce_fleet.simulation.move_base import SimulatedMoveBase
 from rce_fleet.simulation.obstacles import hit_points
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher
-    from rce.ros.types import Message
     from rce_fleet.planning.grid import GridMap
+    from rce_fleet.simulation.goal_list import Goal
     from rce_fleet.simulation.lidar import Floats
-    from rce_fleet.simulation.move_base import Goal
     from rce_fleet.simulation.robot import SimulatedRobot
 
 STATUS_EVERY = 0.2
@@ -75,6 +74,7 @@ class StandIn:
         )
         await node.subscribe("move_base/goal", "move_base_msgs/MoveBaseActionGoal", self._take_goal)
         await node.subscribe("move_base/cancel", "actionlib_msgs/GoalID", self._take_cancel)
+        await node.subscribe("speed_limit", "std_msgs/Float64", self._take_speed_limit)
 
     def reset(self, now: float) -> None:
         """Forget when the last status list was: time begins anew at ``now``, seconds."""
@@ -106,7 +106,7 @@ class StandIn:
             self._robot.drive(twist)
         self._drove = drives
         for goal in self._base.take_ended():
-            self._topics.result.publish(header={"stamp": stamp}, status=_status_of(goal), result={})
+            self._topics.result.publish(header={"stamp": stamp}, status=status_of(goal), result={})
         fresh = self._base.blocked != found
         if fresh or now - self._listed_at >= STATUS_EVERY - 1e-6:
             self._listed_at = now
@@ -120,12 +120,18 @@ class StandIn:
     def _take_cancel(self, message: Message) -> None:
         self._base.cancel(message.id, message.stamp.to_sec())
 
+    def _take_speed_limit(self, message: Message) -> None:
+        try:
+            self._base.limit_speed(read_speed_limit(message.data))
+        except ValueError as error:
+            self._node.log.warning("%s", error)
+
     def _list(self, topics: _Topics, stamp: Time) -> None:
         """Publish the status list, and the cells found blocked while they stop the robot."""
         if self._base.blocked:
             topics.blocked.publish(data=list(self._base.blocked))
         topics.status.publish(
-            header={"stamp": stamp}, status_list=[_status_of(goal) for goal in self._base.goals]
+            header={"stamp": stamp}, status_list=[status_of(goal) for goal in self._base.goals]
         )
 
 
@@ -147,7 +153,8 @@ def _covariance(variances: tuple[float, float, float]) -> list[float]:
     return [float(value) for value in matrix.reshape(-1)]
 
 
-def _status_of(goal: Goal) -> dict[str, Any]:
+def status_of(goal: Goal) -> dict[str, Any]:
+    """Return the fields of an ``actionlib_msgs/GoalStatus``."""
     return {
         "goal_id": {"stamp": Time.from_sec(goal.stamp), "id": goal.id},
         "status": goal.state.value,

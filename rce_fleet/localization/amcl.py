@@ -18,6 +18,7 @@ from rce_fleet.geometry.angles import wrap, wrap_array
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.localization.beam_model import BeamModel
 from rce_fleet.localization.clusters import Hypothesis, find_hypotheses
+from rce_fleet.localization.contradiction import contradicts_map
 from rce_fleet.localization.likelihood import LikelihoodField
 from rce_fleet.localization.motion import move_particles
 from rce_fleet.localization.parameters import AmclParameters, LaserModel
@@ -202,8 +203,10 @@ class Amcl:
         agreement = self._weigh(beams)
         self._updates += 1
         hypotheses = find_hypotheses(self._particles, self._weights)
-        resampled = self._updates % self.parameters.resample_interval == 0 and self._resample(beams)
         best = hypotheses[0]
+        resampled = self._updates % self.parameters.resample_interval == 0 and self._resample(
+            beams, best.pose
+        )
         map_from_odom = best.pose.compose(odometry.inverse())
         return Estimate(best.pose, best.covariance, map_from_odom, hypotheses, resampled, agreement)
 
@@ -277,13 +280,13 @@ class Amcl:
 
     # Resampling
 
-    def _resample(self, beams: Beams) -> bool:
+    def _resample(self, beams: Beams, best: Pose) -> bool:
         count = len(self._weights)
         parameters = self.parameters
         if parameters.selective_resampling and effective_count(self._weights) > count / 2:
             return False
         chosen = self._particles[:, resample(self._particles, self._weights, parameters, self._rng)]
-        anywhere = self._share_anywhere()
+        anywhere = self._share_anywhere(beams, best)
         extra = self._rng.binomial(parameters.max_particles, anywhere) if anywhere > 0 else 0
         if extra:
             kept = self._rng.permutation(chosen.shape[1])[: parameters.max_particles - extra]
@@ -293,11 +296,15 @@ class Amcl:
         self._weights = np.full(chosen.shape[1], 1.0 / chosen.shape[1])
         return True
 
-    def _share_anywhere(self) -> float:
-        """Return the share of particles to draw anywhere, because scans fit worse than they used to."""
+    def _share_anywhere(self, beams: Beams, best: Pose) -> float:
+        """Return the share of particles to draw anywhere, because scans fit worse than they used to.
+
+        It is 0 where people or other robots around the robot explain that: the map is not contradicted.
+        """
         if self.parameters.recovery_alpha_fast <= 0 or self._slow <= 0:
             return 0.0
-        return max(0.0, 1.0 - CAUTION * self._fast / self._slow)
+        share = max(0.0, 1.0 - CAUTION * self._fast / self._slow)
+        return share if share and contradicts_map(self._grid, best, beams) else 0.0
 
     def _anywhere(self, count: int) -> NDArray[np.float64]:
         cells = self._free[self._rng.integers(len(self._free), size=count)]

@@ -156,7 +156,7 @@ def read_header(path: Path) -> MapHeader:
         path.parent / image,
         resolution,
         _origin(path, found),
-        bool(_number(path, found, "negate", 0)),
+        found["negate"] if isinstance(found.get("negate"), bool) else bool(_number(path, found, "negate", 0)),
         occupied,
         free,
         MapMode(mode),
@@ -168,7 +168,7 @@ def _number(path: Path, found: dict[object, object], key: str, default: float | 
     if isinstance(value, str):
         with suppress(ValueError):  # YAML 1.1 takes 5e-2 for a text; any other text is refused below
             value = float(value)
-    if not isinstance(value, int | float) or not isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
         raise MapError(f"{path}: '{key}' must be a number, not {value!r}")
     return float(value)
 

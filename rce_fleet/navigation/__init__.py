@@ -1,1 +1,1 @@
-"""From cells to motion: angles, the controller of one robot, occupancy grids. Pure."""
+"""How a robot drives: costmaps, planners, ``move_base``, the safety stage, exploration. Pure."""

@@ -7,7 +7,7 @@ stops at the waypoint, and can always stop in front of an obstacle ahead.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import atan2, cos, hypot, inf, sqrt
+from math import atan2, cos, hypot, inf, isfinite, sqrt
 from typing import TYPE_CHECKING
 
 from rce_fleet.geometry.angles import wrap
@@ -40,15 +40,35 @@ class DriveLimits:
     gap: float = 0.08
 
 
+def read_speed_limit(value: float) -> float:
+    """Return the limit that a message on the topic ``speed_limit`` sets, metres per second.
+
+    Args:
+        value: Greatest speed, metres per second; 0: not limited.
+
+    Raises:
+        ValueError: It is negative, or not a finite number.
+    """
+    if not isfinite(value) or value < 0:
+        raise ValueError(
+            f"speed_limit: expected a speed in m/s, or 0 for no limit, found {value}; the limit before counts"
+        )
+    return value or inf
+
+
 class Navigator:
     """Follows a list of waypoints.
 
     Args:
         limits: Speeds and accelerations of the robot.
+
+    Attributes:
+        speed_limit: Highest forward speed at present, metres per second, if it is below the robot's own.
     """
 
     def __init__(self, limits: DriveLimits | None = None) -> None:
         self.limits = limits or DriveLimits()
+        self.speed_limit = inf
         self._waypoints: list[tuple[float, float]] = []
         self._twist = Twist()
         self._turning = False
@@ -117,6 +137,7 @@ class Navigator:
         room = max(0.0, clear - limits.gap)
         speed = min(
             limits.speed,
+            self.speed_limit,
             sqrt(2 * limits.acceleration * max(away - limits.reach / 2, 0.0)),
             sqrt(2 * limits.acceleration * room),
         )

@@ -1,1 +1,1 @@
-"""The fleet's ROS nodes: they pass messages to the coordination and from it."""
+"""The ROS nodes: planner, fleet manager, move clients, and the nodes of a robot (``amcl`` ...)."""

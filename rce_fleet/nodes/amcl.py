@@ -13,15 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rce.ros.errors import NodeClosedError, RosError
-from rce.ros.node import Node, run
+from rce.ros.node import Message, Node, NodeClosedError, Publisher, RosError, Time, run
 from rce.ros.tf import TransformBroadcaster, TransformError, TransformListener
-from rce.ros.types import Time
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.exceptions import MapError
+from rce_fleet.geometry.jumps import OdometryWatch
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.localization.amcl import Amcl, Estimate
-from rce_fleet.localization.jumps import OdometryWatch
 from rce_fleet.localization.parameters import LaserModel
 from rce_fleet.localization.scan import LaserScan
 from rce_fleet.nodes.amcl_frames import RobotFrames
@@ -38,8 +36,6 @@ from rce_fleet.nodes.throttled_log import ThrottledLog
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from rce.ros.node import Publisher
-    from rce.ros.types import Message
 
 SCANS = 5
 """Scans that wait for their transforms; more are dropped, the oldest first."""
@@ -88,7 +84,7 @@ class AmclNode:
         """Localize the robot until the node is stopped."""
         node, parameters = self._node, self._parameters
         if parameters.compiled or parameters.laser_model_type is LaserModel.BEAM:
-            compile_kernels()
+            await asyncio.to_thread(compile_kernels)  # the master calls the node meanwhile
         self._poses = await node.advertise("amcl_pose", "geometry_msgs/PoseWithCovarianceStamped", latch=True)
         self._clouds = await node.advertise("particlecloud", "geometry_msgs/PoseArray", latch=True)
         self._diagnostics = await Diagnostics.start(node, "localization")

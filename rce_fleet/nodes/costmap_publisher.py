@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from rce_fleet.geometry.poses import Pose
-from rce_fleet.navigation.costmap.cost_grid import NOWHERE
+from rce_fleet.navigation.costmap.cost_grid import NOWHERE, Area
 from rce_fleet.navigation.costmap.costs import to_occupancy
 from rce_fleet.nodes.planar import pose_fields
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher
-    from rce_fleet.navigation.costmap.cost_grid import Area
     from rce_fleet.navigation.costmap.layered import LayeredCostmap
 
 

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rce.ros.actions import ActionClient, ClientGoal, GoalState
-from rce.ros.node import Node, run
-from rce.ros.tf import TransformListener
-from rce.ros.tf.exceptions import TransformError
+from rce.ros.node import Message, Node, Publisher, run
+from rce.ros.tf import TransformError, TransformListener
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.exceptions import MapError
 from rce_fleet.geometry.poses import Pose
@@ -33,8 +32,6 @@ from rce_fleet.nodes.robot_place import full_name, named_in_message
 from rce_fleet.nodes.throttled_log import ThrottledLog
 
 if TYPE_CHECKING:
-    from rce.ros.node import Publisher
-    from rce.ros.types import Message
     from rce_fleet.maps.occupancy_map import OccupancyMap
 
 UNUSED = ("orientation_scale",)

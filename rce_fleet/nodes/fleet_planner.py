@@ -14,9 +14,6 @@ from typing import TYPE_CHECKING, Any, assert_never
 
 from rce.ros.errors import MasterError
 from rce.ros.node import Node, run
-from rce.ros.node.master import MasterClient
-from rce.ros.xmlrpc import RpcClient
-from rce_fleet.coordination.answers import is_answer, numbered_array, read_answer
 from rce_fleet.coordination.events import (
     BlockedChanged,
     CellBlocked,
@@ -25,14 +22,10 @@ from rce_fleet.coordination.events import (
     GoalSet,
     Instruction,
     MakePlan,
-    ObstacleGone,
-    ObstacleSeen,
     PlanMade,
-    PoseSeen,
     Reply,
-    ReportSeen,
-    RobotHeard,
     RobotRemoved,
+    RobotsExpected,
     SendCancel,
     SendCells,
     Tick,
@@ -40,37 +33,36 @@ from rce_fleet.coordination.events import (
 from rce_fleet.coordination.grid_change import next_planner, refuse_grid
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.settings import FleetSettings
+from rce_fleet.exceptions import MapError, PlannerError, ZoneError
+from rce_fleet.nodes.graph_look import GraphLook
 from rce_fleet.nodes.grid_choice import CHOSEN, GridChoice, GridChooser
-from rce_fleet.nodes.grid_messages import (
-    GRID_TOPIC,
-    OLD_TOPIC,
-    grid_fields,
-    grid_name,
-    wants_old_topic,
-)
+from rce_fleet.nodes.grid_messages import GRID_TOPIC, grid_name
 from rce_fleet.nodes.grid_parameters import make_grid, read_fleet_parameters
+from rce_fleet.nodes.grid_topics import GridTopics
+from rce_fleet.nodes.known_robots import KnownRobots, file_of_robots
+from rce_fleet.nodes.other_planner import stand_by
 from rce_fleet.nodes.plan_worker import PlanWorker
-from rce_fleet.nodes.robot_messages import read_pose_seen, read_report, read_sign
+from rce_fleet.nodes.pose_publisher import PosePublisher
+from rce_fleet.nodes.robot_topics import RobotTopics
 from rce_fleet.nodes.state_publisher import StatePublisher
+from rce_fleet.nodes.throttled_log import ThrottledLog
+from rce_fleet.nodes.zone_messages import read_mode_set, read_zones_set
+from rce_fleet.planning.motion import Motion
+from rce_fleet.planning.planner import planner_names
 
 if TYPE_CHECKING:
-    from rce.ros.node import Publisher
     from rce.ros.types import Message
-    from rce_fleet.coordination.move_client import ClientReport
     from rce_fleet.coordination.replanning import PlanRequest
-    from rce_fleet.coordination.robot_signs import RobotSign
     from rce_fleet.planning.grid import GridMap
 
 TICK = 0.1
 """Seconds between two timer events; changes of the state are published at most this often."""
 LOOK_AROUND = 0.5
-"""Seconds between two searches for new robots."""
-POSE = "geometry_msgs/PoseWithCovarianceStamped"
+"""Seconds between two searches for new robots, in a small graph."""
+KEEP_EVERY = 1.0
+"""Seconds between two looks whether robots have other cells than those kept for the next planner."""
 ROBOT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/amcl_pose")
-OLD_CELLS_LAST = 3.0
-"""Seconds after a change of the grid in which robots may report cells of the one before."""
-OLD_TOPIC_LOOKS = 3
-"""So many looks in a row must find only robot files from before on the old topic of the grid."""
+CLIENT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/moveClient/status")
 
 
 class PlannerNode:
@@ -81,6 +73,7 @@ class PlannerNode:
         planner: The planner.
         chooser: Makes other grids over its map; if None, over the planner's grid.
         takes_answers: Move clients answer on ``goalNodesList`` instead of their own topics.
+        known: Keeps robots for the planner after this one.
     """
 
     def __init__(
@@ -90,25 +83,19 @@ class PlannerNode:
         chooser: GridChooser | None = None,
         *,
         takes_answers: bool = False,
+        known: KnownRobots | None = None,
     ) -> None:
         self._chooser = chooser or GridChooser({}, planner.state.grid)
         self._node = node
         self._takes_answers = takes_answers
         self._planner = planner
-        self._cells: dict[str, Publisher] = {}
-        self._cancels: dict[str, Publisher] = {}
         self._requests: asyncio.Queue[tuple[FleetPlanner, PlanRequest]] = asyncio.Queue()
-        self._client_grids: dict[str, str] = {}
-        """The grid that each robot's move client has; empty: it has one from its parameters."""
-        self._obstacles_from = 0.0
         self._state = StatePublisher(node, planner)
-        self._blocked: Publisher
-        self._requested: Publisher
-        self._map: Publisher
-        self._old_map: Publisher | None = None
-        self._shown_blocked: tuple[int, ...] = ()
-        self._shown_requested: tuple[int, ...] | None = None
-        self._looks_for_old = 0
+        self._poses = PosePublisher(node)
+        self._robots = RobotTopics(node, self._handle, self._poses, takes_answers=takes_answers)
+        self._grid = GridTopics(node)
+        self._known = known
+        self._throttled_log = ThrottledLog(node)
 
     async def run(self, blocked: list[int]) -> None:
         """Run until the node is stopped.
@@ -117,136 +104,85 @@ class PlannerNode:
             blocked: Cells that are blocked at the start, and can be freed.
         """
         node = self._node
-        self._blocked = await node.advertise("/fleet/blockedCells", "std_msgs/Int32MultiArray", latch=True)
-        self._requested = await node.advertise(
-            "/fleet/requestedCells", "std_msgs/Int32MultiArray", latch=True
-        )
-        self._map = await node.advertise(GRID_TOPIC, "nav_msgs/OccupancyGrid", latch=True)
+        await self._grid.start()
         self._publish_blocked(())
+        await self._expect_known()
         for cell in blocked:
             self._handle(CellBlocked(cell))
         await node.advertise_service("/fleet/set_goal", "fleet/SetGoal", self._set_goal)
         await node.advertise_service("/fleet/block_cell", "fleet/BlockCell", self._block_cell)
         await node.advertise_service("/fleet/remove_robot", "fleet/RemoveRobot", self._remove_robot)
+        await node.advertise_service("/fleet/set_zones", "fleet/SetZones", self._set_zones)
+        await node.advertise_service("/fleet/set_mode", "fleet/SetMode", self._set_mode)
         await node.advertise_service("/fleet/set_grid", "fleet/SetGrid", self._set_grid)
+        await self._poses.start()
         await self._state.start()  # last: who sees the state may call the services
         async with PlanWorker(node.log) as worker, asyncio.TaskGroup() as tasks:
             planning = tasks.create_task(self._make_plans(worker))
             tasks.create_task(self._look_around())
+            tasks.create_task(self._keep_known())
             await self._keep_time()
             planning.cancel()
 
-    # What comes in
+    # Robots
+
+    async def _expect_known(self) -> None:
+        """Wait for the robots that the planner before this one knew, and for those of the ROS graph."""
+        expected: dict[str, tuple[int, ...]] = {}
+        async with GraphLook(self._node, LOOK_AROUND) as graph:
+            try:
+                topics = list((await graph.look()).publishers)
+            except MasterError as error:
+                self._node.log.warning("cannot search for robots: %s", error)
+                topics = []
+        for topic in topics:
+            found = ROBOT_TOPIC.fullmatch(topic) or CLIENT_TOPIC.fullmatch(topic)
+            if found is not None:
+                expected[found[1]] = ()
+        if self._known is not None:
+            try:
+                expected |= self._known.read(self._planner.state.grid, time.time())
+            except (OSError, ValueError) as error:
+                self._node.log.warning("robots of an earlier planner are not known: %s", error)
+        if expected:
+            self._handle(RobotsExpected(expected))
+
+    async def _keep_known(self) -> None:
+        """Write the robots and their cells, if they changed, beside the planner's work."""
+        while self._known is not None and await self._node.sleep(KEEP_EVERY):
+            content = self._known.content(self._planner.state)
+            if content is None:
+                continue
+            try:
+                await asyncio.to_thread(self._known.write, content, time.time())
+            except OSError as error:
+                self._throttled_log.warn("known", f"robots cannot be kept for the next planner: {error}")
 
     async def _look_around(self) -> None:
         """Add every robot whose pose is published."""
-        async with RpcClient() as rpc:
-            master = MasterClient(self._node.master_uri, self._node.name, self._node.uri, rpc)
+        async with GraphLook(self._node, LOOK_AROUND) as graph:
             while True:
                 try:
-                    for topic, _ in await master.call("getPublishedTopics", ""):
+                    topics = await graph.look()
+                    for topic in topics.publishers:
                         found = ROBOT_TOPIC.fullmatch(topic)
-                        if found is not None and found[1] not in self._cells:
-                            await self._join(found[1])
-                    await self._serve_old_topic(await master.call("getSystemState"))
+                        if found is not None and found[1] not in self._robots:
+                            await self._robots.join(found[1])
+                    await self._grid.serve_old_topic(topics, self._planner.state, self._state.started)
                 except MasterError as error:
                     self._node.log.warning("cannot search for robots: %s", error)
-                if not await self._node.sleep(LOOK_AROUND):
+                if not await self._node.sleep(graph.pause):
                     return
 
-    async def _serve_old_topic(self, state: list[Any]) -> None:
-        """Publish the grid on the topic that robot files from before connect, while it has no other use."""
-        publishers, subscribers = (dict(topics) for topics in state[:2])
-        wanted = wants_old_topic(publishers, subscribers, self._node.name)
-        self._looks_for_old = self._looks_for_old + 1 if wanted else 0
-        if self._old_map is None and self._looks_for_old >= OLD_TOPIC_LOOKS:
-            self._node.log.warning(
-                "a robot file connects %s; the grid is now %s: change the file", OLD_TOPIC, GRID_TOPIC
-            )
-            self._old_map = await self._node.advertise(OLD_TOPIC, "nav_msgs/OccupancyGrid", latch=True)
-            self._publish_blocked(self._shown_blocked)
-        elif self._old_map is not None and set(publishers.get(OLD_TOPIC, ())) - {self._node.name}:
-            old, self._old_map = self._old_map, None
-            await old.close()
-
-    async def _join(self, robot: str) -> None:
-        node = self._node
-        self._cells[robot] = await node.advertise(f"/{robot}/goalNodesList", "std_msgs/Int32MultiArray")
-        self._cancels[robot] = await node.advertise(f"/{robot}/cancelGoal", "std_msgs/Bool")
-        if self._takes_answers:
-            await node.subscribe(
-                f"/{robot}/goalNodesList",
-                "std_msgs/Int32MultiArray",
-                lambda message: self._take_answer(robot, message),
-            )
-        else:
-            await self._hear_apart(robot)
-        # Clients of the planner's container do not receive what its other interfaces publish.
-        seen = await node.advertise(f"/fleet/poses/{robot}", POSE, latch=True)
-
-        def take(message: Message) -> None:
-            self._take(read_pose_seen(robot, message))
-            seen.publish(message)
-
-        await node.subscribe(f"/{robot}/amcl_pose", POSE, take)
-        node.log.info("found robot %s", robot)
-
-    async def _hear_apart(self, robot: str) -> None:
-        """Subscribe to the topics of a move client and its robot."""
-        await self._node.subscribe(
-            f"/{robot}/moveClient/status",
-            "fleet/MoveStatus",
-            lambda message: self._take_status(robot, message),
-        )
-        await self._node.subscribe(
-            f"/{robot}/blockedCells",
-            "std_msgs/Int32MultiArray",
-            lambda message: self._take_obstacle(ObstacleSeen(robot, tuple(message.data))),
-        )
-        await self._node.subscribe(
-            f"/{robot}/freedCells",
-            "std_msgs/Int32MultiArray",
-            lambda message: self._take_obstacle(ObstacleGone(robot, tuple(message.data))),
-        )
-
-    def _take_answer(self, robot: str, message: Message) -> None:
-        """Handle a move client's answer; the planner's own lists arrive here too."""
-        dimensions = message.layout.dim
-        labels = [dimension.label for dimension in dimensions]
-        if not is_answer(labels):
-            return
-        try:
-            answer = read_answer(labels, [dimension.size for dimension in dimensions], message.data)
-        except ValueError as error:
-            self._node.log.warning("%s: %s", robot, error)
-            return
-        self._take_report(robot, answer.report, answer.sign)
-        if answer.blocked:
-            self._take(ObstacleSeen(robot, answer.blocked))
-        if answer.freed:
-            self._take(ObstacleGone(robot, answer.freed))
-
-    def _take_status(self, robot: str, message: Message) -> None:
-        self._client_grids[robot] = grid_name(message.grid)
-        self._take_report(robot, read_report(message), read_sign(message))
-
-    def _take_obstacle(self, event: ObstacleSeen | ObstacleGone) -> None:
-        """Handle cells that a robot reports, unless they may be of the grid before."""
-        if time.monotonic() >= self._obstacles_from:
-            self._take(event)
-
-    def _take_report(self, robot: str, report: ClientReport, sign: RobotSign) -> None:
-        """Handle a move client's report; what it heard of the robot comes first, because it is older."""
-        if sign.pose is not None:
-            self._take(PoseSeen(robot, *sign.pose))
-        if sign.age is not None:
-            self._take(RobotHeard(robot, sign.age))
-        self._take(ReportSeen(robot, report))
+    # What comes in
 
     async def _keep_time(self) -> None:
         while await self._node.sleep(TICK):
             self._handle(Tick())
             self._state.update(time.monotonic())
+            self._poses.update(self._planner.state.robots, time.monotonic())
+            grids = self._robots.client_grids.values()
+            self._grid.send_again(self._planner.state, self._state.started, grids)
 
     async def _make_plans(self, worker: PlanWorker) -> None:
         while True:
@@ -264,6 +200,19 @@ class PlannerNode:
     def _remove_robot(self, request: Message) -> dict[str, Any]:
         return self._ask(RobotRemoved(request.robot))
 
+    def _set_zones(self, request: Message) -> dict[str, Any]:
+        try:
+            reply = self._ask(read_zones_set(request, time.monotonic()))
+        except ZoneError as error:
+            reply = {"ok": False, "message": str(error)}
+        return {**reply, "revision": self._planner.state.zones.revision}
+
+    def _set_mode(self, request: Message) -> dict[str, Any]:
+        try:
+            return self._ask(read_mode_set(request))
+        except ValueError as error:
+            return {"ok": False, "message": str(error)}
+
     async def _set_grid(self, request: Message) -> dict[str, Any]:
         choice = self._chooser.read(request)
         reply, grid = await self._chooser.answer(choice, self._refuse_grid, preview=request.preview)
@@ -279,14 +228,14 @@ class PlannerNode:
             )
         own = grid_name(self._state.started)
         for robot in sorted(self._planner.state.robots):
-            if self._client_grids.get(robot, own) != own:
+            if self._robots.client_grids.get(robot, own) != own:
                 return f"the move client of {robot} does not take its grid from {GRID_TOPIC}"
         return refuse_grid(self._planner, grid)
 
     async def _take_grid(self, grid: GridMap, choice: GridChoice) -> None:
         """Begin anew with another grid: first the grid is published, then the state and lists of it."""
         self._planner, instructions = next_planner(self._planner, grid, time.monotonic())
-        self._obstacles_from = time.monotonic() + OLD_CELLS_LAST
+        self._robots.ignore_old_cells()
         self._chooser.blocked_share = choice.blocked_share
         self._state.restart(self._planner)
         self._publish_blocked(tuple(sorted(self._planner.state.blocked)))
@@ -301,12 +250,8 @@ class PlannerNode:
         """Pass a request to the planner; return the fields of the response."""
         reply = next(done for done in self._handle(event) if isinstance(done, Reply))
         self._node.log.info("%s", reply.message)
-        self._publish_requested(self._shown_blocked)
+        self._grid.publish_requested(self._planner.state)
         return {"ok": reply.ok, "message": reply.message}
-
-    def _take(self, event: Event) -> None:
-        """Pass an event to the planner."""
-        self._handle(event)
 
     def _handle(self, event: Event) -> list[Instruction]:
         """Pass an event to the planner and carry out its instructions."""
@@ -317,11 +262,10 @@ class PlannerNode:
     def _carry_out(self, instructions: list[Instruction]) -> None:
         for instruction in instructions:
             match instruction:
-                case SendCells(robot, revision, cells):
-                    grid = "" if self._takes_answers else grid_name(self._state.started)
-                    self._cells[robot].publish(numbered_array(cells, revision, grid))
+                case SendCells():
+                    self._robots.send_cells(instruction, grid_name(self._state.started))
                 case SendCancel(robot):
-                    self._cancels[robot].publish(data=True)
+                    self._robots.send_cancel(robot)
                 case BlockedChanged(cells):
                     self._publish_blocked(cells)
                 case MakePlan(request):
@@ -331,21 +275,30 @@ class PlannerNode:
                 case _:
                     assert_never(instruction)
 
-    def _publish_requested(self, blocked: tuple[int, ...]) -> None:
-        """Publish the blocked cells that people asked for, if they changed."""
-        requested = tuple(cell for cell in blocked if cell not in self._planner.state.sensed)
-        if requested != self._shown_requested:
-            self._shown_requested = requested
-            self._requested.publish(data=list(requested))
-
     def _publish_blocked(self, cells: tuple[int, ...]) -> None:
-        self._blocked.publish(data=list(cells))
-        self._publish_requested(cells)
-        fields = grid_fields(self._planner.state.grid, cells, self._node.now(), self._state.started)
-        for grids in (self._map, self._old_map):
-            if grids is not None:
-                grids.publish(fields)
-        self._shown_blocked = cells
+        self._grid.publish(self._planner.state, self._state.started, cells)
+
+
+def warn_of_size(node: Node, grid: GridMap, settings: FleetSettings) -> None:
+    """Refuse robots that are bigger than a cell; warn if they are a little too big.
+
+    Raises:
+        MapError: A robot does not fit into a cell.
+    """
+    size, radius = grid.cell_size, settings.robot_radius
+    if 2 * radius > size:
+        raise MapError(
+            f"robots with a radius of {radius:g} m do not fit into cells of {size:g} m: choose cells of at"
+            f" least {2 * (radius + settings.arrival_tolerance):.2f} m, or set robot_radius"
+        )
+    if 2 * (radius + settings.arrival_tolerance) > size + 1e-9:
+        node.log.warning(
+            "cells of %g m are small for robots with a radius of %g m: one that stands %g m off its cell's"
+            " centre also claims the cell beside it",
+            size,
+            radius,
+            settings.arrival_tolerance,
+        )
 
 
 async def main() -> None:
@@ -355,13 +308,32 @@ async def main() -> None:
         settings = FleetSettings(
             robot_radius=float(values.get("robot_radius", FleetSettings().robot_radius)),
             seed=int(values.get("seed", 0)),
+            pose_only_after=float(values.get("pose_only_after", FleetSettings().pose_only_after)),
+            lost_spread=float(values.get("lost_spread", FleetSettings().lost_spread)),
+            lost_yaw=float(values.get("lost_yaw", FleetSettings().lost_yaw)),
+            planner=str(values.get("planner", FleetSettings().planner)),
+            resolve_deadlocks=bool(values.get("resolve_deadlocks", False)),
+            quarter_turn=float(values.get("quarter_turn", 0.0)),
+            stop=float(values.get("stop", 0.0)),
         )
+        Motion(settings.quarter_turn, settings.stop)  # an impossible value ends the node with its reason
         takes_answers = bool(values.get("answers", False))
+        if settings.planner not in planner_names():
+            known = ", ".join(planner_names())
+            raise PlannerError(
+                f"the parameter planner is {settings.planner!r}; installed planners are {known}"
+            )
         chooser = GridChooser(values, make_grid(values))
         grid, remark = await chooser.grid_at_start(None if takes_answers else values.get(CHOSEN))
+        warn_of_size(node, grid, settings)
+        if not await stand_by(node):
+            return
         if remark:
             node.log.warning("%s", remark)
-        planner = PlannerNode(node, FleetPlanner(grid, settings), chooser, takes_answers=takes_answers)
+        file = file_of_robots(values)
+        kept = KnownRobots(file, settings.ahead) if file is not None else None
+        made = FleetPlanner(grid, settings)
+        planner = PlannerNode(node, made, chooser, takes_answers=takes_answers, known=kept)
         await planner.run(chooser.blocked_at_start(grid))
 
 

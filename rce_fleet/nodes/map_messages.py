@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rce.ros.tf import Vector
+from rce.ros.tf import Transform, Vector
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.localization.scan import LaserScan
 from rce_fleet.nodes.planar import pose_fields
 
 if TYPE_CHECKING:
-    from rce.ros.tf import Transform
     from rce.ros.types import Message, Time
     from rce_fleet.maps.occupancy_map import OccupancyMap
 

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from rce.ros.node import Node, run
+from rce.ros.node import Message, Node, run
 from rce.ros.node.hosting import program_arguments
 from rce_fleet.exceptions import MapError
 from rce_fleet.maps.occupancy_map import FREE_UP_TO, OCCUPIED_FROM
@@ -23,7 +23,6 @@ from rce_fleet.nodes.planar import read_map
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rce.ros.types import Message
 
 COMPLAIN_S = 5.0
 """Seconds of waiting after which the node says what it waits for."""

@@ -16,8 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rce.ros.errors import ServiceFaultError
-from rce.ros.node import Node, run
+from rce.ros.node import Message, Node, Publisher, ServiceFaultError, run
 from rce.ros.node.hosting import program_arguments
 from rce_fleet.exceptions import MapError
 from rce_fleet.maps.ros_map import load_map
@@ -26,8 +25,6 @@ from rce_fleet.nodes.map_messages import map_fields, metadata_fields
 from rce_fleet.nodes.parameters import read_parameters
 
 if TYPE_CHECKING:
-    from rce.ros.node import Publisher
-    from rce.ros.types import Message
     from rce_fleet.maps.occupancy_map import OccupancyMap
 
 USAGE = "usage: map_server MAP.yaml (a map file as of http://wiki.ros.org/map_server)"

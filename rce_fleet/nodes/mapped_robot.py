@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rce.ros.tf import Transform, TransformError
+from rce.ros.tf import Transform, TransformError, TransformListener
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.mapping.records import LaserRecord
 from rce_fleet.nodes.map_messages import read_scan
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rce.ros.node import Node
-    from rce.ros.tf import TransformListener
     from rce.ros.types import Message, Time
     from rce_fleet.nodes.slam_graph_parameters import SlamGraphParameters
     from rce_fleet.nodes.throttled_log import ThrottledLog

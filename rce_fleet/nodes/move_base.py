@@ -10,11 +10,10 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rce.ros.node import Node, run
+from rce.ros.node import Message, Node, Publisher, run
 from rce.ros.tf import TransformListener
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.geometry.poses import Pose, Twist
@@ -30,10 +29,6 @@ from rce_fleet.nodes.observation_sources import ObservationSources
 from rce_fleet.nodes.planar import fault_of_map_frame, path_fields, read_map, twist_fields
 from rce_fleet.nodes.robot_place import RobotPlace, full_name
 from rce_fleet.nodes.throttled_log import ThrottledLog
-
-if TYPE_CHECKING:
-    from rce.ros.node import Publisher
-    from rce.ros.types import Message
 
 DIAGNOSTICS_EVERY = 1.0
 """Seconds between two messages on ``/diagnostics``."""
@@ -317,7 +312,7 @@ async def main() -> None:
         settings, problems = read_settings(values, node.resolve("~").rstrip("/") + "/")
         for problem in problems:
             (node.log.warning if problem.is_unknown else node.log.error)("%s", problem.text)
-        compile_kernels()
+        await asyncio.to_thread(compile_kernels)  # the master calls the node meanwhile
         await MoveBaseNode(node, settings).run()
 
 

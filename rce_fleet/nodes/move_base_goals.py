@@ -10,17 +10,15 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 import numpy as np
 
 from rce.ros.actions import ServerGoal, SimpleActionServer
-from rce.ros.tf.exceptions import TransformError
+from rce.ros.tf import TransformError, TransformListener
 from rce_fleet.geometry.poses import Pose
-from rce_fleet.navigation.move_base.core import Ending
+from rce_fleet.navigation.move_base.core import Decision, Ending
 from rce_fleet.nodes.planar import path_fields, pose_fields, pose_of, read_pose
 from rce_fleet.nodes.robot_place import full_name, named_in_message
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher
-    from rce.ros.tf import TransformListener
     from rce.ros.types import Message
-    from rce_fleet.navigation.move_base.core import Decision
     from rce_fleet.navigation.move_base.stack import NavigationSettings, NavigationStack
     from rce_fleet.nodes.throttled_log import ThrottledLog
 

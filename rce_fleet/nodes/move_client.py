@@ -7,14 +7,13 @@ The work is done by :mod:`rce_fleet.coordination.move_client`; this node passes 
 from __future__ import annotations
 
 import time
+from math import inf
 from typing import TYPE_CHECKING, assert_never
 
-from rce.ros.errors import MasterError
-from rce.ros.node import Node, run
+from rce.ros.node import MasterError, Message, Node, Publisher, Time, run
 from rce.ros.node.master import MasterClient
-from rce.ros.types import Time
 from rce.ros.xmlrpc import RpcClient
-from rce_fleet.coordination.answers import Answer, answer_array, grid_of, is_answer, revision_of
+from rce_fleet.coordination.answers import Answer, answer_array, grid_of, is_answer, revision_of, speed_of
 from rce_fleet.coordination.move_client import (
     ClientReport,
     ClientState,
@@ -39,8 +38,7 @@ from rce_fleet.nodes.throttled_log import ThrottledLog
 from rce_fleet.planning.grid import GridMap
 
 if TYPE_CHECKING:
-    from rce.ros.node import Publisher
-    from rce.ros.types import Message
+    from rce_fleet.nodes.namespaced import NamespacedNode
 
 TICK = 0.25
 """Seconds between two timer events."""
@@ -55,15 +53,20 @@ class MoveClientNode:
 
     Args:
         node: Running node, in the robot's namespace.
+        hears_grid: Whether it takes the grid from its topic; else it is given by :meth:`take_grid`.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node | NamespacedNode, *, hears_grid: bool = True) -> None:
         self._node = node
+        self._hears_grid = hears_grid
         self._client: MoveClient | None = None
         self._reported_at = 0.0
         self._goals: Publisher
         self._stops: Publisher
         self._reports: Publisher
+        self._speeds: Publisher
+        self._speed: float | None = None
+        """What the robot was told last; it may have an old limit from a move client before this one."""
         self._answers = False
         self._hears_old = False
         self._grid = Time()
@@ -73,14 +76,20 @@ class MoveClientNode:
 
     async def run(self) -> None:
         """Send the robot along until the node is stopped."""
+        await self.start()
+        await self.keep_time()
+
+    async def start(self) -> None:
+        """Create publishers and subscribers. They end with the node."""
         node = self._node
         self._goals = await node.advertise("move_base/goal", "move_base_msgs/MoveBaseActionGoal")
+        self._speeds = await node.advertise("speed_limit", "std_msgs/Float64", latch=True)
         self._stops = await node.advertise("move_base/cancel", "actionlib_msgs/GoalID")
         values = await node.get_param("~", {})
         self._answers = bool(values.get("answers", False))
         if {"rows", "map", "map_yaml"} & values.keys():
-            self._take_grid(make_grid(values))
-        else:
+            self.take_grid(make_grid(values))
+        elif self._hears_grid:
             await node.subscribe(GRID_TOPIC, "nav_msgs/OccupancyGrid", self._take_map)
         if self._answers:
             self._reports = await node.advertise("goalNodesList", "std_msgs/Int32MultiArray")
@@ -98,10 +107,15 @@ class MoveClientNode:
         self._alive_topic = str(values.get("alive_topic", ""))
         if self._alive_topic:
             await node.subscribe_serialized(self._alive_topic, "*", lambda _payload, _latched: self._hear())
+
+    async def keep_time(self, delay: float = 0.0) -> None:
+        """Tick until the node is stopped, first after ``delay`` seconds."""
+        node = self._node
+        await node.sleep(delay)
         look_at = time.monotonic() + OLD_MAP_AFTER
         while await node.sleep(TICK):
             if self._client is None:
-                if not self._hears_old and time.monotonic() >= look_at:
+                if self._hears_grid and not self._hears_old and time.monotonic() >= look_at:
                     await self._look_for_old_map()
                     look_at = time.monotonic() + OLD_MAP_AFTER
                 continue
@@ -114,7 +128,7 @@ class MoveClientNode:
 
     def _take_map(self, message: Message) -> None:
         try:
-            self._take_grid(read_grid(message), message.info.map_load_time)
+            self.take_grid(read_grid(message), message.info.map_load_time)
         except ValueError as error:
             self._node.log.warning("the grid on %s cannot be used: %s", GRID_TOPIC, error)
 
@@ -139,7 +153,7 @@ class MoveClientNode:
             self._hears_old = True
             await self._node.subscribe(OLD_TOPIC, "nav_msgs/OccupancyGrid", self._take_old_map)
 
-    def _take_grid(self, grid: GridMap, made: Time | None = None) -> None:
+    def take_grid(self, grid: GridMap, made: Time | None = None) -> None:
         """Drive on a grid; a goal on another one before is cancelled."""
         self._grid = made or Time()
         revision = 0
@@ -169,10 +183,17 @@ class MoveClientNode:
             self._node.log.debug("cells of another grid are ignored; they are sent again")
             return
         revision = revision_of(labels)
+        self._limit_speed(speed_of(labels))
         try:
             self._do(self._client.take_cells(revision, list(message.data), self._node.time()))
         except ValueError as error:
             self._node.log.warning("the list of cells was refused: %s", error)
+
+    def _limit_speed(self, speed: float) -> None:
+        """Tell the robot the greatest speed in its cells; 0 m/s means that it is not limited any more."""
+        if speed != self._speed or speed < inf:
+            self._speed = speed
+            self._speeds.publish(data=0.0 if speed == inf else speed)
 
     def _take_cancel(self, message: Message) -> None:
         if self._client is not None and message.data:

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rce.ros.tf import Vector
-from rce.ros.tf.exceptions import ExtrapolationError, TransformError
-from rce_fleet.navigation.costmap.observation import observe_points, observe_scan
+from rce.ros.tf import ExtrapolationError, Transform, TransformError, TransformListener, Vector
+from rce_fleet.navigation.costmap.observation import Observation, observe_points, observe_scan
 from rce_fleet.navigation.scans import fault_of_scan, fault_of_stamp
 from rce_fleet.nodes.planar import pose_of
 from rce_fleet.nodes.robot_place import full_name, named_in_message
@@ -21,10 +20,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rce.ros.node import Node
-    from rce.ros.tf import Transform, TransformListener
     from rce.ros.types import Message, Time
     from rce_fleet.navigation.costmap.layered import LayeredCostmap
-    from rce_fleet.navigation.costmap.observation import Observation
     from rce_fleet.navigation.costmap.parameters import ObservationSource
     from rce_fleet.nodes.throttled_log import ThrottledLog
 

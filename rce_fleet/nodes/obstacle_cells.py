@@ -1,8 +1,8 @@
 """Reports cells of the fleet's grid that something on no map fills. Runs in a robot's namespace.
 
-It subscribes to ``scan``, ``/tf``, ``map`` (the localization map, if there is one), ``/fleet/map`` (one pixel
-is one cell) and, where it is there, ``/fleet/state`` and ``/fleet/poses/RobotN``, so that it does not report
-other robots. It publishes ``blockedCells`` and ``freedCells``. The work is done by
+It subscribes to ``scan``, ``/tf``, ``map`` (the localization map), ``/fleet/map`` (one pixel is one cell)
+and, where it is there, ``/fleet/state`` and ``/fleet/poses/RobotN``, so that it does not report other robots.
+It publishes ``blockedCells`` and ``freedCells``. The work is done by
 :mod:`rce_fleet.navigation.obstacle_cells`.
 """
 
@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rce.ros.node import Node, run
-from rce.ros.tf import TransformListener
-from rce.ros.tf.exceptions import ExtrapolationError, TransformError
+from rce.ros.node import Message, Node, Publisher, run
+from rce.ros.tf import ExtrapolationError, TransformError, TransformListener
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.maps.occupancy_map import OccupancyMap
 from rce_fleet.navigation.costmap.observation import observe_scan
@@ -26,6 +25,7 @@ from rce_fleet.navigation.costmap.parameters import ObservationSource
 from rce_fleet.navigation.obstacle_cells.watch import CellWatch, Findings, WatchParameters
 from rce_fleet.navigation.scans import fault_of_scan, fault_of_stamp
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
+from rce_fleet.nodes.grid_messages import GRID_TOPIC
 from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import fault_of_map_frame, pose_of, read_map, read_pose
 from rce_fleet.nodes.robot_place import full_name, named_in_message
@@ -34,8 +34,6 @@ from rce_fleet.nodes.throttled_log import ThrottledLog
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from rce.ros.node import Publisher
-    from rce.ros.types import Message
 
 CELLS = "std_msgs/Int32MultiArray"
 REPEAT_EVERY = 1.0
@@ -58,11 +56,14 @@ class ObstacleCellsParameters(WatchParameters):
         map_frame: Frame of both maps.
         robot: This robot's name in the fleet; empty: the node's namespace.
         fleet_radius: Radius of the other robots, metres.
+        static_map: Wait for the localization map: without it, walls and doors would be reported. If false,
+            everything that is seen counts until a map comes.
     """
 
     map_frame: str = "map"
     robot: str = ""
     fleet_radius: float = 0.22
+    static_map: bool = True
 
 
 @dataclass(slots=True)
@@ -115,12 +116,14 @@ class ObstacleCellsNode:
         self._freed_out = await node.advertise("freedCells", CELLS)
         diagnostics = await Diagnostics.start(node, "cells with obstacles")
         async with TransformListener(node, prefix="") as self._tf:
-            await node.subscribe("/fleet/map", "nav_msgs/OccupancyGrid", partial(self._take_map, fleet=True))
+            await node.subscribe(GRID_TOPIC, "nav_msgs/OccupancyGrid", partial(self._take_map, fleet=True))
             await node.subscribe("map", "nav_msgs/OccupancyGrid", partial(self._take_map, fleet=False))
             await node.subscribe("/fleet/state", "fleet/FleetState", self._take_state)
             await node.subscribe("scan", "sensor_msgs/LaserScan", self._take_scan)
             while await node.sleep(1.0):
                 level, text = self._state()
+                if self._watch is None:
+                    self._throttled_log.warn("waiting", text)
                 cells = ", ".join(map(str, sorted(self._reported))) or "none"
                 diagnostics.publish(level, text, {"blocked cells": cells})
 
@@ -130,14 +133,12 @@ class ObstacleCellsNode:
         try:
             picture = read_map(message)
         except ValueError as error:
-            self._fault = (
-                f"a map on {'/fleet/map' if fleet else self._node.resolve('map')} is ignored: {error}"
-            )
+            self._fault = f"a map on {GRID_TOPIC if fleet else self._node.resolve('map')} is ignored: {error}"
             self._throttled_log.warn("map", self._fault)
             return
         fault = fault_of_map_frame(message, full_name(self._tf, self._parameters.map_frame))
         if fault:
-            self._throttled_log.warn("map frame", f"{'/fleet/map' if fleet else 'the map'}: {fault}")
+            self._throttled_log.warn("map frame", f"{GRID_TOPIC if fleet else 'the map'}: {fault}")
         if not fleet:
             self._known = picture
         elif self._fleet is not None and _same_place(self._fleet, picture):
@@ -147,7 +148,7 @@ class ObstacleCellsNode:
             self._reported.clear()
             self._freed.clear()
             self._others.held = self._others.blocked = frozenset()
-        if self._fleet is not None:
+        if self._fleet is not None and (self._known is not None or not self._parameters.static_map):
             self._watch = CellWatch(self._fleet, self._parameters, self._known)
 
     async def _take_state(self, message: Message) -> None:
@@ -214,10 +215,14 @@ class ObstacleCellsNode:
         """Return level and text of the node's state."""
         age = self._node.time() - self._used_at
         if self._watch is None:
-            return Level.WARN, self._fault or "waiting for /fleet/map"
+            return Level.WARN, self._fault or f"waiting for the map on {self._missing()}"
         if 0 <= age <= QUIET:
             return Level.OK, "watching"
         return Level.WARN, self._fault or ("no scan yet" if age == inf else f"no scan for {age:.0f} s")
+
+    def _missing(self) -> str:
+        """Return the name of the map that is missing."""
+        return GRID_TOPIC if self._fleet is None else self._node.resolve("map")
 
     def _places(self, now: float) -> NDArray[np.float64]:
         """Return the other robots' places and radii, shape (K, 3)."""

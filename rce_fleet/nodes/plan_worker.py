@@ -5,22 +5,35 @@ triggers garbage collection in the event loop, and would share one core with the
 of a large fleet. The messages are small: a request with a few numbers per robot, and a result with two
 numbers for each step of a robot.
 
-The process reads requests from its standard input and ends with it.
+The process reads requests from its standard input and ends with it. A few robots on a small map need no
+compiled loops. With the first larger request another process compiles the planner's inner loops into numba's
+cache, unless ``rce compile`` has done it. Robots must not stand for this half a minute: plans are made with
+the plain forms meanwhile. Then a process with compiled loops takes over. On the volume ``fleet`` the cache
+outlives the container, so that later starts load it within seconds.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import signal
 import sys
+import threading
 from asyncio.subprocess import PIPE, Process
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Self
 
 import msgspec
 
+from rce_fleet.compiled import COMPILED, compile_kernels, is_available
 from rce_fleet.coordination.replanning import PlanRequest, PlanResult, compute_plan
+from rce_fleet.coordination.settings import COMPILED_EFFORT
 from rce_fleet.exceptions import PlanWorkerError
+from rce_fleet.nodes.known_robots import VOLUME_VARIABLE
+from rce_fleet.planning.planner import DEFAULT_PLANNER, Planner, load_planner
+from rce_fleet.planning.rerouting_loops import reroute_robots
 
 if TYPE_CHECKING:
     import logging
@@ -30,6 +43,14 @@ _LENGTH = 4
 """Bytes of the length in front of each message."""
 _ENDING_S = 5.0
 """How long a process whose output ended may take to end."""
+_CACHE_VARIABLE = "NUMBA_CACHE_DIR"
+_CACHE = "compiled"
+"""Folder on the volume for compiled loops."""
+_FILL = "--compile"
+_ROBOTS = 20
+_CELLS = 10_000
+"""Loops are compiled for requests with at least so many robots, or cells; they take 150 MB."""
+_LEAST_PRIORITY = 19
 
 
 class PlanWorker:
@@ -38,12 +59,26 @@ class PlanWorker:
     Args:
         log: Logs restarts of the process.
         command: Command of the process.
+        compiled: Whether a process with compiled loops takes over; None: if numba is installed.
     """
 
-    def __init__(self, log: logging.Logger, *, command: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, log: logging.Logger, *, command: tuple[str, ...] = (), compiled: bool | None = None
+    ) -> None:
         self._log = log
         self._command = command or (sys.executable, "-P", "-m", __name__)
+        self._to_compile = is_available() if compiled is None else compiled
+        self._is_compiled = False
         self._process: Process | None = None
+        self._next: Process | None = None
+        """Compiles, or has compiled loops and is not asked yet."""
+        self._compiling: asyncio.Task[None] | None = None
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether the next plan is made with compiled loops."""
+        ready = self._compiling is not None and self._compiling.done() and self._next is not None
+        return self._is_compiled or ready
 
     async def __aenter__(self) -> Self:
         await self._start()
@@ -52,7 +87,41 @@ class PlanWorker:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._compiling is not None:
+            self._compiling.cancel()
+            await asyncio.wait([self._compiling])
         await self._end()
+        self._process, self._next = self._next, None
+        await self._end()
+
+    async def _compile(self) -> None:
+        """Prepare a process with compiled loops."""
+        try:
+            self._next = await self._spawn(_FILL, compiled=True)
+            await self._next.wait()
+            self._next = await self._spawn(compiled=True)
+            assert self._next.stdout is not None
+            await self._next.stdout.readexactly(_LENGTH)
+        except (asyncio.IncompleteReadError, OSError) as error:
+            self._next = None
+            self._log.warning("plans are made without compiled loops: %s", error)
+        else:
+            self._log.info("plans are made with compiled loops from now on")
+
+    def _compile_for(self, request: PlanRequest) -> None:
+        """Begin to compile if this is the first request that is so large."""
+        if self._to_compile and (len(request.robots) >= _ROBOTS or request.rows * request.columns >= _CELLS):
+            self._to_compile = False
+            self._compiling = asyncio.create_task(self._compile())
+
+    async def _take_compiled(self) -> None:
+        """Ask the process with compiled loops from now on, if it is ready."""
+        if self._compiling is not None and self._compiling.done():
+            self._compiling = None
+            if self._next is not None:
+                await self._end()
+                self._process, self._next = self._next, None
+                self._is_compiled = True
 
     async def compute(self, request: PlanRequest) -> PlanResult:
         """Return a plan. If the process ends, it is restarted once.
@@ -62,19 +131,33 @@ class PlanWorker:
         Raises:
             PlanWorkerError: The process ended twice over this request.
         """
+        self._compile_for(request)
+        await self._take_compiled()
         try:
             return await self._ask(request)
         except (asyncio.IncompleteReadError, ConnectionError):
             self._log.warning("the plan worker ended (%s); restarting it", await self._end(_ENDING_S))
-        await self._start()
         try:
+            await self._start()
             return await self._ask(request)
         except (asyncio.IncompleteReadError, ConnectionError) as error:
             status = await self._end(_ENDING_S)
             raise PlanWorkerError(request.number, len(request.robots), status) from error
 
     async def _start(self) -> None:
-        self._process = await asyncio.create_subprocess_exec(*self._command, stdin=PIPE, stdout=PIPE)
+        self._process = await self._spawn(compiled=self._is_compiled)
+        if self._is_compiled:
+            assert self._process.stdout is not None
+            await self._process.stdout.readexactly(_LENGTH)
+
+    async def _spawn(self, *options: str, compiled: bool) -> Process:
+        variables = dict(os.environ)
+        if not compiled:
+            variables[COMPILED] = "no"
+        elif (volume := os.environ.get(VOLUME_VARIABLE, "")) and _CACHE_VARIABLE not in variables:
+            variables[_CACHE_VARIABLE] = str(Path(volume, _CACHE))
+        command = (*self._command, *options)
+        return await asyncio.create_subprocess_exec(*command, stdin=PIPE, stdout=PIPE, env=variables)
 
     async def _end(self, grace: float = 0.0) -> str:
         """End the process, after ``grace`` seconds; return how it ended, in words.
@@ -106,12 +189,34 @@ class PlanWorker:
 
 
 def serve(requests: BinaryIO, results: BinaryIO) -> None:
-    """Make plans until the input ends."""
+    """Make plans until the input ends; an empty frame first says that the loops are compiled, if they are."""
+    planners: dict[str, Planner] = {}
+    compiled = is_available()
+    if compiled:
+        planners[DEFAULT_PLANNER] = load_compiled()
+        results.write(_frame(b""))
+        results.flush()
     while len(head := requests.read(_LENGTH)) == _LENGTH:
-        payload = requests.read(int.from_bytes(head))
-        result = compute_plan(msgspec.msgpack.decode(payload, type=PlanRequest))
+        request = msgspec.msgpack.decode(requests.read(int.from_bytes(head)), type=PlanRequest)
+        if request.planner not in planners:
+            planners[request.planner] = load_planner(request.planner)
+        if compiled:  # compiled loops do so much more in the same time
+            request = replace(request, effort=max(request.effort, COMPILED_EFFORT))
+        result = compute_plan(request, planners[request.planner])
         results.write(_frame(msgspec.msgpack.encode(result)))
         results.flush()
+
+
+def load_compiled() -> Planner:
+    """Compile the loops, and return the default planner."""
+    compile_kernels([reroute_robots])
+    return load_planner(DEFAULT_PLANNER)
+
+
+def _end_with_input() -> None:
+    """End this process when its input ends, in the middle of compiling too: the node was killed."""
+    sys.stdin.buffer.read()
+    os._exit(0)
 
 
 def _frame(payload: bytes) -> bytes:
@@ -120,5 +225,10 @@ def _frame(payload: bytes) -> bytes:
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the node, which then ends this process.
+    if _FILL in sys.argv:
+        os.nice(_LEAST_PRIORITY)
+        threading.Thread(target=_end_with_input, daemon=True).start()
+        load_compiled()
+        sys.exit()
     with contextlib.suppress(BrokenPipeError):
         serve(sys.stdin.buffer, sys.stdout.buffer)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import hypot, isfinite, sqrt
 from typing import TYPE_CHECKING
 
 from rce_fleet.coordination.events import PoseSeen
@@ -10,6 +11,8 @@ from rce_fleet.coordination.robot_signs import RobotSign
 from rce_fleet.geometry.angles import yaw_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rce.ros.types import Message
 
 _POSE_LENGTH = 3
@@ -19,7 +22,24 @@ def read_pose_seen(robot: str, message: Message) -> PoseSeen:
     """Return the event of a ``geometry_msgs/PoseWithCovarianceStamped``."""
     pose = message.pose.pose
     turn = pose.orientation
-    return PoseSeen(robot, pose.position.x, pose.position.y, yaw_of(turn.x, turn.y, turn.z, turn.w))
+    yaw = yaw_of(turn.x, turn.y, turn.z, turn.w)
+    return PoseSeen(robot, pose.position.x, pose.position.y, yaw, *_spreads(message.pose.covariance))
+
+
+def _spreads(covariance: Sequence[float]) -> tuple[float | None, float | None]:
+    """Return standard deviations of place (worst direction, metres) and heading (radians).
+
+    Args:
+        covariance: Row by row, of x, y, z and the rotations about them.
+
+    Returns:
+        None for numbers that are no covariance: not finite, or negative.
+    """
+    xx, xy, yy, turn = covariance[0], covariance[1], covariance[7], covariance[35]
+    # The larger eigenvalue of the symmetric matrix [[xx, xy], [xy, yy]].
+    largest = (xx + yy) / 2 + hypot((xx - yy) / 2, xy)
+    spread = sqrt(largest) if isfinite(largest) and largest >= 0 else None
+    return spread, sqrt(turn) if isfinite(turn) and turn >= 0 else None
 
 
 def read_report(message: Message) -> ClientReport:

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from math import hypot, isfinite
 from typing import TYPE_CHECKING
 
-from rce.ros.tf.exceptions import TransformError
+from rce.ros.tf import TransformError, TransformListener
 from rce_fleet.geometry.poses import Pose, Twist
 from rce_fleet.nodes.planar import pose_of, read_twist
 
 if TYPE_CHECKING:
     from rce.ros.node import Node
-    from rce.ros.tf import TransformListener
     from rce.ros.types import Message
     from rce_fleet.nodes.throttled_log import ThrottledLog
 

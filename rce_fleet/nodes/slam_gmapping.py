@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rce.ros.errors import ServiceFaultError
-from rce.ros.node import Node, run
+from rce.ros.node import Message, Node, Publisher, ServiceFaultError, Time, run
 from rce.ros.tf import (
     StampedTransform,
     Transform,
@@ -24,11 +23,10 @@ from rce.ros.tf import (
     TransformError,
     TransformListener,
 )
-from rce.ros.types import Time
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.exceptions import MapError
+from rce_fleet.geometry.jumps import OdometryWatch
 from rce_fleet.geometry.poses import Pose
-from rce_fleet.localization.jumps import OdometryWatch
 from rce_fleet.mapping.gmapping.filter import GridFilter
 from rce_fleet.mapping.gmapping.parameters import FilterParameters
 from rce_fleet.mapping.occupancy_mapping import map_of
@@ -42,8 +40,6 @@ from rce_fleet.nodes.pose_messages import pose_with_covariance_fields
 from rce_fleet.nodes.throttled_log import ThrottledLog
 
 if TYPE_CHECKING:
-    from rce.ros.node import Publisher
-    from rce.ros.types import Message
     from rce_fleet.maps.occupancy_map import OccupancyMap
 
 UNUSED = ("inverted_laser", "xmin", "ymin", "xmax", "ymax")

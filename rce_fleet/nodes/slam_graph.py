@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rce.ros.node import Node, run
+from rce.ros.node import Message, Node, Publisher, Time, run
 from rce.ros.tf import StampedTransform, Transform, TransformBroadcaster, TransformListener
-from rce.ros.types import Time
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.exceptions import FleetError, MapError
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
@@ -32,8 +31,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rce.ros.node import Publisher
-    from rce.ros.types import Message
     from rce_fleet.mapping.records import LaserRecord
     from rce_fleet.maps.occupancy_map import OccupancyMap
 
@@ -70,6 +67,7 @@ class SlamGraphNode:
         self._map: OccupancyMap | None = None
         self.mapped: dict[str, int] = {}
         self._fault = ""
+        self._undone = 0
         self._maps: Publisher
         self._metadata: Publisher
         self._diagnostics: Diagnostics
@@ -133,6 +131,7 @@ class SlamGraphNode:
                 self._throttled_log.warn("scan", f"a scan cannot be mapped: {error}")
                 continue
             self.mapped[robot] = self.mapped.get(robot, 0) + 1
+            self._warn_of(robot)
             self._odometry[robot] = np.array(record.odometry)
             if transform is None:
                 self._transforms.pop(robot, None)
@@ -142,6 +141,23 @@ class SlamGraphNode:
                 moved = self._session.map_from_odom(other, odometry)
                 if moved is not None:
                     self._transforms[other] = moved
+                elif other != robot and not self._parameters.localize_only:
+                    self._transforms.pop(other, None)
+
+    def _warn_of(self, robot: str) -> None:
+        """Say what the last scan of a robot has shown to be wrong."""
+        jump = self._session.jump(robot)
+        if jump:
+            prefix = f"{robot}: " if robot else ""
+            text = f"{prefix}{jump}; the scans tell how the robot moved"
+            self._throttled_log.warn(f"{robot} jump", text)
+        if self._session.undone > self._undone:
+            self._node.log.warning(
+                "robots were joined at the wrong place: scans of %s contradict it. They are apart until "
+                "scans match again",
+                robot or "the robot",
+            )
+        self._undone = self._session.undone
 
     # Results
 

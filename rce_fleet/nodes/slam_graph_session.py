@@ -37,7 +37,7 @@ class SlamGraphSession:
 
     def __init__(self, parameters: SlamGraphParameters) -> None:
         self._parameters = parameters
-        self._mapper = GraphMapper(parameters.graph_parameters())
+        self._mapper = GraphMapper(parameters.graph_parameters(), bounded=True)
         self._localizers: dict[str, GraphLocalizer] = {}
         self._start: NDArray[np.float64] | None = None
         if len(parameters.initial_pose) == POSE_NUMBERS:
@@ -55,6 +55,15 @@ class SlamGraphSession:
     def loops(self) -> int:
         """Number of closed loops."""
         return self._mapper.loop_closures
+
+    @property
+    def undone(self) -> int:
+        """Number of joins of robots that later scans contradicted."""
+        return self._mapper.undone
+
+    def jump(self, robot: str) -> str:
+        """Return how a robot's odometry jumped at its last scan; empty if it did not."""
+        return self._localizers[robot].jump if self._parameters.localize_only else self._mapper.jump(robot)
 
     def add(self, robot: str, record: LaserRecord) -> NDArray[np.float64] | None:
         """Take a scan; return ``map_from_odom``, shape (3,), or None while the robot's place is not known."""
@@ -124,7 +133,7 @@ class SlamGraphSession:
         """
         path = self._path()
         graph = load_graph(path)
-        self._mapper = GraphMapper(self._parameters.graph_parameters(), graph)
+        self._mapper = GraphMapper(self._parameters.graph_parameters(), graph, bounded=True)
         self._localizers.clear()
         self._drawn = None
         return f"loaded {len(graph)} keyscans from {path}"

@@ -7,13 +7,14 @@ topic. Its rate falls with the size of the fleet: up to 20 robots after each cha
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any
 
-from rce.ros.types import Time
+from rce.ros.types import Message, Time
+from rce_fleet.nodes.zone_messages import zone_fields
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher
-    from rce.ros.types import Message
     from rce_fleet.coordination.changes import FleetChanges
     from rce_fleet.coordination.planner import FleetPlanner
     from rce_fleet.coordination.snapshot import RobotSnapshot
@@ -72,7 +73,8 @@ class StatePublisher:
         changes = self._planner.take_changes()
         if changes is not None or now - self._changes_at >= REPEAT_S:
             self._changes_at = now
-            self._changes.publish(changes_fields(self._started, changes, self._planner.sequence))
+            fields = changes_fields(self._started, changes, self._planner.sequence, now)
+            self._changes.publish(fields | fleet_fields(self._planner))
         self._is_whole_due |= changes is not None
         pause = len(self._planner.state.robots) / WHOLE_ROBOTS_PER_S
         if self._is_whole_due and now - self._whole_at >= pause:
@@ -81,15 +83,22 @@ class StatePublisher:
 
     def publish_whole(self) -> None:
         """Publish the complete state now."""
-        self._state.publish(state_fields(self._started, self._planner))
+        self._state.publish(state_fields(self._started, self._planner, time.monotonic()))
 
     def _get_state(self, request: Message) -> dict[str, Any]:
         del request
-        return {"sequence": self._planner.sequence, "state": state_fields(self._started, self._planner)}
+        state = state_fields(self._started, self._planner, time.monotonic())
+        return {"sequence": self._planner.sequence, "state": state}
 
 
-def state_fields(started: Time, planner: FleetPlanner) -> dict[str, Any]:
-    """Return the fields of a ``fleet/FleetState``."""
+def state_fields(started: Time, planner: FleetPlanner, now: float = 0.0) -> dict[str, Any]:
+    """Return the fields of a ``fleet/FleetState``.
+
+    Args:
+        started: When the planner began.
+        planner: The planner.
+        now: The planner's time, seconds.
+    """
     grid, snapshot = planner.state.grid, planner.snapshot()
     walls = sorted(grid.blocked)
     return {
@@ -99,11 +108,28 @@ def state_fields(started: Time, planner: FleetPlanner) -> dict[str, Any]:
         "pending": list(snapshot.pending),
         "walls": walls,
         "robots": [robot_fields(robot) for robot in snapshot.robots],
+        "planner": planner.settings.planner,
+        "zones": [zone_fields(zone, now) for _, zone in sorted(planner.state.zones.zones.items())],
+        **fleet_fields(planner),
     }
 
 
-def changes_fields(started: Time, changes: FleetChanges | None, sequence: int) -> dict[str, Any]:
-    """Return the fields of a ``fleet/FleetChanges``; without changes, those of a repeated number."""
+def fleet_fields(planner: FleetPlanner) -> dict[str, Any]:
+    """Return the fields of the fleet that states and changes have in common."""
+    return {"mode": planner.state.mode.value, "zones_revision": planner.state.zones.revision}
+
+
+def changes_fields(
+    started: Time, changes: FleetChanges | None, sequence: int, now: float = 0.0
+) -> dict[str, Any]:
+    """Return the fields of a ``fleet/FleetChanges``; without changes, those of a repeated number.
+
+    Args:
+        started: When the planner began.
+        changes: The changes.
+        sequence: Number of the last change.
+        now: The planner's time, seconds.
+    """
     if changes is None:
         return {"started": started, "sequence": sequence}
     return {
@@ -114,6 +140,8 @@ def changes_fields(started: Time, changes: FleetChanges | None, sequence: int) -
         "blocked": list(changes.blocked),
         "pending": list(changes.pending),
         "freed": list(changes.freed),
+        "zones": [zone_fields(zone, now) for zone in changes.zones],
+        "removed_zones": list(changes.removed_zones),
     }
 
 
@@ -128,6 +156,8 @@ def robot_fields(robot: RobotSnapshot) -> dict[str, Any]:
         "plan": list(robot.plan),
         "granted": list(robot.granted),
         "replans": robot.replans,
+        "mode": robot.mode,
+        "pose_only": robot.pose_only,
     }
 
 

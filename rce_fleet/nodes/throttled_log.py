@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rce.ros.node import Node
+    from rce_fleet.nodes.namespaced import NamespacedNode
 
 EVERY = 5.0
 """Seconds after which the same warning on the same subject is logged again."""
@@ -28,7 +29,7 @@ class ThrottledLog:
         count: How many warnings there were, also those that were not logged.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node | NamespacedNode) -> None:
         self._node = node
         self._logged: dict[tuple[str, str], float] = {}
         self.count = 0

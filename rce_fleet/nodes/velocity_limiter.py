@@ -1,6 +1,7 @@
 """The safety stage between planner and wheels, as a node. Runs on the robot, in its namespace.
 
-It subscribes to ``raw_cmd_vel``, ``scan`` and ``odom`` (or tf), and publishes ``cmd_vel``. A message true on
+It subscribes to ``raw_cmd_vel``, ``scan`` and ``odom`` (or tf), and publishes ``cmd_vel``. A number on
+``speed_limit`` is the highest speed that passes, in m/s, until another comes; 0 ends it. A message true on
 ``emergency_stop``, or the service ``~set_emergency_stop``, stops the robot until false releases it. The work
 is done by :mod:`rce_fleet.navigation.safety`.
 """
@@ -8,16 +9,16 @@ is done by :mod:`rce_fleet.navigation.safety`.
 from __future__ import annotations
 
 from math import isfinite
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from rce.ros.node import Node, run
-from rce.ros.tf import TransformListener
-from rce.ros.tf.exceptions import TransformError
+from rce.ros.node import Message, Node, Publisher, run
+from rce.ros.tf import TransformError, TransformListener
+from rce_fleet.geometry.jumps import OdometryWatch
 from rce_fleet.geometry.poses import Pose
-from rce_fleet.localization.jumps import OdometryWatch
 from rce_fleet.navigation.costmap.footprint import Footprint
+from rce_fleet.navigation.navigation import read_speed_limit
 from rce_fleet.navigation.safety.limiter import STANDING, VelocityLimiter, Verdict
 from rce_fleet.navigation.safety.parameters import SafetyParameters
 from rce_fleet.navigation.safety.seen import Scan, sensor_pose
@@ -27,10 +28,6 @@ from rce_fleet.nodes.parameters import read_parameters
 from rce_fleet.nodes.planar import pose_of, read_pose, read_twist, twist_fields
 from rce_fleet.nodes.robot_place import full_name, named_in_message
 from rce_fleet.nodes.throttled_log import ThrottledLog
-
-if TYPE_CHECKING:
-    from rce.ros.node import Publisher
-    from rce.ros.types import Message
 
 DIAGNOSTICS_EVERY = 1.0
 """Seconds between two messages on ``/diagnostics``."""
@@ -74,6 +71,7 @@ class VelocityLimiterNode:
             await node.subscribe("scan", "sensor_msgs/LaserScan", self._take_scan)
             await node.subscribe("raw_cmd_vel", "geometry_msgs/Twist", self._take_command)
             await node.subscribe("emergency_stop", "std_msgs/Bool", lambda message: self._halt(message.data))
+            await node.subscribe("speed_limit", "std_msgs/Float64", self._take_speed_limit)
             await node.advertise_service("~set_emergency_stop", "std_srvs/SetBool", self._answer_stop)
             told = float("-inf")
             async for _ in node.rate(self._parameters.frequency):
@@ -94,6 +92,12 @@ class VelocityLimiterNode:
             )
         self._limiter.take_command(twist, self._node.time())
         self._pass_on()
+
+    def _take_speed_limit(self, message: Message) -> None:
+        try:
+            self._limiter.speed_limit = read_speed_limit(message.data)
+        except ValueError as error:
+            self._throttled_log.warn("speed_limit", str(error))
 
     def _take_odometry(self, message: Message) -> None:
         try:
@@ -198,6 +202,7 @@ class VelocityLimiterNode:
                 "age of the scan": f"{age:.3f}" if isfinite(age) else "no scan",
                 "limited commands": str(self._limited),
                 "emergency stop": self._limiter.emergency or "no",
+                "speed limit": f"{limit:.3f}" if isfinite(limit := self._limiter.speed_limit) else "none",
             },
         )
 

@@ -1,1 +1,1 @@
-"""``rce map`` and ``rce localize``: mapping and localization of recorded logs, without a robot."""
+"""``rce map``, ``rce localize``, ``rce plan``: from logs, maps and scenarios to files, without robots."""

@@ -1,1 +1,1 @@
-"""Grids and paths: maps of cells, shortest paths, plans for many robots. Pure."""
+"""Maps of cells and lanes, distances, planners for many robots, a checker of plans. Pure."""

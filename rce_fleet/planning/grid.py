@@ -8,6 +8,7 @@ therefore mirrors y (and headings with it).
 
 from __future__ import annotations
 
+import json
 from collections import deque
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
+    from typing import Self
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,27 @@ class GridMap:
     def with_blocked(self, cells: Iterable[int]) -> GridMap:
         """Return the same map with exactly these cells blocked."""
         return replace(self, blocked=frozenset(cells))
+
+    @property
+    def layout(self) -> str:
+        """Size and place of the cells as text, without what is blocked; for :meth:`from_layout`."""
+        place = (self.rows, self.columns, *map(float, (self.cell_size, *self.origin, self.yaw)))
+        return json.dumps(dict(zip(_LAYOUT, place, strict=True)))
+
+    @classmethod
+    def from_layout(cls, text: str) -> Self:
+        """Return a grid without blocked cells from the text of :attr:`layout`.
+
+        Raises:
+            ValueError: The text is not that of a grid.
+        """
+        try:
+            rows, columns, cell_size, x, y, yaw = (json.loads(text)[name] for name in _LAYOUT)
+            return cls(int(rows), int(columns), float(cell_size), (float(x), float(y)), yaw=float(yaw))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"expected the layout of a grid ({', '.join(_LAYOUT)}), found {text!r}"
+            ) from error
 
     # Numbers, places, metres
 
@@ -170,3 +193,7 @@ class GridMap:
         if not wanted:
             return True
         return wanted.isdisjoint(self.blocked) and wanted <= self.reachable(next(iter(wanted)))
+
+
+_LAYOUT = ("rows", "columns", "cell_size", "x", "y", "yaw")
+"""Keys of a grid's layout."""

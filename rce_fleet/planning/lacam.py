@@ -1,65 +1,144 @@
-"""LaCAM: complete planning for several robots over the configurations that PIBT proposes.
+"""The planner ``lacam``: one plan for all robots, complete, and better with more time.
 
 After Okumura, "LaCAM: Search-Based Algorithm for Quick Multi-Agent Pathfinding" (2023): a depth-first
-search over configurations. Every configuration has a tree of constraints, read breadth first, that
-forces more and more robots to other cells, so that in the end all successors are tried. Given time, it finds
-a plan whenever one exists; after a limit on the work it returns the best configuration found so far.
+search over configurations, which PIBT proposes. Every configuration has a tree of constraints, read breadth
+first, that forces more and more robots to other nodes, so that in the end all successors are tried. Given
+effort, it finds a plan whenever one exists; after that it returns the nearest configuration found so far.
+
+Robots follow guidance in aisles as long as this brings them nearer. In the time that is left the plan is
+improved by large-neighbourhood search.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
-from dataclasses import dataclass, field
-from math import inf
-from random import Random
+from time import perf_counter
 from typing import TYPE_CHECKING
 
-from rce_fleet.planning.dijkstra import distances
-from rce_fleet.planning.pibt import Configuration, ConfigurationGenerator
+import numpy as np
+
+from rce_fleet.compiled import compile_kernels
+from rce_fleet.planning.compaction import Compaction
+from rce_fleet.planning.configurations import ConfigurationSearch
+from rce_fleet.planning.execution import execute, execution_times
+from rce_fleet.planning.fields import FIELD_KERNELS, distance_fields, field_table
+from rce_fleet.planning.graph import PlanningGraph
+from rce_fleet.planning.guidance import guided
+from rce_fleet.planning.improvement import Improver, enter_all, improve
+from rce_fleet.planning.motion import Turning, edge_directions
+from rce_fleet.planning.pibt import roll_out
+from rce_fleet.planning.planner import JointPlan, PlanningProblem
+from rce_fleet.planning.smoothing import smooth, smoothed
+from rce_fleet.planning.straightening import ends_of, straighten
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
 
     from rce_fleet.planning.grid import GridMap
+    from rce_fleet.planning.motion import Motion
+
+    Ints = NDArray[np.int32]
+    Table = NDArray[np.int16] | NDArray[np.int32]
 
 DEFAULT_EFFORT = 40_000
-"""How many single-robot moves are tried before the search gives up."""
+"""How many single-robot moves :func:`plan` tries before it gives up."""
+_MAX_IMPROVED = 150_000_000
+"""Entries of the table of distances up to which a plan is improved; larger ones take too much memory."""
 
 
-@dataclass(frozen=True, slots=True)
-class JointPlan:
-    """The cell of every robot at every step.
+_GUIDED_FROM = 0.005
+"""Robots by node from which on the first plan follows guidance in aisles; a few robots have room anyway."""
+_RESTARTS = 0.15
+"""Share of the time in which first plans are made from other seeds, before the best of them is improved."""
+_SMOOTHING = 1000
+"""States of searches by robot, with which a plan is made straighter."""
+KERNELS = (*FIELD_KERNELS, roll_out, improve, enter_all, straighten, smooth, execute)
 
-    In a step a robot stays or goes to a neighbouring cell. It may enter the cell that another leaves in
-    the same step, but robots never follow one another around in a circle.
 
-    Attributes:
-        steps: Configurations, from the start on.
-        complete: Whether the last one is the goal; otherwise it is the nearest that was found.
+class LacamPlanner:
+    """Plans all robots together; see the module.
+
+    Args:
+        compiled: Compile the inner loops now if numba is installed.
+        on_first: Called with the first complete plan, before it is improved.
     """
 
-    steps: tuple[Configuration, ...]
-    complete: bool
+    def __init__(self, *, compiled: bool = True, on_first: Callable[[JointPlan], None] | None = None) -> None:
+        if compiled:
+            compile_kernels(KERNELS)
+        self._on_first = on_first
 
-    def route(self, robot: int) -> list[tuple[int, int]]:
-        """``(step, cell)`` of every cell that a robot enters, the start with step 0 first."""
-        route = [(0, self.steps[0][robot])]
-        for step, configuration in enumerate(self.steps):
-            if configuration[robot] != route[-1][1]:
-                route.append((step, configuration[robot]))
-        return route
+    def plan(self, problem: PlanningProblem) -> JointPlan:
+        """Return a plan without conflicts; an incomplete one if none is found with the problem's effort."""
+        began = perf_counter()
+        if not len(problem.starts):
+            return JointPlan.of([[]], complete=True)
+        part = Compaction(problem)
+        steps = part.graph.unweighted
+        guide = part.graph
+        if guide.is_unweighted and len(part.starts) >= _GUIDED_FROM * len(guide):
+            guide = part.compact(guided(problem.graph))
+        if problem.motion is not None:
+            return self._plan_in_motion(part, problem, problem.motion, guide, began + problem.seconds)
+        cells, complete = _search(part, problem, guide, problem.seed)
+        if not problem.rotations and cells.size * len(part.graph) < _MAX_IMPROVED * 16:
+            straighten(cells, len(part.graph), ends_of(cells, part.goals, lifelong=problem.lifelong))
+        joint = JointPlan(part.original(cells), complete)
+        if self._on_first is not None and complete:
+            self._on_first(joint)
+        deadline = began + problem.seconds
+        if not complete or perf_counter() >= deadline or cells.shape[1] * len(steps) > _MAX_IMPROVED:
+            return joint
+        seed = problem.seed
+        while perf_counter() < began + _RESTARTS * problem.seconds:
+            seed += 7919
+            cells = _another(part, problem, guide, cells, seed)
+        distances = _table(part, steps).astype(np.int32, copy=False)
+        improver = Improver(
+            steps, distances, cells, part.goals, rotations=problem.rotations, seed=problem.seed
+        )
+        improver.run(deadline)
+        return JointPlan(part.original(improver.cells), complete, lower_bound=improver.lower_bound)
 
-
-@dataclass(slots=True)
-class _Node:
-    """A configuration in the search, with what is still to be tried from it."""
-
-    cells: Configuration
-    parent: _Node | None
-    urgency: list[float]
-    order: list[int]
-    focus: list[int] | None = None
-    constraints: deque[tuple[tuple[int, int], ...]] = field(default_factory=lambda: deque([()]))
+    def _plan_in_motion(
+        self,
+        part: Compaction,
+        problem: PlanningProblem,
+        motion: Motion,
+        guide: PlanningGraph,
+        deadline: float,
+    ) -> JointPlan:
+        """Return the plan that real robots carry out soonest, of those with and without regard to turns."""
+        directions = part.edges(edge_directions(problem.graph))
+        turning = Turning.of(part.graph.unweighted, directions, part.goals, motion, part.forbidden)
+        guided_turning = turning
+        if guide is not part.graph:
+            guided_turning = Turning.of(guide, directions, part.goals, motion, part.forbidden)
+        best, least = JointPlan(part.original(part.starts[None]), complete=False), float("inf")
+        seed = problem.seed
+        effort = min(problem.effort, _SMOOTHING * len(part.starts))
+        while True:
+            for choice in (guided_turning, None):
+                cells, complete = _search(part, problem, guide, seed, choice)
+                for smooth_effort in (0, effort) if complete else (0,):
+                    if smooth_effort:
+                        cells = smoothed(
+                            part.graph.unweighted, cells, part.goals, turning, stop=motion.stop,
+                            rotations=problem.rotations, effort=smooth_effort, seed=seed,
+                        )  # fmt: skip
+                    elif not problem.rotations and cells.size * len(part.graph) < _MAX_IMPROVED * 16:
+                        ends = ends_of(cells, part.goals, lifelong=problem.lifelong)
+                        straighten(cells, len(part.graph), ends)
+                    joint = JointPlan(part.original(cells), complete)
+                    took = float(execution_times(joint.cells, problem.graph.columns, motion).sum())
+                    if (not complete, took) < (not best.complete, least):
+                        if self._on_first is not None and complete and not best.complete:
+                            self._on_first(joint)
+                        best, least = joint, took
+            seed += 7919
+            if perf_counter() >= deadline:
+                return best
 
 
 def plan(
@@ -78,153 +157,38 @@ def plan(
         goals: Goal cells of the robots, all different.
         seed: The same arguments with the same seed make the same plan.
         effort: Moves of single robots to try at most.
+
+    Raises:
+        PlanningError: Starts or goals are not all different, or not as many.
     """
-    if len(set(starts)) != len(starts) or len(set(goals)) != len(goals) or len(starts) != len(goals):
-        raise ValueError("each robot needs a start and a goal: all starts different, all goals different")
-    if not starts:
-        return JointPlan(((),), complete=True)
-    fields = [_field(grid, start, goal) for start, goal in zip(starts, goals, strict=True)]
-    search = _Search(grid, fields, Random(seed))  # noqa: S311 - for ties, not for secrets
-    return search.run(tuple(starts), tuple(goals), effort // len(starts))
+    graph = PlanningGraph.from_grid(grid)
+    return LacamPlanner(compiled=False).plan(
+        PlanningProblem.of(graph, starts, goals, seed=seed, effort=effort)
+    )
 
 
-def _field(grid: GridMap, start: int, goal: int) -> list[float]:
-    """Distances to the goal, also from a start that is blocked and can only be left."""
-    costs = distances(grid, goal)
-    if start == goal:
-        costs[start] = 0.0
-    elif start in grid.blocked:
-        costs[start] = 1.0 + min((costs[cell] for cell in grid.neighbours[start]), default=inf)
-    return costs
+def _table(part: Compaction, graph: PlanningGraph) -> Table:
+    if part.forbidden:
+        return distance_fields(graph, part.goals, part.forbidden, part.starts)
+    return field_table(graph, part.goals)
 
 
-class _Search:
-    def __init__(self, grid: GridMap, fields: list[list[float]], rng: Random) -> None:
-        self._grid = grid
-        self._fields = fields
-        self._rng = rng
-        self._generator = ConfigurationGenerator(grid.neighbours, fields, rng)
-
-    def run(self, starts: Configuration, goals: Configuration, rounds: int) -> JointPlan:
-        root = self._node(starts, None)
-        known = {starts: root}
-        stack = [root]
-        best, best_rest = root, self._rest(starts)
-        for _ in range(max(rounds, 1)):
-            node = stack[-1]
-            if node.cells == goals:
-                return JointPlan(_straighten(_trace(node)), complete=True)
-            if not node.constraints:
-                stack.pop()
-                if not stack:
-                    break
-                continue
-            successor = self._successor(node)
-            if successor is None:
-                continue
-            reached = known.get(successor)
-            if reached is None:
-                reached = known[successor] = self._node(successor, node)
-                rest = self._rest(successor)
-                if rest < best_rest:
-                    best, best_rest = reached, rest
-            stack.append(reached)
-        return JointPlan(_straighten(_trace(best)), complete=best.cells == goals)
-
-    def _node(self, cells: Configuration, parent: _Node | None) -> _Node:
-        """A node whose robots are the more urgent the longer they have been away from their goals."""
-        away = [self._fields[robot][cell] for robot, cell in enumerate(cells)]
-        if parent is None:
-            urgency = [distance / len(self._grid) if distance < inf else 0.0 for distance in away]
-        else:
-            urgency = [
-                before + 1.0 if distance > 0 else before % 1.0
-                for before, distance in zip(parent.urgency, away, strict=True)
-            ]
-        order = sorted(range(len(cells)), key=lambda robot: -urgency[robot])
-        return _Node(cells, parent, urgency, order)
-
-    def _successor(self, node: _Node) -> Configuration | None:
-        """Read the next constraint, grow the tree below it, and let PIBT fill in the rest."""
-        constraint = node.constraints.popleft()
-        if len(constraint) < len(node.cells):
-            robot = self._focus(node)[len(constraint)]
-            choices = [*self._grid.neighbours[node.cells[robot]], node.cells[robot]]
-            self._rng.shuffle(choices)
-            node.constraints.extend((*constraint, (robot, cell)) for cell in choices)
-        before = node.parent.cells if node.parent is not None else node.cells
-        return self._generator.generate(node.cells, before, node.order, dict(constraint))
-
-    def _focus(self, node: _Node) -> list[int]:
-        """The robots in the order in which they are constrained.
-
-        First come those that are not at their goals, then those nearest to them: where robots block each
-        other, it is mostly one of these that has to step aside.
-        """
-        if node.focus is None:
-            away = [robot for robot in node.order if self._fields[robot][node.cells[robot]] > 0]
-            places = [self._grid.place(node.cells[robot]) for robot in away]
-            rest = [robot for robot in node.order if self._fields[robot][node.cells[robot]] == 0]
-
-            def distance(robot: int) -> int:
-                row, column = self._grid.place(node.cells[robot])
-                return min((abs(row - r) + abs(column - c) for r, c in places), default=0)
-
-            node.focus = [*away, *sorted(rest, key=distance)]
-        return node.focus
-
-    def _rest(self, cells: Configuration) -> float:
-        return sum(min(self._fields[robot][cell], len(self._grid)) for robot, cell in enumerate(cells))
+def _search(
+    part: Compaction,
+    problem: PlanningProblem,
+    graph: PlanningGraph,
+    seed: int,
+    turning: Turning | None = None,
+) -> tuple[Ints, bool]:
+    search = ConfigurationSearch(
+        graph, _table(part, graph), part.goals, rotations=problem.rotations, seed=seed, turning=turning
+    )
+    return search.run(part.starts, problem.effort // len(part.starts), problem.urgency)
 
 
-def _trace(node: _Node) -> list[Configuration]:
-    steps = []
-    reached: _Node | None = node
-    while reached is not None:
-        steps.append(reached.cells)
-        reached = reached.parent
-    return steps[::-1]
-
-
-def _straighten(steps: list[Configuration]) -> tuple[Configuration, ...]:
-    """Replace loops by waiting: a robot waits in a cell that it would leave and come back to.
-
-    PIBT moves robots that could stand still. If no other robot enters the cell meanwhile, waiting in it
-    blocks none, so each such loop is cut out.
-    """
-    paths = [list(cells) for cells in zip(*steps, strict=True)]
-    occupants: dict[int, dict[int, int]] = defaultdict(dict)
-    for step, cells in enumerate(steps):
-        for robot, cell in enumerate(cells):
-            occupants[cell][step] = robot
-    shortened = True
-    while shortened:
-        shortened = False
-        for robot, path in enumerate(paths):
-            shortened |= _cut_loop(robot, path, occupants)
-    return tuple(zip(*paths, strict=True))
-
-
-def _cut_loop(robot: int, path: list[int], occupants: dict[int, dict[int, int]]) -> bool:
-    """Cut the longest loop of ``path`` from its earliest cell that allows one.
-
-    Args:
-        robot: Whose path it is.
-        path: Its cell at every step; changed.
-        occupants: For every cell the robot that is in it, by step; changed.
-    """
-    last = {cell: step for step, cell in enumerate(path)}
-    for step, cell in enumerate(path[:-1]):
-        if path[step + 1] == cell:
-            continue
-        back = last[cell]
-        robots = occupants[cell]
-        while back > step + 1:
-            if path[back] == cell and all(robots.get(at, robot) == robot for at in range(step + 1, back)):
-                for at in range(step, back):
-                    del occupants[path[at]][at]
-                    robots[at] = robot
-                path[step:back] = [cell] * (back - step)
-                return True
-            back -= 1
-    return False
+def _another(
+    part: Compaction, problem: PlanningProblem, graph: PlanningGraph, cells: Ints, seed: int
+) -> Ints:
+    """Return a plan from another seed, or ``cells`` if it is not better."""
+    other, complete = _search(part, problem, graph, seed)
+    return other if complete and JointPlan(other, complete).cost < JointPlan(cells, complete).cost else cells

@@ -92,6 +92,26 @@ def make_scenario(
     return best
 
 
+def spread_scenario(grid: GridMap, robots: int, *, seed: int = 0) -> Scenario:
+    """Draw starts and goals of many robots, without boxes; the same arguments make the same scenario.
+
+    No joint plan is made: on a map with as much room as robots each can reach its goal, but whether all can
+    stand at theirs at the same time is not checked.
+
+    Raises:
+        ScenarioError: The map is too small for the robots.
+    """
+    rng = Random(seed)  # noqa: S311 - for scenarios, not for secrets
+    room = _largest_part(grid)
+    if robots < 1 or 2 * robots > len(room):
+        raise ScenarioError(f"{robots} robots do not fit into {len(room)} cells; take fewer robots")
+    starts, goals = rng.sample(room, robots), rng.sample(room, robots)
+    while any(start == goal for start, goal in zip(starts, goals, strict=True)):
+        goals = rng.sample(room, robots)
+    headings = tuple(rng.choice(_HEADINGS) for _ in starts)
+    return Scenario(grid, tuple(starts), headings, tuple(goals), (), ())
+
+
 def _draw(
     grid: GridMap, room: Sequence[int], robots: int, boxes: tuple[int, int], rng: Random
 ) -> Scenario | None:

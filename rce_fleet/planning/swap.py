@@ -1,99 +1,128 @@
 """Finds robots that have to change places, which PIBT alone cannot do in narrow passages.
 
-After Okumura, "Improving LaCAM for Scalable Eventually Optimal Multi-Agent Pathfinding" (2023): two robots
-that face each other in a passage both move in the direction of one of them, until the passage has a side arm.
-Whether they must, and whether there is one, is found by simulating their moves cell by cell.
+After Okumura, "Improving LaCAM for Scalable Eventually Optimal Multi-Agent Pathfinding" (2023, section 4):
+two robots that face each other in a passage both move in the direction of one of them, until the passage has
+a side arm. Whether they must, and whether there is one, is found by following the passage node by node.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rce_fleet.compiled import helper
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Ints = NDArray[np.int32]
+    Table = NDArray[np.int16] | NDArray[np.int32]
+
+OPEN = -1
+"""In a row of next nodes: not chosen yet."""
 
 
-class SwapFinder:
-    """Finds the robot that another one has to change places with.
+@helper
+def draw(random: NDArray[np.int64]) -> int:
+    """Return 23 random bits; ``random`` holds the state of the generator, 31 bits."""
+    random[0] = (random[0] * 1103515245 + 12345) & 0x7FFFFFFF
+    return int(random[0] >> 8)
 
-    Args:
-        neighbours: For every cell the cells that can be entered from it.
-        fields: For every robot the distance to its goal from every cell.
+
+@helper
+def _exits(
+    indptr: Ints, neighbours: Ints, goals: Ints, occupant: Ints, node: int, back: int
+) -> tuple[int, int]:
+    """Count the ways out of a passage's node, without the way back and dead ends whose robot is at its goal.
+
+    Returns:
+        Number of exits, and the last of them.
     """
-
-    def __init__(self, neighbours: Sequence[Sequence[int]], fields: Sequence[Sequence[float]]) -> None:
-        self._neighbours = neighbours
-        self._fields = fields
-
-    def partner(
-        self,
-        robot: int,
-        best: int,
-        now: Sequence[int],
-        occupant: Mapping[int, int],
-        undecided: Callable[[int], bool],
-    ) -> int | None:
-        """Return the robot to change places with; ``None`` if that is not needed, or not possible.
-
-        Args:
-            robot: The robot that moves.
-            best: Its best next cell.
-            now: Cells of all robots.
-            occupant: The robot in each cell.
-            undecided: Returns whether a robot's next cell is not chosen yet.
-        """
-        here = now[robot]
-        if best == here:
-            return None
-        ahead = occupant.get(best)
-        if (
-            ahead is not None
-            and undecided(ahead)
-            and self._required(robot, ahead, here, best, occupant)
-            and self._possible(best, here, occupant)
-        ):
-            return ahead
-        for cell in self._neighbours[here]:
-            behind = occupant.get(cell)
-            if behind is None or cell == best:
+    count, ahead = 0, -1
+    for edge in range(indptr[node], indptr[node + 1]):
+        other = neighbours[edge]
+        if other == back:
+            continue
+        if indptr[other + 1] - indptr[other] == 1:
+            robot = occupant[other]
+            if robot >= 0 and goals[robot] == other:
                 continue
-            # A robot behind has to get past; this robot clears the way by moving on ahead of it.
-            if self._required(behind, robot, here, best, occupant) and self._possible(best, here, occupant):
-                return behind
-        return None
+        count += 1
+        ahead = other
+    return count, ahead
 
-    def _required(self, pusher: int, pulled: int, back: int, front: int, occupant: Mapping[int, int]) -> bool:
-        """Return whether ``pusher`` moves to where ``pulled`` is, and ``pulled`` moves towards it."""
-        push, pull = self._fields[pusher], self._fields[pulled]
-        for before, cell, exits in self._passage(back, front, occupant):
-            back, front = before, cell
-            if push[front] >= push[back] or exits == 0:
-                break
-            if exits > 1:
-                return False
-        return pull[back] < pull[front] and (push[back] == 0 or push[front] < push[back])
 
-    def _possible(self, back: int, front: int, occupant: Mapping[int, int]) -> bool:
-        """Return whether a passage from ``back`` over ``front`` leads to a cell with two exits."""
-        for _, cell, exits in self._passage(back, front, occupant):
-            if cell == back:
-                return False
-            if exits != 1:
-                return exits > 1
-        return False
+@helper
+def _is_swap_required(
+    indptr: Ints,
+    neighbours: Ints,
+    table: Table,
+    goals: Ints,
+    occupant: Ints,
+    pusher: int,
+    pulled: int,
+    back: int,
+    front: int,
+) -> bool:
+    """Return whether ``pusher`` moves to where ``pulled`` is, and ``pulled`` towards it, in a passage."""
+    while table[pusher, front] < table[pusher, back]:
+        count, ahead = _exits(indptr, neighbours, goals, occupant, front, back)
+        if count > 1:
+            return False
+        if count < 1:
+            break
+        back, front = front, ahead
+    return bool(
+        table[pulled, back] < table[pulled, front]
+        and (table[pusher, back] == 0 or table[pusher, front] < table[pusher, back])
+    )
 
-    def _passage(self, back: int, front: int, occupant: Mapping[int, int]) -> Iterator[tuple[int, int, int]]:
-        """Follow a passage; yield the previous cell, the cell, and the number of its exits."""
-        for _ in range(len(self._neighbours)):
-            ways = [
-                cell for cell in self._neighbours[front] if cell != back and not self._filled(cell, occupant)
-            ]
-            yield back, front, len(ways)
-            if len(ways) != 1:
-                return
-            back, front = front, ways[0]
 
-    def _filled(self, cell: int, occupant: Mapping[int, int]) -> bool:
-        """Return whether a cell is a dead end with a robot in it whose goal it is."""
-        robot = occupant.get(cell)
-        return robot is not None and len(self._neighbours[cell]) == 1 and self._fields[robot][cell] == 0
+@helper
+def _is_swap_possible(
+    indptr: Ints, neighbours: Ints, goals: Ints, occupant: Ints, back: int, front: int
+) -> bool:
+    """Return whether the passage from ``back`` over ``front`` leads to a node with two exits."""
+    begin = back
+    while front != begin:
+        count, ahead = _exits(indptr, neighbours, goals, occupant, front, back)
+        if count != 1:
+            return bool(count > 1)
+        back, front = front, ahead
+    return False
+
+
+@helper
+def swap_partner(
+    indptr: Ints,
+    neighbours: Ints,
+    table: Table,
+    goals: Ints,
+    now: Ints,
+    after: Ints,
+    occupant: Ints,
+    robot: int,
+    best: int,
+) -> int:
+    """Return the robot that ``robot`` has to change places with; -1 if there is none."""
+    here = now[robot]
+    if best == here:
+        return -1
+    ahead = occupant[best]
+    if (
+        ahead >= 0
+        and after[ahead] == OPEN
+        and _is_swap_required(indptr, neighbours, table, goals, occupant, robot, ahead, here, best)
+        and _is_swap_possible(indptr, neighbours, goals, occupant, best, here)
+    ):
+        return int(ahead)
+    for edge in range(indptr[here], indptr[here + 1]):
+        behind = occupant[neighbours[edge]]
+        if behind < 0 or neighbours[edge] == best:
+            continue
+        # A robot behind has to get past; this robot clears the way by moving on ahead of it.
+        if _is_swap_required(
+            indptr, neighbours, table, goals, occupant, behind, robot, here, best
+        ) and _is_swap_possible(indptr, neighbours, goals, occupant, best, here):
+            return int(behind)
+    return -1

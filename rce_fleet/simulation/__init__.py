@@ -1,1 +1,1 @@
-"""A simulated world of walls, boxes and differential-drive robots with odometry and lidar."""
+"""A simulated world: walls, boxes, doors, people, and robots with wheels, sensors and batteries. Pure."""

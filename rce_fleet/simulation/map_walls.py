@@ -13,12 +13,11 @@ from scipy import ndimage
 from rce_fleet.geometry.poses import Pose, transform_points
 from rce_fleet.maps.occupancy_map import FREE, OCCUPIED, UNKNOWN, OccupancyMap
 from rce_fleet.simulation.lidar import Floats
-from rce_fleet.simulation.walls import Walls, distances
+from rce_fleet.simulation.walls import Block, Point, Walls, distances
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rce_fleet.simulation.walls import Block, Point
 
 TILE = 32
 """Cells of a side of the squares that are vectorised one by one: those without a wall are left out."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import atan2, cos, hypot, inf, pi
 from typing import TYPE_CHECKING
 
@@ -81,6 +81,13 @@ class Walker:
         self._next, self._direction = min(1, len(self.spec.waypoints) - 1), 1
         self._stands_until = self.spec.start
         self._waited = 0.0
+
+    def put(self, x: float, y: float) -> None:
+        """Stand elsewhere, metres; the whole way moves with the walker."""
+        before_x, before_y = self.body.position
+        ways = tuple((way_x + x - before_x, way_y + y - before_y) for way_x, way_y in self.spec.waypoints)
+        self.spec = replace(self.spec, waypoints=ways)
+        self.body.position = (x, y)
 
     def walk(self, now: float, dt: float, robots: Floats) -> None:
         """Choose the velocity for the next ``dt`` seconds.

@@ -19,18 +19,19 @@ from rce_fleet.simulation.box import BoxSpec
 from rce_fleet.simulation.contacts import Collisions, ContactWatch, Kind
 from rce_fleet.simulation.doors import Door, DoorSpec
 from rce_fleet.simulation.lidar import Floats
+from rce_fleet.simulation.light.robots import LightRobots
 from rce_fleet.simulation.models import DISC, RobotModel
 from rce_fleet.simulation.robot import SimulatedRobot
 from rce_fleet.simulation.sensing import scan_all
 from rce_fleet.simulation.solids import Solids
 from rce_fleet.simulation.walkers import Walker, WalkerSpec
-from rce_fleet.simulation.walls import Walls, grid_walls
+from rce_fleet.simulation.walls import Block, Walls, grid_walls
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from rce_fleet.planning.grid import GridMap
-    from rce_fleet.simulation.walls import Block
+    from rce_fleet.simulation.light.bodies import LightModel
 
 _OVERLAP = 0.002
 """How far things that touch may overlap, metres: so much that a contact that lasts is one contact."""
@@ -83,6 +84,7 @@ class World:
         time: Simulated time, seconds.
         min_separation: Smallest distance between the hulls of two robots so far, metres; ``inf`` while
             there are fewer than two.
+        light: Robots that advance with the world, but not in the physics engine; None without any.
     """
 
     def __init__(
@@ -105,6 +107,7 @@ class World:
         self._solids = Solids(self._space, self.walls)
         self._contacts = ContactWatch(self._space, self._robots)
         self._places = np.empty((0, 3))
+        self.light: LightRobots | None = None
 
     # What there is
 
@@ -136,7 +139,15 @@ class World:
     @property
     def collisions(self) -> Collisions:
         """Collisions so far."""
-        return self._contacts.collisions
+        seen, light = self._contacts.collisions, self.light
+        if light is None:
+            return seen
+        return replace(
+            seen,
+            robot_robot=seen.robot_robot + light.judge.with_robots,
+            robot_box=seen.robot_box + light.judge.with_boxes,
+            robot_wall=seen.robot_wall + light.judge.with_walls,
+        )
 
     @property
     def edges(self) -> Floats:
@@ -196,8 +207,13 @@ class World:
         self._note_places()
         return made
 
-    def move_robot(self, robot: str, pose: Pose) -> None:
+    def move_robot(self, robot: str, pose: Pose, *, as_start: bool = False) -> None:
         """Put a robot elsewhere, as a hand would: it stands there, and its odometry does not notice.
+
+        Args:
+            robot: Its id.
+            pose: Where.
+            as_start: Whether it also stands there after the next :meth:`reset`.
 
         Raises:
             PlaceTakenError: Another robot or a walker is there.
@@ -205,6 +221,8 @@ class World:
         moved = self._robots[robot]
         self._check_free(pose, moved.radius, but=robot)
         moved.put(pose)
+        if as_start:
+            moved.start = pose
         self._space.reindex_shapes_for_body(moved.body)
         self._note_places()
 
@@ -253,6 +271,7 @@ class World:
             raise PlaceTakenError(box.pose.x, box.pose.y, in_the_way)
         self._boxes[name] = box
         self._solids.put(name, box.block, Kind.BOX)
+        self._show_boxes()
 
     def move_box(self, name: str, pose: Pose) -> None:
         """Put a box elsewhere.
@@ -268,12 +287,62 @@ class World:
         self._timed.pop(name, None)
         if self._boxes.pop(name, None) is not None:
             self._solids.take(name)
+            self._show_boxes()
+
+    def add_light_robots(self, starts: Mapping[str, Pose], model: LightModel | None = None) -> LightRobots:
+        """Put light robots on the floor, all at once.
+
+        Args:
+            starts: Where each of them stands, by its id.
+            model: What they are like; None for the usual.
+
+        Raises:
+            ValueError: There are light robots already, or a robot of such an id.
+            PlaceTakenError: Something is where one of them is to stand.
+        """
+        if self.light is not None or not self._robots.keys().isdisjoint(starts):
+            raise ValueError("light robots are added once, with ids that no other robot has")
+        edges = np.concatenate([self.walls.edges(glass=glass) for glass in (False, True)])
+        made = LightRobots(starts, edges, model, seed=self._seed)
+        for pose in starts.values():
+            if self.is_solid(pose.x, pose.y, made.model.radius):
+                raise PlaceTakenError(pose.x, pose.y, ("a wall or box",))
+            self._check_free(pose, made.model.radius)
+        made.docks = np.array([(dock.x, dock.y, dock.reach) for dock in self.spec.docks]).reshape(-1, 3)
+        self.light = made
+        self._show_boxes()
+        return made
 
     def add_door(self, door: str, spec: DoorSpec) -> Door:
         """Add a door."""
         made = self._doors[door] = Door(door, spec)
         self._solids.put(door, made.block, Kind.DOOR)
         return made
+
+    def put_walker(self, walker: str, spec: WalkerSpec) -> Walker:
+        """Add a walker while others are about.
+
+        Raises:
+            PlaceTakenError: A robot or another walker is at the first waypoint.
+        """
+        self._check_free(Pose(*spec.waypoints[0], 0.0), spec.radius)
+        return self.add_walker(walker, spec)
+
+    def move_walker(self, walker: str, x: float, y: float) -> None:
+        """Put a walker elsewhere, metres; the waypoints move with the walker.
+
+        Raises:
+            PlaceTakenError: A robot or another walker is there.
+        """
+        moved = self._walkers[walker]
+        self._check_free(Pose(x, y, 0.0), moved.spec.radius, but=walker)
+        moved.put(x, y)
+        self._space.reindex_shapes_for_body(moved.body)
+
+    def remove_walker(self, walker: str) -> None:
+        """Remove a walker."""
+        gone = self._walkers.pop(walker)
+        self._space.remove(gone.shape, gone.body)
 
     def add_walker(self, walker: str, spec: WalkerSpec) -> Walker:
         """Add a walker."""
@@ -311,6 +380,8 @@ class World:
             door.reset()
             self._solids.put(door.id, door.block, Kind.DOOR)
         self._contacts.reset()
+        if self.light is not None:
+            self.light.reset()
         self._note_places()
         self._update_timed()
 
@@ -329,7 +400,8 @@ class World:
         """
         seers = [self._robots[robot] for robot in robots]
         walkers = [(*walker.position, walker.spec.radius) for walker in self._walkers.values()]
-        circles = np.concatenate((self._places, np.array(walkers, np.float64).reshape(-1, 3)))
+        light = np.empty((0, 3)) if self.light is None else self.light.discs
+        circles = np.concatenate((self._places, np.array(walkers, np.float64).reshape(-1, 3), light))
         return scan_all(seers, self._solids, circles, self._steps)
 
     # Inside
@@ -349,7 +421,11 @@ class World:
         self._steps += 1
         self._note_places()
         self._update_timed()
-        if len(self._robots) > 1:
+        if self.light is not None:
+            self.light.others = self._places
+            self.light.advance(dt)
+            self.min_separation = self.light.judge.min_separation
+        elif len(self._robots) > 1:
             places, radii = self._places[:, :2], self._places[:, 2]
             apart = np.hypot(*(places[:, None, :] - places[None, :, :]).transpose(2, 0, 1))
             apart -= radii[:, None] + radii[None, :]
@@ -368,8 +444,16 @@ class World:
             if due and name not in self._boxes and not self._near(box.block, 0.0):
                 self._boxes[name] = box
                 self._solids.put(name, box.block, Kind.BOX)
+                self._show_boxes()
             elif not due and self._boxes.pop(name, None) is not None:
                 self._solids.take(name)
+                self._show_boxes()
+
+    def _show_boxes(self) -> None:
+        """Tell light robots, who do not see the physics engine's shapes, where boxes are."""
+        if self.light is not None:
+            edges = [edge for box in self._boxes.values() for edge in box.block.edges]
+            self.light.set_boxes(np.array(edges, np.float64).reshape(-1, 4))
 
     def _docked(self, robot: SimulatedRobot) -> bool:
         x, y, _ = robot.place
@@ -380,7 +464,9 @@ class World:
         """Return name, place and radius of all robots and walkers."""
         robots = [(robot.id, *robot.place[:2], robot.radius) for robot in self._robots.values()]
         walkers = [(walker.id, *walker.position, walker.spec.radius) for walker in self._walkers.values()]
-        return robots + walkers
+        light = [] if self.light is None else self.light.discs.tolist()
+        names = () if self.light is None else self.light.names
+        return robots + walkers + [(name, *disc) for name, disc in zip(names, light, strict=True)]
 
     def _near(self, block: Block, apart: float) -> tuple[str, ...]:
         """Return the robots and walkers that are nearer to a block than ``apart``, metres."""

@@ -1,1 +1,1 @@
-"""The operator station: the fleet's web page, and HTTP for an ERP, as a client of the engine."""
+"""The operator station: the fleet's page, and HTTP for an ERP; with the engine or without it."""

@@ -18,6 +18,7 @@ from rce.cli.options import Authority, CertificateName, Certificates, Tls, TlsCe
 from rce.cli.program_files import from_file
 from rce.config.client import ClientConfig, load
 from rce.config.exceptions import ConfigError, Fault
+from rce.config.folders import default_state_dir
 from rce.config.logs import start_logging
 from rce.masters import split_addresses
 from rce.own_process import end_signals
@@ -30,10 +31,13 @@ from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_client.exceptions import RefusedError
 from rce_fleet.station.authentication import Authenticator, TokenAuthenticator
+from rce_fleet.station.commands.control import RobotControl
+from rce_fleet.station.commands.sources import CommandSource, EngineCommandSource, RosCommandSource
 from rce_fleet.station.engine_authenticator import EngineAuthenticator, StationAccount
 from rce_fleet.station.engine_planner_client import EnginePlannerClient
 from rce_fleet.station.engine_watch import EngineWatch
 from rce_fleet.station.feed import Feed
+from rce_fleet.station.figures import FigureRecorder
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.graph_watch import GraphWatch
 from rce_fleet.station.layers.engine_source import EngineLayerSource
@@ -41,9 +45,11 @@ from rce_fleet.station.layers.hub import LayerHub
 from rce_fleet.station.layers.ros_source import RosLayerSource
 from rce_fleet.station.layers.sources import LayerSource
 from rce_fleet.station.planner_client import PlannerClient
+from rce_fleet.station.recording import Recorder, Records
 from rce_fleet.station.ros_planner_client import RosPlannerClient
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
+from rce_fleet.station.world_link import WorldLink, states_text, things_text
 
 PORT = 9080
 
@@ -78,6 +84,16 @@ def ui(
             show_default=False,
         ),
     ] = None,
+    history: Annotated[
+        Path | None,
+        typer.Option(help="File that keeps what the fleet did, for replays; default: in memory."),
+    ] = None,
+    world: Annotated[
+        str, typer.Option(help="ROS master of the simulated world in which the fleet drives (rce sim).")
+    ] = "",
+    state_dir: Annotated[
+        Path | None, typer.Option(help="Folder for the station's webhooks [STATE/station].")
+    ] = None,
     tls: Tls = False,
     certificates: Certificates = None,
     certificate: CertificateName = ENGINE,
@@ -107,7 +123,14 @@ def ui(
     authenticator = _authenticator(backend, bind, token, login)
     try:
         names = ServerNames(bind, public_name or ())
-        uvloop.run(serve(backend, bind, port, authenticator, names, identity.server if identity else None))
+        server_tls = identity.server if identity else None
+        place = state_dir or default_state_dir() / "station"
+        uvloop.run(
+            serve(
+                *(backend, bind, port, authenticator, names, server_tls, history, world),
+                webhooks=place / "webhooks.json",
+            )
+        )
     except* RefusedError as group:
         typer.echo(f"rce ui: {group.exceptions[0]}", err=True)
         raise typer.Exit(1) from None
@@ -170,6 +193,10 @@ class Backend(Protocol):
     def layers(self) -> LayerSource:
         """Where layers come from."""
 
+    @property
+    def commands(self) -> CommandSource:
+        """What publishes on robots' topics."""
+
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
         """Call ``on_state`` with the state of engine or graph until cancelled."""
 
@@ -191,6 +218,7 @@ class EngineBackend:
             account.url, account.user, account.password, tls=self._tls, on_state=self._take
         )
         self.layers = EngineLayerSource(lambda: self.client.connection, self._watch.read_items)
+        self.commands = EngineCommandSource(lambda: self.client.connection, self._watch.read_items)
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
         """Call ``on_state`` with the engine's state until cancelled; restart nodes that ended."""
@@ -213,6 +241,7 @@ class RosBackend:
         types = TypeRegistry(PackageIndex.from_environ())
         self.client = RosPlannerClient(master_uri, types)
         self.layers = RosLayerSource(master_uri, types)
+        self.commands = RosCommandSource(self.layers)
         self._master_uri = master_uri
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
@@ -227,20 +256,60 @@ async def serve(
     authenticator: Authenticator,
     names: ServerNames,
     tls: Context | None = None,
+    history: Path | None = None,
+    world: str = "",
+    *,
+    webhooks: Path | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM."""
     view = FleetView()
     feed = Feed(view)
     fleet = FleetLink(
-        backend.client, view, on_change=feed.on_change, on_pose=feed.on_pose, on_event=feed.on_event
+        backend.client,
+        view,
+        on_change=feed.on_change,
+        on_pose=feed.on_pose,
+        on_event=feed.on_event,
+        on_fleet_event=lambda text: station.fleet_api.feed.take(text),  # noqa: PLW0108 - made below
     )
     stop = asyncio.Event()
     for number in end_signals():
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     layers = LayerHub(backend.layers, view, TypeRegistry(PackageIndex.from_environ()))
-    station = Station(view, fleet, feed.pages, authenticator=authenticator, names=names, layers=layers)
+    control = RobotControl(
+        backend.commands, view.robot_ids, lambda: feed.on_control(control.stopped, control.driven)
+    )
+    types = TypeRegistry(PackageIndex.from_environ())
+    link = (
+        WorldLink(
+            world,
+            types,
+            lambda states: feed.pages.send("world", states_text(states)),
+            feed.pages.are_open,
+            lambda things: feed.pages.send("things", things_text(things)),
+        )
+        if world
+        else None
+    )
+    recorder = Recorder(view, Records(history))
+    station = Station(
+        view,
+        fleet,
+        feed.pages,
+        authenticator=authenticator,
+        names=names,
+        layers=layers,
+        control=control,
+        records=recorder.records,
+        world=link,
+        webhooks=webhooks,
+    )
+    figures = FigureRecorder(view, recorder.records, station.fleet_api.statistics)
+    await station.fleet_api.load()
     async with AsyncExitStack() as stack:
         stack.push_async_callback(layers.close)
+        stack.push_async_callback(control.close)
+        stack.callback(recorder.records.close)
         if isinstance(authenticator, EngineAuthenticator):
             await stack.enter_async_context(authenticator)
         server = await stack.enter_async_context(HttpServer(station.make_app(), bind, port, tls))
@@ -248,7 +317,17 @@ async def serve(
         async def announce() -> None:
             typer.echo(f"rce ui ready: {server.url}")
 
-        await _until(stop.wait, lambda: fleet.run(announce), feed.run, lambda: backend.watch(feed.on_engine))
+        await _until(
+            stop.wait,
+            lambda: fleet.run(announce),
+            feed.run,
+            lambda: backend.watch(feed.on_engine),
+            control.run,
+            recorder.run,
+            figures.run,
+            *([link.run] if link else []),
+            station.fleet_api.run,
+        )
 
 
 async def _until(done: Callable[[], Any], *work: Callable[[], Any]) -> None:

@@ -30,6 +30,8 @@ class AccessControl:
     def __init__(self, authenticator: Authenticator, names: ServerNames) -> None:
         self._authenticator = authenticator
         self._names = names
+        self.on_audit: Callable[[str, AuditedAction], None] | None = None
+        """Called with the user and the action of each entry of the audit log."""
 
     @web.middleware
     async def check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -83,6 +85,8 @@ class AccessControl:
         """
         action = AuditedAction(name, subject, detail, request.remote or "", done)
         self._authenticator.audit(request[TOKEN], action)
+        if self.on_audit is not None:
+            self.on_audit(request[USER].name, action)
 
     def _unauthorized(self, request: web.Request) -> web.StreamResponse:
         if request.path == "/" and self._authenticator.has_logins:

@@ -107,7 +107,8 @@ class RobotModel(_Model):
 
     id: str
     state: str = Field(
-        description="joining, stopping, silent, unreachable, driving, waiting, arrived or idle."
+        description="joining, stopping, silent, lost, unreachable, driving, waiting, arrived or idle; or its "
+        "mode: paused, stopped, manual, out_of_service or dead."
     )
     reason: str = Field(description="Why it is joining, stopping or silent; else empty.")
     cell: int | None = Field(description="The cell that it stands in or is entering.")
@@ -115,6 +116,10 @@ class RobotModel(_Model):
     plan: list[int] = Field(description="All cells of its planned path, from the current one.")
     granted: list[int] = Field(description="The first cells of the plan, which it may enter now.")
     replans: int
+    mode: str = Field(default="automatic", description="automatic, or who drives it instead.")
+    pose_only: bool = Field(
+        default=False, description="Its move client answers nothing: its poses show its progress."
+    )
     pose: PoseModel | None
 
 

@@ -49,6 +49,14 @@ class Desired:
         """Store whether the planner blocked or freed a cell."""
         self._cells[cell] = blocked
 
+    def forget_cell(self, cell: int) -> None:
+        """Forget a cell: the fleet manager keeps it."""
+        self._cells.pop(cell, None)
+
+    def forget_goal(self, robot: str) -> None:
+        """Forget a goal: the fleet manager keeps it."""
+        self._goals.pop(robot, None)
+
     def clear(self) -> None:
         """Forget everything: the cells are numbered in another way now."""
         self._goals.clear()

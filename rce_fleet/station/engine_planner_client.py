@@ -19,12 +19,18 @@ from rce_fleet.station.planner_client import (
     CALL_TIMEOUT_S,
     CHANGES,
     CHANGES_TOPIC,
+    EVENTS,
+    EVENTS_TOPIC,
+    FLEET_REQUEST,
     GET_STATE,
     GRID,
     GRID_TOPIC,
     POSE,
+    POSES,
+    POSES_TOPIC,
     SET_GOAL,
     SET_GRID,
+    SET_MODE,
     STATE,
     STATE_TOPIC,
     Call,
@@ -34,8 +40,12 @@ from rce_fleet.station.planner_client import (
     pose_topic,
 )
 
+MANAGER_EXECUTABLE = "fleet_manager.py"
 _SERVICES = (("setGoal", SET_GOAL), ("blockCell", BLOCK_CELL))
-_NEWER_SERVICES = (("getState", GET_STATE), ("setGrid", SET_GRID))
+_NEWER_SERVICES = (
+    *(("getState", GET_STATE), ("setGrid", SET_GRID), ("setMode", SET_MODE)),
+    ("fleetRequest", FLEET_REQUEST),
+)
 """Services that planners of earlier releases do not have; the station does not wait for them."""
 
 
@@ -59,6 +69,11 @@ class EnginePlannerClient(PlannerClient):
         self._node_requests: asyncio.Queue[Request] = asyncio.Queue()
         self._listener: PlannerListener
         self._states: Subscriber[dict[str, Any]]
+
+    @property
+    def expects_manager(self) -> bool:
+        """Whether the operator's config has a fleet manager."""
+        return any(add.node.exe == MANAGER_EXECUTABLE for add in self._config.nodes)
 
     async def run(self, listener: PlannerListener, ready: Callable[[], Awaitable[None]]) -> None:
         """Create the planner's container, connect to it, and receive messages until cancelled."""
@@ -110,6 +125,13 @@ class EnginePlannerClient(PlannerClient):
         await connection.subscriber("fleetChanges", CHANGES, self._listener.take_changes)
         await self._join(connection, "fleetChanges", "SubscriberInterface", CHANGES, CHANGES_TOPIC)
         self._listener.may_have_missed()
+        await connection.subscriber("fleetPoses", POSES, self._listener.take_poses)
+        await self._join(connection, "fleetPoses", "SubscriberInterface", POSES, POSES_TOPIC)
+        await connection.subscriber("fleetEvents", EVENTS, self._take_fleet_event)
+        await self._join(connection, "fleetEvents", "SubscriberInterface", EVENTS, EVENTS_TOPIC)
+
+    def _take_fleet_event(self, message: dict[str, Any]) -> None:
+        self._listener.take_fleet_event(message["data"])
 
     async def _read_grid(self, connection: Connection) -> None:
         """Receive the grid once for each start of the planner: each blocked cell publishes it anew."""

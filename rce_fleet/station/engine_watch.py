@@ -16,6 +16,7 @@ from rce.tls.faults import explain_to_client
 from rce.web.client import session_connector
 from rce_fleet.station.engine_authenticator import RequestOptions
 from rce_fleet.station.layers.frames import LayerError
+from rce_fleet.station.rates import InterfaceRates
 
 if TYPE_CHECKING:
     from rce.tls.identity import Context
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 POLL_S = 1.0
+RATES_EVERY_S = 5.0
+"""How often the counters of all interfaces are read."""
 TIMEOUT = aiohttp.ClientTimeout(total=5)
 
 
@@ -53,6 +56,8 @@ class EngineWatch:
         self._token = ""
         self._last: dict[str, Any] = {}
         self._session: aiohttp.ClientSession | None = None
+        self._rates = InterfaceRates()
+        self._rated_at = float("-inf")
 
     async def read_items(self, kind: str) -> list[dict[str, Any]]:
         """Return the user's items of a kind from the REST API, such as ``interfaces``.
@@ -124,6 +129,10 @@ class EngineWatch:
             (await self._get(session, kind))[kind] for kind in ("containers", "nodes", "connections")
         ]
         usage = await self._get(session, "usage")
+        now = asyncio.get_running_loop().time()
+        if now - self._rated_at >= RATES_EVERY_S:
+            self._rated_at = now
+            self._rates.take(now, (await self._get(session, "interfaces"))["interfaces"])
         used = {container["id"]: container for container in usage["containers"]}
         return {
             "containers": [
@@ -139,12 +148,20 @@ class EngineWatch:
                 for container in containers
             ],
             "connections": [
-                {key: connection[key] for key in ("tag_a", "tag_b", "established")}
+                {
+                    **{key: connection[key] for key in ("tag_a", "tag_b", "established")},
+                    **self._rate(connection["tag_a"], connection["tag_b"]),
+                }
                 for connection in connections
             ],
             # Only administrators get machines.
             "machines": [{key: machine[key] for key in _MACHINE} for machine in usage["machines"]],
         }
+
+    def _rate(self, tag_a: str, tag_b: str) -> dict[str, float]:
+        """Return messages and bytes in a second of a connection; neither before they are known."""
+        rate = self._rates.of_connection(tag_a, tag_b)
+        return {} if rate is None else {"messages_s": round(rate.messages, 1), "bytes_s": round(rate.bytes)}
 
     async def _get(self, session: aiohttp.ClientSession, kind: str) -> dict[str, Any]:
         headers = {"Authorization": f"Bearer {self._token}"}

@@ -1,7 +1,8 @@
 """Sends the view and its changes to the pages.
 
 A page first gets ``map``, ``state`` and ``poses``, which are complete; then ``changes``, numbered from the
-``state`` on, and ``poses`` of robots that moved. A page that misses a number reconnects.
+``state`` on, and ``poses`` of robots that moved. A page that misses a number reconnects. A page that asked
+for it gets poses as frames (:mod:`rce_fleet.station.pose_frames`).
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import json
 import time
 from typing import Any
 
-from rce_fleet.station.live import Broadcast
+from rce_fleet.station.live import Broadcast, Message
+from rce_fleet.station.pose_frames import PoseRow, encode_poses
 from rce_fleet.station.view import FleetView, ViewChange
 
 POSES_EVERY_S = 0.1
@@ -33,13 +35,14 @@ class Feed:
     """
 
     def __init__(self, view: FleetView) -> None:
-        self.pages = Broadcast(self._tell_all)
+        self.pages = Broadcast(self._tell_all, lambda: self._tell_all(compact=True))
         self._view = view
         self._number = 0
         self._heard: set[str] = set()
         self._any_heard = asyncio.Event()
         self._sent: dict[str, tuple[_Pose, float]] = {}
-        self._all: list[str] = []
+        self._all: dict[bool, list[Message]] = {}
+        self._indices: dict[str, int] = {}
 
     async def run(self) -> None:
         """Send poses in batches until cancelled."""
@@ -54,7 +57,7 @@ class Feed:
         if not change:
             return
         self._number += 1
-        self._all = []
+        self._all.clear()
         for robot in change.removed:
             self._sent.pop(robot, None)
         for robot in change.robots:
@@ -67,6 +70,7 @@ class Feed:
                 "changes",
                 {
                     "sequence": self._number,
+                    "mode": self._view.mode,
                     "robots": self._robots(change.robots),
                     "removed": change.removed,
                     "blocked": change.blocked,
@@ -94,35 +98,56 @@ class Feed:
                 moved[robot] = pose
         self._heard.clear()
         if moved:
-            self._all = []
-            self.pages.send_change(_text("poses", {"poses": moved}))
+            self._all.clear()
+            self.pages.send_forms(lambda: _text("poses", {"poses": moved}), lambda: self._frame(moved))
 
     def on_engine(self, state: dict[str, Any]) -> None:
         """Send the engine's state."""
         self.pages.send("engine", _text("engine", state))
 
+    def on_control(self, stopped: dict[str, str], driven: dict[str, str]) -> None:
+        """Send who stopped and who drives which robots."""
+        self.pages.send("control", _text("control", {"stopped": stopped, "driven": driven}))
+
     def on_event(self, text: str, tone: str) -> None:
         """Send an event."""
         self.pages.send_event(_text("event", {"text": text, "tone": tone}))
 
-    def _tell_all(self) -> list[str]:
+    def _tell_all(self, *, compact: bool = False) -> list[Message]:
         """Return the complete messages; made once for all pages that need them now."""
         grid = self._view.map()
-        if grid is not None and not self._all:
+        if grid is None:
+            return []
+        if compact not in self._all:
             names = self._view.robot_ids()
             state = {
                 "sequence": self._number,
+                "mode": self._view.mode,
                 "robots": self._robots(names),
                 "blocked": self._view.blocked(),
                 "pending": self._view.pending(),
             }
             poses = {robot: self._pose(robot) for robot in names if robot in self._view.poses}
-            self._all = [_text("map", grid), _text("state", state), _text("poses", {"poses": poses})]
-        return self._all
+            last = self._frame(poses) if compact else _text("poses", {"poses": poses})
+            self._all[compact] = [_text("map", grid), _text("state", state), last]
+        return self._all[compact]
 
     def _robots(self, names: tuple[str, ...] | list[str]) -> list[dict[str, Any]]:
         robots = self._view.robots(names)
-        return [{key: value for key, value in robot.items() if key != "pose"} for robot in robots]
+        return [
+            {key: value for key, value in robot.items() if key != "pose"}
+            | {"index": self._index(robot["id"])}
+            for robot in robots
+        ]
+
+    def _index(self, robot: str) -> int:
+        """Return the number of a robot in frames; it keeps it while the station runs."""
+        return self._indices.setdefault(robot, len(self._indices))
+
+    def _frame(self, poses: dict[str, _Pose]) -> bytes:
+        ages = self._view.ages
+        rows = [PoseRow(self._index(robot), *pose, ages.get(robot, -1.0)) for robot, pose in poses.items()]
+        return encode_poses(time.time(), rows)
 
     def _pose(self, robot: str) -> _Pose:
         pose = self._view.poses[robot]

@@ -5,16 +5,19 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable
+from math import inf
 from typing import Any, assert_never
 
 from rce.aio.backoff import Backoff
+from rce_fleet.coordination.following import ChangeFollower
 from rce_fleet.station.desired import Desired, DesiredCell, DesiredGoal
-from rce_fleet.station.following import ChangeFollower
 from rce_fleet.station.planner_client import (
     BLOCK_CELL,
+    FLEET_REQUEST,
     GET_STATE,
     SET_GOAL,
     SET_GRID,
+    SET_MODE,
     PlannerClient,
     PlannerError,
     PlannerService,
@@ -33,6 +36,14 @@ SILENT_S = 10.0
 """A planner publishes a change, or the number of the last one, every second. After this time without one, the
 planner is asked whether it still publishes changes."""
 
+POSES_WAIT_S = 10.0
+"""A planner that has sent states for this time, but no poses, is of an earlier release: each robot's own
+topic of poses is followed then."""
+
+
+def _ignore(text: str) -> None:
+    del text
+
 
 class FleetLink:
     """Keeps the station's view up to date, and sends requests to the planner.
@@ -43,6 +54,7 @@ class FleetLink:
         on_change: Called with the change after the view was updated with a state or changes.
         on_pose: Called with a robot's id after its pose was updated.
         on_event: Called with a text and a tone (``good``, ``warn``, ``bad`` or empty) for each event.
+        on_fleet_event: Called with each event of the fleet manager, a JSON object.
     """
 
     def __init__(
@@ -53,6 +65,7 @@ class FleetLink:
         on_change: Callable[[ViewChange], None],
         on_pose: Callable[[str], None],
         on_event: Callable[[str, str], None],
+        on_fleet_event: Callable[[str], None] = _ignore,
     ) -> None:
         self._client = client
         self._view = view
@@ -67,6 +80,7 @@ class FleetLink:
         self._told = False
         """Whether an event told that the planner publishes no changes."""
         self._on_event = on_event
+        self._on_fleet_event = on_fleet_event
         self._desired = Desired()
         self._planner_started: str | None = None
         self._planner_restarted = asyncio.Event()
@@ -74,6 +88,9 @@ class FleetLink:
         self._changes_grid = False
         """Whether this station changed the grid, and the planner's new state is not here yet."""
         self._known: set[str] = set()
+        """Robots whose own topic of poses is followed."""
+        self._poses_due: float | None = None
+        """When poses must have come from this planner; infinite: they came. None: it has no robots yet."""
 
     async def run(self, ready: Callable[[], Awaitable[None]]) -> None:
         """Receive messages until cancelled; ``ready`` is called once the planner is connected."""
@@ -104,6 +121,24 @@ class FleetLink:
         self._desired.set_cell(cell, blocked=blocked)
         return said
 
+    def forget_cell(self, cell: int) -> None:
+        """Do not send a cell to a restarted planner again: the fleet manager does."""
+        self._desired.forget_cell(cell)
+
+    def forget_goal(self, robot: str) -> None:
+        """Do not send a goal to a restarted planner again: the fleet manager does."""
+        self._desired.forget_goal(robot)
+
+    @property
+    def expects_manager(self) -> bool:
+        """Whether the fleet was configured with a fleet manager."""
+        return self._client.expects_manager
+
+    @property
+    def can_ask_manager(self) -> bool:
+        """Whether requests can reach a fleet manager now, if there is one."""
+        return self._client.offers(FLEET_REQUEST)
+
     async def set_grid(self, choice: dict[str, Any], *, preview: bool) -> dict[str, Any]:
         """Lay another grid over the planner's map, or only show it; return the planner's answer.
 
@@ -125,6 +160,28 @@ class FleetLink:
         if not preview:
             self._desired.clear()
         return answer
+
+    async def set_mode(self, robot: str, mode: str, *, reason: str, user: str) -> str:
+        """Set who drives a robot, or stop and resume the fleet (robot empty); return the planner's answer.
+
+        A planner of an earlier release knows no modes: the robot's goal is removed instead.
+
+        Raises:
+            PlannerError: The planner refused, or cannot be reached.
+        """
+        if not self._client.offers(SET_MODE):
+            if not robot:
+                raise PlannerUnavailableError("this planner cannot pause the fleet")
+            return await self.set_goal(robot, None) if mode != "automatic" else ""
+        return await self._call(SET_MODE, {"robot": robot, "mode": mode, "reason": reason, "by": user})
+
+    async def request(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Ask the fleet manager (``fleet/Request``); return its answer.
+
+        Raises:
+            PlannerUnavailableError: It does not answer.
+        """
+        return await self._client.call(FLEET_REQUEST, request)
 
     async def _call(self, service: PlannerService, request: dict[str, Any]) -> str:
         return str((await self._ask(service, request))["message"])
@@ -233,6 +290,7 @@ class FleetLink:
     def _take(self, planner_started: str, change: ViewChange) -> None:
         """Subscribe to new robots, and report the change."""
         if self._planner_started not in (None, planner_started):
+            self._poses_due = None
             self._grid_came.clear()
             self._client.read_grid()
             if self._changes_grid or change.is_new_map:
@@ -242,11 +300,26 @@ class FleetLink:
                 self._planner_restarted.set()
             self._changes_grid = False
         self._planner_started = planner_started
-        for robot in change.robots:
+        self._follow_poses()
+        self._on_change(change)
+
+    def _follow_poses(self) -> None:
+        """Follow each robot's own topic, if the planner does not publish the poses of all together."""
+        robots = self._view.robot_ids()
+        if self._poses_due is None and robots:
+            self._poses_due = _now() + POSES_WAIT_S
+        if self._poses_due is None or _now() < self._poses_due:
+            return
+        for robot in robots:
             if robot not in self._known:
                 self._known.add(robot)
                 self._client.follow(robot)
-        self._on_change(change)
+
+    def take_poses(self, message: dict[str, Any]) -> None:
+        """Handle the poses of many robots."""
+        self._poses_due = inf
+        for robot in self._view.on_poses(message):
+            self._on_pose(robot)
 
     def take_pose(self, robot: str, message: dict[str, Any]) -> None:
         """Handle a robot's pose message."""
@@ -260,6 +333,10 @@ class FleetLink:
             self._desired.clear()
         self._grid_came.set()
         self._on_change(change)
+
+    def take_fleet_event(self, text: str) -> None:
+        """Handle an event of the fleet manager."""
+        self._on_fleet_event(text)
 
     def take_event(self, text: str, tone: str) -> None:
         """Handle an event."""

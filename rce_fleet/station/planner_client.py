@@ -13,6 +13,8 @@ CHANGES = "fleet/FleetChanges"
 CHANGES_TOPIC = "/fleet/changes"
 GRID = "nav_msgs/OccupancyGrid"
 GRID_TOPIC = "/fleet/map"
+POSES = "fleet/FleetPoses"
+POSES_TOPIC = "/fleet/poses"
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 CALL_TIMEOUT_S = 10.0
 
@@ -27,11 +29,16 @@ class PlannerService(NamedTuple):
 SET_GOAL = PlannerService("/fleet/set_goal", "fleet/SetGoal")
 BLOCK_CELL = PlannerService("/fleet/block_cell", "fleet/BlockCell")
 SET_GRID = PlannerService("/fleet/set_grid", "fleet/SetGrid")
+SET_MODE = PlannerService("/fleet/set_mode", "fleet/SetMode")
 GET_STATE = PlannerService("/fleet/get_state", "fleet/GetState")
+FLEET_REQUEST = PlannerService("/fleet/request", "fleet/Request")
+"""Of the fleet manager, beside the planner."""
+EVENTS = "std_msgs/String"
+EVENTS_TOPIC = "/fleet/events"
 
 
 def pose_topic(robot: str) -> str:
-    """Return the topic on which the planner publishes a robot's pose."""
+    """Return the topic on which the planner publishes a robot's pose, also one that has no common topic."""
     return f"/fleet/poses/{robot}"
 
 
@@ -55,11 +62,17 @@ class PlannerListener(Protocol):
     def may_have_missed(self) -> None:
         """Handle a new or restored subscription to changes: some may have been missed."""
 
+    def take_poses(self, message: dict[str, Any]) -> None:
+        """Handle a ``fleet/FleetPoses``."""
+
     def take_pose(self, robot: str, message: dict[str, Any]) -> None:
         """Handle a robot's pose message."""
 
     def take_grid(self, message: dict[str, Any]) -> None:
         """Handle the grid, a ``nav_msgs/OccupancyGrid``."""
+
+    def take_fleet_event(self, text: str) -> None:
+        """Handle an event of the fleet manager, a JSON object."""
 
     def take_event(self, text: str, tone: str) -> None:
         """Handle an event; the tone is ``good``, ``warn`` or ``bad``."""
@@ -85,12 +98,17 @@ class PlannerClient(ABC):
         self._grid_needed = asyncio.Event()
         self._grid_needed.set()
 
+    @property
+    def expects_manager(self) -> bool:
+        """Whether a fleet manager was configured; False: unknown."""
+        return False
+
     @abstractmethod
     async def run(self, listener: PlannerListener, ready: Callable[[], Awaitable[None]]) -> None:
         """Receive state and poses until cancelled; call ``ready`` once the planner is connected."""
 
     def follow(self, robot: str) -> None:
-        """Subscribe to a robot's poses."""
+        """Subscribe to a robot's poses, of a planner that does not publish those of all robots together."""
         self._new_robots.put_nowait(robot)
 
     def stop_states(self) -> None:
@@ -106,6 +124,10 @@ class PlannerClient(ABC):
     def read_grid(self) -> None:
         """Receive the grid once more: a planner that began anew may have another one."""
         self._grid_needed.set()
+
+    def offers(self, service: PlannerService) -> bool:
+        """Return whether the planner has a service that earlier releases do not have."""
+        return service in self._calls
 
     async def call(self, service: PlannerService, request: dict[str, Any]) -> dict[str, Any]:
         """Call a service of the planner.

@@ -15,12 +15,18 @@ from rce_fleet.station.planner_client import (
     CALL_TIMEOUT_S,
     CHANGES,
     CHANGES_TOPIC,
+    EVENTS,
+    EVENTS_TOPIC,
+    FLEET_REQUEST,
     GET_STATE,
     GRID,
     GRID_TOPIC,
     POSE,
+    POSES,
+    POSES_TOPIC,
     SET_GOAL,
     SET_GRID,
+    SET_MODE,
     STATE,
     STATE_TOPIC,
     Call,
@@ -56,7 +62,7 @@ class RosPlannerClient(PlannerClient):
             self._heard.set()
 
         async with self._node as node:
-            for service in (SET_GOAL, BLOCK_CELL, GET_STATE, SET_GRID):
+            for service in (SET_GOAL, BLOCK_CELL, GET_STATE, SET_GRID, SET_MODE, FLEET_REQUEST):
                 self._calls[service] = _caller(node.service_client(service.name, service.type_name))
             states = await node.subscribe(STATE_TOPIC, STATE, take_state)
             await self._heard.wait()
@@ -65,6 +71,10 @@ class RosPlannerClient(PlannerClient):
                 CHANGES_TOPIC, CHANGES, lambda message: listener.take_changes(plain(message))
             )
             listener.may_have_missed()
+            await node.subscribe(POSES_TOPIC, POSES, lambda message: listener.take_poses(plain(message)))
+            await node.subscribe(
+                EVENTS_TOPIC, EVENTS, lambda message: listener.take_fleet_event(message.data)
+            )
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._follow_robots(listener))
                 group.create_task(self._read_grid(listener))

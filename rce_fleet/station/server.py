@@ -1,22 +1,22 @@
-"""The station's HTTP server: the page, its live socket, and the API for an ERP."""
+"""The station's HTTP server: the page, and the API for the page and an ERP."""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import json
+import time
 from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
 
-from aiohttp import WSCloseCode, WSMsgType, hdrs, web
+from aiohttp import hdrs, web
 from pydantic import BaseModel, ValidationError
 
-from rce.aio.tasks import cancel_and_wait
 from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, build_document
 from rce.web.origin import ServerNames
 from rce.web.routes import Route, RouteTable
+from rce_fleet.exceptions import EventsRestartedError, RequestRefusedError
+from rce_fleet.station import replay_routes, world_link
 from rce_fleet.station.access import COOKIE, USER, AccessControl, problem, set_cookie, token_of
 from rce_fleet.station.api import (
     MAX_CELL,
@@ -26,20 +26,31 @@ from rce_fleet.station.api import (
     GoalRequest,
     GridAnswer,
     GridRequest,
-    LayersRequest,
     LoginRequest,
     MapModel,
     Problem,
     RobotModel,
     UserModel,
 )
-from rce_fleet.station.authentication import AuthenticationError, Authenticator, TokenAuthenticator
+from rce_fleet.station.authentication import (
+    AuditedAction,
+    AuthenticationError,
+    Authenticator,
+    TokenAuthenticator,
+)
+from rce_fleet.station.commands import routes as control_routes
+from rce_fleet.station.commands.control import RobotControl
+from rce_fleet.station.fleet_api import FleetApi
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.grids import complete_grid, grid_answer
 from rce_fleet.station.layers.hub import LayerHub
-from rce_fleet.station.live import Broadcast, Page
+from rce_fleet.station.live import Broadcast
+from rce_fleet.station.page_socket import PageSocket
 from rce_fleet.station.planner_client import PlannerError, PlannerUnavailableError
+from rce_fleet.station.recording import Records
+from rce_fleet.station.replay_routes import ReplayRoutes
 from rce_fleet.station.view import FleetView
+from rce_fleet.station.world_link import WorldLink
 
 STATIC = Path(__file__).parent / "static"
 MAX_BODY = 1 << 16
@@ -47,11 +58,6 @@ MAX_DIGITS = 20
 """Digits of a cell's number; Python parses at most 4300."""
 SHOWN = 80
 """Characters of an invalid name that an error repeats."""
-MIN_FRAME_S = 0.05
-"""Minimum time between two batches of messages to one page."""
-HEARTBEAT_S = 20.0
-CHECK_S = 5.0
-"""How often the login of an open page is checked."""
 
 _VIEW_ERRORS = (401, 403, 421, 503)
 """Error statuses of requests that read."""
@@ -75,6 +81,13 @@ class Station:
         authenticator: Finds the user of a token; if None, every request may do everything.
         names: Host names under which the station may be requested.
         layers: Sends layers to the pages that ask for them; if None, there are none.
+        control: Reaches robots without the planner; if None, nothing does.
+        records: What the fleet did, for replays; if None, there are none.
+        world: The simulated world in which the fleet drives; if None, there is none.
+        webhooks: File in which webhooks are kept; if None, they end with the program.
+
+    Attributes:
+        fleet_api: The part of the API that the fleet manager answers.
     """
 
     def __init__(
@@ -86,23 +99,46 @@ class Station:
         authenticator: Authenticator | None = None,
         names: ServerNames | None = None,
         layers: LayerHub | None = None,
+        control: RobotControl | None = None,
+        records: Records | None = None,
+        world: WorldLink | None = None,
+        webhooks: Path | None = None,
     ) -> None:
-        self._layers = layers
         self._view = view
         self._fleet = fleet
         self._pages = pages
         self._authenticator = authenticator or TokenAuthenticator()
         self._access = AccessControl(self._authenticator, names or ServerNames())
+        self._access.on_audit = self._tell_audit
+        self._socket = PageSocket(pages, layers, self._access)
+        self._replay = ReplayRoutes(records)
+        self._world = world_link.WorldRoutes(world, self._access)
+        self._control = control_routes.ControlRoutes(control, fleet, self._access)
+        has_roles = self._authenticator.has_logins
+        self.fleet_api = FleetApi(fleet, self._access, webhooks, has_roles=has_roles)
+        self.fleet_api.feed.on_restart = self._tell_restart
+        self.fleet_api.manager.on_change = self._tell_manager
 
     def make_app(self) -> web.Application:
         """Build the application."""
         app = web.Application(middlewares=[_problems, self._access.check], client_max_size=MAX_BODY)
         for route in ROUTES:
             app.router.add_route(route.method, PREFIX + route.path, partial(route.handler, self))
+        for control_route in control_routes.ROUTES:
+            handler = partial(control_route.handler, self._control)
+            app.router.add_route(control_route.method, PREFIX + control_route.path, handler)
+        for world_route in world_link.ROUTES:
+            handler = partial(world_route.handler, self._world)
+            app.router.add_route(world_route.method, PREFIX + world_route.path, handler)
+        for replay_route in replay_routes.ROUTES:
+            handler = partial(replay_route.handler, self._replay)
+            app.router.add_route(replay_route.method, PREFIX + replay_route.path, handler)
+        self.fleet_api.add_to(app)
+        routes = (*ROUTES, *control_routes.ROUTES, *replay_routes.ROUTES, *world_link.ROUTES)
         document = build_document(
-            [route.operation for route in ROUTES],
+            [*(route.operation for route in routes), *self.fleet_api.operations],
             title="RCE operator station",
-            description="Control a fleet of robots: set goals, block cells. Used by the page and by an ERP.",
+            description="Control a fleet of robots: tasks, goals, zones, events. For the page and an ERP.",
             error=Problem,
         )
 
@@ -111,7 +147,8 @@ class Station:
             return web.json_response(document)
 
         app.router.add_get(f"{PREFIX}/openapi.json", describe)
-        app.router.add_get(f"{PREFIX}/live", self.live)
+        app.router.add_get(f"{PREFIX}/live", self._socket.handle)
+        app.router.add_get(f"{PREFIX}/robots/{{robot}}/drive", self._control.drive)
         app.router.add_get("/login", self.login_page)
         app.router.add_get("/", self.page)
         app.router.add_static("/static", STATIC)
@@ -216,7 +253,7 @@ class Station:
         if refusal is not None:
             return refusal
         asked = GoalRequest.model_validate_json(await read_whole(request))
-        message = await self._fleet.set_goal(robot, asked.cell)
+        message = await self.fleet_api.set_goal(robot, asked.cell, user=request[USER])
         self._access.audit(request, "set_goal", robot, "stop" if asked.cell is None else f"cell {asked.cell}")
         return _reply(Answer(message=message))
 
@@ -237,7 +274,8 @@ class Station:
         if refusal is not None:
             return refusal
         asked = CellRequest.model_validate_json(await read_whole(request))
-        message = await self._fleet.block_cell(int(number), blocked=asked.blocked)
+        user = request[USER]
+        message = await self.fleet_api.block_cell(int(number), blocked=asked.blocked, user=user)
         self._access.audit(request, "block_cell" if asked.blocked else "free_cell", number)
         return _reply(Answer(message=message))
 
@@ -278,55 +316,20 @@ class Station:
             self._access.audit(request, "set_grid", "grid", f"{detail} yaw {made.yaw:g}")
         return _reply(made)
 
-    async def live(self, request: web.Request) -> web.StreamResponse:
-        """Send changes to a page until it disconnects.
+    def _tell_manager(self, here: bool) -> None:
+        """Tell all pages whether there is a fleet manager, which they may ask."""
+        self._pages.send("manager", json.dumps({"type": "manager", "here": here}))
 
-        Without ``?changes=1`` it gets everything whenever something changes, as pages of 0.1 expect.
-        """
-        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, compress=False, max_msg_size=MAX_BODY)
-        await socket.prepare(request)
-        page = self._pages.open(takes_changes=request.query.get("changes") == "1")
-        writer = asyncio.create_task(_write(socket, page))
-        watcher = asyncio.create_task(self._close_when_logged_out(socket, request))
-        try:
-            async for message in socket:
-                if message.type is WSMsgType.TEXT and self._layers is not None:
-                    self._show_layers(self._layers, page, message.data)
-        finally:
-            self._pages.close(page)
-            if self._layers is not None:
-                self._layers.leave(page)
-            await cancel_and_wait(writer, watcher)
-        return socket
+    def _tell_restart(self) -> None:
+        """Tell all pages that the fleet manager lost its journal."""
+        text = str(EventsRestartedError(self.fleet_api.feed.journal))
+        self._pages.send_kept_event(json.dumps({"type": "event", "text": text, "tone": "bad"}))
 
-    def _show_layers(self, layers: LayerHub, page: Page, text: str) -> None:
-        """Set the layers that a page shows; tell the page if it cannot be read."""
-        try:
-            wanted = LayersRequest.model_validate_json(text)
-        except ValidationError as error:
-            fault = f"a page asked for something else than layers: {error.errors()[0]['msg']}"
-            page.put_event(json.dumps({"type": "event", "text": fault, "tone": "bad"}))
-            return
-        layers.show(page, wanted.robot, wanted.layers)
-
-    async def _close_when_logged_out(self, socket: web.WebSocketResponse, request: web.Request) -> None:
-        """Close a page's socket when its user may not see the fleet any more."""
-        while True:
-            await asyncio.sleep(CHECK_S)
-            if not await self._access.is_still_allowed(request):
-                break
-        await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=b"your login has ended; log in again")
-
-
-async def _write(socket: web.WebSocketResponse, page: Page) -> None:
-    with contextlib.suppress(ConnectionError):
-        while True:
-            for message in await page.take():
-                if isinstance(message, bytes):
-                    await socket.send_bytes(message)
-                else:
-                    await socket.send_str(message)
-            await asyncio.sleep(MIN_FRAME_S)
+    def _tell_audit(self, user: str, action: AuditedAction) -> None:
+        """Show all pages who did what."""
+        told = {"type": "audit", "time": time.time(), "user": user, "name": action.name}
+        told |= {"subject": action.subject, "detail": action.detail, "done": action.done}
+        self._pages.send_kept_event(json.dumps(told))
 
 
 @web.middleware
@@ -342,7 +345,7 @@ async def _problems(request: web.Request, handler: Handler) -> web.StreamRespons
         return problem(error.status, str(error), headers)
     except PlannerUnavailableError as error:
         return problem(503, str(error))
-    except PlannerError as error:
+    except (PlannerError, RequestRefusedError) as error:
         return problem(409, str(error))
     except web.HTTPException as error:
         kept = {"Allow": error.headers["Allow"]} if "Allow" in error.headers else None

@@ -26,7 +26,7 @@ class Pose:
         """Read a geometry_msgs/PoseWithCovarianceStamped in its JSON form."""
         pose = message["pose"]["pose"]
         position, turn = pose["position"], pose["orientation"]
-        return cls(position["x"], position["y"], _yaw_of(turn))
+        return cls(position["x"], position["y"], yaw_of(turn))
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +35,7 @@ class ViewChange:
 
     Attributes:
         is_new_map: Whether the map changed.
+        is_new_mode: Whether the fleet was paused, stopped or resumed.
         robots: Ids of robots that are new or changed.
         removed: Ids of removed robots.
         blocked: Cells that became blocked, ascending.
@@ -43,6 +44,7 @@ class ViewChange:
     """
 
     is_new_map: bool = False
+    is_new_mode: bool = False
     robots: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
     blocked: tuple[int, ...] = ()
@@ -61,6 +63,10 @@ class FleetView:
     """The newest state of the fleet and the newest pose of each robot."""
 
     poses: dict[str, Pose] = field(default_factory=dict)
+    ages: dict[str, float] = field(default_factory=dict)
+    """Of robots' last signs of life, as the planner told with the newest poses; seconds."""
+    mode: str = "automatic"
+    """The mode of the fleet: automatic, paused or stopped."""
     _yaw: float = 0.0
     """Direction of the grid's columns, radians; it is in no ``fleet/FleetState``."""
     _map: dict[str, Any] | None = None
@@ -87,6 +93,7 @@ class FleetView:
         blocked, pending = set(message["blocked"]), set(message["pending"])
         change = ViewChange(
             is_new_map=grid != self._map,
+            is_new_mode=self._set_mode(message),
             robots=tuple(sorted(robot for robot in robots if robots[robot] != self._robots.get(robot))),
             removed=tuple(sorted(self._robots.keys() - robots.keys())),
             blocked=_ascending(blocked - self._blocked),
@@ -96,11 +103,12 @@ class FleetView:
         self._map, self._robots, self._blocked, self._pending = grid, robots, blocked, pending
         for robot in self.poses.keys() - robots.keys():
             del self.poses[robot]
+            self.ages.pop(robot, None)
         return change
 
     def on_grid(self, message: dict[str, Any]) -> ViewChange:
         """Set the grid's rotation from a ``nav_msgs/OccupancyGrid`` of ``/fleet/map``."""
-        yaw = _yaw_of(message["info"]["origin"]["orientation"])
+        yaw = yaw_of(message["info"]["origin"]["orientation"])
         if yaw == self._yaw or not isfinite(yaw):
             return _NOTHING
         self._yaw = yaw
@@ -113,10 +121,12 @@ class FleetView:
         for name in message["removed"]:
             self._robots.pop(name, None)
             self.poses.pop(name, None)
+            self.ages.pop(name, None)
         blocked, pending, freed = (set(message[part]) for part in ("blocked", "pending", "freed"))
         self._blocked = (self._blocked | blocked) - pending - freed
         self._pending = (self._pending | pending) - blocked - freed
         return ViewChange(
+            is_new_mode=self._set_mode(message),
             robots=tuple(sorted(robot["id"] for robot in message["robots"])),
             removed=tuple(message["removed"]),
             blocked=_ascending(blocked),
@@ -124,9 +134,27 @@ class FleetView:
             freed=_ascending(freed),
         )
 
+    def _set_mode(self, message: dict[str, Any]) -> bool:
+        """Set the mode of the fleet; return whether it is another one. Earlier planners tell none."""
+        before, self.mode = self.mode, message.get("mode") or "automatic"
+        return self.mode != before
+
     def on_pose(self, robot: str, message: dict[str, Any]) -> None:
         """Set a robot's pose."""
         self.poses[robot] = Pose.of_message(message)
+
+    def on_poses(self, message: dict[str, Any]) -> list[str]:
+        """Set the poses of a ``fleet/FleetPoses``; return the robots that are known."""
+        columns = (message[name] for name in ("robots", "x", "y", "yaw"))
+        ages = message.get("age", ())  # planners of earlier releases tell none
+        known = []
+        for place, (robot, x, y, yaw) in enumerate(zip(*columns, strict=False)):
+            if robot in self._robots:
+                self.poses[robot] = Pose(x, y, yaw)
+                if place < len(ages):
+                    self.ages[robot] = ages[place]
+                known.append(robot)
+        return known
 
     def robot_ids(self) -> list[str]:
         """Return the ids of the robots that the planner knows, ascending."""
@@ -185,7 +213,7 @@ def _cell(number: int) -> int | None:
     return None if number < 0 else number
 
 
-def _yaw_of(turn: dict[str, float]) -> float:
+def yaw_of(turn: dict[str, float]) -> float:
     """Return the yaw of a ``geometry_msgs/Quaternion`` in its JSON form, radians."""
     return atan2(
         2.0 * (turn["w"] * turn["z"] + turn["x"] * turn["y"]),

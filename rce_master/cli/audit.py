@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rce.protocol.printable import one_line
+from rce.printable import one_line
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
 
@@ -17,9 +17,9 @@ POLL_S = 1.0
 
 
 def audit(
-    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what comes.")] = False,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Follow the audit log.")] = False,
     user: Annotated[str, typer.Option("--user", help="Only what this user did.")] = "",
-    lines: Annotated[int, typer.Option("--lines", "-n", help="How many of the newest.", min=1)] = 100,
+    lines: Annotated[int, typer.Option("--lines", "-n", help="Number of newest records.", min=1)] = 100,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON lines.")] = False,
 ) -> None:
     """Show logins, refusals and changes (administrators)."""

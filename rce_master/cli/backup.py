@@ -9,8 +9,7 @@ from typing import Annotated
 import typer
 from msgspec.structs import replace
 
-from rce.config.exceptions import ConfigError
-from rce.config.loading import load_settings
+from rce.config import ConfigError, load_settings
 from rce.model import about
 from rce_master.backup import CERTIFICATES, MASTER, Copy, back_up, restore
 from rce_master.cli.exceptions import CliError
@@ -42,10 +41,10 @@ def restore_(
     config: Config = None,
     state_dir: StateDir = None,
     replace_: Annotated[
-        bool, typer.Option("--replace", help="Move state that is there aside, and take its place.")
+        bool, typer.Option("--replace", help="Move existing state aside and replace it.")
     ] = False,
 ) -> None:
-    """Put a backup back, while no master runs on the folder."""
+    """Restore a backup while no master uses the folder."""
     folders = _folders(config, state_dir)
     try:
         found, aside = restore(file, folders, replace=replace_)

@@ -12,8 +12,7 @@ import msgspec
 import typer
 
 from rce.masters import Masters
-from rce.tls.faults import CertificateError, explain_to_client
-from rce.tls.identity import client_context
+from rce.tls import CertificateError, client_context, explain_to_client
 from rce.web.client import session_connector
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.events import Event

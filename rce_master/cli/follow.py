@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rce.control.logs import LogLevel
-from rce.protocol.printable import for_terminal, one_line
+from rce.control import LogLevel
+from rce.printable import for_terminal, one_line
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import ApiError
@@ -28,19 +28,19 @@ def logs(
     node: Annotated[
         str, typer.Argument(metavar="CONTAINER[/NODE]", help="Without a node: the environment's own log.")
     ],
-    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what comes.")] = False,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Follow the log.")] = False,
     bytes_: Annotated[int, typer.Option("--bytes", help="Begin that many bytes before the end; 0: all.")] = 0,
-    stdout: Annotated[bool, typer.Option("--stdout", help="What the node prints.")] = False,
-    stderr: Annotated[bool, typer.Option("--stderr", help="What it prints as errors.")] = False,
+    stdout: Annotated[bool, typer.Option("--stdout", help="The node's standard output.")] = False,
+    stderr: Annotated[bool, typer.Option("--stderr", help="The node's standard error.")] = False,
     rosout: Annotated[
-        bool, typer.Option("--rosout", help="Its log records in ROS; without a node: all nodes'.")
+        bool, typer.Option("--rosout", help="The node's ROS log; without a node: that of all nodes.")
     ] = False,
-    engine: Annotated[bool, typer.Option("--engine", help="What became of it.")] = False,
+    engine: Annotated[bool, typer.Option("--engine", help="The engine's messages about the node.")] = False,
     level: Annotated[
-        LogLevel | None, typer.Option(help="Of log records in ROS those from this level on; means --rosout.")
+        LogLevel | None, typer.Option(help="ROS log records of this level and above; implies --rosout.")
     ] = None,
     previous: Annotated[
-        bool, typer.Option("--previous", "-p", help="Of the container's last incarnation that ended.")
+        bool, typer.Option("--previous", "-p", help="The log of the last incarnation that ended.")
     ] = False,
     user: Annotated[str, typer.Option(help="Whose container; administrators only.")] = "",
 ) -> None:
@@ -123,7 +123,7 @@ def events(
     since: Annotated[int | None, typer.Option(help="Begin after the event of this id.")] = None,
     json_: Annotated[bool, typer.Option("--json", help="One JSON object a line.")] = False,
 ) -> None:
-    """Print what happens, until Ctrl-C."""
+    """Print events until Ctrl-C."""
     run(_events(since, json_))
 
 

@@ -69,12 +69,12 @@ def _run(tool: str, context: typer.Context) -> None:
 
 
 def _topic(context: typer.Context) -> None:
-    """Look at topics of a container (-c) or of ROS_MASTER_URI, and publish on them."""
+    """Show topics of a container (-c) or of ROS_MASTER_URI, and publish on them."""
     _run("topic", context)
 
 
 def _service(context: typer.Context) -> None:
-    """Look at services of a container (-c) or of ROS_MASTER_URI, and call them."""
+    """Show and call services of a container (-c) or of ROS_MASTER_URI."""
     _run("service", context)
 
 

@@ -69,7 +69,7 @@ def _amount(kind: str, value: float) -> str:
 
 
 def limit(
-    name: str,
+    name: Annotated[str, typer.Argument(help="Name of the user.")],
     containers: Annotated[str | None, typer.Option(help=_DEFAULT)] = None,
     slots: Annotated[str | None, typer.Option(help="Of all containers, as `size` counts them.")] = None,
     cpu: Annotated[str | None, typer.Option(help="Cores that all containers may ask for.")] = None,

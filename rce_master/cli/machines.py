@@ -23,7 +23,7 @@ Machine = dict[str, Any]
 def machines(
     json_: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
 ) -> None:
-    """Show the machines and what is promised of them; administrators only."""
+    """Show machines and their reserved resources; administrators only."""
     run(_machines(json_))
 
 
@@ -84,7 +84,7 @@ def drain(
     machine: Annotated[str, typer.Argument(help="Name of the machine, or of its container task set.")],
     undo: Annotated[bool, typer.Option("--undo", help="Let it take containers again.")] = False,
     wait: Annotated[
-        bool, typer.Option("--wait", help="Go on until all its containers are elsewhere.")
+        bool, typer.Option("--wait", help="Wait until all its containers are elsewhere.")
     ] = False,
 ) -> None:
     """Give a machine no new containers, and hand over those that it has; administrators only.
@@ -140,7 +140,7 @@ def resize(
     ] = None,
     user: Annotated[str, typer.Option(help="Whose container; administrators only.")] = "",
 ) -> None:
-    """Change what a container may use, while it runs."""
+    """Change a container's resources while it runs."""
     requested: dict[str, Any] = {"cpu": cpu, "memory": memory, "size": size, "bandwidth": bandwidth}
     body = {key: value for key, value in requested.items() if value is not None}
     if not body:

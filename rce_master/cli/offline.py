@@ -15,9 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rce.config.exceptions import ConfigError
-from rce.config.folders import MASTER_FOLDER, STORE_FILE, default_state_dir
-from rce.config.loading import load_settings
+from rce.config import MASTER_FOLDER, STORE_FILE, ConfigError, default_state_dir, load_settings
 from rce_master.audit import AuditLog
 from rce_master.cli import credentials
 from rce_master.cli.exceptions import CliError, NotLoggedInError
@@ -25,14 +23,13 @@ from rce_master.exceptions import StoreBusyError
 from rce_master.settings import state_settings
 from rce_master.state.core import State
 from rce_master.state_service import load_converted
-from rce_master.store import SqliteStore
+from rce_master.store import SqliteStore, Store
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from rce_master.cli.credentials import Credentials
     from rce_master.state.commands import Command
-    from rce_master.store import Store
 
 OFFLINE = "offline"
 """The address in the audit log for changes made on this machine."""

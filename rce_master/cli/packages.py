@@ -14,9 +14,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from rce.packages.exceptions import BadArchiveError
+from rce.packages import BadArchiveError, SigningKey, key_id, statement
 from rce.packages.folder import Source, look_into
-from rce.packages.signing import SigningKey, key_id, statement
 from rce_master.cli import credentials, signing_key
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import CliError
@@ -127,7 +126,7 @@ async def _list(user: str) -> None:
 
 @app.command("show")
 def show(
-    name: str,
+    name: Annotated[str, typer.Argument(help="Name of the package.")],
     version: Annotated[str, typer.Argument(help="[the newest]", show_default=False)] = "",
     user: OfUser = "",
 ) -> None:
@@ -161,7 +160,11 @@ async def _show(name: str, version: str, user: str) -> None:
 
 
 @app.command("remove")
-def remove(name: str, version: str, user: OfUser = "") -> None:
+def remove(
+    name: Annotated[str, typer.Argument(help="Name of the package.")],
+    version: Annotated[str, typer.Argument(help="Version of the package.")],
+    user: OfUser = "",
+) -> None:
     """Remove a version that no node needs."""
     run(_remove(name, version, user))
 

@@ -52,7 +52,7 @@ async def _give_back(url: str) -> None:
 
 
 def logout() -> None:
-    """Give the token back and forget it."""
+    """Log out: revoke the token and delete it."""
     run(_logout())
 
 

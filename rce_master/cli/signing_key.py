@@ -6,8 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from rce.packages.exceptions import BadKeyError
-from rce.packages.signing import SigningKey
+from rce.packages import BadKeyError, SigningKey
 from rce_master.cli.credentials import login_file
 from rce_master.cli.exceptions import CliError
 

@@ -14,11 +14,11 @@ from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import NotLoggedInError
 
 tokens = typer.Typer(invoke_without_command=True, help="Print, list, make and revoke tokens.")
-robots = typer.Typer(no_args_is_help=True, help="Give robots credentials of their own, and take them back.")
+robots = typer.Typer(no_args_is_help=True, help="Add, list and revoke tokens of robots.")
 
 OfUser = Annotated[str, typer.Option("--user", help="Whose; administrators only (default: yourself).")]
-Label = Annotated[str, typer.Option(help="What you call it.")]
-Days = Annotated[float, typer.Option(help="Days for which it is good; 0: until it is revoked.", min=0)]
+Label = Annotated[str, typer.Option(help="Your name for the token.")]
+Days = Annotated[float, typer.Option(help="Days until it expires; 0: valid until it is revoked.", min=0)]
 
 
 @tokens.callback()
@@ -43,14 +43,19 @@ def list_tokens(user: OfUser = "") -> None:
 
 @tokens.command("new")
 def new_token(
-    metrics: Annotated[bool, typer.Option("--metrics", help="Good for reading /metrics only.")] = False,
+    metrics: Annotated[bool, typer.Option("--metrics", help="Valid for reading /metrics only.")] = False,
+    fleet: Annotated[
+        bool, typer.Option("--fleet", help="Valid at operator stations only, with the user's role.")
+    ] = False,
     label: Label = "",
     days: Days = 0.0,
+    user: OfUser = "",
 ) -> None:
     """Make and print a token for a program."""
-    if not metrics:
-        raise typer.BadParameter("say what it is for: --metrics (for yourself, log in: rce login)")
-    run(_new("/tokens", {"scope": "metrics", "label": label, "days": days}, ""))
+    if metrics == fleet:
+        raise typer.BadParameter("say what it is for: --metrics or --fleet (for yourself, log in: rce login)")
+    scope = "metrics" if metrics else "fleet"
+    run(_new("/tokens", {"scope": scope, "label": label, "days": days}, user))
 
 
 @tokens.command("revoke")
@@ -65,12 +70,12 @@ def revoke_tokens(
 @robots.command("add")
 def add_robot(
     robot: Annotated[str, typer.Argument(help="The robot ID.")],
-    replace: Annotated[bool, typer.Option("--replace", help="In place of the token that it has.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the token that it has.")] = False,
     label: Label = "",
     days: Days = 0.0,
     user: OfUser = "",
 ) -> None:
-    """Make and print a token that is good for this robot ID only: "token" in the robot's file."""
+    """Make and print a token that is valid for this robot ID only: "token" in the robot's file."""
     body = {"robot": robot, "label": label, "days": days, "replace": replace}
     run(_new("/robot-tokens", body, user))
 

@@ -35,13 +35,13 @@ class Order(Enum):
 
 
 def top(
-    interval: Annotated[float, typer.Option(help="Seconds between two looks.", min=0.2)] = 2.0,
+    interval: Annotated[float, typer.Option(help="Seconds between two updates.", min=0.2)] = 2.0,
     sort: Annotated[Order, typer.Option(help="What to sort by.")] = Order.CPU,
     nodes: Annotated[bool, typer.Option("--nodes", help="Show the nodes of each container.")] = False,
     interfaces: Annotated[bool, typer.Option("--interfaces", help="Show messages of interfaces.")] = False,
     once: Annotated[bool, typer.Option("--once", help="Print it once; so does a pipe.")] = False,
 ) -> None:
-    """Show live what machines and containers consume, and what could be better; ends with Ctrl-C."""
+    """Show resource usage and advice live, until Ctrl-C."""
     once = once or not sys.stdout.isatty()
     run(_top(interval, Look(sort, nodes=nodes, interfaces=interfaces), once=once))
 

@@ -27,12 +27,13 @@ app = typer.Typer(no_args_is_help=True, help="Add, list and remove users, change
 app.command("show")(limits.show)
 app.command("limit")(limits.limit)
 
+UserName = Annotated[str, typer.Argument(help="Name of the user.")]
 PasswordStdin = Annotated[bool, typer.Option(help="Read the password from standard input.")]
 
 
 @app.command("add")
 def add(
-    name: str,
+    name: UserName,
     role: Annotated[UserRole, typer.Option(help="What the user may do.")] = UserRole.USER,
     admin: Annotated[bool, typer.Option("--admin", help="The same as --role admin.")] = False,
     password_stdin: PasswordStdin = False,
@@ -71,7 +72,7 @@ async def _list(state_dir: Path | None) -> None:
 
 
 @app.command("passwd")
-def passwd(name: str, password_stdin: PasswordStdin = False, state_dir: StateDir = None) -> None:
+def passwd(name: UserName, password_stdin: PasswordStdin = False, state_dir: StateDir = None) -> None:
     """Change a user's password; of your own, the old one is asked for first (or is the first line)."""
     old = read_password(from_stdin=password_stdin, what="Old password") if _is_own(name, state_dir) else ""
     run(_passwd(name, old, read_password(from_stdin=password_stdin, confirm=True), state_dir))
@@ -92,7 +93,7 @@ async def _passwd(name: str, old: str, password: str, state_dir: Path | None) ->
 
 
 @app.command("remove")
-def remove(name: str, state_dir: StateDir = None) -> None:
+def remove(name: UserName, state_dir: StateDir = None) -> None:
     """Remove a user with all robots and containers."""
     run(_remove(name, state_dir))
 
@@ -104,7 +105,11 @@ async def _remove(name: str, state_dir: Path | None) -> None:
 
 
 @app.command("role")
-def set_role(name: str, role: UserRole, state_dir: StateDir = None) -> None:
+def set_role(
+    name: UserName,
+    role: Annotated[UserRole, typer.Argument(help="What the user may do.")],
+    state_dir: StateDir = None,
+) -> None:
     """Change what a user may do."""
     run(_set_role(name, role.value, state_dir))
 

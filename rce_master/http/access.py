@@ -8,15 +8,22 @@ from typing import TYPE_CHECKING
 from aiohttp import hdrs, web
 
 from rce_master.exceptions import ForbiddenError, WrongCredentialsError
-from rce_master.state.records import METRICS_SCOPE, UserRole
+from rce_master.state.records import FLEET_SCOPE, METRICS_SCOPE, Token, User, UserRole
 
 if TYPE_CHECKING:
     from rce_master.http.routes import Route, Services
-    from rce_master.state.records import Token, User
 
 
-def bearer(request: web.Request, services: Services) -> tuple[str, User | None]:
+_GOOD_FOR = {FLEET_SCOPE: "operator stations"}
+
+
+def bearer(request: web.Request, services: Services, *, stations: bool = False) -> tuple[str, User | None]:
     """Return the token of a request and its user; without one, an empty text and None.
+
+    Args:
+        request: The request.
+        services: The master's services.
+        stations: Whether tokens for operator stations are good for it.
 
     Raises:
         WrongCredentialsError: The token is unknown or expired.
@@ -26,8 +33,8 @@ def bearer(request: web.Request, services: Services) -> tuple[str, User | None]:
     if not token:
         return "", None
     user, record = services.tokens.find(token)
-    if record.scope:
-        what = f"robot {record.robot!r}" if record.robot else record.scope
+    if record.scope and not (stations and record.scope == FLEET_SCOPE):
+        what = f"robot {record.robot!r}" if record.robot else _GOOD_FOR.get(record.scope, record.scope)
         raise ForbiddenError(f"this token is good for {what} only; log in for one for the API: rce login")
     return token, user
 

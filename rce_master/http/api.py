@@ -28,6 +28,7 @@ from rce_master.http import (
     api_stream,
     api_tokens,
     api_usage,
+    api_volumes,
 )
 from rce_master.http.access import admit, bearer
 from rce_master.http.auditing import note_done, note_refused
@@ -49,6 +50,7 @@ ROUTES: list[Route] = [
     *api_machines.routes,
     *api_usage.routes,
     *api_packages.routes,
+    *api_volumes.routes,
     *api_stream.routes,
     *api_exec.routes,
 ]
@@ -88,7 +90,7 @@ class Api:
 
 def _adapt(route: Route, services: Services) -> Answer:
     async def answer(request: web.Request, parts: Mapping[str, str]) -> web.StreamResponse:
-        token, user = bearer(request, services)
+        token, user = bearer(request, services, stations=route.stations)
         if user is not None:
             services.quotas.request(user)
         call = Call(request, services, user, token, None, parts)

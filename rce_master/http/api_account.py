@@ -40,7 +40,7 @@ async def log_out(call: Call) -> None:
     await call.services.state_service.submit(commands.RemoveToken(digest=token_digest(call.token)))
 
 
-@routes.route("GET", "/user", "Show who you are", reply=models.UserOut)
+@routes.route("GET", "/user", "Show who you are", reply=models.UserOut, stations=True)
 async def show_caller(call: Call) -> models.UserOut:
     """Show the caller."""
     return _views(call).user(call.caller)

@@ -44,6 +44,7 @@ async def read_audit(call: Call) -> models.AuditOut:
     body=models.AuditIn,
     status=204,
     any_role=True,
+    stations=True,
 )
 async def note_action(call: Call) -> None:
     """Record a control action; a station sends it with the token of the acting user."""

@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from rce.model import (
     AddInterface,
     AddNode,
+    Component,
     ConfigureConnections,
     Connection,
     CreateContainer,
     DeleteParameter,
     DestroyContainer,
+    Item,
     RemoveInterface,
     RemoveNode,
+    Request,
     ResizeContainer,
     SetParameter,
     SpecError,
@@ -26,7 +29,6 @@ from rce_master.http.spec_models import SPELLING
 from rce_master.requests import commands_of
 
 if TYPE_CHECKING:
-    from rce.model import Component, Item, Request
     from rce_master.http.model import Model
 
 T = TypeVar("T", bound="Request | Item")

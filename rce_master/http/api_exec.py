@@ -11,14 +11,13 @@ from aiohttp import WSMsgType, web
 from websockets.exceptions import ConnectionClosed
 
 from rce.aio.tasks import run_until_first
-from rce.control.execution import MAX_COMMAND, NOT_RUN, ended_frame, read_command
+from rce.control.execution import MAX_COMMAND, NOT_RUN, Command, ended_frame, read_command
 from rce_master.exceptions import InvalidRequestError, MasterError
 from rce_master.http.routes import OF_USER, Call, route_table
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
-    from rce.control.execution import Command
 
 routes = route_table("exec")
 

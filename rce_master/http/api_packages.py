@@ -5,8 +5,7 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING
 
-from rce.packages.exceptions import BadKeyError
-from rce.packages.signing import key_id
+from rce.packages import BadKeyError, key_id
 from rce.web.bodies import read_pieces
 from rce.web.openapi import Query
 from rce_master.exceptions import InvalidRequestError, NotFoundError

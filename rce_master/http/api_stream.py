@@ -11,7 +11,7 @@ from typing import TypeVar
 import msgspec
 from aiohttp import web
 
-from rce.control.logs import LogLevel, LogQuery, LogStream
+from rce.control import LogLevel, LogQuery, LogStream
 from rce.web.openapi import Query
 from rce_master.events import AT_ONCE, Event
 from rce_master.exceptions import InvalidRequestError

@@ -24,16 +24,21 @@ async def list_tokens(call: Call) -> models.TokensOut:
 @routes.route(
     "POST",
     "/tokens",
-    "Make a token for a program that may only read the metrics",
+    "Make a token for a program: for metrics (administrators), or for operator stations",
     body=models.ScopedTokenIn,
     reply=models.TokenOut,
     status=201,
-    admin=True,
+    any_role=True,
+    query=(OF_USER,),
 )
 async def add_token(call: Call) -> models.TokenOut:
     """Make a token with a scope."""
     body = call.read(models.ScopedTokenIn)
-    return await _make(call, call.caller.name, body.label, METRICS_SCOPE, body.days)
+    if body.scope == METRICS_SCOPE and not call.is_admin:
+        raise ForbiddenError("only an administrator makes tokens for metrics")
+    if call.owner != call.caller.name and not call.is_admin:
+        raise ForbiddenError("only an administrator makes tokens of others")
+    return await _make(call, call.owner, body.label, body.scope, body.days)
 
 
 @routes.route(

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce_master.exceptions import AuthError, ForbiddenError
+from rce_master.exceptions import AuthError, ForbiddenError, MasterError
 
 if TYPE_CHECKING:
-    from rce_master.exceptions import MasterError
     from rce_master.http.routes import Call, Route
 
 _NAMES = ("userID", "tag", "tag_a", "tag_b", "name", "robot", "role", "scope", "draining")

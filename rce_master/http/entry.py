@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections import Counter, deque
 from typing import TYPE_CHECKING
 
-from aiohttp import web
-
-from rce.control.messages import TaskSetKind
-from rce.protocol.exceptions import HandshakeError
-from rce.protocol.http import master_reply, read_master_request
+from rce.control import TaskSetKind
+from rce.protocol import HandshakeError, master_reply, read_master_request
+from rce.web.entry import EntryAnswer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from rce_master.state.records import TaskSet
     from rce_master.state.tables import Tables
@@ -42,22 +40,21 @@ class Entry:
         self._sent: deque[tuple[float, str]] = deque()
         self._expected: Counter[str] = Counter()
 
-    async def handle(self, request: web.Request) -> web.Response:
-        """Answer a client with its WebSocket URL."""
+    def answer(self, query: str) -> EntryAnswer:
+        """Answer a client with its WebSocket URL.
+
+        Args:
+            query: What comes after the ``?``, still percent-encoded.
+        """
         try:
-            wanted = read_master_request(request.url.raw_query_string)
+            wanted = read_master_request(query)
         except HandshakeError as error:
-            return web.Response(status=error.status, text=f"{error.reason}\n")
+            return _plain(error.status, f"{error.reason}\n")
         task_set = self.choose()
         if task_set is None:
-            return web.Response(
-                status=503, text="No robot process is free; try again later.\n", headers={"Retry-After": "1"}
-            )
-        return web.Response(
-            body=master_reply(wanted, task_set.url, header=task_set.bearer),
-            content_type="application/json",
-            charset="utf-8",
-        )
+            return _plain(503, "No robot process is free; try again later.\n", {"Retry-After": "1"})
+        body = master_reply(wanted, task_set.url, header=task_set.bearer)
+        return EntryAnswer(200, body, "application/json; charset=utf-8")
 
     def choose(self) -> TaskSet | None:
         """Choose the least loaded robot task set, and expect a robot there."""
@@ -79,3 +76,7 @@ class Entry:
 
     def _load(self, task_set: TaskSet) -> int:
         return self._tables.endpoints.count("task_set", task_set.process)
+
+
+def _plain(status: int, text: str, headers: Mapping[str, str] | None = None) -> EntryAnswer:
+    return EntryAnswer(status, text.encode(), "text/plain; charset=utf-8", headers or {})

@@ -17,20 +17,18 @@ from prometheus_client import (
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from rce.control.model import EndpointUsage, InterfaceUsage, NodeUsage
+from rce.control import EndpointUsage, InterfaceUsage, NodeUsage, Usage
 from rce_master.http.views import Views
 from rce_master.state import capacity
 from rce_master.state.lifecycle import ContainerPhase, RobotSession
-from rce_master.state.records import Container
+from rce_master.state.records import Container, Endpoint
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from prometheus_client.metrics_core import Metric
 
-    from rce.control.messages import Usage
     from rce_master.state.placement import Room
-    from rce_master.state.records import Endpoint
     from rce_master.state.tables import Tables
     from rce_master.usage import UsageBook
 

@@ -47,7 +47,7 @@ class RobotTokenIn(Body):
 class ScopedTokenIn(Body):
     """A token to make, for a program that may do one thing only."""
 
-    scope: Annotated[str, Field(pattern="^metrics$")]
+    scope: Annotated[str, Field(pattern="^(metrics|fleet)$")]
     label: Annotated[str, Field(max_length=128)] = ""
     days: Annotated[float, Field(ge=0, le=36500)] = 0.0
     """Days until it expires; 0: it is valid until it is revoked."""

@@ -8,11 +8,11 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rce.guard.proxies import TrustedProxies
+from rce.guard import TrustedProxies
 from rce.web import routes
 from rce.web.openapi import Query
 from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError, WrongCredentialsError
-from rce_master.state.records import UserRole
+from rce_master.state.records import User, UserRole
 
 if TYPE_CHECKING:
     from aiohttp import web
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from rce_master.packages.service import PackageService
     from rce_master.quotas import Quotas
     from rce_master.reconciler import Reconciler
-    from rce_master.state.records import User
     from rce_master.state_service import StateService
     from rce_master.tokens import Tokens
 
@@ -186,6 +185,8 @@ class Route(routes.Route[Handler]):
     admin: bool = False
     any_role: bool = False
     """Whether read-only users may use it too."""
+    stations: bool = False
+    """Whether tokens for operator stations may use it: a station asks for their user, and notes actions."""
     acts: bool = False
     """Whether it makes a change although it is a GET."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import math
 from functools import cache
@@ -23,13 +22,13 @@ from rce_master.exceptions import (
     TooMuchError,
 )
 from rce_master.http.access import check_metrics
-from rce_master.http.entry import Entry
 from rce_master.http.health import Health
 from rce_master.http.late import LateApi
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
+    from rce_master.http.entry import Entry
     from rce_master.http.routes import Services
 
     Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -40,20 +39,20 @@ MAX_BODY = 1 << 20
 
 
 def make_app(
-    services: Services, *, allowed_origins: Iterable[str] = (), names: ServerNames | None = None
+    services: Services, entry: Entry, *, allowed_origins: Iterable[str] = (), names: ServerNames | None = None
 ) -> web.Application:
     """Make the application.
 
     Args:
         services: The services of the handlers.
+        entry: Where robots ask for their endpoint.
         allowed_origins: Origins whose pages may use the server from a browser, such as
             ``https://fleet.example.org``; pages of the server itself always may.
         names: The allowed host names of the server.
     """
     guard = _origin_guard(frozenset(allowed_origins), names or ServerNames())
     app = web.Application(middlewares=[guard, _errors], client_max_size=MAX_BODY)
-    entry = Entry(services.state_service.tables, asyncio.get_running_loop().time)
-    app.router.add_get("/", entry.handle)
+    app.router.add_get("/", _at_entry(entry))
     app.router.add_get("/healthz", Health(services.state_service).handle)
     app.router.add_get("/metrics", _metrics(services))
     app.router.add_route("*", PREFIX + "/{rest:.*}", LateApi(services).handle)
@@ -61,6 +60,15 @@ def make_app(
 
 
 # Routes
+
+
+def _at_entry(entry: Entry) -> Handler:
+    async def handle(request: web.Request) -> web.Response:
+        answer = entry.answer(request.url.raw_query_string)
+        headers = {**answer.headers, hdrs.CONTENT_TYPE: answer.content_type}
+        return web.Response(status=answer.status, body=answer.body, headers=headers)
+
+    return handle
 
 
 def _metrics(services: Services) -> Handler:

@@ -7,8 +7,9 @@ API only.
 from __future__ import annotations
 
 from enum import Enum
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
+from msgspec import Struct, to_builtins
 from pydantic import Field as Option
 from pydantic import create_model
 
@@ -30,8 +31,6 @@ from rce_master.http.model import Body, Model
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from msgspec import Struct
 
 M = TypeVar("M", bound=Model)
 Amount = int | float | str
@@ -89,7 +88,7 @@ def _taken(field: Field) -> Any:
     if get_origin(kind) is Literal:
         kind = str
     elif get_origin(field.kept) is tuple:
-        kind = list[str]
+        kind = list[_item(kind) or str]  # type: ignore[misc]  # made at run time
     elif field.rule.type != Value and len(get_args(kind)) > 1 and get_origin(kind) is not None:
         kind = get_args(kind)[0] if hasattr(kind, "__metadata__") else Amount
     return kind | None if field.default is None else kind
@@ -107,13 +106,27 @@ def _given(field: Field) -> Any:
     """Return the type of a shown field."""
     if isinstance(field.kept, type) and issubclass(field.kept, Enum):
         return str
-    return list[str] if get_origin(field.kept) is tuple else field.kept
+    if get_origin(field.kept) is tuple:
+        return list[_item(field.kept) or str]  # type: ignore[misc]  # made at run time
+    return field.kept
+
+
+def _item(kind: Any) -> Any:
+    """Return the model of the specs in a list, such as volumes; None for a list of texts."""
+    spec = next(iter(get_args(kind)), None)
+    if not (isinstance(spec, type) and issubclass(spec, Struct)):
+        return None
+    members = get_type_hints(spec).items()
+    types: dict[str, Any] = {
+        name: (Amount if len(get_args(hint)) > 1 else hint, ...) for name, hint in members
+    }
+    return create_model(spec.__name__, __base__=Body, __doc__=spec.__doc__, **types)
 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, Enum):
         return value.value
-    return list(value) if isinstance(value, tuple) else value
+    return to_builtins(value) if isinstance(value, tuple) else value
 
 
 # In

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rce.control.model import EndpointUsage, NodeStatus, NodeUsage
+from rce.control import EndpointUsage, NodeStatus, NodeUsage
 from rce_master import advice
 from rce_master.http import usage_models as models
 from rce_master.state import capacity
-from rce_master.usage import NO_RATES
+from rce_master.usage import NO_RATES, History, UsageBook
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from rce_master.state.placement import Room
     from rce_master.state.records import Container
     from rce_master.state.tables import Tables
-    from rce_master.usage import History, UsageBook
 
 _NOTHING = EndpointUsage()
 _NO_NODE_USAGE = NodeUsage()

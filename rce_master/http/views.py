@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from rce.control.model import EndpointUsage, InterfaceUsage, NodeStatus
+from rce.control import EndpointUsage, InterfaceUsage, NodeStatus, Usage
 from rce_master.http import models, spec_models
 from rce_master.http.spec_models import shown
 from rce_master.state import capacity
-from rce_master.state.records import Container
-from rce_master.state.wiring_records import open_end_key
+from rce_master.state.records import Container, Endpoint, Robot, TaskSet, User, UserVolume
+from rce_master.state.volumes import holder_of
+from rce_master.state.wiring_records import Connection, Link, open_end_key
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rce.control.messages import Usage
-    from rce_master.state.records import Endpoint, Robot, TaskSet, User
     from rce_master.state.tables import Tables
-    from rce_master.state.wiring_records import Connection, Link
 
 _NO_USAGE = EndpointUsage()
 _NO_INTERFACE_USAGE = InterfaceUsage()
@@ -56,6 +54,24 @@ class Views:
             revision=robot.revision,
             interfaces=self._tables.interfaces.count("endpoint", robot.id),
         )
+
+    def volume(self, known: UserVolume) -> dict[str, Any]:
+        """Show a volume."""
+        task_set = self._tables.task_sets.get(known.process)
+        usage = self._usage.get(known.process)
+        holder = holder_of(self._tables, known.user, known.name)
+        volumes = () if holder is None else holder.resources.volumes
+        return {
+            "user": known.user,
+            "name": known.name,
+            "size": known.size,
+            "used": None if usage is None else usage.volumes.get(known.id),
+            "machine": "" if task_set is None else task_set.machine.name,
+            "task_set": known.process,
+            "limit": "" if task_set is None else task_set.machine.volumes,
+            "container": "" if holder is None else holder.tag,
+            "path": next((volume.path for volume in volumes if volume.name == known.name), ""),
+        }
 
     def container(self, container: Container) -> spec_models.ContainerOut:
         """Show a container."""

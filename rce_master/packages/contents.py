@@ -11,14 +11,14 @@ import shutil
 import tempfile
 from typing import TYPE_CHECKING
 
-from rce.packages.contents import Contents, inspect
-from rce.packages.exceptions import BadArchiveError
-from rce.packages.limits import DEFAULT_LIMITS, ArchiveLimits
+from rce.packages import DEFAULT_LIMITS, ArchiveLimits, BadArchiveError
 from rce_master.exceptions import InvalidRequestError, StoreError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Collection
     from pathlib import Path
+
+    from rce.packages.contents import Contents
 
 _HASH = re.compile(r"[0-9a-f]{64}")
 _INCOMING = "incoming"
@@ -47,6 +47,8 @@ class Incoming:
             raise InvalidRequestError(f"the archive cannot be taken: {error}") from error
 
     def _inspect(self) -> Contents:
+        from rce.packages.contents import inspect  # takes 1 MB, which engines without packages do not need
+
         with self.path.open("rb") as file:
             return inspect(file, self._limits)
 

@@ -8,10 +8,9 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rce.control.messages import TaskSetKind
-from rce.guard.turns import CrowdedError, Turns
-from rce.packages.exceptions import BadKeyError, BadSignatureError
-from rce.packages.signing import statement, verify
+from rce.control import TaskSetKind
+from rce.guard import CrowdedError, Turns
+from rce.packages import BadKeyError, BadSignatureError, statement, verify
 from rce_master.exceptions import BusyError, ForbiddenError, InvalidRequestError
 from rce_master.packages.uploads import MAX_UPLOADS, Uploads
 from rce_master.state import commands, packages

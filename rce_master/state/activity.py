@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rce_master.state.wiring_records import ActiveInterface, OpenEnd, interface_key, open_end_key
 
 if TYPE_CHECKING:
-    from rce.control.model import EndpointStatus, StatusPatch
+    from rce.control import EndpointStatus, StatusPatch
     from rce_master.state.changes import Transaction
 
 

@@ -6,10 +6,10 @@ import ipaddress
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from rce.control.messages import TaskSetKind
+from rce.control import TaskSetKind
 from rce.model import DEFAULT_PREFIX, MEGABYTE, MIN_MEMORY, Network, Resources
 from rce_master.exceptions import ConflictError, ForbiddenError, InvalidRequestError
-from rce_master.state import limits
+from rce_master.state import limits, volumes
 from rce_master.state.placement import Room
 from rce_master.state.records import Container, TaskSet, UserRole, tombstone_key
 
@@ -74,6 +74,7 @@ def open_to(tables: Tables, container: Container, found: dict[str, Room]) -> lis
         for room in found.values()
         if (not tied or room.process in tied)
         and tombstone_key(room.process, container.id) not in tables.tombstones
+        and volumes.admits(tables, container, room.process)
     ]
 
 

@@ -25,6 +25,8 @@ from rce_master.state.records import (
     User,
     UserLimits,
     UserPackage,
+    UserVolume,
+    VolumeRemoval,
 )
 from rce_master.state.wiring_records import ActiveInterface, Connection, Interface, Link, OpenEnd
 from rce_master.store.base import Row
@@ -32,7 +34,7 @@ from rce_master.store.base import Row
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rce.control.messages import TaskSetKind
+    from rce.control import TaskSetKind
     from rce_master.state.settings import StateSettings
     from rce_master.state.tables import Table, Tables
 
@@ -109,6 +111,8 @@ class Changes:
     withdrawals: list[Withdrawal] = field(default_factory=list)
     notices: list[Notice] = field(default_factory=list)
     events: list[StateEvent] = field(default_factory=list)
+    volume_removals: list[VolumeRemoval] = field(default_factory=list)
+    """Volumes that task sets are to remove."""
     arrived: str = ""
     """Process name of the task set that is to be synchronised."""
     answered: str = ""
@@ -171,6 +175,8 @@ class Transaction:
         | UserLimits
         | PackageKey
         | UserPackage
+        | UserVolume
+        | VolumeRemoval
         | Endpoint
         | Interface
         | Link
@@ -281,6 +287,8 @@ class Transaction:
             UserLimits: tables.user_limits,
             PackageKey: tables.package_keys,
             UserPackage: tables.packages,
+            UserVolume: tables.volumes,
+            VolumeRemoval: tables.volume_removals,
             Robot: tables.endpoints,
             Container: tables.endpoints,
             Interface: tables.interfaces,

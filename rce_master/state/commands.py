@@ -9,12 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
-from rce.model import Resources
+from rce.model import InterfaceSpec, NodeSpec, ParameterValue, ResourceChanges, Resources
 
 if TYPE_CHECKING:
-    from rce.control.messages import Hello
-    from rce.control.model import EndpointStatus, StatusPatch
-    from rce.model import InterfaceSpec, NodeSpec, ParameterValue, ResourceChanges
+    from rce.control import EndpointStatus, Hello, StatusPatch
     from rce_master.state.records import KnownLogin, PackageKey, Token, User, UserPackage, UserRole
 
 
@@ -146,6 +144,26 @@ class RemovePackage:
     user: str
     name: str
     version: str
+
+
+# Volumes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemoveVolume:
+    """Remove a volume with its files; refused while a container has it."""
+
+    user: str
+    name: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VolumeRemoved:
+    """A task set has removed the files of a volume."""
+
+    process: str
+    volume: str
+    """``user/name``."""
 
 
 # Task sets
@@ -377,6 +395,8 @@ Command: TypeAlias = (
     | RemovePackageKey
     | AddPackage
     | RemovePackage
+    | RemoveVolume
+    | VolumeRemoved
     | TaskSetArrived
     | TaskSetLeft
     | StatusReported

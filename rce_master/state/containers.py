@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
+from rce.control import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
 from rce.model import NodeSpec, ParameterValue, find_circle
 from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
-from rce_master.state import activity, capacity, draining, endpoints, limits, packages, placing
+from rce_master.state import activity, capacity, draining, endpoints, limits, packages, placing, volumes
 from rce_master.state.lifecycle import ContainerEvent, ContainerPhase
 from rce_master.state.records import Container, ContainerLive
 
@@ -54,6 +54,7 @@ def create_container(tx: Transaction, command: CreateContainer) -> None:
         raise ConflictError(f"{command.tag!r} is a robot already; a container needs another tag")
     limits.check_containers(tx, command.user)
     capacity.check_resources(tx, command.user, id_, command.resources)
+    volumes.check(tx, command.user, id_, command.resources)
     made = Container(
         id=id_,
         resources=command.resources,
@@ -62,6 +63,7 @@ def create_container(tx: Transaction, command: CreateContainer) -> None:
     )
     tx.put(replace(made, size=endpoints.grown(tx, made, command.resources)))
     tx.put(ContainerLive(id=id_, phase=ContainerPhase.REQUESTED, since=tx.now))
+    volumes.reserve(tx, made)
     tx.touch(id_)
     tx.happen("container_requested", id_)
     placing.admit(tx, made, wait=command.wait)

@@ -20,9 +20,10 @@ from rce_master.state import (
     task_sets,
     tokens,
     users,
+    volumes,
     wiring,
 )
-from rce_master.state.changes import Changes, Transaction
+from rce_master.state.changes import Changes, Touched, Transaction
 from rce_master.state.invariants import validate
 from rce_master.state.migration import converted
 from rce_master.state.settings import StateSettings
@@ -32,8 +33,7 @@ from rce_master.state.tables import Tables
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.control.model import EndpointSpec, SpecPatch
-    from rce_master.state.changes import Touched
+    from rce.control import EndpointSpec, SpecPatch
     from rce_master.store.base import Snapshot
 
 _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
@@ -52,6 +52,7 @@ _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
     commands.RemovePackageKey: packages.remove_key,
     commands.AddPackage: packages.add_package,
     commands.RemovePackage: packages.remove_package,
+    commands.RemoveVolume: volumes.remove,
     commands.TaskSetArrived: task_sets.arrived,
     commands.TaskSetLeft: task_sets.left,
     commands.StatusReported: task_sets.status_reported,
@@ -81,7 +82,13 @@ def _create_and_place(tx: Transaction, command: commands.CreateContainer) -> Non
     placing.place_waiting(tx)
 
 
+def _remove_and_place(tx: Transaction, command: commands.VolumeRemoved) -> None:
+    volumes.removed(tx, command)
+    placing.place_waiting(tx)
+
+
 _HANDLERS[commands.CreateContainer] = _create_and_place
+_HANDLERS[commands.VolumeRemoved] = _remove_and_place
 
 
 def _new_token() -> str:

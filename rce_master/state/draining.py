@@ -16,11 +16,9 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.control.messages import TaskSetKind
-from rce.control.model import EndpointState, EndpointStatus, NodeState
-from rce.control.observed import without_wiring
+from rce.control import EndpointState, EndpointStatus, NodeState, TaskSetKind, without_wiring
 from rce_master.exceptions import NotFoundError
-from rce_master.state import activity, capacity, endpoints, placing
+from rce_master.state import activity, capacity, endpoints, placing, volumes
 from rce_master.state.lifecycle import ContainerEvent
 from rce_master.state.placement import Room, choose, refusals
 from rce_master.state.records import Container, Drain, Move, TaskSet, tombstone_key
@@ -122,13 +120,21 @@ def _target(tx: Transaction, unit: list[Container]) -> str:
 
 
 def _open(tx: Transaction, unit: list[Container], process: str) -> bool:
-    return all(tombstone_key(process, each.id) not in tx.tables.tombstones for each in unit)
+    return all(
+        tombstone_key(process, each.id) not in tx.tables.tombstones
+        and volumes.admits(tx.tables, each, process)
+        for each in unit
+    )
 
 
 def obstacle(tables: Tables, container: Container) -> str:
     """Report why a container cannot be handed over."""
     rooms = [r for r in capacity.rooms(tables).values() if r.process != container.task_set]
-    mates = len(_unit(tables, container)) - 1
+    unit = _unit(tables, container)
+    bound = next((each for each in unit if volumes.tied_to(tables, each)), None)
+    if bound is not None:
+        return f"the volumes of container {bound.tag!r} are on this machine and stay there"
+    mates = len(unit) - 1
     whole = f"it moves with {mates} others of its group; " if mates else ""
     return whole + (refusals(rooms, container.resources) or _nothing_said(rooms, mates))
 

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from rce.control.model import EndpointKind, LinkAddress
+from rce.control import EndpointKind, LinkAddress
 from rce_master.exceptions import LimitReachedError
-from rce_master.state import activity
+from rce_master.state import activity, volumes
 from rce_master.state.records import Container, Endpoint, Robot, Tombstone
 
 if TYPE_CHECKING:
@@ -56,6 +56,8 @@ def remove(tx: Transaction, id_: str, reason: str) -> None:
     activity.forget(tx, id_)
     tx.delete(tx.tables.endpoints, id_)
     tx.delete(tx.tables.live, id_)
+    if isinstance(endpoint, Container):
+        volumes.release(tx, endpoint)
     if endpoint.task_set:
         withdraw(tx, endpoint, reason)
 

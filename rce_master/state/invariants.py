@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from rce.control.messages import TaskSetKind
+from rce.control import TaskSetKind
 from rce.model import EndpointId, Form, InterfaceType, Role
 from rce_master.state import endpoints
 from rce_master.state.lifecycle import RobotSession

@@ -6,15 +6,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec.structs import asdict, replace
 
-from rce.control.messages import TaskSetKind
-from rce.model import MEGABYTE, write_cores
+from rce.control import TaskSetKind
+from rce.model import MEGABYTE, Resources, write_cores
 from rce_master.exceptions import LimitReachedError, NotFoundError
 from rce_master.state.records import UserLimits, UserRole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rce.model import Resources
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import SetLimits
     from rce_master.state.settings import StateSettings
@@ -76,7 +75,8 @@ def used_of(tables: Tables, user: str) -> dict[str, float]:
         "containers": len(all_requested),
         **{kind: _asked(all_requested, kind) for kind in _OF_MACHINES},
         "packages": len(packages),
-        "disk": sum(package.size for package in packages),
+        "disk": sum(package.size for package in packages)
+        + sum(volume.size for volume in tables.volumes.by("user", user)),
     }
 
 
@@ -137,8 +137,8 @@ def check_packages(tables: Tables, settings: StateSettings, user: str, size: int
     limit = limit_of(tables, settings, user, "disk")
     if limit.most and used["disk"] + size > limit.most:
         raise LimitReachedError(
-            f"the files of your packages would have {used['disk'] + size:.0f} bytes, {limit.most:.0f} are "
-            f"allowed; remove a version first, or {_advice(user, 'disk')}"
+            f"your packages and volumes would have {used['disk'] + size:.0f} bytes, {limit.most:.0f} are "
+            f"allowed; remove a version or a volume first, or {_advice(user, 'disk')}"
         )
 
 

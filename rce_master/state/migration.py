@@ -15,12 +15,11 @@ from rce.model import InterfaceSpec
 from rce_master.exceptions import StoreError
 from rce_master.state.records import Counter
 from rce_master.state.wiring_records import Connection, Interface
-from rce_master.store.base import Row
+from rce_master.store.base import Row, Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rce_master.store.base import Snapshot
 
 _ENDPOINTS, _LINKS, _INTERFACES, _CONNECTIONS = "endpoints", "links", "interfaces", "connections"
 _COUNTERS, _NUMBER = "counters", "interface"

@@ -8,9 +8,9 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING
 
-from rce.control.model import PackageSpec
-from rce.model import is_name, is_version, newest, split_package
-from rce.packages.signing import key_id
+from rce.control import PackageSpec
+from rce.model import NodeSpec, is_name, is_version, newest, split_package
+from rce.packages import key_id
 from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
 from rce_master.state import limits
 from rce_master.state.records import Container, UserPackage, package_key_key, user_package_key
@@ -18,7 +18,6 @@ from rce_master.state.records import Container, UserPackage, package_key_key, us
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rce.model import NodeSpec
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import AddPackage, AddPackageKey, RemovePackage, RemovePackageKey
     from rce_master.state.settings import StateSettings

@@ -20,7 +20,7 @@ from rce.model import MEGABYTE, Network, Resources, write_cores
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from rce.control.messages import MachineInfo
+    from rce.control import MachineInfo
 
 DETOUR = 0.2
 """So much more of a machine may be in use, as a share of it, for the sake of a container's company."""
@@ -117,6 +117,8 @@ class Room:
             found.append(f"has no network {requested.network.value}")
         if requested.image and PODMAN not in (machine.runtime, *machine.runtimes):
             found.append(f"has no {PODMAN} for the image {requested.image}")
+        if requested.volumes and not machine.volumes:
+            found.append("has no volumes (its container task set is of an earlier release)")
         if self.draining:
             found.append("is draining")
         return found

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from rce_master.exceptions import NoRoomError
-from rce_master.state import capacity
+from rce_master.state import capacity, volumes
 from rce_master.state.lifecycle import ContainerEvent
 from rce_master.state.placement import Room, choose, refusals
 from rce_master.state.records import Container, ContainerLive
@@ -82,6 +82,7 @@ def best(tx: Transaction, container: Container, rooms: dict[str, Room]) -> Room 
 def bind(tx: Transaction, container: Container, process: str) -> None:
     """Make a task set responsible for a container."""
     tx.put(replace(container, task_set=process))
+    volumes.bind(tx, container, process)
     happened(tx, container.id, ContainerEvent.PLACE)
     tx.touch(container.id)
     tx.happen("container_placed", container.id, f"at {process}")
@@ -116,6 +117,10 @@ def _why_nowhere(tx: Transaction, container: Container, rooms: dict[str, Room]) 
     if not rooms:
         return "no container task set is connected"
     open_ = capacity.open_to(tx.tables, container, rooms)
+    place = volumes.tied_to(tx.tables, container)
+    if place and place not in rooms:
+        names = ", ".join(volume.name for volume in container.resources.volumes)
+        return f"the machine with its volumes ({names}) is away: {place}"
     if not open_ and capacity.group_mates(tx.tables, container):
         return f"the machine with its group {container.resources.group!r} is away"
     return refusals(open_, container.resources) or "what it was before is still ending"
@@ -123,4 +128,8 @@ def _why_nowhere(tx: Transaction, container: Container, rooms: dict[str, Room]) 
 
 def _with_group(tx: Transaction, container: Container, rooms: dict[str, Room]) -> list[Room]:
     tied = {mate.task_set for mate in capacity.group_mates(tx.tables, container) if mate.task_set}
-    return [room for room in rooms.values() if not tied or room.process in tied]
+    return [
+        room
+        for room in rooms.values()
+        if (not tied or room.process in tied) and volumes.admits(tx.tables, container, room.process)
+    ]

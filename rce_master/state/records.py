@@ -11,8 +11,7 @@ from typing import TypeAlias
 from msgspec import Struct
 from msgspec.structs import replace
 
-from rce.control.messages import MachineInfo, TaskSetKind
-from rce.control.model import EndpointKind, EndpointStatus, LinkAddress
+from rce.control import EndpointKind, EndpointStatus, LinkAddress, MachineInfo, TaskSetKind
 from rce.lifecycle import remember
 from rce.model import NodeSpec, ParameterValue, Resources
 from rce_master.state.lifecycle import (
@@ -62,6 +61,8 @@ class User(Struct, frozen=True, kw_only=True):
 TOKEN_ID_LENGTH = 12
 ROBOT_SCOPE = "robot:"
 METRICS_SCOPE = "metrics"
+FLEET_SCOPE = "fleet"
+"""Of a program that uses operator stations, with its user's role there."""
 
 
 class Token(Struct, frozen=True, kw_only=True):
@@ -77,7 +78,7 @@ class Token(Struct, frozen=True, kw_only=True):
     used: float = 0.0
     """When it was last used, to the minute; 0: never."""
     scope: str = ""
-    """Its scope: all permissions of its user (empty), or one of ``robot:ID`` and ``metrics``."""
+    """Its scope: all permissions of its user (empty), or one of ``robot:ID``, ``metrics`` and ``fleet``."""
 
     @property
     def id(self) -> str:
@@ -106,7 +107,7 @@ class UserLimits(Struct, frozen=True, kw_only=True):
     """Bytes."""
     packages: float | None = None
     disk: float | None = None
-    """Bytes of the packages' files."""
+    """Bytes of the packages' files and of the volumes."""
 
 
 class KnownLogin(Struct, frozen=True, kw_only=True):
@@ -173,6 +174,45 @@ class UserPackage(Struct, frozen=True, kw_only=True):
 def user_package_key(user: str, name: str, version: str) -> str:
     """Tell the key of a package."""
     return f"{user}/{name}@{version}"
+
+
+class UserVolume(Struct, frozen=True, kw_only=True):
+    """A folder of a user's on a container machine, which outlives the containers that write to it."""
+
+    user: str
+    name: str
+    size: int
+    """Bytes that it may hold."""
+    process: str = ""
+    """Of the container task set on whose machine it is; empty until its first container is placed."""
+
+    @property
+    def id(self) -> str:
+        """``user/name``."""
+        return user_volume_key(self.user, self.name)
+
+
+def user_volume_key(user: str, name: str) -> str:
+    """Tell the key of a volume."""
+    return f"{user}/{name}"
+
+
+class VolumeRemoval(Struct, frozen=True, kw_only=True):
+    """A volume whose files a task set still has to remove; kept until it says that they are gone."""
+
+    process: str
+    volume: str
+    """``user/name``."""
+
+    @property
+    def id(self) -> str:
+        """Its key."""
+        return volume_removal_key(self.process, self.volume)
+
+
+def volume_removal_key(process: str, volume: str) -> str:
+    """Tell the key of the removal of a volume."""
+    return f"{process} {volume}"
 
 
 class _Endpoint(Struct, frozen=True, kw_only=True):

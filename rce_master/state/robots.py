@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.control.messages import TaskSetKind
-from rce.control.model import EndpointState, EndpointStatus
+from rce.control import EndpointState, EndpointStatus, TaskSetKind
 from rce.model import EndpointId
 from rce_master.exceptions import (
     ConflictError,

@@ -58,7 +58,7 @@ class StateSettings:
     max_package_bytes: int = 2 * 2**30
     """All archives of one user's packages together."""
     max_package_size: int = 8 * 2**30
-    """All files of one user's packages together, on the machines where they are unpacked."""
+    """All files of one user's packages together, on the machines where they are unpacked; and all volumes."""
     max_endpoint_bytes: int = 2 * 2**20
     """What the nodes, parameters and interfaces of one endpoint take when they are written down. All are sent
     when a task set or a container starts again; a change of a node or a parameter is stored and sent with all

@@ -6,22 +6,14 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.control.model import (
-    ConnectionSpec,
-    EndpointContents,
-    EndpointSpec,
-    LinkAddress,
-    LinkSpec,
-    SpecPatch,
-)
+from rce.control import ConnectionSpec, EndpointContents, EndpointSpec, LinkAddress, LinkSpec, SpecPatch
 from rce.model import ParameterSpec
 from rce_master.state import endpoints, packages
-from rce_master.state.records import Container
+from rce_master.state.records import Container, Endpoint
 from rce_master.state.wiring_records import Connection, Link
 
 if TYPE_CHECKING:
     from rce_master.state.changes import Touched
-    from rce_master.state.records import Endpoint
     from rce_master.state.tables import Tables
 
 

@@ -25,6 +25,8 @@ from rce_master.state.records import (
     User,
     UserLimits,
     UserPackage,
+    UserVolume,
+    VolumeRemoval,
 )
 from rce_master.state.wiring_records import (
     ActiveInterface,
@@ -194,6 +196,8 @@ class Tables:
 
     - ``known_logins``, ``user_limits``: at most one for each user.
     - ``endpoints``: robots and containers; both in one table, because a tag is unique among both.
+    - ``volumes``: every volume of every container, and those that containers left.
+    - ``volume_removals``: also of task sets that are gone: they may come back.
     - ``interfaces``: only of endpoints that are there.
     - ``links``: one for each pair of endpoints that has a connection.
     - ``connections``: only on links that are there, between interfaces that are there.
@@ -220,6 +224,12 @@ class Tables:
             user=lambda b: [b.user],
             package=lambda b: [f"{b.user}/{b.name}"],
             sha256=lambda b: [b.sha256],
+        )
+        self.volumes = Table[UserVolume](
+            "volumes", type_=UserVolume, key=lambda v: v.id, user=lambda v: [v.user]
+        )
+        self.volume_removals = Table[VolumeRemoval](
+            "volume_removals", type_=VolumeRemoval, key=lambda r: r.id, process=lambda r: [r.process]
         )
         self.endpoints = Table[Endpoint](
             "endpoints",
@@ -286,6 +296,8 @@ class Tables:
             self.user_limits,
             self.package_keys,
             self.packages,
+            self.volumes,
+            self.volume_removals,
             self.endpoints,
             self.interfaces,
             self.links,

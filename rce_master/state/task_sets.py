@@ -5,9 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from rce.control.messages import Hello, TaskSetKind
-from rce.control.model import EndpointState, EndpointStatus, StatusPatch
-from rce.control.observed import without_wiring
+from rce.control import EndpointState, EndpointStatus, Hello, StatusPatch, TaskSetKind, without_wiring
 from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError
 from rce_master.state import activity, capacity, containers, draining, endpoints, placing, robots
 from rce_master.state.lifecycle import ContainerPhase, RobotSession

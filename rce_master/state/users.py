@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from rce.model import is_name
 from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError
-from rce_master.state import endpoints, limits, packages, robots, tokens
+from rce_master.state import endpoints, limits, packages, robots, tokens, volumes
 from rce_master.state.records import User, UserRole
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def set_role(tx: Transaction, command: SetRole) -> None:
 
 
 def remove_user(tx: Transaction, command: RemoveUser) -> None:
-    """Remove a user with all robots, containers, packages and tokens."""
+    """Remove a user with all robots, containers, packages, volumes and tokens."""
     user = _find(tx, command.name)
     _keep_an_admin(tx, user)
     for endpoint in tx.tables.endpoints.by("user", user.name):
@@ -69,6 +69,7 @@ def remove_user(tx: Transaction, command: RemoveUser) -> None:
     for token in tx.tables.tokens.by("user", user.name):
         tokens.forget(tx, token, "the user was removed")
     packages.forget_user(tx, user.name)
+    volumes.forget_user(tx, user.name)
     limits.forget(tx, user.name)
     tx.delete(tx.tables.users, user.name)
     tx.happen("user_removed", user.name, user="")

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.model import Form, InterfaceType, Role
+from rce.model import Form, InterfaceSpec, InterfaceType, Role
 from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
 from rce_master.state import endpoints
 from rce_master.state.records import Container, Endpoint
 from rce_master.state.wiring_records import Connection, Interface, Link, interface_key
 
 if TYPE_CHECKING:
-    from rce.model import InterfaceSpec
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import AddInterface, Connect, Disconnect, RemoveInterface
 

@@ -24,9 +24,10 @@ class FolderLock:
     """
 
     def __init__(self, folder: Path) -> None:
+        self._path = folder / "lock"
         try:
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            self._fd = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError as error:
             raise StoreError(f"cannot use the state folder {folder}: {error}") from error
         try:
@@ -37,6 +38,10 @@ class FolderLock:
             raise StoreBusyError(
                 f"a master is running on the state folder {folder}; stop it first"
             ) from error
+
+    def remove(self) -> None:
+        """Remove its file, which is held until :meth:`close`."""
+        self._path.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Release it."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import aiosqlite
 
-from rce.config.folders import STORE_FILE
+from rce.config import STORE_FILE
 from rce_master.exceptions import StaleTermError, StoreError
 from rce_master.store.lock import FolderLock
 

@@ -11,14 +11,13 @@ import sys
 from typing import TYPE_CHECKING
 
 from rce.buffers import unfilled
-from rce_robot.conversion.jobs import HEAD, MAX_PARTS, decode_result, pack
+from rce_robot.conversion.jobs import HEAD, MAX_PARTS, Job, Result, decode_result, pack
 from rce_robot.exceptions import ConversionFailedError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from rce_robot.conversion.jobs import Job, Result
     from rce_robot.outgoing import Buffer
 
 _START_TIMEOUT_S = 60.0

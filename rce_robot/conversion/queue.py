@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine
 
-    from rce.guard.holdings import Holding
+    from rce.guard import Holding
 
 Out = TypeVar("Out")
 

@@ -21,21 +21,18 @@ import msgspec
 from rce.buffers import unfilled
 from rce.link import InterfaceError
 from rce.model import InterfaceSpec, InterfaceType
-from rce.protocol.exceptions import ProtocolError
+from rce.protocol import Address, ProtocolError
 from rce.protocol.large import read_large
-from rce.protocol.weight import Address
 from rce.ros.packages import PackageIndex
 from rce.ros.tcpros.allocator import give_back_free_memory
 from rce.ros.types import TypeRegistry
-from rce_robot.conversion.jobs import HEAD, ReadText, ReadValue, Result, Show, decode_job, pack
+from rce_robot.conversion.jobs import HEAD, Job, ReadText, ReadValue, Result, Show, decode_job, pack
 from rce_robot.exceptions import UnreadableError
 from rce_robot.factory import FormFactory
-from rce_robot.outgoing import Outgoing
+from rce_robot.outgoing import Buffer, Outgoing
 
 if TYPE_CHECKING:
-    from rce_robot.conversion.jobs import Job
     from rce_robot.forms import Form
-    from rce_robot.outgoing import Buffer
 
 MAX_TEXT = 64 << 20
 """Longest text that is sent to a robot, in bytes; clients do not accept longer ones."""

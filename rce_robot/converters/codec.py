@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from rce.ros.types.codegen import Code
-from rce.ros.types.readers import ReaderBuilder
+from rce.ros.types.readers import Reader, ReaderBuilder
 from rce.ros.types.values import NUMBERS
 from rce.ros.types.writers import WriterBuilder
 from rce_robot.converters.stamps import (
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from rce.ros.types import Field, MessageType
-    from rce.ros.types.readers import Reader
     from rce_robot.converters.custom import CustomConverter
 
 _MISSING: Any = object()

@@ -24,7 +24,7 @@ from rce.ros.types.codegen import FAULTS
 from rce.ros.types.faults import read_fault
 from rce.ros.types.fields import LARGE
 from rce_robot.converters.codec import make_reader, make_writer
-from rce_robot.converters.custom import load_custom_converters
+from rce_robot.converters.custom import CustomConverter, load_custom_converters
 from rce_robot.converters.faults import find_fault, unknown_fields
 from rce_robot.exceptions import ConversionError
 
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rce.ros.types import Buffer, MessageType
-    from rce_robot.converters.custom import CustomConverter
 
 
 class Converter:

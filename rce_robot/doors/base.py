@@ -14,11 +14,9 @@ if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
 
     from rce.aio.queues import OverflowPolicy
-    from rce.control.model import EndpointSpec
+    from rce.control import EndpointSpec
     from rce.model import EndpointId, Request
-    from rce.protocol.http import Credentials
-    from rce.protocol.messages import CallId, DataMessage, ErrorReport
-    from rce.protocol.stream import LargeData
+    from rce.protocol import CallId, Credentials, DataMessage, ErrorReport, LargeData
     from rce_robot.namespace import Namespace
     from rce_robot.outgoing import Rendered
 

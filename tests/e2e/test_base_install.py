@@ -63,6 +63,8 @@ def test_base_is_small(base: Path) -> None:
         ("rce ps", "server"),
         ("rce certificate init", "server"),
         ("rce ui fleet.config", "fleet"),
+        ("rce sim", "fleet"),
+        ("rce map log.bag", "fleet"),
         ("rce demo", "all"),
     ],
 )
@@ -80,6 +82,18 @@ def test_command_of_a_missing_role_names_its_extra(
     assert done.returncode == 1
     assert f"pip install 'rce[{extra}]'" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_help_of_a_missing_role_names_its_extra(base: Path, tmp_path: Path) -> None:
+    """Help is markup, where brackets would be left out."""
+    done = subprocess.run(
+        [str(base / "rce"), "sim", "--help"],
+        env=environment(tmp_path),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "rce[fleet]" in done.stdout
 
 
 @pytest.mark.parametrize("program", ["rce", "rce-ros"])

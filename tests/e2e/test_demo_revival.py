@@ -44,16 +44,22 @@ async def test_killed_parts_return_killed_world_is_named() -> None:
         robot = fleet.robots[0]
         assert fleet.map is not None
         taken = {one.cell for one in fleet.robots} | set(fleet.blocked)
-        cells = [cell for cell in range(fleet.map.rows * fleet.map.columns) if cell not in taken]
+        columns, here = fleet.map.columns, robot.cell
+        assert here is not None
+
+        def distance(cell: int) -> int:
+            return abs(cell // columns - here // columns) + abs(cell % columns - here % columns)
+
+        near = min(set(range(fleet.map.rows * columns)) - taken, key=lambda cell: (distance(cell), cell))
         kill_program(demo.process.pid, "rce_client.ros_bridge", f"{robot.id.lower()}.config")
         kill_program(demo.process.pid, "rce_fleet.station")
-        kill_program(demo.process.pid, "rce.cli.launch", f"robot:={robot.id}")
+        kill_program(demo.process.pid, "rce.ros.launching.cli", f"robot:={robot.id}")
         await until(
             lambda: demo.output().count("was ended by SIGKILL; restarting it") == 3,
             timeout=60,
             what="the demo tells what it starts again",
         )
-        await reaches(station, robot.id, cells[0])
+        await reaches(station, robot.id, near)
         kill_program(demo.process.pid, "rce_fleet.drivers")
         assert await asyncio.wait_for(demo.process.wait(), 60) == 1
         assert "rce demo: world was ended by SIGKILL" in demo.output()

@@ -153,9 +153,7 @@ async def test_whole_container_dies_and_is_made_again() -> None:
     async with running_engine(runtime="namespace") as engine, stranger(engine.url) as client:
         await wire_echo(client)
         client.statuses.clear()
-        for process in engine.processes_of("rce_container.environment"):
-            with contextlib.suppress(psutil.NoSuchProcess):
-                process.kill()
+        engine.kill_processes("rce_container.environment")
         await seen_inactive_and_active(client)
         await check_echo(client, "made again")
 
@@ -205,9 +203,7 @@ async def test_next_manager_adopts_its_containers(
             assert set(range(first, last + 1)) == running.returned, "a surviving link lost messages"
         assert node_pids(engine) == nodes
         assert all(state for _, state in client.statuses)
-        for process in engine.processes_of("rce_container.environment"):
-            with contextlib.suppress(psutil.NoSuchProcess):
-                process.kill()
+        engine.kill_processes("rce_container.environment")
         await client.wait_status(dict.fromkeys(ROBOT_TAGS, False))
         await client.wait_status(dict.fromkeys(ROBOT_TAGS, True))
         await until(lambda: not zombies(engine.container.pid), what="ended children are waited for")

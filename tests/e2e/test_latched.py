@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import signal
 import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from support.engine import Engine, Program, command_line, running_engine, until
 from support.ros_real import Graph, real_graph
@@ -148,7 +147,8 @@ async def test_latched_in_the_cloud_is_latched_at_the_robot(packages: Path, tmp_
         await it.late("/map", *everything)
 
         for process in it.nodes("one"):
-            os.kill(process.pid, signal.SIGKILL)
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
         await it.late("/map", *everything)
 
         for part in (*it.engine.robots, it.engine.container, it.engine.master):
@@ -156,8 +156,7 @@ async def test_latched_in_the_cloud_is_latched_at_the_robot(packages: Path, tmp_
             await part.start()
             await it.late("/map", *everything)
 
-        for process in it.engine.processes_of("rce_container.environment"):
-            os.kill(process.pid, signal.SIGKILL)
+        it.engine.kill_processes("rce_container.environment")
         await it.late("/map", *everything)
 
         await it.bridge.kill()
@@ -193,8 +192,7 @@ async def test_latched_at_the_robot_is_latched_in_the_cloud(packages: Path, tmp_
                 await part.start(timeout=90)
             async with visitor(it.engine) as pending_login:
                 await pending_login.late("here_says", "there_says")
-        for process in it.engine.processes_of("rce_container.environment"):
-            os.kill(process.pid, signal.SIGKILL)
+        it.engine.kill_processes("rce_container.environment")
         async with visitor(it.engine) as pending_login:
             await pending_login.late("here_says", "there_says")
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import os
-import signal
 import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -127,13 +125,6 @@ async def visitor(engine: Engine, box: str) -> AsyncIterator[Visitor]:
         yield Visitor(robot, box)
 
 
-def kill_processes(engine: Engine, *needles: str) -> None:
-    """Kill -9 what has one of these words in its command line."""
-    for needle in needles:
-        for process in engine.processes_of(needle):
-            os.kill(process.pid, signal.SIGKILL)
-
-
 async def restart(*programs: Program) -> None:
     """Kill -9 programs, all of them before the first one is started again."""
     for program in programs:
@@ -168,7 +159,7 @@ async def test_robot_and_container_hear_what_the_other_latched(tmp_path: Path) -
             await pending_login.late(f"{IN_CLOUD}.", *subjects)
 
         await restart(*engine.robots, engine.container, bridge)
-        kill_processes(engine, "rce_container.environment")
+        engine.kill_processes("rce_container.environment")
         await graph.says(*listener, text=AT_ROBOT)
         async with visitor(engine, "box") as pending_login:
             await pending_login.late(IN_CLOUD, *subjects)
@@ -195,8 +186,8 @@ async def test_container_hears_what_another_one_latched(tmp_path: Path) -> None:
         )
         async with visitor(engine, "target") as pending_login:
             await pending_login.late(f"{said}.", *subjects)
-            kill_processes(engine, "latcher.py")
+            engine.kill_processes("latcher.py")
             await pending_login.late(said, *subjects)
             await restart(engine.container)
-            kill_processes(engine, "rce_container.environment")
+            engine.kill_processes("rce_container.environment")
             await pending_login.late(said, *subjects)

@@ -108,7 +108,7 @@ class Machine:
 
 
 def _command(name: str) -> str:
-    return f"import typer; from rce.cli.{name} import {name}; typer.run({name})"
+    return f"import typer; from rce.ros.cli.{name} import {name}; typer.run({name})"
 
 
 async def _end(program: Program) -> None:

@@ -90,7 +90,8 @@ class Judge:
 
 @asynccontextmanager
 async def started(engine: Engine, uri: str, ready: str, name: str, *words: str) -> AsyncIterator[Program]:
-    env = {**engine.env, "ROS_MASTER_URI": uri, "ROS_LOG_DIR": str(engine.folder / "log")}
+    home = {"ROS_HOME": str(engine.folder / "ros"), "ROS_LOG_DIR": str(engine.folder / "log")}
+    env = {**engine.env, "ROS_MASTER_URI": uri, **home}
     program = Program(name, [str(BIN / words[0]), *words[1:]], env, engine.folder)
     await program.start(ready=ready)
     try:

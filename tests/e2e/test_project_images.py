@@ -52,7 +52,9 @@ def pip_settings(folder: Path) -> list[str]:
         if scope in ("global", "user", "site", "install", ":env:"):
             values[name] = value.strip("'\"")
     config = folder / "pip.conf"
-    config.write_text("[global]\n" + "".join(f"{name} = {value}\n" for name, value in values.items()))
+    lines = [f"{name} = {value}" for name, value in values.items()]
+    # Compiling all modules of all packages takes longer than compiling those that the test uses.
+    config.write_text("\n".join(["[global]", *lines, "[install]", "compile = false", ""]))
     paths = set()
     for word in " ".join(values.values()).split():
         parts = urlsplit(word)
@@ -93,10 +95,10 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def images(base: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    """The images by target."""
+    """The images by target; that of the wheel has a name too, so that it is removed with the others."""
     options = pip_settings(tmp_path_factory.mktemp("pip"))
     tag = f"{os.getpid()}-{secrets.token_hex(4)}"
-    made = {target: f"localhost/rce-{target}-test:{tag}" for target in ("robot", "engine")}
+    made = {target: f"localhost/rce-{target}-test:{tag}" for target in ("wheel", "robot", "engine")}
     try:
         for target, name in made.items():
             podman("build", "--build-arg", f"BASE={base}", *options, "--target", target, "--tag", name, ".")

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
-import signal
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -153,7 +151,7 @@ async def test_time_and_services_go_on_after_each_restart(tmp_path: Path) -> Non
             async with driver(graph.uri) as drive:
                 pid = await drive.all_goes_on()
                 for needles in (("times.py", "stringEcho.py"), ("rce_container.environment",)):
-                    kill(engine, *needles)
+                    engine.kill_processes(*needles)
                     pid = await drive.all_goes_on(not_pid=pid)
                 for part in (*engine.robots, engine.container, engine.master, bridge):
                     await part.kill()
@@ -161,10 +159,3 @@ async def test_time_and_services_go_on_after_each_restart(tmp_path: Path) -> Non
                     await drive.all_goes_on()
         finally:
             await bridge.stop()
-
-
-def kill(engine: Engine, *needles: str) -> None:
-    """Kill -9 what has one of these words in its command line."""
-    for needle in needles:
-        for process in engine.processes_of(needle):
-            os.kill(process.pid, signal.SIGKILL)

@@ -35,6 +35,10 @@ NOT_LOADED = {
         "rce_container",
     ),
     "master": (
+        "aiohttp",
+        "attr",
+        "h11",
+        "tarfile",
         "typer",
         "yaml",
         "cryptography",
@@ -65,6 +69,8 @@ NOT_LOADED = {
         "cryptography",
         "pydantic",
         "aiohttp",
+        "h11",
+        "tarfile",
         "PIL",
         "numpy",
         "rich",
@@ -74,7 +80,7 @@ NOT_LOADED = {
 }
 LOADED = {
     "up": "uvloop",
-    "master": "aiohttp",
+    "master": "rce_master.program",
     "robot": "rce_robot.program",
     "container": "rce_container.program",
 }

@@ -137,8 +137,10 @@ async def booted() -> AsyncIterator[Booted]:
             def init() -> int:
                 assert process.returncode is None, _tail(console.fileno())
                 children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-                is_systemd = children and Path(f"/proc/{children[0]}/comm").read_text() == "systemd\n"
-                return int(children[0]) if is_systemd else 0
+                with contextlib.suppress(FileNotFoundError):  # a step of the boot that has just ended
+                    if children and Path(f"/proc/{children[0]}/comm").read_text() == "systemd\n":
+                        return int(children[0])
+                return 0
 
             machine = Booted(await until(init, what="systemd starts"))
             state = "systemctl is-system-running --wait"

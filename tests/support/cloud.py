@@ -31,6 +31,7 @@ from rce.control.messages import (
     SpecWanted,
     Status,
     Sync,
+    ToMaster,
     Usage,
 )
 from rce.control.model import (
@@ -44,8 +45,8 @@ from rce.control.model import (
     LinkSpec,
 )
 from rce.control.observed import ObservedStatus
-from rce.control.server import ControlServer
-from rce.link import Endpoint, Interface, LinkHub
+from rce.control_channel.server import ControlServer
+from rce.link import Buffer, Endpoint, Interface, LinkHub, Port
 from rce.model.names import EndpointId, InterfaceType
 from rce.model.specs import InterfaceSpec
 from rce.protocol.requests import read_request, write_request
@@ -57,9 +58,7 @@ from support.patches import patch_between
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
-    from rce.control.messages import ToMaster
-    from rce.control.peer import Peer
-    from rce.link import Buffer, Port
+    from rce.control_channel.peer import Peer
     from rce.model.requests import Request
 
 T = TypeVar("T")
@@ -100,7 +99,7 @@ class Signal:
         self._event.set()
 
     async def until(self, condition: Callable[[], T | None]) -> T:
-        async with asyncio.timeout(15):
+        async with asyncio.timeout(60):
             while not (found := condition()):
                 self._event.clear()
                 await self._event.wait()

@@ -4,6 +4,26 @@ from __future__ import annotations
 
 NODES = {
     "talk.py": "import os, sys, time\nprint('hello', *sys.argv[1:], flush=True)\ntime.sleep(600)\n",
+    "keep.py": (
+        "import os, pathlib, time\n"
+        "folder = pathlib.Path(os.environ['RCE_VOLUME_JOURNAL'])\n"
+        "with (folder / 'log').open('a') as file:\n"
+        "    file.write('run\\n')\n"
+        "print(folder, len((folder / 'log').read_text().split()), 'runs', flush=True)\n"
+        "time.sleep(600)\n"
+    ),
+    "fill.py": (
+        "import os, pathlib, time\n"
+        "folder = pathlib.Path(os.environ['RCE_VOLUME_JOURNAL'])\n"
+        "try:\n"
+        "    with (folder / 'big').open('wb', buffering=0) as file:\n"
+        "        for _ in range(64):\n"
+        "            file.write(bytes(1 << 20))\n"
+        "except OSError as error:\n"
+        "    print('stopped', error.errno, flush=True)\n"
+        "print('wrote', (folder / 'big').stat().st_size, flush=True)\n"
+        "time.sleep(600)\n"
+    ),
     "fail.py": "import sys\nprint('it is broken', flush=True)\nsys.exit(3)\n",
     "end.py": "print('done')\n",
     "stubborn.py": (

@@ -14,7 +14,6 @@ import msgspec
 import pytest
 
 from rce.config.folders import examples_dir
-from rce.control.contents import Piece
 from rce.control.exceptions import ContentError
 from rce.control.messages import (
     Drop,
@@ -26,6 +25,7 @@ from rce.control.messages import (
     ReadLog,
     ToMaster,
     Usage,
+    VolumeLimit,
 )
 from rce.control.model import (
     EndpointState,
@@ -33,6 +33,7 @@ from rce.control.model import (
     NodeState,
     NodeStatus,
 )
+from rce.control_channel.contents import Piece
 from rce.link.handover import LinkAcceptor
 from rce_container.environment import proc
 from rce_container.folder import Record, StateFolder
@@ -109,6 +110,7 @@ class Machine:
         self.manager: Manager
         self.marks: set[str] = set()
         self.pids: dict[int, int] = {}
+        self.volume_limit = VolumeLimit.WATCHED
         self.cgroups = folder / "none"
         """The file that says where the cgroups of this machine's containers are."""
 
@@ -134,7 +136,9 @@ class Machine:
             self.cgroups = state.cgroups
             self.manager = Manager(
                 name=state.name(""),
-                info=MachineInfo(name=MACHINE, runtimes=tuple(self.runtimes)),
+                info=MachineInfo(
+                    name=MACHINE, runtimes=tuple(self.runtimes), volumes=self.volume_limit.value
+                ),
                 settings=settings,
                 runtimes=self.runtimes,
                 runtime=self.runtime,
@@ -310,8 +314,9 @@ class Machine:
 
     @property
     def containers(self) -> list[Path]:
-        folder = self.folder / "state" / "containers"
-        return list(folder.iterdir()) if folder.is_dir() else []
+        with contextlib.suppress(FileNotFoundError):  # also while it is removed
+            return list((self.folder / "state" / "containers").iterdir())
+        return []
 
     def control_groups(self) -> list[Path]:
         """The cgroups of this machine's containers."""
@@ -328,7 +333,9 @@ class Machine:
         found += [f"process {one.pid}" for mark in self.marks for one in proc.marked(mark)]
         found += map(str, self.containers)
         found += map(str, [*self.control_groups(), *self.cell_parents()])
-        found += [str(path) for path in (self.folder / "run").rglob("*") if path.is_socket()]
+        # Unlike rglob, os.walk passes over folders that are removed meanwhile.
+        paths = [Path(at, name) for at, _, names in os.walk(self.folder / "run") for name in names]
+        found += [str(path) for path in paths if path.is_socket()]
         found += [line for line in Path("/proc/mounts").read_text().splitlines() if str(self.folder) in line]
         return found
 

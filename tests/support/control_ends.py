@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from rce.aio.backoff import Backoff
 from rce.config.secret import Secret
-from rce.control.channel import TaskSetChannel
 from rce.control.exceptions import (
     PeerRefusedError,
 )
@@ -30,9 +29,10 @@ from rce.control.messages import (
     ToMaster,
     ToTaskSet,
 )
-from rce.control.peer import Peer
-from rce.control.server import ControlServer
-from rce.control.timeouts import ControlTimeouts
+from rce.control_channel.channel import TaskSetChannel
+from rce.control_channel.peer import Peer
+from rce.control_channel.server import ControlServer
+from rce.control_channel.timeouts import ControlTimeouts
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

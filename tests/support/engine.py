@@ -257,6 +257,16 @@ class Engine:
                     found.append(process)
         return found
 
+    def kill_processes(self, *needles: str) -> None:
+        """Kill -9 each process that has one of these words in its command line.
+
+        What ends with a process that was killed before it, as a sandbox's parts do, may be gone by then.
+        """
+        for needle in needles:
+            for process in self.processes_of(needle):
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    process.kill()
+
 
 def command_line(process: psutil.Process) -> list[str]:
     """The command line of a process; empty once it has ended."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TypedDict
 
 from rce.control.model import ConnectionSpec, LinkAddress, LinkSpec, NodeStatus, PackageSpec
+from rce.model import Volume
 from rce.model.specs import InterfaceSpec, Network, NodeSpec, ParameterSpec, Resources, RestartPolicy
 
 
@@ -39,6 +40,7 @@ class MachineParts(TypedDict, total=False):
     labels: tuple[str, ...]
     runtimes: tuple[str, ...]
     networks: tuple[str, ...]
+    volumes: str
 
 
 class ResourceParts(TypedDict, total=False):
@@ -53,6 +55,7 @@ class ResourceParts(TypedDict, total=False):
     memory: int
     bandwidth: int
     special_features: tuple[str, ...]
+    volumes: tuple[Volume, ...]
 
 
 class StatusParts(TypedDict, total=False):

@@ -19,11 +19,11 @@ MIN_LINES = 40
 BASE = "the lowest module of its package: merged into one of its users, it would make a circle of imports"
 TYPER = "loads typer, which a program that gets its settings from another one does without"
 TINY = {
-    "rce/control/timeouts.py": BASE,
+    "rce/control_channel/timeouts.py": BASE,
     "rce/packages/limits.py": BASE,
     "rce/protocol/limits.py": BASE,
     "rce/aio/servers.py": "about one fault of the event loop, which five servers avoid by it",
-    "rce/protocol/printable.py": "the one module of the package that `rce.ros` may import",
+    "rce/printable.py": "below five packages, which have nothing else in common",
     "rce/ros/actions/topics.py": BASE,
     "rce/ros/tf/frames.py": BASE,
     "rce_client/socket.py": "below asyncio's transport, with a test of its own; its user has 300 lines",

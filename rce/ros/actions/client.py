@@ -47,7 +47,7 @@ class ActionClient:
         self,
         node: Node,
         name: str,
-        kind: str,
+        action_type: str,
         *,
         silence_timeout: float = SILENCE_TIMEOUT,
     ) -> None:
@@ -56,14 +56,15 @@ class ActionClient:
         Args:
             node: The node that it is part of; it must be running while the client is.
             name: The action's name: the namespace of its topics.
-            kind: Its type, such as ``actionlib_tutorials/FibonacciAction``; ``Action`` may be left out.
+            action_type: Its type, such as ``actionlib_tutorials/FibonacciAction``; ``Action`` may be left
+                out.
             silence_timeout: Seconds without a message of the server after which its goals are lost;
                 ``math.inf``: never.
                 Time does not count while simulated time stands still.
         """
         self.name = node.resolve(name)
         self._node = node
-        self._types = topics.ActionTypes.named(kind)
+        self._types = topics.ActionTypes.named(action_type)
         self._silence_timeout = silence_timeout
         self._goals: dict[str, ClientGoal] = {}
         self._payloads: dict[str, bytes] = {}
@@ -96,12 +97,12 @@ class ActionClient:
             stack.push_async_callback(release, self._goal)
             self._cancel = await node.advertise(f"{self.name}/cancel", topics.GOAL_ID)
             stack.push_async_callback(release, self._cancel)
-            for topic, kind, callback in (
+            for topic, message_type, callback in (
                 ("feedback", types.action_feedback, self._feedback_received),
                 ("result", types.action_result, self._result_received),
                 ("status", topics.STATUS, self._status_received),
             ):
-                subscriber = await node.subscribe(f"{self.name}/{topic}", kind, callback)
+                subscriber = await node.subscribe(f"{self.name}/{topic}", message_type, callback)
                 stack.push_async_callback(release, subscriber)
                 self._inputs.append(subscriber)
             tasks.spawn(self._look_after_goals(), name=f"goals of {self.name}")

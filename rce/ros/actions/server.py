@@ -54,7 +54,7 @@ class ActionServer:
         self,
         node: Node,
         name: str,
-        kind: str,
+        action_type: str,
         handler: work.Handler,
         *,
         auto_accept: bool = True,
@@ -65,7 +65,8 @@ class ActionServer:
         Args:
             node: The node that it is part of; it must be running while the server is.
             name: The action's name: the namespace of its topics.
-            kind: Its type, such as ``actionlib_tutorials/FibonacciAction``; ``Action`` may be left out.
+            action_type: Its type, such as ``actionlib_tutorials/FibonacciAction``; ``Action`` may be left
+                out.
             handler: Works on a goal.
             auto_accept: Accept every goal before the handler is called; else the handler calls
                 ``goal.accept()`` or ``goal.reject()``.
@@ -73,7 +74,7 @@ class ActionServer:
         """
         self.name = node.resolve(name)
         self._node = node
-        self._types = topics.ActionTypes.named(kind)
+        self._types = topics.ActionTypes.named(action_type)
         self._handler = handler
         self._policy: Policy = ManyGoals(max_goals)
         self._auto_accept = auto_accept
@@ -100,9 +101,9 @@ class ActionServer:
         node, types = self._node, self._types
         async with AsyncExitStack() as stack:
 
-            async def advertise(topic: str, kind: str, *, latch: bool = False) -> Publisher:
+            async def advertise(topic: str, message_type: str, *, latch: bool = False) -> Publisher:
                 publisher = await node.advertise(
-                    f"{self.name}/{topic}", kind, latch=latch, queue_size=QUEUE_SIZE
+                    f"{self.name}/{topic}", message_type, latch=latch, queue_size=QUEUE_SIZE
                 )
                 stack.push_async_callback(release, publisher)
                 return publisher
@@ -117,11 +118,11 @@ class ActionServer:
             self._publish_status()
             if frequency > 0:
                 self._tasks.spawn(self._keep_publishing(1 / frequency), name=f"status of {self.name}")
-            for topic, kind, callback in (
+            for topic, message_type, callback in (
                 ("cancel", topics.GOAL_ID, self._cancel_received),
                 ("goal", types.action_goal, self._goal_received),
             ):
-                subscriber = await node.subscribe(f"{self.name}/{topic}", kind, callback)
+                subscriber = await node.subscribe(f"{self.name}/{topic}", message_type, callback)
                 stack.push_async_callback(release, subscriber)
             self._stack = stack.pop_all()
         return self
@@ -218,10 +219,10 @@ class ActionServer:
         Raises:
             SerializationError: The feedback does not fit its type.
         """
-        kind = self._feedback.type
-        message = kind.new(header=self._header(), status=_status(entry), feedback=feedback)
+        message_type = self._feedback.type
+        message = message_type.new(header=self._header(), status=_status(entry), feedback=feedback)
         # As bytes: the program may change its message after that.
-        self._feedback.publish_serialized(kind.serialize(message))
+        self._feedback.publish_serialized(message_type.serialize(message))
 
     async def sleep(self, seconds: float) -> bool:
         """Sleep in ROS time; return whether the node continues."""
@@ -260,9 +261,9 @@ class ActionServer:
         self._status.publish(header=self._header(), status_list=[_status(entry) for entry in entries])
 
     def _publish_result(self, entry: Entry, result: Message | Content) -> None:
-        kind = self._result.type
-        message = kind.new(header=self._header(), status=_status(entry), result=result)
-        self._result.publish_serialized(kind.serialize(message))
+        message_type = self._result.type
+        message = message_type.new(header=self._header(), status=_status(entry), result=result)
+        self._result.publish_serialized(message_type.serialize(message))
         self._publish_status()
 
     def _header(self) -> dict[str, Any]:
@@ -284,13 +285,13 @@ class SimpleActionServer(ActionServer):
         self,
         node: Node,
         name: str,
-        kind: str,
+        action_type: str,
         handler: work.Handler,
         *,
         auto_accept: bool = True,
     ) -> None:
         """Prepare a server; as for :class:`ActionServer`."""
-        super().__init__(node, name, kind, handler, auto_accept=auto_accept)
+        super().__init__(node, name, action_type, handler, auto_accept=auto_accept)
         self._policy = SingleGoal()
 
 

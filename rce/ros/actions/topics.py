@@ -22,9 +22,9 @@ class ActionTypes(NamedTuple):
     action_result: str
 
     @classmethod
-    def named(cls, kind: str) -> ActionTypes:
+    def named(cls, action_type: str) -> ActionTypes:
         """Return the types of the action ``package/Name`` or ``package/NameAction``."""
-        base = kind.removesuffix("Action")
+        base = action_type.removesuffix("Action")
         return cls(f"{base}ActionGoal", f"{base}ActionFeedback", f"{base}ActionResult")
 
 

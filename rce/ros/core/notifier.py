@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable
 from typing import Any
 
+from rce.aio.backoff import Backoff
 from rce.aio.tasks import TaskScope
 from rce.ros.core.events import Call
-from rce.ros.errors import RpcUnreachableError, XmlRpcError
+from rce.ros.errors import RpcTimeoutError, RpcUnreachableError, XmlRpcError
 from rce.ros.xmlrpc import RpcClient
 from rce.ros.xmlrpc.codec import encode_call
 from rce.ros.xmlrpc.dispatch import ERROR
@@ -17,6 +19,15 @@ _log = logging.getLogger(__name__)
 
 CALL_TIMEOUT = 5.0
 """Seconds that a node may take to answer one call."""
+
+RETRY = Backoff(first=0.5, longest=15.0, jitter=0.5)
+"""Seconds until a call is repeated that a node did not answer in time."""
+
+MAX_REPEATS = 60
+"""A node that answers none of so many calls in a row, for some 15 minutes, is taken to be gone."""
+
+SHUTDOWN = "shutdown"
+"""The only call that is not repeated: it may reach a newer node at the same address."""
 
 MAX_DOCUMENTS = 32
 """How many of the newest calls are kept in serialized form."""
@@ -30,6 +41,9 @@ class Notifier:
 
     A newer call takes the place of a waiting one with the same key, so a queue is never longer than the
     number of topics and parameters of its node, however slow the node is.
+
+    A call that is not answered in time is repeated: nothing else tells a node that was busy or stopped of a
+    publisher that came meanwhile.
     """
 
     def __init__(
@@ -58,10 +72,20 @@ class Notifier:
         queue[call.key] = call
 
     async def _deliver(self, uri: str, queue: dict[object, Call]) -> None:
+        pauses, repeats = RETRY.start(), 0
         try:
             while queue:
                 call = queue.pop(next(iter(queue)))
-                await self._call(call, queue)
+                if await self._call(call, queue):
+                    pauses.reset()
+                    repeats = 0
+                    continue
+                repeats += 1
+                if repeats > MAX_REPEATS:
+                    _log.warning("%s has not answered %d calls: it is not called any more", uri, repeats)
+                    return
+                queue.setdefault(call.key, call)  # a newer one carries the whole state too
+                await asyncio.sleep(pauses.next())
         finally:
             del self._waiting[uri]
 
@@ -81,10 +105,17 @@ class Notifier:
         self._documents[key] = call.arguments, document
         return document
 
-    async def _call(self, call: Call, queue: dict[object, Call]) -> None:
+    async def _call(self, call: Call, queue: dict[object, Call]) -> bool:
+        """Make a call; return whether it is done with, delivered or not."""
         try:
             document = self._written(call)
             answer = await self._client.send(call.uri, call.method, document, timeout=CALL_TIMEOUT)
+        except RpcTimeoutError as error:
+            if call.method == SHUTDOWN:
+                _log.info("%s is not delivered: %s", call.method, error)
+                return True
+            _log.info("%s is repeated: %s", call.method, error)
+            return False
         except RpcUnreachableError as error:
             _log.info("%s is not delivered: %s", call.method, error)
             queue.clear()  # the node is gone; a new node at this address registers and learns the state again
@@ -93,6 +124,7 @@ class Notifier:
         else:
             if _is_error(answer):
                 self._on_unwanted(call)
+        return True
 
 
 def _is_error(answer: Any) -> bool:

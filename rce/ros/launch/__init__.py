@@ -1,7 +1,7 @@
 """Launch files: which nodes start together, with which parameters. As ``roslaunch`` reads them.
 
 :func:`~rce.ros.launch.loader.load_launch_files` reads files into a :class:`~rce.ros.launch.plan.LaunchPlan`;
-:mod:`rce.launching` carries the plan out.
+:mod:`rce.ros.launching` carries the plan out.
 """
 
 from rce.ros.launch.exceptions import LaunchError, LaunchFileError

@@ -13,11 +13,10 @@ from rce.ros.launch.nodes import NODE, node_name, read_node
 from rce.ros.launch.parameters import read_param, read_rosparam, set_parameter
 from rce.ros.launch.plan import ArgumentPlan, LaunchPlan
 from rce.ros.launch.scope import Scope
-from rce.ros.launch.tree import parse_launch_file
+from rce.ros.launch.tree import Element, parse_launch_file
 
 if TYPE_CHECKING:
     from rce.ros.launch.inputs import LaunchInputs
-    from rce.ros.launch.tree import Element
 
 MAX_DEPTH = 32
 """How deep files may include others."""

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, TypeVar
 
 from rce.ros import names
 from rce.ros.launch.exceptions import LaunchValueError
-from rce.ros.launch.plan import NodePlan, Output, WorkingFolder
+from rce.ros.launch.plan import LaunchPlan, NodePlan, Output, WorkingFolder
 
 if TYPE_CHECKING:
     from rce.ros.launch.element_reader import ElementReader
-    from rce.ros.launch.plan import LaunchPlan
     from rce.ros.launch.scope import Scope
 
 NODE = (

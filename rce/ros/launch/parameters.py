@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from rce.ros import names
 from rce.ros.launch.exceptions import LaunchValueError
-from rce.ros.launch.plan import ParameterCommand
+from rce.ros.launch.plan import LaunchPlan, ParameterCommand
 from rce.ros.launch.values import check, convert, read_yaml
 
 if TYPE_CHECKING:
     from rce.ros.launch.element_reader import ElementReader
-    from rce.ros.launch.plan import LaunchPlan
     from rce.ros.launch.scope import Scope
 
 PARAM = ("name", "value", "type", "textfile", "binfile", "command")

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rce.aio.tasks import TaskScope
-from rce.ros.errors import MasterError, ParameterMissingError, XmlRpcError
+from rce.ros.errors import MasterError, ParameterMissingError, RpcTimeoutError, XmlRpcError
 from rce.ros.multimaster.plan import Clash, Registration, RegistrationKind, split_clashes
 from rce.ros.multimaster.source import multicall, multicall_as
 from rce.ros.node import Node
@@ -21,6 +21,8 @@ RECORD = "~registrations"
 """Parameter that records the registrations, so that a successor can remove them after a kill."""
 
 UPDATE_TIMEOUT = 5.0
+UPDATE_ATTEMPTS = 5
+"""So often a remote subscriber that does not answer in time is told of its publishers."""
 MASTER_CALLER = "/master"
 
 _REGISTER = {
@@ -186,10 +188,16 @@ class Registrar:
     async def _tell_subscriber(self, entry: Registration, uris: list[str]) -> None:
         """Send a remote subscriber its publishers, which the master only gave in its answer to this node."""
         arguments = (MASTER_CALLER, entry.name, uris)
-        try:
-            await self._master.rpc.call(entry.uri, "publisherUpdate", arguments, timeout=UPDATE_TIMEOUT)
-        except XmlRpcError as error:
-            _log.warning("%s does not learn of publishers of %s: %s", entry.node, entry.name, error)
+        left = UPDATE_ATTEMPTS
+        while True:
+            left -= 1
+            try:
+                await self._master.rpc.call(entry.uri, "publisherUpdate", arguments, timeout=UPDATE_TIMEOUT)
+            except XmlRpcError as error:
+                if left and isinstance(error, RpcTimeoutError):
+                    continue  # it may be busy
+                _log.warning("%s does not learn of publishers of %s: %s", entry.node, entry.name, error)
+            return
 
     def _tell_once(self, text: str) -> None:
         if text not in self._told:

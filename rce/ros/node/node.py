@@ -20,7 +20,9 @@ from rce.ros.node.subscriber import (
     MessageCallback,
     QueueSink,
     SerializedCallback,
+    Sink,
     Subscriber,
+    TopicListener,
     decoding,
     sink_for,
 )
@@ -28,7 +30,6 @@ from rce.ros.node.timing import Rate, Timer, TimerCallback
 from rce.ros.tcpros.header import ANY
 
 if TYPE_CHECKING:
-    from rce.ros.node.subscriber import Sink, TopicListener
     from rce.ros.types import MessageType, ServiceType, Time, TypeRegistry
 
 SERVICE_POLL = 0.1

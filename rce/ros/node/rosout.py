@@ -17,6 +17,9 @@ MD5SUM = "acffd30cd6b6de30f120938c17c593fb"
 MAX_WAITING = 100
 """How many records are kept for the first listener."""
 
+MAX_TOPICS = 50
+"""A record names the node's topics, but not more: a planner of many robots has hundreds."""
+
 _LEVELS = ((logging.CRITICAL, 16), (logging.ERROR, 8), (logging.WARNING, 4), (logging.INFO, 2))
 _DEBUG = 1
 
@@ -66,5 +69,5 @@ class RosoutHandler(logging.Handler):
             file=record.pathname,
             function=record.funcName or "",
             line=record.lineno,
-            topics=self._topics(),
+            topics=self._topics()[:MAX_TOPICS],
         )

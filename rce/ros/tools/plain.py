@@ -5,16 +5,13 @@ from __future__ import annotations
 import base64
 import json
 from array import array
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
-from rce.ros.types import Duration, Time
+from rce.ros.types import Duration, MessageType, Time
 from rce.ros.types.fields import attribute
 from rce.ros.types.values import Message
-
-if TYPE_CHECKING:
-    from rce.ros.types import MessageType
 
 _LONG = 64
 """Elements of an array above which it is cut in text for users."""

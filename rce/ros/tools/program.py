@@ -11,7 +11,7 @@ from typing import Annotated, Concatenate, ParamSpec
 
 import typer
 
-from rce.protocol.printable import for_terminal
+from rce.printable import for_terminal
 from rce.ros.errors import RosError, ToolError
 from rce.ros.node import Node, run
 from rce.ros.node.master import MasterClient
@@ -23,8 +23,8 @@ from rce.ros.xmlrpc import RpcClient
 
 P = ParamSpec("P")
 
-topic = typer.Typer(no_args_is_help=True, help="Look at topics, and publish on them.")
-service = typer.Typer(no_args_is_help=True, help="Look at services, and call them.")
+topic = typer.Typer(no_args_is_help=True, help="List, show, measure and publish topics.")
+service = typer.Typer(no_args_is_help=True, help="List, show and call services.")
 param = typer.Typer(no_args_is_help=True, help="Read and set parameters.")
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(topic, name="topic")

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 from rce.ros.types.arrays import BOOL_BYTES
 from rce.ros.types.codegen import FAULTS
 from rce.ros.types.exceptions import SerializationError
-from rce.ros.types.fields import attribute
+from rce.ros.types.fields import Buffer, Field, attribute
 from rce.ros.types.readers import MAX_EMPTY_ELEMENTS
 from rce.ros.types.values import NUMBERS, STAMPS, Message
 
 if TYPE_CHECKING:
-    from rce.ros.types.fields import Buffer, Field
     from rce.ros.types.message import MessageType
 
 _LONG_INTEGER_BITS = 200

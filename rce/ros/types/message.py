@@ -6,18 +6,22 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from rce.ros.types.definition import PART_HEADER, SEPARATOR, checksum_text, md5
+from rce.ros.types.definition import (
+    PART_HEADER,
+    SEPARATOR,
+    Constant,
+    Definition,
+    RawField,
+    checksum_text,
+    md5,
+)
 from rce.ros.types.exceptions import UnknownTypeError
-from rce.ros.types.fields import Field, min_size
+from rce.ros.types.fields import Buffer, Field, min_size
 from rce.ros.types.objects import make_class, make_codec, make_message
-from rce.ros.types.values import BUILTINS
+from rce.ros.types.values import BUILTINS, Message
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-
-    from rce.ros.types.definition import Constant, Definition, RawField
-    from rce.ros.types.fields import Buffer
-    from rce.ros.types.values import Message
 
 
 class MessageType:

@@ -10,17 +10,15 @@ from rce.ros.types.arrays import BOOL_BYTES, pack_bools, pack_numbers, pack_octe
 from rce.ros.types.codegen import FAULTS, Code
 from rce.ros.types.exceptions import SerializationError
 from rce.ros.types.faults import array_fault, find_fault, read_fault
-from rce.ros.types.fields import LARGE, attribute
-from rce.ros.types.readers import ReaderBuilder
+from rce.ros.types.fields import LARGE, Buffer, Field, attribute
+from rce.ros.types.readers import Reader, ReaderBuilder
 from rce.ros.types.values import NUMBERS, STAMPS, Duration, Message, Time
 from rce.ros.types.writers import WriterBuilder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rce.ros.types.fields import Buffer, Field
     from rce.ros.types.message import MessageType
-    from rce.ros.types.readers import Reader
 
 _UNSET: Any = object()
 

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from rce.ros.types.codegen import Code
-from rce.ros.types.fields import element_min_size
+from rce.ros.types.fields import Buffer, Field, element_min_size
 from rce.ros.types.values import NUMBERS, STAMPS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
-    from rce.ros.types.fields import Buffer, Field
     from rce.ros.types.message import MessageType
 
-    Reader = Callable[[Buffer, int], tuple[Any, int]]
-    """Reads a value at a position and returns it with the position after it."""
+Reader: TypeAlias = Callable[[Buffer, int], tuple[Any, int]]
+"""Reads a value at a position and returns it with the position after it."""
 
 MAX_EMPTY_ELEMENTS = 1 << 16
 """Longest array of messages without content: its length is not bounded by the size of the buffer."""

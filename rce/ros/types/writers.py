@@ -6,13 +6,12 @@ import struct
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rce.ros.types.codegen import Code, IndentedCode
-from rce.ros.types.fields import element_min_size
+from rce.ros.types.fields import Field, element_min_size
 from rce.ros.types.values import NUMBERS, STAMPS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.ros.types.fields import Field
     from rce.ros.types.message import MessageType
 
 

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import h11
 
 from rce.ros.dialing import open_peer_socket
-from rce.ros.errors import RpcUnreachableError
+from rce.ros.errors import RpcTimeoutError, RpcUnreachableError
 from rce.ros.xmlrpc.codec import decode_response, encode_call
 
 _log = logging.getLogger(__name__)
@@ -67,7 +67,7 @@ class RpcClient:
             timeout: Seconds for all of it.
 
         Raises:
-            RpcUnreachableError: No answer came, for whatever reason.
+            RpcUnreachableError: No answer came, for whatever reason; an RpcTimeoutError if none came in time.
             RemoteFaultError: The server answered with a fault.
             MalformedDocumentError: An argument cannot be sent or the answer cannot be read.
         """
@@ -83,7 +83,7 @@ class RpcClient:
             timeout: Seconds for all of it.
 
         Raises:
-            RpcUnreachableError: No answer came, for whatever reason.
+            RpcUnreachableError: No answer came, for whatever reason; an RpcTimeoutError if none came in time.
             RemoteFaultError: The server answered with a fault.
             MalformedDocumentError: The answer cannot be read.
         """
@@ -91,7 +91,7 @@ class RpcClient:
             async with asyncio.timeout(timeout):
                 answer = await self._exchange(uri, document)
         except TimeoutError as error:
-            raise RpcUnreachableError(uri, f"{method} took longer than {timeout:g} s") from error
+            raise RpcTimeoutError(uri, f"{method} took longer than {timeout:g} s") from error
         except (OSError, h11.ProtocolError, EOFError, ValueError) as error:
             raise RpcUnreachableError(uri, str(error) or type(error).__name__) from error
         return decode_response(answer)

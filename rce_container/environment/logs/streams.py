@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 
-from rce.control.logs import LogLevel, LogStream
+from rce.control import LogLevel, LogStream
 from rce.ros.logrecord import Level
 
 FRAGMENT_BYTES = 4096

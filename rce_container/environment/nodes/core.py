@@ -12,7 +12,7 @@ from itertools import count
 from typing import assert_never
 
 from rce.aio.backoff import Backoff
-from rce.control.model import NodeState, NodeStatus
+from rce.control import NodeState, NodeStatus
 from rce.model import NodeSpec
 from rce_container.environment.nodes.events import (
     Beat,

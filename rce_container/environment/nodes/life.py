@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from rce.control.model import NodeState
+from rce.control import NodeState
 from rce.lifecycle import LifeCycle
 
 

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import assert_never
 
-from rce.control.model import NodeStatus
+from rce.control import NodeStatus
 from rce.model import NodeSpec
 from rce_container.environment.logs.files import remove_log
 from rce_container.environment.logs.node_log import NodeLog

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from rce.control.model import NodeState, NodeStatus
+from rce.control import NodeState, NodeStatus
 from rce.lifecycle import StateMachine
 from rce.model import NodeSpec, RestartPolicy
 from rce_container.environment.nodes.life import NODE_LIFE, WITH_PROCESS, LifeEvent

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import hypot, inf, isfinite
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,8 @@ from rce_fleet.geometry.poses import compose, relative
 from rce_fleet.mapping.graph.joining import part_conflict
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from rce_fleet.mapping.graph.key_graph import KeyGraph
     from rce_fleet.mapping.graph.loop_closing import Closure
     from rce_fleet.mapping.graph.parameters import GraphParameters
@@ -105,6 +108,14 @@ class Agreement:
             one
             for one in self.pending[-MOST_PENDING:]
             if isfinite(one.length) or parts[one.earlier] != parts[one.later]
+        ]
+
+    def renumber(self, numbers: NDArray[np.int64]) -> None:
+        """Take the new numbers of the keyscans, shape (N,), after others were removed; -1: removed."""
+        self.pending = [
+            replace(one, earlier=int(numbers[one.earlier]), later=int(numbers[one.later]))
+            for one in self.pending
+            if min(numbers[one.earlier], numbers[one.later]) >= 0
         ]
 
     def _spread(self, group: list[Closure]) -> float:

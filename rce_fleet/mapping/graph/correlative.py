@@ -11,13 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rce_fleet.mapping.graph.fields import PEAK
+from rce_fleet.mapping.graph.fields import PEAK, FieldPyramid
 from rce_fleet.mapping.graph.search import SCALE, search
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from rce_fleet.mapping.graph.fields import FieldPyramid
 
 
 @dataclass(frozen=True, slots=True)

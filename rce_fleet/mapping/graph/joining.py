@@ -1,7 +1,8 @@
-"""Joining of robots whose pose is not known: where on the map to look, and whether a find is true."""
+"""Joining of robots whose pose is not known: where on the map to look, and whether a join is true."""
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,11 @@ from rce_fleet.geometry.poses import compose, inverse, relative, transform_point
 from rce_fleet.mapping.graph.visibility import conflict_share
 
 if TYPE_CHECKING:
-    from rce_fleet.mapping.graph.key_graph import KeyGraph
+    from collections.abc import Collection
+
+    from numpy.typing import NDArray
+
+    from rce_fleet.mapping.graph.key_graph import Edge, KeyGraph
     from rce_fleet.mapping.graph.loop_closing import Closure
     from rce_fleet.mapping.graph.parameters import GraphParameters
 
@@ -22,6 +27,8 @@ MOST_SAMPLES = 40
 VIEW_RADIUS = 3.0
 """Keyscans nearer than this to each other are compared, metres."""
 MOST_VIEWS = 4
+WATCHED, LEAST_WATCHED = 24, 8
+"""Of two joined strands so many new keyscans where they overlap are watched, at least so many."""
 WORST = 0.25
 """The share of the compared keyscans that counts: those that fit worst."""
 
@@ -44,18 +51,86 @@ def part_conflict(graph: KeyGraph, closure: Closure) -> float:
         near = there[order[apart[order] < VIEW_RADIUS]].tolist()
         if not near:
             continue
-        scan = graph.scans[int(here[at])]
-        views = [(graph.scans[key], poses[key]) for key in near]
-        forth = conflict_share(transform_points(moved[at], scan.points), views)
-        back = conflict_share(
-            transform_points(relative(moved[at], poses[near[0]]), graph.scans[near[0]].points),
-            [(scan, np.zeros(3))],
-        )
-        shares.append(max(forth, back))
-    if not shares:
-        return 0.0
+        shares.append(_conflict(graph, int(here[at]), moved[at], near))
+    return _worst(shares) if shares else 0.0
+
+
+def _conflict(graph: KeyGraph, key: int, pose: NDArray[np.float64], near: list[int]) -> float:
+    """Return the share of points that a keyscan and others saw through, on the side where it is greater.
+
+    Args:
+        graph: The graph.
+        key: The keyscan.
+        pose: Its pose in the frame of the others, shape (3,).
+        near: The others, the nearest first.
+    """
+    poses, scan = graph.poses, graph.scans[key]
+    views = [(graph.scans[other], poses[other]) for other in near]
+    forth = conflict_share(transform_points(pose, scan.points), views)
+    back = conflict_share(
+        transform_points(relative(pose, poses[near[0]]), graph.scans[near[0]].points), [(scan, np.zeros(3))]
+    )
+    return max(forth, back)
+
+
+def _worst(shares: Collection[float]) -> float:
+    """Return the mean of the greatest quarter."""
     worst = sorted(shares)[-max(1, round(WORST * len(shares))) :]
     return sum(worst) / len(worst)
+
+
+class JoinWatch:
+    """Watches whether later scans contradict the join of two strands of a part.
+
+    Where strands overlap, a new keyscan of one must not see through the walls of the other, nor the other way
+    round. A join that many keyscans contradict was wrong.
+
+    Args:
+        graph: The graph.
+        parameters: Parameters.
+    """
+
+    def __init__(self, graph: KeyGraph, parameters: GraphParameters) -> None:
+        self._graph = graph
+        self._parameters = parameters
+        self._shares: dict[tuple[int, int], deque[float]] = {}
+
+    def add(self, key: int) -> list[Edge]:
+        """Take a new keyscan; return the loops of a join that is contradicted now, or nothing."""
+        graph = self._graph
+        strand = int(graph.strands[key])
+        others = np.flatnonzero((graph.parts == graph.parts[key]) & (graph.strands != strand))
+        if not len(others) or len(graph.scans[key]) < self._parameters.fewest_points:
+            return []
+        apart = np.hypot(*(graph.poses[others, :2] - graph.poses[key, :2]).T)
+        order = np.argsort(apart)
+        near = others[order[apart[order] < VIEW_RADIUS]]
+        for other in np.unique(graph.strands[near]).tolist():
+            views = near[graph.strands[near] == other][:MOST_VIEWS].tolist()
+            pair = (min(strand, other), max(strand, other))
+            shares = self._shares.setdefault(pair, deque(maxlen=WATCHED))
+            shares.append(_conflict(graph, key, graph.poses[key], views))
+            if len(shares) >= LEAST_WATCHED and _worst(shares) > self._parameters.undo_conflicts:
+                return self._undo(pair)
+        return []
+
+    def _undo(self, pair: tuple[int, int]) -> list[Edge]:
+        """Return the loops that hold that strand of a pair which is tied to others less."""
+        graph = self._graph
+        strands = graph.strands
+        self._shares = {other: shares for other, shares in self._shares.items() if not {*other} & {*pair}}
+        loops = [edge for edge in graph.edges if strands[edge.first] != strands[edge.second]]
+        first = int(strands[graph.parts[graph.strands == pair[0]][0]])
+        tied = {
+            strand: [edge for edge in loops if strand in (strands[edge.first], strands[edge.second])]
+            for strand in pair
+            if strand != first  # that of the part's first keyscan stays
+        }
+        others = {
+            strand: sum({int(strands[edge.first]), int(strands[edge.second])} != {*pair} for edge in edges)
+            for strand, edges in tied.items()
+        }
+        return tied[min(tied, key=lambda strand: (others[strand], -strand))]
 
 
 class PlaceList:
@@ -89,6 +164,10 @@ class PlaceList:
             shift = graph.poses[places, :2] - graph.poses[key, :2]
             if not len(places) or np.hypot(shift[:, 0], shift[:, 1]).min() > apart:
                 self._places.append(key)
+
+    def forget(self) -> None:
+        """Choose all places anew: keyscans were removed."""
+        self._places, self._known = [], 0
 
     def all_of(self, part: int) -> list[int]:
         """Return the places of a part."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import TYPE_CHECKING
 
@@ -51,7 +51,8 @@ class KeyGraph:
     """Keyscans, their poses and edges.
 
     Keyscans that edges join are one *part* and share a frame; the first keyscan of a part keeps its pose. A
-    part has the number of its first keyscan.
+    part has the number of its first keyscan. Keyscans that edges other than loops join are one *strand*: the
+    way of one robot without a gap. Loops join strands, and may be wrong.
 
     Attributes:
         scans: Points of the keyscans.
@@ -71,6 +72,8 @@ class KeyGraph:
         self.moves = 0
         self._poses = np.zeros((FIRST_CAPACITY, 3))
         self._parts = np.zeros(FIRST_CAPACITY, np.int64)
+        self._strands = np.zeros(FIRST_CAPACITY, np.int64)
+        self._strand_count = 0
         self._ends = array("q")
         self._lengths = array("d")
         self._of_robot: dict[int, list[int]] = {}
@@ -90,6 +93,11 @@ class KeyGraph:
         return self._parts[: len(self.scans)]
 
     @property
+    def strands(self) -> NDArray[np.int64]:
+        """Number of the strand of each keyscan, shape (N,); a view. It stays when others are removed."""
+        return self._strands[: len(self.scans)]
+
+    @property
     def loops(self) -> int:
         """Number of edges that close loops."""
         return sum(edge.is_loop for edge in self.edges)
@@ -106,10 +114,14 @@ class KeyGraph:
         """Add a keyscan as a part of its own, and return its number."""
         number = len(self.scans)
         if number == len(self._poses):
-            self._poses = np.concatenate((self._poses, np.zeros_like(self._poses)))
-            self._parts = np.concatenate((self._parts, np.zeros_like(self._parts)))
+            more = max(FIRST_CAPACITY, number)
+            self._poses = np.concatenate((self._poses, np.zeros((more, 3))))
+            self._parts = np.concatenate((self._parts, np.zeros(more, np.int64)))
+            self._strands = np.concatenate((self._strands, np.zeros(more, np.int64)))
         self._poses[number] = pose
         self._parts[number] = number
+        self._strands[number] = self._strand_count
+        self._strand_count += 1
         self.scans.append(scan)
         self.robots.append(robot)
         self.ways.append(way)
@@ -123,6 +135,9 @@ class KeyGraph:
         self.edges.append(edge)
         self._ends.extend((edge.first, edge.second))
         self._lengths.append(edge.length)
+        if not edge.is_loop:
+            ends = self.strands[[edge.first, edge.second]]
+            self.strands[self.strands == ends.max()] = ends.min()
         one, two = int(self.parts[edge.first]), int(self.parts[edge.second])
         if one == two:
             return
@@ -136,6 +151,55 @@ class KeyGraph:
         self.poses[members] = compose(shift, self.poses[members])
         if np.count_nonzero(members) > 1:
             self.moves += 1
+
+    def keep(self, numbers: NDArray[np.int64], edges: Sequence[Edge]) -> None:
+        """Remove keyscans, and give the others new numbers in the same order.
+
+        Args:
+            numbers: New number of each keyscan, -1 of those to remove, shape (N,); not of a part's first one.
+            edges: The edges, with the new numbers.
+        """
+        kept = np.flatnonzero(numbers >= 0)
+        poses, parts, strands = self.poses[kept], numbers[self.parts[kept]], self.strands[kept]
+        self.scans = [self.scans[key] for key in kept]
+        self.robots = [self.robots[key] for key in kept]
+        self.ways = [self.ways[key] for key in kept]
+        self._poses, self._parts, self._strands = poses, parts, strands
+        self._of_robot, self._place = {}, []
+        for number, robot in enumerate(self.robots):
+            keys = self._of_robot.setdefault(robot, [])
+            self._place.append(len(keys))
+            keys.append(number)
+        self.refined = [
+            replace(edge, first=int(numbers[edge.first]), second=int(numbers[edge.second]))
+            for edge in self.refined
+            if min(numbers[edge.first], numbers[edge.second]) >= 0
+        ]
+        self._set_edges(list(edges))
+        self.moves += 1
+
+    def _set_edges(self, edges: list[Edge]) -> None:
+        self.edges = edges
+        self._ends = array("q", [end for edge in edges for end in (edge.first, edge.second)])
+        self._lengths = array("d", [edge.length for edge in edges])
+
+    def components(self, edges: Sequence[Edge]) -> NDArray[np.int64]:
+        """Return the smallest number among the keyscans that edges join each one with, shape (N,)."""
+        ends = np.array([(edge.first, edge.second) for edge in edges], np.int64).reshape(-1, 2)
+        links = csr_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(self), len(self)))
+        _, labels = connected_components(links, directed=False)
+        firsts = np.full(len(self), len(self), np.int64)
+        np.minimum.at(firsts, labels, np.arange(len(self)))
+        found: NDArray[np.int64] = firsts[labels]
+        return found
+
+    def part_at(self, dropped: Sequence[Edge]) -> None:
+        """Remove edges; keyscans that nothing joins any more become parts of their own, where they are."""
+        gone = {id(edge) for edge in dropped}
+        self._set_edges([edge for edge in self.edges if id(edge) not in gone])
+        self.refined = []
+        self.parts[:] = self.components(self.edges)
+        self.moves += 1
 
     def lengths_from(self, key: int, limit: float = inf) -> NDArray[np.float64]:
         """Return the length of the shortest way in the graph from a keyscan to each, metres, shape (N,)."""
@@ -168,14 +232,9 @@ class KeyGraph:
             return []
         kept = [edge for edge, bad in zip(self.edges, wrong, strict=True) if not (bad and edge.is_loop)]
         dropped = [edge for edge, bad in zip(self.edges, wrong, strict=True) if bad and edge.is_loop]
-        before = (self.edges, self._ends, self._lengths)
-        self.edges = kept
-        self._ends = array("q", [end for edge in kept for end in (edge.first, edge.second)])
-        self._lengths = array("d", [edge.length for edge in kept])
-        _, labels = connected_components(self._links(np.frombuffer(self._lengths)), directed=False)
-        if len(np.unique(labels)) != len(np.unique(self.parts)):
-            self.edges, self._ends, self._lengths = before
+        if len(np.unique(self.components(kept))) != len(np.unique(self.parts)):
             return []
+        self._set_edges(kept)
         return dropped
 
 

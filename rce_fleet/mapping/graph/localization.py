@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rce_fleet.geometry.angles import wrap
-from rce_fleet.geometry.poses import compose, relative
+from rce_fleet.geometry.jumps import OdometryWatch
+from rce_fleet.geometry.poses import Pose, compose, relative
 from rce_fleet.mapping.graph.front_end import Submap, make_submap, place_scan
 from rce_fleet.mapping.graph.joining import PlaceList
 from rce_fleet.mapping.graph.loop_closing import APART, LoopMatcher
 from rce_fleet.mapping.graph.parameters import GraphParameters
 from rce_fleet.mapping.graph.scan_points import ScanPoints, prepare_scan
+from rce_fleet.mapping.graph.tracker import UNTRUSTED
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,6 +42,7 @@ class GraphLocalizer:
     Attributes:
         pose: Pose in the map at the last scan, shape (3,); None while the robot is not found.
         unmatched: Number of scans in a row that did not match.
+        jump: How the odometry jumped at the last scan; empty if it did not.
     """
 
     def __init__(
@@ -50,6 +53,9 @@ class GraphLocalizer:
     ) -> None:
         self.pose = None if start is None else np.array(start, np.float64)
         self.unmatched = 0
+        self.jump = ""
+        self._watch = OdometryWatch()
+        self._has_jumped = False
         self._graph = graph
         self._parameters = parameters or GraphParameters()
         self._matcher = LoopMatcher(graph, self._parameters)
@@ -72,16 +78,22 @@ class GraphLocalizer:
             )
         moved = np.zeros(3) if self._odometry is None else relative(self._odometry, odometry)
         self._odometry = odometry
+        self.jump = self._watch.check(Pose(*record.odometry), record.time)
+        if self.jump:
+            moved, self._has_jumped = np.zeros(3), True
         scan = prepare_scan(record, farthest=self._parameters.usable_range, cell=self._parameters.point_cell)
         if self.pose is None or self.unmatched >= LOST_AFTER:
             found = self.find(scan)
             if found is not None:
-                self.pose, self.unmatched = found, 0
+                self.pose, self.unmatched, self._has_jumped = found, 0, False
                 return self.pose
         if self.pose is None:
             return None
-        placement = place_scan(scan, self._submap_near(self.pose), self.pose, moved, self._parameters)
+        scale = UNTRUSTED if self._has_jumped else 1.0
+        submap = self._submap_near(self.pose)
+        placement = place_scan(scan, submap, self.pose, moved, self._parameters, scale)
         self.unmatched = 0 if placement.is_matched else self.unmatched + 1
+        self._has_jumped &= not placement.is_matched
         self.pose = placement.pose
         return self.pose
 

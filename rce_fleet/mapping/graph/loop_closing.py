@@ -91,6 +91,10 @@ class LoopMatcher:
         self._submaps: OrderedDict[int, tuple[int, Submap, list[int]]] = OrderedDict()
         self.refused = {"score": 0, "points": 0, "conflict": 0, "rival": 0}
 
+    def forget(self) -> None:
+        """Make all submaps anew: keyscans were removed."""
+        self._submaps.clear()
+
     def candidates(self, key: int, lengths: NDArray[np.float64]) -> list[int]:
         """Return earlier keyscans of the same part that a keyscan may be near to, the nearest first.
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rce_fleet.geometry.poses import compose, inverse, relative
+from rce_fleet.mapping.graph import pruning
 from rce_fleet.mapping.graph.agreement import Agreement
-from rce_fleet.mapping.graph.joining import PlaceList
+from rce_fleet.mapping.graph.joining import JoinWatch, PlaceList
 from rce_fleet.mapping.graph.key_graph import Edge, KeyGraph
 from rce_fleet.mapping.graph.loop_closing import Closure, LoopMatcher
 from rce_fleet.mapping.graph.occupancy import draw_graph
@@ -36,6 +37,10 @@ BATCH = 15
 CONTRADICTED = (0.5, 0.2)
 """Loops that the optimized poses contradict by more, metres and radians, are taken back."""
 ONLINE_ITERATIONS = 5
+PRUNE_EVERY = 50
+"""The graph is pruned after so many keyscans..."""
+RECENT = 100
+"""... of which each robot's newest ones stay, so many."""
 
 
 class GraphMapper:
@@ -47,20 +52,34 @@ class GraphMapper:
     Args:
         parameters: Parameters.
         graph: A graph to continue, as :func:`~rce_fleet.mapping.graph.storage.load_graph` returns it.
+        bounded: For runs without end: keep a bounded number of keyscans of each place, and no trajectory.
 
     Attributes:
         graph: The keyscans and their poses.
         matcher: Finds loops; counts those it refuses.
         contradicted: Number of loops that were taken back.
+        undone: Number of joins that were undone.
+        pruned: Number of keyscans that were removed.
     """
 
-    def __init__(self, parameters: GraphParameters | None = None, graph: KeyGraph | None = None) -> None:
+    def __init__(
+        self,
+        parameters: GraphParameters | None = None,
+        graph: KeyGraph | None = None,
+        *,
+        bounded: bool = False,
+    ) -> None:
         self.parameters = parameters or GraphParameters()
         self.graph = graph or KeyGraph()
         self.matcher = LoopMatcher(self.graph, self.parameters)
         self.contradicted = 0
         self._agreement = Agreement(self.graph, self.parameters)
         self._places = PlaceList(self.graph, self.parameters)
+        self._joins = JoinWatch(self.graph, self.parameters)
+        self.undone = 0
+        self.pruned = 0
+        self._bounded = bounded
+        self._unpruned = 0
         self._trackers: dict[str, Tracker] = {}
         self._new_loops = 0
 
@@ -93,7 +112,8 @@ class GraphMapper:
         tracker = self._trackers.get(robot)
         if tracker is None:
             number = max(self.graph.robots, default=-1) + 1
-            tracker = Tracker(self.graph, self.parameters, max(number, len(self._trackers)))
+            number = max(number, len(self._trackers))
+            tracker = Tracker(self.graph, self.parameters, number, keeps_way=not self._bounded)
             self._trackers[robot] = tracker
         is_first = tracker.key < 0
         key = tracker.add(record, start)
@@ -102,6 +122,10 @@ class GraphMapper:
         if is_first and start is not None and key > 0:
             self._anchor(key, start)
         self._close_loops(key)
+        self._check_joins(key)
+        self._unpruned += 1
+        if self._bounded and self._unpruned >= PRUNE_EVERY:
+            self._prune()
 
     def _anchor(self, key: int, start: NDArray[np.float64]) -> None:
         """Join a robot's first keyscan to the nearest one of the map, loosely."""
@@ -146,6 +170,31 @@ class GraphMapper:
             self.contradicted += len(dropped)
             self.graph.optimize(ONLINE_ITERATIONS)
 
+    def _check_joins(self, key: int) -> None:
+        """Undo a join of two robots that a new keyscan contradicts."""
+        wrong = self._joins.add(key)
+        if wrong:
+            self.undone += 1
+            self.graph.part_at(wrong)
+            self.graph.optimize(ONLINE_ITERATIONS)
+
+    def _prune(self) -> None:
+        """Remove keyscans of places that have more than enough."""
+        graph = self.graph
+        self._unpruned = 0
+        protected = {key for robot in {*graph.robots} for key in graph.keys_of(robot)[-RECENT:]}
+        protected.update(end for one in self._agreement.pending for end in (one.earlier, one.later))
+        needless = pruning.surplus(graph, protected)
+        if not needless:
+            return
+        self.pruned += len(needless)
+        numbers = pruning.remove(graph, needless)
+        for tracker in self._trackers.values():
+            tracker.renumber(numbers)
+        self._agreement.renumber(numbers)
+        self._places.forget()
+        self.matcher.forget()
+
     def finish(self) -> None:
         """Improve all poses after the last scan."""
         self._optimize()
@@ -156,6 +205,10 @@ class GraphMapper:
     def pose(self, robot: str = "") -> NDArray[np.float64]:
         """Return where a robot was at its last scan, in the frame of its part, shape (3,)."""
         return self._trackers[robot].pose
+
+    def jump(self, robot: str = "") -> str:
+        """Return how a robot's odometry jumped at its last scan; empty if it did not."""
+        return self._trackers[robot].jump
 
     def is_joined(self, robot: str = "") -> bool:
         """Return whether a robot's poses are in the map's frame."""
@@ -174,7 +227,8 @@ class GraphMapper:
     def trajectory(self, robot: str = "") -> NDArray[np.float64]:
         """Return the pose of each scan of a robot, in the order in which they came, shape (N, 3).
 
-        Scans that were skipped have the pose by odometry relative to the scan before.
+        Scans that were skipped have the pose by odometry relative to the scan before. A bounded mapper keeps
+        the last pose only.
         """
         tracker = self._trackers.get(robot)
         if tracker is None:
@@ -197,11 +251,14 @@ class GraphMapper:
         """Return counts of a robot's scans and of the graph, by name."""
         tracker = self._trackers[robot]
         return {
-            "scans": len(tracker.entries),
+            "scans": tracker.scans,
             "matched": tracker.matched,
             "unmatched": tracker.unmatched,
             "keyscans": len(self.graph),
             "loops": self.loop_closures,
             "contradicted": self.contradicted,
+            "undone": self.undone,
+            "pruned": self.pruned,
+            "jumps": tracker.jumps,
             **{f"refused_{reason}": count for reason, count in self.matcher.refused.items()},
         }

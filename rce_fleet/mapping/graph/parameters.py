@@ -41,6 +41,7 @@ class GraphParameters:
         join_spread: These loops are spread over at least this way, metres.
         join_disagreement: Loops that disagree with them are at most this share of them.
         join_conflicts: Greatest share of points that the robots saw through on each other's way.
+        undo_conflicts: A join is undone if robots saw through more than this share of points afterwards.
         loop_spread: The loops of a group are spread over at least this way, metres.
         join_places: So many places of other parts are tried for each keyscan of a robot that is not joined.
     """
@@ -75,5 +76,6 @@ class GraphParameters:
     join_spread: float = 3.0
     join_disagreement: float = 0.5
     join_conflicts: float = 0.08
+    undo_conflicts: float = 0.25
     loop_spread: float = 0.25
     join_places: int = 4

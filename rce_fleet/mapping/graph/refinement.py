@@ -6,18 +6,13 @@ tie all passes along a wall to each other, so walls get as thin as the laser mea
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy.spatial import cKDTree
 
 from rce_fleet.geometry.angles import wrap_array
 from rce_fleet.geometry.poses import relative
 from rce_fleet.mapping.graph.alignment import Reference, align
-from rce_fleet.mapping.graph.key_graph import Edge
-
-if TYPE_CHECKING:
-    from rce_fleet.mapping.graph.key_graph import KeyGraph
+from rce_fleet.mapping.graph.key_graph import Edge, KeyGraph
 
 RADIUS = 2.5
 """Keyscans nearer than this to each other are aligned, metres."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rce_fleet.geometry.poses import transform_points
+from rce_fleet.geometry.poses import Pose, transform_points
 from rce_fleet.navigation.costmap.cost_grid import NOWHERE, Area, CostGrid, shifted
 from rce_fleet.navigation.costmap.costs import FREE, LETHAL
 from rce_fleet.navigation.costmap.layer import fill_of, write_known, write_larger
@@ -15,7 +15,6 @@ from rce_fleet.navigation.costmap.layer import fill_of, write_known, write_large
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from rce_fleet.geometry.poses import Pose
     from rce_fleet.navigation.costmap.footprint import Footprint
     from rce_fleet.navigation.costmap.observation import Observation
     from rce_fleet.navigation.costmap.parameters import ObservationSource, ObstacleLayerParameters

@@ -16,7 +16,7 @@ import numpy as np
 from rce.lifecycle import LifeCycle
 from rce_fleet.geometry.poses import Pose, Twist, compose
 from rce_fleet.navigation.costmap.costs import INSCRIBED, UNKNOWN
-from rce_fleet.navigation.planners.local_planner import Following
+from rce_fleet.navigation.planners.local_planner import Following, LocalPlanner
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from rce_fleet.navigation.move_base.recovery import Recovery
     from rce_fleet.navigation.move_base.situation import Situation
     from rce_fleet.navigation.planners.global_planner import Plan
-    from rce_fleet.navigation.planners.local_planner import LocalPlanner
 
 STANDING = Twist()
 TIME_JUMP = 1.0

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from rce_fleet.geometry.angles import wrap
-from rce_fleet.geometry.poses import Twist
+from rce_fleet.geometry.poses import Pose, Twist
 from rce_fleet.navigation.planners.trajectories import free_steps, roll_out
 
 if TYPE_CHECKING:
-    from rce_fleet.geometry.poses import Pose
     from rce_fleet.navigation.costmap.footprint import Footprint
     from rce_fleet.navigation.costmap.layered import LayeredCostmap
     from rce_fleet.navigation.move_base.situation import Situation

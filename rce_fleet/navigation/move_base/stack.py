@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from rce_fleet.navigation.costmap.cost_grid import CostGrid
+from rce_fleet.navigation.costmap.cost_grid import Area, CostGrid
 from rce_fleet.navigation.costmap.footprint import Footprint
 from rce_fleet.navigation.costmap.layered import LayeredCostmap
 from rce_fleet.navigation.costmap.parameters import CostmapParameters
-from rce_fleet.navigation.move_base.core import MoveBase
+from rce_fleet.navigation.move_base.core import Decision, MoveBase
 from rce_fleet.navigation.move_base.parameters import MoveBaseParameters
 from rce_fleet.navigation.move_base.recovery import BackUp, ClearCostmaps, Recovery, Rotate, Wait
 from rce_fleet.navigation.planners.global_planner import GlobalPlannerParameters, Plan, make_plan
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rce_fleet.geometry.poses import Pose
-    from rce_fleet.navigation.costmap.cost_grid import Area
-    from rce_fleet.navigation.move_base.core import Decision
     from rce_fleet.navigation.move_base.situation import Situation
 
 CLEAR_TYPES = ("clear_costmap_recovery/ClearCostmapRecovery",)

@@ -13,21 +13,20 @@ does an emergency stop until it is released.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil, hypot, isfinite, pi, sqrt
+from math import ceil, hypot, inf, isfinite, pi, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rce_fleet.geometry.poses import Pose, Twist
 from rce_fleet.navigation.planners.trajectories import free_steps
-from rce_fleet.navigation.safety.seen import SeenPoints, in_frame
+from rce_fleet.navigation.safety.seen import Scan, SeenPoints, in_frame
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rce_fleet.navigation.costmap.footprint import Footprint
     from rce_fleet.navigation.safety.parameters import SafetyParameters
-    from rce_fleet.navigation.safety.seen import Scan
 
     Floats = NDArray[np.float64]
 
@@ -70,12 +69,14 @@ class VelocityLimiter:
 
     Attributes:
         emergency: Why the robot is stopped until :meth:`release`; empty if it is not.
+        speed_limit: Highest speed where the robot is, metres per second; infinity: the stage's own.
     """
 
     def __init__(self, parameters: SafetyParameters, footprint: Footprint) -> None:
         self.parameters = parameters
         self.footprint = footprint
         self.emergency = ""
+        self.speed_limit = inf
         self.seen = SeenPoints(parameters.memory)
         self._command = STANDING
         self._commanded_at = float("-inf")
@@ -119,7 +120,7 @@ class VelocityLimiter:
             return Verdict(STANDING, problem, stopped=True)
         assert self._pose is not None
         limits, command = self.parameters, self._command
-        twist = _shortened(command, limits.max_speed, limits.max_turn_rate)
+        twist = _shortened(command, min(limits.max_speed, self.speed_limit), limits.max_turn_rate)
         if twist == STANDING:
             return Verdict(twist)
         scan = self.seen.newest

@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rce_fleet.geometry.poses import compose, inverse, transform_points
+from rce_fleet.geometry.poses import Pose, compose, inverse, transform_points
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from rce_fleet.geometry.poses import Pose
 
     Floats = NDArray[np.float64]
 

@@ -65,6 +65,17 @@ class RosLayerSource(LayerSource):
             yield
 
     @asynccontextmanager
+    async def graph_of(self, robot: str) -> AsyncIterator[tuple[Node, str]]:
+        """Give the station's node in a robot's graph, and the namespace of the robot's topics there.
+
+        Raises:
+            RosError: The graph cannot be reached.
+        """
+        own = await self._find_master(robot)
+        async with self._joined(own or self._master_uri, robot) as node:
+            yield node, "/" if own else f"/{robot}/"
+
+    @asynccontextmanager
     async def _joined(self, uri: str, robot: str) -> AsyncIterator[Node]:
         """Give a node in a graph: one for all topics, as long as one of them is open."""
         joining = self._joining.setdefault(uri, asyncio.Lock())

@@ -1,10 +1,13 @@
-// The engine's state: containers with usage, nodes and advice; or the nodes of a ROS graph.
+// The engine's state: containers with usage, nodes, advice, and connections with rates; or the nodes of a ROS graph.
+
+import { t } from "./texts.js";
 
 const TONE = {
   running: "good", connected: "good", placed: "warn", starting: "warn", requested: "warn", waiting: "warn",
   absent: "warn", draining: "warn", away: "bad", degraded: "warn", stopped: "warn", stopping: "warn", failed: "bad", lost: "bad", stuck: "bad",
 };
 const NEARLY_FULL = 0.9;
+const MOST_CONNECTIONS = 40; // that are listed, the busiest first
 
 export function element(tag, text = "", className = "") {
   const made = document.createElement(tag);
@@ -34,17 +37,19 @@ function bar(name, used, limit, words) {
   return line;
 }
 
-const megabytes = (count) => `${Math.round(count / 2 ** 20)} MB`;
-const percent = (cores) => `${Math.round(100 * cores)} %`;
+const megabytes = (count) => t("unit.megabytes", { count: Math.round(count / 2 ** 20) });
+const percent = (share) => t("unit.percent", { percent: Math.round(100 * share) });
+const of = (used, limit) => t("engine.of", { used, limit });
+const rate = (messages, bytes, key = "engine.rate") => t(key, { messages: messages < 10 ? messages.toFixed(1) : Math.round(messages), kilobytes: (bytes / 1000).toFixed(bytes < 10000 ? 1 : 0) });
 
 function uses(usage) {
   const found = document.createDocumentFragment();
-  const cpu = usage.cpu_limit ? `${percent(usage.cpu)} of ${percent(usage.cpu_limit)}` : percent(usage.cpu);
-  const memory = usage.memory_limit ? `${megabytes(usage.memory)} of ${megabytes(usage.memory_limit)}` : megabytes(usage.memory);
-  found.append(bar("CPU", usage.cpu, usage.cpu_limit, cpu), bar("Memory", usage.memory, usage.memory_limit, memory));
+  const cpu = usage.cpu_limit ? of(percent(usage.cpu), percent(usage.cpu_limit)) : percent(usage.cpu);
+  const memory = usage.memory_limit ? of(megabytes(usage.memory), megabytes(usage.memory_limit)) : megabytes(usage.memory);
+  found.append(bar(t("engine.cpu"), usage.cpu, usage.cpu_limit, cpu), bar(t("engine.memory"), usage.memory, usage.memory_limit, memory));
   const troubles = [];
-  if (usage.restarts) troubles.push(usage.restarts === 1 ? "1 restart" : `${usage.restarts} restarts`);
-  if (usage.oom_kills) troubles.push(usage.oom_kills === 1 ? "once out of memory" : `${usage.oom_kills} times out of memory`);
+  if (usage.restarts) troubles.push(usage.restarts === 1 ? t("engine.restart") : t("engine.restarts", { count: usage.restarts }));
+  if (usage.oom_kills) troubles.push(usage.oom_kills === 1 ? t("engine.oom") : t("engine.ooms", { count: usage.oom_kills }));
   if (troubles.length) found.append(element("div", troubles.join(", "), "use warn"));
   return found;
 }
@@ -56,7 +61,7 @@ function adviceLine(advice) {
 }
 
 function containerItem(container) {
-  const place = container.moving_to ? `${container.machine}, moving to ${container.moving_to}` : container.machine;
+  const place = container.moving_to ? t("engine.moving", { machine: container.machine, to: container.moving_to }) : container.machine;
   const item = stateLine(container.tag, container.state, place);
   if (container.usage) item.append(uses(container.usage));
   for (const advice of container.advice ?? []) item.append(adviceLine(advice));
@@ -69,11 +74,11 @@ function containerItem(container) {
 // A machine and its reserved resources.
 function machineItem(machine) {
   const state = !machine.connected ? "away" : machine.draining ? "draining" : "connected";
-  const item = stateLine(machine.machine, state, `${machine.containers} containers`);
-  if (machine.slots) item.append(bar("Slots", machine.promised_slots, machine.slots, `${machine.promised_slots} of ${machine.slots}`));
+  const item = stateLine(machine.machine, state, t("engine.containers", { count: machine.containers }));
+  if (machine.slots) item.append(bar(t("engine.slots"), machine.promised_slots, machine.slots, of(machine.promised_slots, machine.slots)));
   item.append(
-    bar("Cores", machine.promised_cores, machine.cores, `${machine.promised_cores} of ${machine.cores}`),
-    bar("Memory", machine.promised_memory, machine.memory, `${megabytes(machine.promised_memory)} of ${megabytes(machine.memory)}`),
+    bar(t("engine.cores"), machine.promised_cores, machine.cores, of(machine.promised_cores, machine.cores)),
+    bar(t("engine.memory"), machine.promised_memory, machine.memory, of(megabytes(machine.promised_memory), megabytes(machine.memory))),
   );
   for (const advice of machine.advice) item.append(adviceLine(advice));
   return item;
@@ -83,20 +88,55 @@ function graphItems(graph) {
   return [
     element("li", graph.uri, "quiet"),
     ...graph.nodes.map((node) => {
-      const counts = `${node.publishes} out, ${node.subscribes} in, ${node.serves} services`;
-      return stateLine(node.name, "registered", counts);
+      const counts = t("engine.graphNode", { publishes: node.publishes, subscribes: node.subscribes, serves: node.serves });
+      return stateLine(node.name, t("engine.registered"), counts);
     }),
   ];
 }
 
 function engineItems(engine) {
   const containers = [...engine.containers].sort((a, b) => a.tag.localeCompare(b.tag, "en", { numeric: true }));
-  const up = engine.connections.filter((connection) => connection.established).length;
   return [
     ...containers.map(containerItem),
-    stateLine("connections", `${up} of ${engine.connections.length}`, "established"),
+    connectionsItem(engine.connections),
     ...(engine.machines ?? []).map(machineItem),
   ];
+}
+
+// The connections: one element, so that its list stays open, and keeps its place, while the state is drawn again.
+const shown = { item: null, summary: null, body: null };
+
+function connectionsItem(connections) {
+  if (!shown.item) {
+    shown.item = element("li");
+    shown.summary = element("summary");
+    shown.body = element("tbody");
+    const [details, table, box] = [element("details"), element("table"), element("div", "", "scroll")];
+    details.id = "connections";
+    details.addEventListener("toggle", () => drawConnections(shown.connections));
+    table.append(shown.body);
+    box.append(table);
+    details.append(shown.summary, box);
+    shown.item.append(details);
+  }
+  drawConnections(connections);
+  return shown.item;
+}
+
+function drawConnections(connections) {
+  shown.connections = connections;
+  const up = connections.filter(({ established }) => established).length;
+  const sum = (part) => connections.reduce((all, one) => all + (one[part] ?? 0), 0);
+  shown.summary.textContent = t("engine.connections", { up, count: connections.length, rate: rate(sum("messages_s"), sum("bytes_s")) });
+  if (!shown.summary.parentElement.open) return;
+  const busiest = [...connections].sort((a, b) => (b.messages_s ?? 0) - (a.messages_s ?? 0) || (b.bytes_s ?? 0) - (a.bytes_s ?? 0));
+  shown.body.replaceChildren(...busiest.slice(0, MOST_CONNECTIONS).map((one) => {
+    const row = element("tr");
+    const between = element("td", `${one.tag_a} \u2194 ${one.tag_b}`, one.established ? "" : "bad");
+    const carries = one.established ? (one.messages_s === undefined ? "" : rate(one.messages_s, one.bytes_s, "engine.rate.short")) : t("engine.down");
+    row.append(between, element("td", carries, "rate quiet"));
+    return row;
+  }));
 }
 
 // The list with the state of an engine or ROS graph, or the error that prevents reading it.

@@ -1,5 +1,7 @@
 // Another grid of cells: its numbers, its picture over the map, and taking it over.
 
+import { t } from "./texts.js";
+
 const WAIT_MS = 300; // after the last key, before the planner is asked
 const DEGREES = 180 / Math.PI;
 
@@ -26,7 +28,7 @@ export class GridEditor extends EventTarget {
   // Begin with the grid that the fleet has.
   #begin() {
     const { map } = this.fleet;
-    if (!map) return this.#say("the fleet's grid is not known yet", true);
+    if (!map) return this.#say(t("grid.unknown"), true);
     const [x, y] = map.origin;
     const shown = { size: map.cell_size, x, y, yaw: (map.yaw ?? 0) * DEGREES };
     for (const [name, value] of Object.entries(shown)) this.fields[name].value = Number(value.toFixed(4));
@@ -58,15 +60,15 @@ export class GridEditor extends EventTarget {
 
   async #preview() {
     const request = this.#request();
-    if (!request) return this.#say("a number is missing or out of range", true);
+    if (!request) return this.#say(t("grid.number"), true);
     const number = ++this.#asked;
-    this.#say("waiting for the planner");
+    this.#say(t("grid.waiting"));
     try {
       const grid = await this.ask("POST", "/api/v1/grid/preview", request);
       if (number !== this.#asked) return;
       if (this.fields.share.value === "") this.fields.share.value = Number((100 * grid.blocked_share).toFixed(2));
       this.#show(grid);
-      this.#say(`${grid.columns} x ${grid.rows} cells, ${grid.walls.length} of them blocked; ${grid.message}`);
+      this.#say(t("grid.says", { columns: grid.columns, rows: grid.rows, walls: grid.walls.length, message: grid.message }));
     } catch (error) {
       if (number !== this.#asked) return;
       this.#show(null);
@@ -91,6 +93,7 @@ export class GridEditor extends EventTarget {
   #show(grid) {
     this.proposed = grid && { ...grid, walls: new Set(grid.walls) };
     this.take.disabled = !grid;
+    this.dispatchEvent(new Event("shown"));
   }
 
   #say(text, bad = false) {

@@ -2,17 +2,25 @@
 
 import { element } from "./engine.js";
 import { LAYERS } from "./layers.js";
+import { t } from "./texts.js";
 
 export class LayerPanel {
   #notes = new Map();
 
-  constructor(fleet, layers) {
+  constructor(fleet, layers, view) {
     this.fleet = fleet;
     this.layers = layers;
     this.robot = document.querySelector("#layer-robot");
     this.list = document.querySelector("#layer-list");
-    this.#add("grid", "Fleet grid", true, (on) => layers.toggleGrid(on));
-    for (const { name, label } of LAYERS) this.#add(name, label, false, (on) => layers.toggle(name, on));
+    this.#addFleet("grid", true, (on) => layers.toggleGrid(on));
+    const { shown } = view.scene;
+    const set = (name, value, ...touched) => { shown[name] = value; view.touch(...touched); };
+    this.#addFleet("paths", true, (on) => set("paths", on ? "all" : "selected", "lines"));
+    this.#addFleet("goals", true, (on) => set("goals", on, "lines"));
+    this.#addFleet("trails", false, (on) => set("trails", on ? "all" : "few", "lines"));
+    this.#addFleet("zones", true, (on) => set("zones", on, "cells"));
+    this.#addFleet("congestion", false, (on) => set("congestion", on, "cells"));
+    for (const name of LAYERS) this.#add(name, false, (on) => layers.toggle(name, on));
     this.robot.addEventListener("change", () => layers.look(this.robot.value || null));
     fleet.addEventListener("selected", () => { if (fleet.selected) layers.look(fleet.selected); });
     for (const type of ["state", "changes"]) fleet.addEventListener(type, () => this.#listRobots());
@@ -21,7 +29,18 @@ export class LayerPanel {
     this.#listRobots();
   }
 
-  #add(name, label, checked, toggle) {
+  #addFleet(name, checked, toggle) {
+    const item = element("li");
+    const row = element("label");
+    const box = element("input");
+    Object.assign(box, { type: "checkbox", id: `layer-${name}`, checked });
+    box.addEventListener("change", () => toggle(box.checked));
+    row.append(box, t(`layer.${name}`));
+    item.append(row);
+    document.querySelector("#fleet-layers").append(item);
+  }
+
+  #add(name, checked, toggle) {
     const item = element("li");
     const row = element("label");
     const box = element("input");
@@ -33,24 +52,25 @@ export class LayerPanel {
     const note = element("span", "", "note");
     note.id = `layer-note-${name}`;
     this.#notes.set(name, note);
-    row.append(box, swatch, label);
+    row.append(box, swatch, t(`layer.${name}`));
     item.append(row, note);
     this.list.append(item);
   }
 
   // Rebuilt only when the robots changed, so that an open list stays open.
   #listRobots() {
-    const ids = [...this.fleet.robots.keys()].sort((a, b) => a.localeCompare(b, "en", { numeric: true }));
     if (this.layers.robot !== null && !this.fleet.robots.has(this.layers.robot)) this.layers.look(null);
-    if (ids.join() === this.ids) return;
-    this.ids = ids.join();
-    this.robot.replaceChildren(new Option("none", ""), ...ids.map((id) => new Option(id, id)));
+    const known = [...this.fleet.robots.keys()].join();
+    if (known === this.known) return;
+    this.known = known;
+    const ids = known.split(",").sort((a, b) => a.localeCompare(b, "en", { numeric: true }));
+    this.robot.replaceChildren(new Option(t("layers.none"), ""), ...ids.filter(Boolean).map((id) => new Option(id, id)));
     this.#draw();
   }
 
   #draw() {
     this.robot.value = this.layers.robot ?? "";
-    for (const { name } of LAYERS) {
+    for (const name of LAYERS) {
       const note = this.#notes.get(name);
       const text = this.layers.note(name);
       if (note.textContent !== text) note.textContent = text;

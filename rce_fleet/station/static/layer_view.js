@@ -38,6 +38,10 @@ export class LayerView {
     this.#drawParticles(place);
   }
 
+  get hasGround() {
+    return ["map", "global_costmap", "local_costmap"].some((name) => this.layers.newest.get(name)?.cells !== undefined);
+  }
+
   get hasMap() {
     return this.layers.newest.get("map")?.cells !== undefined;
   }

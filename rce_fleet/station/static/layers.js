@@ -1,14 +1,9 @@
 // The layers of one robot: which are shown, and their newest messages. Independent of the screen.
 // A frame has the length of its header (uint32), the header (JSON), and numbers; all little-endian.
 
-export const LAYERS = [
-  { name: "map", label: "Map" },
-  { name: "global_costmap", label: "Global costmap" },
-  { name: "local_costmap", label: "Local costmap" },
-  { name: "plan", label: "Planned path" },
-  { name: "scan", label: "Scan" },
-  { name: "particles", label: "Particle cloud" },
-];
+import { t } from "./texts.js";
+
+export const LAYERS = ["map", "global_costmap", "local_costmap", "plan", "scan", "particles"];
 
 export const UNKNOWN = 255;
 const GRIDS = new Set(["map", "global_costmap", "local_costmap"]);
@@ -80,13 +75,13 @@ export class Layers extends EventTarget {
   // What the operator should know about a layer: trouble, notes, age.
   note(name) {
     if (!this.shown.has(name)) return "";
-    if (this.robot === null) return "pick a robot";
+    if (this.robot === null) return t("layers.pick");
     const trouble = this.troubles.get(name);
     if (trouble) return trouble;
     const entry = this.newest.get(name);
-    if (!entry?.header) return "waiting";
+    if (!entry?.header) return t("layers.waiting");
     const age = Math.round((performance.now() - entry.received) / 1000);
-    return [...entry.header.notes, ...(age >= 5 ? [`${age} s ago`] : [])].join("; ");
+    return [...entry.header.notes, ...(age >= 5 ? [t("layers.age", { seconds: age })] : [])].join("; ");
   }
 
   #wants(robot, layer) {

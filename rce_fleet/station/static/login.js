@@ -1,5 +1,9 @@
 // Logs a user of the engine in at the station; the token stays in a cookie that no script can read.
 
+import { fillTexts, t } from "./texts.js";
+
+fillTexts();
+document.title = t("login.title");
 const form = document.querySelector("#login");
 const message = document.querySelector("#message");
 

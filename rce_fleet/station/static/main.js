@@ -1,110 +1,159 @@
-// Connects model, view and panel to the station: a WebSocket for changes, HTTP for the operator's requests.
+// Connects the parts of the page: the fleet, the map, the panels, and what the operator does.
 
+import { Actions } from "./actions.js";
+import { Attention } from "./attention.js";
+import { Connection } from "./connection.js";
+import { Drive } from "./drive.js";
+import { Gestures } from "./gestures.js";
 import { GridEditor } from "./grid_editor.js";
-import { Fleet } from "./model.js";
 import { LayerPanel } from "./layer_panel.js";
 import { Layers } from "./layers.js";
+import { Figures } from "./figures.js";
+import { Fleet } from "./model.js";
 import { Panel } from "./panel.js";
+import { Replay } from "./replay.js";
+import { Operator, ask } from "./requests.js";
+import { RobotCard } from "./robot_card.js";
+import { RobotsTable } from "./robots_table.js";
+import { TasksPanel } from "./tasks_panel.js";
+import { fillTexts, t } from "./texts.js";
+import { startTheme } from "./theme.js";
+import { Tools } from "./tools.js";
 import { View } from "./view.js";
+import { World3d } from "./view3d.js";
+import { WorldPanel } from "./world_panel.js";
+import { Work } from "./work.js";
+import { ZoneForm } from "./zone_form.js";
 
-let socket = null;
+const at = (selector) => document.querySelector(selector);
+const WIDE = 1.3; // a map that is this much wider than high is above the view of the world, not beside it
+
+fillTexts();
 const fleet = new Fleet();
-const layers = new Layers((request) => { if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(request)); });
-const canvas = document.querySelector("#map");
-const view = new View(canvas, fleet, layers);
+const layers = new Layers((request) => connection.send(request));
+const view = new View(at("#stage"), fleet, layers);
 const panel = new Panel(fleet);
-new LayerPanel(fleet, layers);
-const badge = document.querySelector("#link");
-const message = document.querySelector("#message");
-const toolBlock = document.querySelector("#tool-block");
-const toolGoal = document.querySelector("#tool-goal");
+const badge = at("#link");
+const connection = new Connection(fleet, layers, (live) => {
+  badge.textContent = t(live ? "link.live" : "link.connecting");
+  badge.classList.toggle("live", live);
+});
+const message = at("#message");
 
 function say(text, bad = false) {
   message.textContent = text;
   message.className = bad ? "bad" : "";
 }
 
-// Send a request; return the answer, or throw an error with its text.
-async function ask(method, path, body) {
-  const response = await fetch(path, {
-    method,
-    headers: { "Content-Type": "application/json" },
-    body: body === undefined ? undefined : JSON.stringify(body),
-  });
-  const answer = await response.json();
-  if (!response.ok) throw new Error(answer.error ?? response.statusText);
-  return answer;
+const operator = new Operator(say, (text) => panel.addEvent(text, "bad"));
+const work = new Work(fleet);
+const actions = new Actions(fleet, operator, work);
+const tools = new Tools(view, fleet, actions);
+const drive = new Drive(fleet);
+const gestures = new Gestures(view.canvas, view.camera, tools);
+new RobotsTable(fleet);
+new LayerPanel(fleet, layers, view);
+new Figures();
+const world = new World3d(at("#world"), view.scene, fleet);
+const worldPanel = new WorldPanel(world, fleet, operator);
+const replay = new Replay(view, fleet);
+new ZoneForm(tools, actions, work);
+const tasks = new TasksPanel(work, actions, fleet);
+
+// An answer to an exception, or a button of a robot's card.
+function answer(name, robot) {
+  const task = fleet.robots.get(robot)?.task;
+  const answers = {
+    show: () => {
+      if (fleet.selected !== robot) fleet.select(robot);
+      const { pose } = fleet.robots.get(robot);
+      if (pose) view.camera.centre(pose.x, pose.y);
+    },
+    stop: () => actions.emergencyStop(robot, true),
+    release: () => actions.emergencyStop(robot, false),
+    drive: () => drive.begin(robot),
+    localize: () => {
+      if (fleet.selected !== robot) fleet.select(robot);
+      tools.choose("pose");
+    },
+    raise: () => task && actions.raise(task, 100),
+  };
+  return (answers[name] ?? (() => actions[name](robot)))();
 }
 
-async function request(method, path, body) {
-  try {
-    say((await ask(method, path, body)).message);
-  } catch (error) {
-    say(error.message, true);
-    panel.addEvent(error.message, "bad");
-  }
-}
+const attention = new Attention(fleet, answer);
+const card = new RobotCard(fleet, answer);
 
-function act(cell) {
-  if (fleet.selected) {
-    const robot = fleet.selected;
-    fleet.select(robot);
-    return request("PUT", `/api/v1/robots/${robot}/goal`, { cell });
-  }
-  const blocked = fleet.blocked.has(cell) || fleet.pending.has(cell);
-  return request("PUT", `/api/v1/cells/${cell}`, { blocked: !blocked });
-}
-
-canvas.addEventListener("click", (event) => {
+view.canvas.addEventListener("keydown", (event) => {
   if (!fleet.map) return;
-  const [x, y] = view.worldAt(event);
-  const robot = fleet.robotAt(x, y, 0.35 * fleet.map.cell_size);
-  if (robot) return fleet.select(robot.id);
-  const cell = fleet.cellAt(x, y);
-  if (cell !== null) act(cell);
-});
-
-canvas.addEventListener("pointermove", (event) => {
-  if (fleet.map) view.cursor = fleet.cellAt(...view.worldAt(event));
-});
-canvas.addEventListener("pointerleave", () => { view.cursor = null; });
-
-canvas.addEventListener("keydown", (event) => {
-  if (!fleet.map) return;
+  if (gestures.key(event)) return event.preventDefault();
   const { rows, columns } = fleet.map;
   const steps = { ArrowLeft: -1, ArrowRight: 1, ArrowUp: columns, ArrowDown: -columns };
   if (event.key in steps) {
     const next = (view.cursor ?? 0) + steps[event.key];
-    if (next >= 0 && next < rows * columns) view.cursor = next;
-  } else if (event.key === "Enter" && view.cursor !== null) {
-    act(view.cursor);
-  } else {
-    return;
-  }
+    if (next >= 0 && next < rows * columns) view.cursorCell = next;
+  } else if (event.key === "Enter" && view.cursor !== null) tools.use(view.cursor);
+  else if (event.key === "Escape") tools.choose("act");
+  else return;
   event.preventDefault();
+});
+
+at("#zoom-in").addEventListener("click", () => view.camera.zoom(1.5));
+at("#zoom-out").addEventListener("click", () => view.camera.zoom(1 / 1.5));
+at("#zoom-fit").addEventListener("click", () => view.camera.fit());
+
+for (const button of document.querySelectorAll("[data-tool]")) button.addEventListener("click", () => tools.choose(button.dataset.tool));
+
+function drawTools() {
+  for (const button of document.querySelectorAll("[data-tool]")) button.setAttribute("aria-pressed", button.dataset.tool === tools.tool);
+  at("#hint").textContent = tools.hint;
+}
+tools.addEventListener("chosen", drawTools);
+fleet.addEventListener("selected", drawTools);
+drawTools();
+
+// What holds for the whole fleet.
+
+at("#fleet-pause").addEventListener("click", () => actions.setMode("paused"));
+at("#fleet-resume").addEventListener("click", () => actions.setMode("automatic"));
+at("#stop-all").addEventListener("click", () => actions.emergencyStop(null, true));
+at("#release-all").addEventListener("click", () => { if (confirm(t("stop.confirm"))) actions.emergencyStop(null, false); });
+for (const type of ["state", "changes"]) fleet.addEventListener(type, () => {
+  const { mode } = fleet;
+  const isPaused = mode !== "automatic";
+  if (at("#mode").hidden === isPaused) {
+    at("#mode").hidden = at("#fleet-resume").hidden = !isPaused;
+    at("#fleet-pause").hidden = isPaused;
+  }
+  if (isPaused) at("#mode").textContent = t(`mode.${mode}`);
+});
+fleet.addEventListener("control", () => { at("#release-all").hidden = !Object.keys(fleet.stopped).length; });
+at("#undo").addEventListener("click", () => operator.undo());
+operator.addEventListener("acted", () => {
+  const { undoable } = operator;
+  at("#undo").disabled = undoable === null;
+  at("#undo").title = undoable === null ? "" : t("undo.what", { label: undoable });
+  work.refresh();
+});
+work.addEventListener("change", () => {
+  view.scene.zones = work.zones;
+  view.touch("cells");
+});
+document.addEventListener("keydown", (event) => {
+  if ((event.ctrlKey || event.metaKey) && event.key === "z" && !event.target.closest("input")) operator.undo();
 });
 
 const editor = new GridEditor(fleet, ask);
 view.editor = editor;
 editor.addEventListener("taken", ({ detail }) => say(detail));
 
-toolBlock.addEventListener("click", () => { if (fleet.selected) fleet.select(fleet.selected); });
-
-fleet.addEventListener("selected", () => {
-  toolBlock.setAttribute("aria-pressed", fleet.selected === null);
-  toolGoal.setAttribute("aria-pressed", fleet.selected !== null);
-  toolGoal.disabled = fleet.selected === null;
-  toolGoal.textContent = fleet.selected ? `Send ${fleet.selected}: click its goal` : "Pick a robot to send it";
-});
-
 fleet.addEventListener("news", ({ detail }) => panel.addEvent(detail.text, detail.tone));
-
 // A station that was restarted does not know which layers are shown, and refuses them until it knows the robots.
 fleet.addEventListener("state", () => layers.request());
-
 fleet.addEventListener("map", () => {
-  canvas.style.aspectRatio = `${fleet.map.columns} / ${fleet.map.rows}`;
-  view.cursor = null;
+  at("#stage").style.aspectRatio = `${fleet.map.columns} / ${fleet.map.rows}`;
+  at("#stages").classList.toggle("wide", fleet.map.columns > WIDE * fleet.map.rows);
+  view.cursorCell = null;
 });
 
 async function identify() {
@@ -112,51 +161,26 @@ async function identify() {
   if (response.status === 401) return location.replace("/login");
   if (!response.ok) return say((await response.json()).error, true);
   const person = await response.json();
-  document.querySelector("#person").textContent = person.logged_in ? `${person.name} (${person.role})` : "";
-  document.querySelector("#logout").hidden = !person.logged_in;
+  at("#person").textContent = person.logged_in ? `${person.name} (${person.role})` : "";
+  at("#logout").hidden = !person.logged_in;
   editor.form.hidden = !person.steers;
-  if (!person.steers) {
-    for (const tool of [toolBlock, toolGoal]) tool.hidden = true;
-    document.querySelector("#hint").textContent = `Your role, ${person.role}, looks and does not steer.`;
-  }
+  for (const part of [tools, tasks, attention, card, worldPanel]) part.steers = person.steers;
+  for (const part of document.querySelectorAll(".steer")) part.hidden = !person.steers;
+  card.draw();
+  drawTools();
 }
 
-document.querySelector("#logout").addEventListener("click", async () => {
+at("#logout").addEventListener("click", async () => {
   await fetch("/api/v1/login", { method: "DELETE" });
   location.replace("/login");
 });
 
-const LOGIN_ENDED = 1008;
-
-function connect(delay = 500) {
-  const opening = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/v1/live?changes=1`);
-  opening.binaryType = "arraybuffer";
-  socket = opening;
-  let opened = false;
-  opening.addEventListener("open", () => {
-    opened = true;
-    badge.textContent = "live";
-    badge.classList.add("live");
-    layers.request();
-  });
-  opening.addEventListener("message", (event) => {
-    if (event.data instanceof ArrayBuffer) return layers.takeFrame(event.data);
-    const received = JSON.parse(event.data);
-    if (received.type === "layer") return layers.take(received);
-    fleet.apply(received);
-    // A change is missing; the next connection begins with the complete state.
-    if (received.type === "changes" && fleet.isBehind) opening.close();
-  });
-  opening.addEventListener("close", ({ code }) => {
-    if (code === LOGIN_ENDED) return location.replace("/login");
-    badge.textContent = "connecting";
-    badge.classList.remove("live");
-    setTimeout(connect, delay * (0.5 + Math.random()), opened ? 500 : Math.min(2 * delay, 8000));
-  });
-}
-
+startTheme(at("#theme"), () => {
+  view.readColours();
+  world.readColours(view.colour);
+});
 identify();
-connect();
+connection.open();
 
 // For automated tests of the page.
-window.rceFleet = { fleet, layers, view, editor };
+window.rceFleet = { fleet, layers, view, editor, tools, actions, operator, work, drive, replay, world, worldPanel, traffic: connection.traffic };

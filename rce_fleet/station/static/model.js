@@ -1,7 +1,12 @@
 // The page's model of the fleet, updated by messages of the station's WebSocket; independent of the screen.
 // The station sends the complete state first (map, state, poses), then numbered changes.
 
-export const TRAIL_LENGTH = 240;
+import { t } from "./texts.js";
+import { Trail } from "./trail.js";
+
+const FRAME = 0x50454352;   // "RCEP", as the number at the start of a frame of poses
+const FRAME_HEADER = 16;
+const ROW_BYTES = 20;
 
 export class Fleet extends EventTarget {
   map = null;          // {rows, columns, cell_size, origin: [x, y], yaw, robot_radius, walls}; row 0 is the lowest
@@ -11,14 +16,22 @@ export class Fleet extends EventTarget {
   pending = new Set();
   engine = null;
   selected = null;
+  models = [];         // of a simulated world: [name, x, y, yaw]
+  things = {};         // what they are: {name: ["robot" or "light"], ["box", width, depth] or ["walker", radius]}
+  isPaused = false;    // whether the time of the simulated world stands still
+  mode = "automatic";  // of the whole fleet: automatic, paused or stopped
+  stopped = {};        // robot -> who stopped it
+  driven = {};         // robot -> who drives it by hand
+  manager = false;     // whether a fleet manager answers
   sequence = 0;        // number of the last change that is known
   isBehind = false;    // a change is missing: everything is needed again
+  #byIndex = [];       // robots by their index in frames
 
   apply(message) {
     const handler = this[`on_${message.type}`];
     if (handler) {
       handler.call(this, message);
-      this.dispatchEvent(new Event(message.type));
+      if (message.type !== "audit") this.dispatchEvent(new Event(message.type));
     }
   }
 
@@ -29,6 +42,7 @@ export class Fleet extends EventTarget {
 
   on_state(message) {
     this.sequence = message.sequence;
+    this.mode = message.mode;
     this.isBehind = false;
     for (const [text, tone] of this.#cellNews(message)) this.#tell(text, tone);
     for (const [text, tone] of this.#robotNews(message.robots)) this.#tell(text, tone);
@@ -37,7 +51,7 @@ export class Fleet extends EventTarget {
     const present = new Set();
     for (const state of message.robots) {
       present.add(state.id);
-      Object.assign(this.#robot(state.id), state);
+      this.#take(state);
     }
     for (const id of this.robots.keys()) {
       if (!present.has(id)) this.#remove(id);
@@ -48,38 +62,97 @@ export class Fleet extends EventTarget {
     this.isBehind ||= message.sequence !== this.sequence + 1;
     if (this.isBehind) return;
     this.sequence = message.sequence;
-    for (const cell of message.blocked) if (!this.blocked.has(cell)) this.#tell(`cell ${cell} is blocked`, "warn");
-    for (const cell of message.freed) if (this.blocked.has(cell)) this.#tell(`cell ${cell} is free`, "good");
+    this.mode = message.mode;
+    for (const cell of message.blocked) if (!this.blocked.has(cell)) this.#tell(t("news.blocked", { cell }), "warn");
+    for (const cell of message.freed) if (this.blocked.has(cell)) this.#tell(t("news.free", { cell }), "good");
     for (const [text, tone] of this.#robotNews(message.robots)) this.#tell(text, tone);
     for (const cell of [...message.pending, ...message.freed]) this.blocked.delete(cell);
     for (const cell of [...message.blocked, ...message.freed]) this.pending.delete(cell);
     for (const cell of message.blocked) this.blocked.add(cell);
     for (const cell of message.pending) this.pending.add(cell);
-    for (const state of message.robots) Object.assign(this.#robot(state.id), state);
+    for (const state of message.robots) this.#take(state);
     for (const id of message.removed) this.#remove(id);
+    if (message.blocked.length || message.pending.length || message.freed.length) this.dispatchEvent(new Event("cells"));
+  }
+
+  #take(state) {
+    const robot = this.#robot(state.id);
+    if (state.state !== "waiting") robot.waitingSince = null;
+    else if (robot.state !== "waiting") robot.waitingSince = performance.now();
+    Object.assign(robot, state);
+    if (state.index !== undefined) this.#byIndex[state.index] = robot;
   }
 
   #remove(id) {
+    const robot = this.robots.get(id);
+    if (robot?.index !== undefined) delete this.#byIndex[robot.index];
     this.robots.delete(id);
     if (this.selected === id) this.selected = null;
   }
 
   on_poses(message) {
-    for (const [id, [x, y, theta]] of Object.entries(message.poses)) {
-      const robot = this.#robot(id);
-      robot.pose = { x, y, theta };
-      robot.shown ??= { x, y, theta };
-      robot.seen = performance.now();
-      const last = robot.trail.at(-1);
-      if (!last || Math.hypot(last[0] - x, last[1] - y) > 0.05) {
-        robot.trail.push([x, y]);
-        if (robot.trail.length > TRAIL_LENGTH) robot.trail.shift();
-      }
+    for (const [id, [x, y, theta]] of Object.entries(message.poses)) this.#move(this.#robot(id), x, y, theta, performance.now());
+  }
+
+  // Whether a binary message is a frame of poses; rce_fleet.station.pose_frames describes them.
+  static isFrame(buffer) {
+    return buffer.byteLength >= FRAME_HEADER && new DataView(buffer).getUint32(0, true) === FRAME;
+  }
+
+  applyFrame(buffer) {
+    // Little-endian, as all machines are that run browsers.
+    const whole = new Uint32Array(buffer);
+    const parts = new Float32Array(buffer);
+    const end = Math.min(whole.length, (FRAME_HEADER + whole[1] * ROW_BYTES) / 4);
+    const now = performance.now();
+    for (let at = FRAME_HEADER / 4; at < end; at += ROW_BYTES / 4) {
+      const robot = this.#byIndex[whole[at]];
+      if (!robot) continue;
+      this.#move(robot, parts[at + 1], parts[at + 2], parts[at + 3], now);
+      if (parts[at + 4] >= 0) robot.heard = now - 1000 * parts[at + 4];
     }
+    this.dispatchEvent(new Event("poses"));
+  }
+
+  #move(robot, x, y, theta, now) {
+    const { pose } = robot;
+    if (pose) {
+      pose.x = x;
+      pose.y = y;
+      pose.theta = theta;
+    } else robot.pose = { x, y, theta };
+    robot.shown ??= { x, y, theta };
+    robot.seen = now;
+    robot.trail.add(x, y);
+  }
+
+  // Who stopped robots, and who drives them by hand: {robot: user}.
+  on_control({ stopped, driven }) {
+    this.stopped = stopped;
+    this.driven = driven;
+    for (const robot of this.robots.values()) Object.assign(robot, { emergency: stopped[robot.id] ?? null, driver: driven[robot.id] ?? null });
+  }
+
+  on_manager({ here }) {
+    this.manager = here;
   }
 
   on_engine(message) {
     this.engine = message;
+  }
+
+  // The truth of a simulated world: [name, x, y, yaw].
+  on_world({ models }) {
+    this.models = models;
+  }
+
+  on_things({ things, paused }) {
+    this.things = things;
+    this.isPaused = paused;
+  }
+
+  on_audit(message) {
+    this.dispatchEvent(new CustomEvent("audit", { detail: message }));
   }
 
   on_event(message) {
@@ -89,9 +162,9 @@ export class Fleet extends EventTarget {
   // Events for the operator from the cells of a complete state.
   *#cellNews(message) {
     if (!this.blocked.size) return;
-    for (const cell of message.blocked) if (!this.blocked.has(cell)) yield [`cell ${cell} is blocked`, "warn"];
+    for (const cell of message.blocked) if (!this.blocked.has(cell)) yield [t("news.blocked", { cell }), "warn"];
     const left = new Set([...message.blocked, ...message.pending]);
-    for (const cell of this.blocked) if (!left.has(cell)) yield [`cell ${cell} is free`, "good"];
+    for (const cell of this.blocked) if (!left.has(cell)) yield [t("news.free", { cell }), "good"];
   }
 
   // Events for the operator from robots that changed.
@@ -99,12 +172,12 @@ export class Fleet extends EventTarget {
     for (const state of robots) {
       const before = this.robots.get(state.id);
       if (!before) continue;
-      if (state.replans > before.replans) yield [`${state.id} gets a new path`, "warn"];
+      if (state.replans > before.replans) yield [t("news.replanned", { robot: state.id }), "warn"];
       if (state.state === before.state) continue;
-      if (state.state === "arrived") yield [`${state.id} is at its goal, cell ${state.goal}`, "good"];
-      if (state.state === "unreachable") yield [`no path leads ${state.id} to cell ${state.goal}`, "bad"];
-      if (state.state === "silent") yield [`${state.id} is silent: ${state.reason}`, "bad"];
-      if (before.state === "silent") yield [`${state.id} sends messages again`, "good"];
+      if (state.state === "arrived") yield [t("news.arrived", { robot: state.id, cell: state.goal }), "good"];
+      if (state.state === "unreachable") yield [t("news.unreachable", { robot: state.id, cell: state.goal }), "bad"];
+      if (state.state === "silent") yield [t("news.silent", { robot: state.id, reason: state.reason }), "bad"];
+      if (before.state === "silent") yield [t("news.back", { robot: state.id }), "good"];
     }
   }
 
@@ -141,6 +214,17 @@ export class Fleet extends EventTarget {
     return this.#place((cell % columns) + 0.5, Math.floor(cell / columns) + 0.5);
   }
 
+  // The same without a pair for each cell: {x(cell), y(cell)}; for as long as the map is not replaced.
+  get frame() {
+    const { columns, cell_size, origin, yaw = 0 } = this.map;
+    const [c, s] = [cell_size * Math.cos(yaw), cell_size * Math.sin(yaw)];
+    const up = (cell) => Math.floor(cell / columns) + 0.5;
+    return {
+      x: (cell) => origin[0] + ((cell % columns) + 0.5) * c - up(cell) * s,
+      y: (cell) => origin[1] + ((cell % columns) + 0.5) * s + up(cell) * c,
+    };
+  }
+
   // The rectangle around the fleet's grid, and another one: [least x, least y, greatest x, greatest y], metres.
   bounds(other = null) {
     const corners = [this.map, other].filter(Boolean).flatMap((grid) => {
@@ -160,16 +244,8 @@ export class Fleet extends EventTarget {
 
   #robot(id) {
     if (!this.robots.has(id)) {
-      this.robots.set(id, { id, state: "unknown", reason: "", cell: null, goal: null, plan: [], granted: [], replans: 0, pose: null, shown: null, seen: null, trail: [] });
+      this.robots.set(id, { id, state: "unknown", reason: "", cell: null, goal: null, plan: [], granted: [], replans: 0, pose: null, shown: null, seen: null, heard: null, trail: new Trail(), waitingSince: null, emergency: this.stopped[id] ?? null, driver: this.driven[id] ?? null });
     }
     return this.robots.get(id);
   }
-}
-
-// A fixed colour for each robot: chosen ones for the first, then hues spread by the golden angle.
-const COLOURS = ["#2a7de1", "#d9480f", "#0f9d76", "#9c36b5", "#c2255c", "#5f7d0e", "#0b7285", "#7048e8"];
-
-export function colourOf(id) {
-  const number = Number(id.replace(/\D+/g, "")) || [...id].reduce((sum, c) => sum + c.charCodeAt(0), 0);
-  return COLOURS[number - 1] ?? `hsl(${(205 + number * 137.508) % 360} 65% 48%)`;
 }

@@ -1,261 +1,202 @@
-// Draws the world on a canvas: cells, boxes, plans, trails, robots. World metres, y up; the screen's y points down.
+// The map: canvases over each other (layers below, the fleet, texts and tools), drawn when something changed.
 
+import { Camera } from "./camera.js";
+import { readColours } from "./colours.js";
+import { CanvasRenderer } from "./fleet_canvas.js";
+import { GlRenderer } from "./fleet_gl.js";
+import { SplitRenderer } from "./fleet_split.js";
+import { isSoftware } from "./gl.js";
 import { LayerView } from "./layer_view.js";
-import { colourOf } from "./model.js";
+import { Overlay } from "./overlay.js";
+import { MANY, Scene } from "./scene.js";
 
-const MARGIN = 0.15;    // of a cell, around the map
-const BOX = 0.6;        // edge of a box, of a cell
-const SMOOTHING = 0.25; // share of the way to the newest pose that a robot is moved in one frame
+const MARGIN = 0.15;         // of a cell, around the map
+const LINES_EVERY_MS = 100;  // paths and trails are made again at most this often
+const LINES_OF_MANY_MS = 500; // the same with more robots than 300
+const CELLS_EVERY_MS = 1000; // congestion is counted again at most this often
 
 export class View {
   cursor = null; // cell under the pointer or the keyboard
-  editor = null; // has the grid that may be taken over
+  meter = { frames: 0, drawn: 0, script_ms: 0, longest_ms: 0 };
+  #editor = null;
+  #last = 0;
+  #madeAt = { lines: 0, cells: 0 };
+  #waiting = null;      // for the next frame
+  #timer = null;        // until what was made a moment ago may be made again
+  #needs = { ground: true, fleet: true, overlay: true, lines: true, cells: true };
 
-  constructor(canvas, fleet, layers) {
-    this.canvas = canvas;
+  // stage: the element with the canvases #ground, #still, #fleet and #map.
+  constructor(stage, fleet, layers) {
+    this.stage = stage;
+    this.canvas = stage.querySelector("#map");
+    this.ground = stage.querySelector("#ground");
     this.fleet = fleet;
+    this.scene = new Scene(fleet);
+    this.camera = new Camera();
     this.layers = new LayerView(layers);
-    this.context = canvas.getContext("2d");
-    new ResizeObserver(() => this.#resize()).observe(canvas);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#readColours());
-    this.#readColours();
+    this.context = this.ground.getContext("2d");
+    this.renderer = this.#makeRenderer(stage);
+    this.overlay = new Overlay(this);
+    new ResizeObserver(() => this.#resize()).observe(stage);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.readColours());
+    this.camera.addEventListener("change", () => this.touch());
+    layers.addEventListener("change", () => this.touch("ground", "overlay", "fleet"));
+    fleet.addEventListener("map", () => { this.#fit(); this.touch("cells", "lines"); });
+    for (const type of ["state", "changes", "selected"]) fleet.addEventListener(type, () => this.touch("lines", "overlay", "fleet"));
+    for (const type of ["state", "cells"]) fleet.addEventListener(type, () => this.touch("cells"));
+    fleet.addEventListener("changes", () => { if (this.scene.shown.congestion) this.touch("cells"); });
+    fleet.addEventListener("poses", () => {
+      if (fleet.robots.size <= MANY || this.scene.shown.trails === "all") this.touch("lines");
+      this.#wake();
+    });
+    this.readColours();
     this.#resize();
-    const frame = () => { this.draw(); requestAnimationFrame(frame); };
-    requestAnimationFrame(frame);
+  }
+
+  // ?renderer=webgl, split or canvas chooses one, to try it.
+  #makeRenderer(stage) {
+    const [still, canvas] = ["#still", "#fleet"].map((name) => stage.querySelector(name));
+    const wanted = new URLSearchParams(location.search).get("renderer");
+    const isSplit = wanted === "split" || (!wanted && isSoftware());
+    still.hidden = !isSplit;
+    try {
+      if (isSplit) return new SplitRenderer(still, canvas, this.scene);
+      if (wanted !== "canvas") return new GlRenderer(canvas, this.scene);
+    } catch (error) {
+      console.info(`drawing without WebGL: ${error.message}`);
+      still.hidden = true;
+    }
+    return new CanvasRenderer(canvas, this.scene);
+  }
+
+  get left() { return this.camera.left; }
+  get bottom() { return this.camera.bottom; }
+  get scale() { return this.camera.scale; }
+  get ratio() { return this.canvas.width / Math.max(1, this.canvas.getBoundingClientRect().width); }
+  get editor() { return this.#editor; }
+
+  set editor(editor) {
+    this.#editor = editor;
+    editor.addEventListener("shown", () => { this.#fit(); this.touch(); });
+  }
+
+  // Note what must be drawn again: ground, fleet, overlay, lines, cells; without a name, all that the camera moves.
+  touch(...names) {
+    for (const name of names.length ? names : ["ground", "fleet", "overlay"]) this.#needs[name] = true;
+    this.#wake();
+  }
+
+  // Frames are drawn while something moves or waits to be drawn; otherwise the page rests.
+  #wake() {
+    if (this.#waiting !== null) return;
+    this.#waiting = requestAnimationFrame((now) => {
+      this.#waiting = null;
+      this.#frame(now);
+    });
+  }
+
+  set cursorCell(cell) {
+    if (cell === this.cursor) return;
+    this.cursor = cell;
+    this.touch("overlay");
   }
 
   worldAt(event) {
     const box = this.canvas.getBoundingClientRect();
     const ratio = this.canvas.width / box.width;
-    return [
-      ((event.clientX - box.left) * ratio - this.left) / this.scale,
-      (this.bottom - (event.clientY - box.top) * ratio) / this.scale,
-    ];
+    return this.camera.worldAt((event.clientX - box.left) * ratio, (event.clientY - box.top) * ratio);
   }
 
   // Where the middle of a cell is on the page, in CSS pixels from the canvas' corner.
   screenOf(cell) {
     const [x, y] = this.fleet.centre(cell);
-    const ratio = this.canvas.width / this.canvas.getBoundingClientRect().width;
-    return [(this.left + x * this.scale) / ratio, (this.bottom - y * this.scale) / ratio];
+    return [this.camera.x(x) / this.ratio, this.camera.y(y) / this.ratio];
   }
 
-  #readColours() {
+  readColours() {
     const style = getComputedStyle(document.documentElement);
-    this.colour = Object.fromEntries(
-      ["cell", "line", "wall", "box", "boxedge", "shut", "pending", "ink", "quiet", "accent", "bad"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]),
-    );
+    this.colour = readColours(style);
+    this.renderer.readColours(this.colour);
     this.layers.readColours(style);
+    this.touch();
   }
 
   #resize() {
     const ratio = window.devicePixelRatio || 1;
-    const box = this.canvas.getBoundingClientRect();
-    this.canvas.width = Math.max(1, Math.round(box.width * ratio));
-    this.canvas.height = Math.max(1, Math.round(box.height * ratio));
+    const box = this.stage.getBoundingClientRect();
+    const [width, height] = [box.width, box.height].map((side) => Math.max(1, Math.round(side * ratio)));
+    for (const canvas of this.stage.querySelectorAll("canvas.flat")) {
+      if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    }
+    this.camera.resize(width, height);
+    this.touch();
   }
 
   #fit() {
-    const [x0, y0, x1, y1] = this.fleet.bounds(this.editor?.proposed);
-    const margin = MARGIN * this.fleet.map.cell_size;
-    const width = x1 - x0 + 2 * margin;
-    const height = y1 - y0 + 2 * margin;
-    this.scale = Math.min(this.canvas.width / width, this.canvas.height / height);
-    this.left = (this.canvas.width - width * this.scale) / 2 + (margin - x0) * this.scale;
-    this.bottom = (this.canvas.height + height * this.scale) / 2 - (margin - y0) * this.scale;
+    const { map } = this.fleet;
+    if (map) this.camera.show(this.fleet.bounds(this.editor?.proposed), MARGIN * map.cell_size);
   }
 
-  #x(x) { return this.left + x * this.scale; }
-  #y(y) { return this.bottom - y * this.scale; }
+  #frame(now) {
+    const started = performance.now();
+    this.meter.frames++;
+    this.draw(now);
+    const spent = performance.now() - started;
+    this.meter.script_ms += spent;
+    this.meter.longest_ms = Math.max(this.meter.longest_ms, spent);
+  }
 
-  draw() {
-    const { context, canvas, fleet } = this;
-    context.clearRect(0, 0, canvas.width, canvas.height);
+  draw(now = performance.now()) {
+    const seconds = Math.max(0.001, Math.min(0.1, (now - this.#last) / 1000));
+    this.#last = now;
+    const { fleet, scene } = this;
     if (!fleet.map) return;
-    this.#fit();
-    this.layers.drawBelow(this);
-    if (this.layers.layers.grid) this.#drawCells();
-    this.#drawCursor();
-    if (this.editor?.proposed) this.#drawProposed(this.editor.proposed);
-    for (const robot of fleet.robots.values()) this.#drawTrail(robot);
-    for (const robot of fleet.robots.values()) this.#drawPlan(robot);
-    for (const robot of fleet.robots.values()) this.#drawRobot(robot);
-    this.layers.drawAbove(this);
-  }
-
-  // Go to the grid: the first cell begins at the origin; its columns go right and its rows up (negative).
-  #enterGrid(grid = this.fleet.map) {
-    const { context } = this;
-    const [x, y] = grid.origin;
-    context.save();
-    context.translate(this.#x(x), this.#y(y));
-    context.rotate(-(grid.yaw ?? 0));
-  }
-
-  // The grid that may be taken over: dashed lines, blocked cells crossed out.
-  #drawProposed(grid) {
-    const { context, colour } = this;
-    const side = grid.cell_size * this.scale;
-    this.#enterGrid(grid);
-    context.strokeStyle = colour.accent;
-    context.lineWidth = Math.max(1, devicePixelRatio);
-    context.setLineDash([4 * devicePixelRatio, 3 * devicePixelRatio]);
-    context.beginPath();
-    for (let row = 0; row <= grid.rows; row++) {
-      context.moveTo(0, -row * side);
-      context.lineTo(grid.columns * side, -row * side);
+    const needs = this.#needs;
+    if (this.#isDue("cells", now, scene.shown.congestion ? CELLS_EVERY_MS : 0)) scene.makeCells();
+    if (this.#isDue("lines", now, fleet.robots.size > 300 ? LINES_OF_MANY_MS : LINES_EVERY_MS)) scene.makeLines();
+    const moving = scene.moveRobots(seconds);
+    if (moving) this.#wake();
+    if (this.stage.hidden) return;
+    if (needs.ground) {
+      this.context.clearRect(0, 0, this.ground.width, this.ground.height);
+      this.layers.drawBelow(this.#place(this.context));
+      // An empty canvas costs as much as a full one where the page is put together without a graphics card.
+      this.ground.style.visibility = this.layers.hasGround ? "" : "hidden";
+      needs.ground = false;
     }
-    for (let column = 0; column <= grid.columns; column++) {
-      context.moveTo(column * side, 0);
-      context.lineTo(column * side, -grid.rows * side);
+    if (moving || needs.fleet) {
+      this.renderer.draw(this.camera, { grid: this.layers.layers.grid, over: this.layers.hasMap });
+      this.meter.drawn++;
+      needs.fleet = false;
     }
-    context.stroke();
-    context.setLineDash([]);
-    context.beginPath();
-    for (const cell of grid.walls) {
-      const [left, top] = [(cell % grid.columns) * side, -(Math.floor(cell / grid.columns) + 1) * side];
-      context.moveTo(left, top);
-      context.lineTo(left + side, top + side);
-      context.moveTo(left + side, top);
-      context.lineTo(left, top + side);
-    }
-    context.stroke();
-    context.restore();
-  }
-
-  #drawCells() {
-    const { context, fleet, colour } = this;
-    const { rows, columns } = fleet.map;
-    this.#enterGrid();
-    const overMap = this.layers.hasMap;
-    const side = fleet.map.cell_size * this.scale;
-    const small = side < 24;
-    const gap = small ? 0 : Math.max(1, side * 0.02);
-    context.font = `${Math.round(side * 0.16)}px system-ui, sans-serif`;
-    context.textAlign = "left";
-    context.textBaseline = "top";
-    for (let cell = 0; cell < rows * columns; cell++) {
-      const left = (cell % columns) * side + gap;
-      const top = -(Math.floor(cell / columns) + 1) * side + gap;
-      const wall = fleet.walls.has(cell);
-      const boxed = !wall && fleet.blocked.has(cell);
-      context.fillStyle = wall ? colour.wall : boxed ? colour.shut : fleet.pending.has(cell) ? colour.pending : colour.cell;
-      // Over the map, cells are outlined, so that it can be seen through them.
-      if (overMap) {
-        context.globalAlpha = 0.35;
-        if (wall || boxed || fleet.pending.has(cell)) context.fillRect(left, top, side - 2 * gap, side - 2 * gap);
-        context.globalAlpha = 1;
-        context.strokeStyle = colour.line;
-        context.lineWidth = 1;
-        context.strokeRect(left, top, side - 2 * gap, side - 2 * gap);
-      } else if (wall) context.fillRect(left - gap - 0.5, top - gap - 0.5, side + 1, side + 1);
-      else context.fillRect(left, top, side - 2 * gap, side - 2 * gap);
-      if (boxed) this.#drawBox(left - gap + side / 2, top - gap + side / 2, BOX * side);
-      if (!small && !wall) {
-        context.fillStyle = colour.quiet;
-        context.fillText(cell, left + side * 0.05, top + side * 0.05);
-      }
-    }
-    context.restore();
-  }
-
-  #drawCursor() {
-    if (this.cursor === null) return;
-    const { context, fleet } = this;
-    const side = fleet.map.cell_size * this.scale;
-    const gap = side < 24 ? 0 : Math.max(1, side * 0.02);
-    const [left, top] = [(this.cursor % fleet.map.columns) * side, -(Math.floor(this.cursor / fleet.map.columns) + 1) * side];
-    this.#enterGrid();
-    context.strokeStyle = this.colour.accent;
-    context.lineWidth = Math.max(2, side * 0.04);
-    context.strokeRect(left + gap, top + gap, side - 2 * gap, side - 2 * gap);
-    context.restore();
-  }
-
-  #drawBox(x, y, side) {
-    const { context, colour } = this;
-    const half = side / 2;
-    context.fillStyle = colour.box;
-    context.fillRect(x - half, y - half, side, side);
-    context.strokeStyle = colour.boxedge;
-    context.lineWidth = Math.max(1, side * 0.06);
-    context.strokeRect(x - half, y - half, side, side);
-    context.beginPath();
-    context.moveTo(x - half, y - half);
-    context.lineTo(x + half, y + half);
-    context.moveTo(x + half, y - half);
-    context.lineTo(x - half, y + half);
-    context.stroke();
-  }
-
-  #line(points) {
-    const { context } = this;
-    context.beginPath();
-    points.forEach(([x, y], index) => (index ? context.lineTo(this.#x(x), this.#y(y)) : context.moveTo(this.#x(x), this.#y(y))));
-    context.stroke();
-  }
-
-  #drawTrail(robot) {
-    if (robot.trail.length < 2) return;
-    const { context } = this;
-    context.strokeStyle = colourOf(robot.id);
-    context.globalAlpha = 0.35;
-    context.lineWidth = Math.max(1, 0.03 * this.scale);
-    this.#line(robot.trail);
-    context.globalAlpha = 1;
-  }
-
-  #drawPlan(robot) {
-    const { context, fleet } = this;
-    context.strokeStyle = context.fillStyle = colourOf(robot.id);
-    context.lineWidth = Math.max(2, 0.06 * this.scale);
-    context.lineCap = context.lineJoin = "round";
-    if (robot.plan.length > 1) {
-      context.setLineDash([0.12 * this.scale, 0.14 * this.scale]);
-      this.#line(robot.plan.map((cell) => fleet.centre(cell)));
-      context.setLineDash([]);
-    }
-    if (robot.granted.length > 1) this.#line(robot.granted.map((cell) => fleet.centre(cell)));
-    if (robot.goal !== null) {
-      const [x, y] = fleet.centre(robot.goal);
-      const half = 0.16 * fleet.map.cell_size * this.scale;
-      context.strokeRect(this.#x(x) - half, this.#y(y) - half, 2 * half, 2 * half);
+    if (needs.overlay || (moving && this.overlay.hasNames)) {
+      this.overlay.draw();
+      needs.overlay = false;
     }
   }
 
-  #drawRobot(robot) {
-    if (!robot.pose) return;
-    const { context, fleet } = this;
-    const { pose, shown } = robot;
-    shown.x += (pose.x - shown.x) * SMOOTHING;
-    shown.y += (pose.y - shown.y) * SMOOTHING;
-    shown.theta += Math.atan2(Math.sin(pose.theta - shown.theta), Math.cos(pose.theta - shown.theta)) * SMOOTHING;
-    const radius = (fleet.map.robot_radius ?? 0.25) * this.scale;
-    context.save();
-    context.translate(this.#x(shown.x), this.#y(shown.y));
-    context.fillStyle = colourOf(robot.id);
-    context.beginPath();
-    context.arc(0, 0, radius, 0, 2 * Math.PI);
-    context.fill();
-    if (robot.id === fleet.selected) {
-      context.strokeStyle = this.colour.ink;
-      context.lineWidth = Math.max(2, radius * 0.16);
-      context.stroke();
+  // Whether something is needed and was not made a moment ago; if it was, another frame comes in time.
+  #isDue(name, now, every) {
+    if (!this.#needs[name]) return false;
+    const rest = this.#madeAt[name] + every - now;
+    if (rest > 0) {
+      this.#timer ??= setTimeout(() => {
+        this.#timer = null;
+        this.#wake();
+      }, rest);
+      return false;
     }
-    context.rotate(-shown.theta);
-    context.fillStyle = "#fff";
-    context.beginPath();
-    context.moveTo(radius * 0.85, 0);
-    context.lineTo(-radius * 0.2, radius * 0.5);
-    context.lineTo(-radius * 0.2, -radius * 0.5);
-    context.fill();
-    context.restore();
-    if (this.scale * fleet.map.cell_size > 40) {
-      context.font = `600 ${Math.round(radius * 0.75)}px system-ui, sans-serif`;
-      context.textAlign = "center";
-      context.textBaseline = "bottom";
-      context.fillStyle = this.colour.ink;
-      context.fillText(robot.id, this.#x(shown.x), this.#y(shown.y) - radius * 1.1);
-    }
+    this.#madeAt[name] = now;
+    this.#needs[name] = false;
+    this.#needs.fleet = true;
+    return true;
+  }
+
+  #place(context) {
+    return { context, left: this.left, bottom: this.bottom, scale: this.scale };
+  }
+
+  drawLayersAbove(context) {
+    this.layers.drawAbove(this.#place(context));
   }
 }

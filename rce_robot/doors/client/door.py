@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 from websockets.asyncio.server import serve
 
-from rce.guard.proxies import TrustedProxies
+from rce.guard import Lobby, TrustedProxies
 from rce.guard.websocket import guarded
 from rce.tls.gate import TlsGate
 from rce.tls.websocket import behind_gate
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
     from websockets.asyncio.server import ServerConnection
 
-    from rce.guard.lobby import Lobby
-    from rce.tls.identity import Context
+    from rce.tls import Context
     from rce_robot.doors.base import Admission
     from rce_robot.settings import RobotSettings
 

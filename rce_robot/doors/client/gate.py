@@ -9,13 +9,9 @@ from typing import TYPE_CHECKING
 
 from websockets.protocol import State
 
-from rce.guard.lobby import address_of
-from rce.guard.loop_share import LoopShare
-from rce.guard.proxies import TrustedProxies
-from rce.guard.rates import LogThrottle
+from rce.guard import LogThrottle, LoopShare, TrustedProxies, address_of
 from rce.model import EndpointId
-from rce.protocol.exceptions import HandshakeError
-from rce.protocol.http import FEATURES_HEADER, read_credentials, read_features
+from rce.protocol import FEATURES_HEADER, Credentials, HandshakeError, read_credentials, read_features
 from rce.web.origin import ServerNames, is_foreign
 from rce_robot.doors.client.session import Session
 from rce_robot.doors.client.websocket import RobotSocket
@@ -26,7 +22,6 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
-    from rce.protocol.http import Credentials
     from rce_robot.doors.base import Admission
     from rce_robot.namespace import Namespace
     from rce_robot.settings import SessionSettings

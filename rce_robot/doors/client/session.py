@@ -22,15 +22,27 @@ from rce.model import (
     DestroyContainer,
     ResizeContainer,
 )
-from rce.protocol.codec import encode
-from rce.protocol.http import LATCH, SINGLE_FRAME
-from rce.protocol.limits import Limits
-from rce.protocol.messages import DataMessage, ErrorReport, InterfaceStatus, LatchedSources, type_of
-from rce.protocol.stream import Fault, LargeData, ProtocolStream
-from rce.protocol.weight import is_light, utf8_in_steps
+from rce.protocol import (
+    LATCH,
+    SINGLE_FRAME,
+    CallId,
+    DataMessage,
+    ErrorReport,
+    Event,
+    Fault,
+    InterfaceStatus,
+    LargeData,
+    LatchedSources,
+    Limits,
+    ProtocolStream,
+    encode,
+    is_light,
+    type_of,
+    utf8_in_steps,
+)
 from rce_robot.doors.client.outbox import Outbox
 from rce_robot.doors.client.waiting_requests import WaitingRequests
-from rce_robot.doors.client.websocket import LARGE_PART
+from rce_robot.doors.client.websocket import LARGE_PART, RobotSocket
 from rce_robot.exceptions import RobotError
 from rce_robot.outgoing import LatchedDelivery, Outgoing, Serialized
 
@@ -38,10 +50,7 @@ if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Coroutine, Iterator, Sequence
 
-    from rce.protocol.messages import CallId
-    from rce.protocol.stream import Event
     from rce_robot.doors.base import Owner, Queued
-    from rce_robot.doors.client.websocket import RobotSocket
     from rce_robot.settings import SessionSettings
 
 _log = logging.getLogger(__name__)

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from rce.model import ConfigureComponents, ConfigureConnections
-from rce.protocol.messages import ErrorReport, type_of
+from rce.model import ConfigureComponents, ConfigureConnections, Request
+from rce.protocol import ErrorReport, type_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.model import Request
     from rce_robot.doors.base import Owner
     from rce_robot.settings import SessionSettings
 

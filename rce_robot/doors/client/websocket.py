@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from websockets.protocol import Event
 
-    from rce.guard.loop_share import LoopShare
+    from rce.guard import LoopShare
     from rce_robot.outgoing import Buffer, Outgoing
 
 LARGE_PART = LARGE_FRAME

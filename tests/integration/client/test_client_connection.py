@@ -126,10 +126,12 @@ async def test_failed_call_is_known_from_the_text_of_an_older_engine(
         assert not conn.errors
 
 
-async def test_service_provider(engine: Engine) -> None:
+async def test_service_provider(engine: Engine, caplog: pytest.LogCaptureFixture) -> None:
     async def handler(request: dict[str, Any]) -> dict[str, Any]:
         if request["data"] == "fail":
             raise ValueError("robot says no")
+        if request["data"] == "ask":
+            raise CallError("nothing answers yet")
         return {"data": request["data"].upper()}
 
     async with engine.connection() as conn:
@@ -140,6 +142,12 @@ async def test_service_provider(engine: Engine) -> None:
         assert await asyncio.gather(*calls) == [ros_string("A"), ros_string("B")]
         with pytest.raises(Exception, match="robot says no"):
             await port.call(ros_string("fail"))
+        assert "Traceback" in caplog.text
+        caplog.clear()
+        with pytest.raises(Exception, match="nothing answers yet"):
+            await port.call(ros_string("ask"))
+        assert "service serve: nothing answers yet" in caplog.text
+        assert "Traceback" not in caplog.text
 
 
 async def test_an_answer_that_cannot_be_sent_fails_its_caller(engine: Engine) -> None:

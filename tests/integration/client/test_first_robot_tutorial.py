@@ -102,6 +102,6 @@ async def test_the_robot_gets_its_greeting(short_folder: Path) -> None:
             async with program(*bridge, folder=short_folder, ready="rce-ros ready", env=ros) as process:
                 assert SAID in await output("robot.py", folder=short_folder, master=core.uri)
                 process.terminate()
-                async with asyncio.timeout(20):
+                async with asyncio.timeout(60):
                     await process.communicate()
                 assert process.returncode == 0

@@ -113,7 +113,7 @@ async def test_messages_and_calls_pass_both_ways(engine: Engine, tmp_path: Path)
 
             heard: asyncio.Queue[str] = asyncio.Queue()
             subscriber = await node.subscribe("/hear", STRING, lambda message: heard.put_nowait(message.data))
-            async with asyncio.timeout(10):
+            async with asyncio.timeout(60):
                 while not subscriber.connections:
                     await asyncio.sleep(0.01)
             engine.end("hear").port.send(ros_string("down"))

@@ -204,7 +204,9 @@ async def test_nodes_and_fork_server_may_die_during_resize(stage: Stage) -> None
     async with machine.engine(interrupt_timeout=0.2, terminate_timeout=0.2):
         await stage.reach("resizing")
         incarnation_id = stage.incarnation.incarnation_id
-        os.kill(stage.pid_of("node fork server"), signal.SIGKILL)
-        os.kill(stage.pid_of("node"), signal.SIGKILL)
+        server, node = stage.pid_of("node fork server"), stage.pid_of("node")
+        os.kill(server, signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):  # it may have ended of what ended its server
+            os.kill(node, signal.SIGKILL)
         await machine.node_is(BOX, "node", NodeState.FAILED)
         assert stage.incarnation.incarnation_id == incarnation_id

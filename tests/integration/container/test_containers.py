@@ -38,7 +38,7 @@ async def start_echo(machine: Machine) -> LinkAddress:
 async def echo(peer: Peer, text: str) -> None:
     payload = STRING.serialize(STRING.new(data=text))
     peer.ends["req"].port.send(payload)
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         assert await peer.ends["resp"].received.get() == payload
         assert await peer.ends["srv"].port.call(payload) == payload
 

@@ -152,5 +152,5 @@ async def test_nobody_waits_for_bubblewrap_that_fails(namespaces: Machine) -> No
         await until(lambda: machine.faults, timeout=10)
         assert "its namespaces cannot be made" in machine.faults[0]
         machine.runtime._bwrap = "/usr/bin/bwrap"
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             await until(lambda: machine.reported(BOX).state is EndpointState.RUNNING)

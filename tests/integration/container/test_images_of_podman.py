@@ -131,7 +131,7 @@ async def test_a_peer_talks_to_a_node_in_a_folder(machine: Machine) -> None:
             await peer.active()
             payload = STRING.serialize(STRING.new(data="through podman"))
             peer.ends["req"].port.send(payload)
-            async with asyncio.timeout(10):
+            async with asyncio.timeout(60):
                 assert await peer.ends["resp"].received.get() == payload
                 assert await peer.ends["srv"].port.call(payload) == payload
         assert machine.faults == []

@@ -98,7 +98,7 @@ async def read(
 async def holds(
     machine: Machine, node: str, text: str, *streams: LogStream, **query: Unpack[QueryParts]
 ) -> str:
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(60):
         while text not in (found := (await read(machine, node, *streams, **query)).text):
             await asyncio.sleep(0.02)
     return found

@@ -11,12 +11,12 @@ from typing import BinaryIO
 import pytest
 from support.user_packages import pack, sign, write_package
 
-from rce.control.contents import Piece
 from rce.control.exceptions import ContentError
 from rce.control.model import PackageSpec
+from rce.control_channel.contents import Piece
+from rce.packages import unpacking
 from rce.packages.limits import ArchiveLimits
 from rce.packages.unpacking import unpack
-from rce_container.packages import cache as cache_module
 from rce_container.packages import disk, shelf
 from rce_container.packages.cache import PackageCache
 from rce_container.packages.disk import replicate
@@ -142,7 +142,7 @@ async def test_a_full_disk_is_told_and_leaves_nothing(
         unpack(file, into, limits)
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(cache_module, "unpack", full)
+    monkeypatch.setattr(unpacking, "unpack", full)
     with pytest.raises(NoSpaceError, match="disk of the container's machine is full"):
         await cache.ensure("user", nav)
     assert not list((tmp_path / "cache" / "incoming").iterdir())

@@ -11,7 +11,6 @@ from support.ports import free_port
 from websockets.asyncio.client import connect
 from websockets.asyncio.server import ServerConnection, serve
 
-from rce.control.channel import TaskSetChannel
 from rce.control.exceptions import (
     MasterUnavailableError,
     PeerGoneError,
@@ -30,7 +29,8 @@ from rce.control.messages import (
     Welcome,
     encode,
 )
-from rce.control.timeouts import ControlTimeouts
+from rce.control_channel.channel import TaskSetChannel
+from rce.control_channel.timeouts import ControlTimeouts
 from rce.masters import Masters
 
 

@@ -16,7 +16,7 @@ from rce.control.messages import (
     Notify,
     encode,
 )
-from rce.control.timeouts import MAX_TEXT, ControlTimeouts
+from rce.control_channel.timeouts import MAX_TEXT, ControlTimeouts
 
 
 async def test_failing_callback_ends_that_peer_only(caplog: pytest.LogCaptureFixture) -> None:

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 from support.fuzzing import Tracebacks, exchange, requests
 
 from rce.config.secret import Secret
-from rce.control.server import ControlServer
+from rce.control_channel.server import ControlServer
 
 if TYPE_CHECKING:
     from rce.control.messages import Hello, ToMaster
-    from rce.control.peer import Peer
+    from rce.control_channel.peer import Peer
 
 COUNT = 300
 SECRET = Secret("the engine's secret")

@@ -12,7 +12,6 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.typing import Origin
 
 from rce.config.secret import Secret
-from rce.control.channel import TaskSetChannel
 from rce.control.messages import (
     CONTROL_VERSION,
     Left,
@@ -21,6 +20,7 @@ from rce.control.messages import (
     Welcome,
     encode,
 )
+from rce.control_channel.channel import TaskSetChannel
 
 
 async def test_wrong_secret_is_refused_and_tried_again(caplog: pytest.LogCaptureFixture) -> None:

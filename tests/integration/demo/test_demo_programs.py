@@ -47,6 +47,34 @@ async def test_lines_are_logged_shown_and_waited_for(tmp_path: Path) -> None:
     assert talker.child.returncode == -signal.SIGTERM
 
 
+async def test_programs_are_stopped_if_a_signal_comes_while_they_stop(tmp_path: Path) -> None:
+    """The time of a run is up, and a signal cancels it once more before all programs have ended."""
+    slow = (
+        "import signal, time\nsignal.signal(signal.SIGTERM, lambda *_: time.sleep(1) or exit(0))\nprint('up')"
+    )
+    programs = []
+
+    async def run() -> None:
+        async with ProgramGroup(tmp_path, ignore) as group:
+            for name in ("first", "second"):
+                programs.append(
+                    await group.start(name, python(f"{slow}\ntime.sleep(600)"), stop_last=name == "second")
+                )
+                await group.wait_line(programs[-1], "up", 60)
+            stopping.set()
+            await group.run_while_alive(for_ever())
+
+    stopping = asyncio.Event()
+    task = asyncio.create_task(run())
+    await stopping.wait()
+    for _ in range(2):
+        task.cancel()
+        await asyncio.sleep(0.1)
+    with pytest.raises(asyncio.CancelledError):
+        await asyncio.wait_for(task, 60)
+    assert [program.child.returncode for program in programs] == [0, 0]
+
+
 async def test_error_names_the_ended_program_and_its_last_lines(tmp_path: Path) -> None:
     async with ProgramGroup(tmp_path, ignore) as group:
         talker = await group.start("talker", python(TALKER))
@@ -66,7 +94,7 @@ async def test_restartable_program_is_restarted(tmp_path: Path) -> None:
         os.kill(former.pid, signal.SIGKILL)
         work = asyncio.create_task(group.run_while_alive(for_ever()))
         assert await told.get() == "talker was ended by SIGKILL; restarting it"
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             while (tmp_path / "talker.log").read_text().count("talker ready: 42") < 2:
                 await asyncio.sleep(0.05)
         assert talker.child is not former

@@ -16,6 +16,7 @@ from support.resting_robot import PACKAGES, STATUS, RestingRobot, fleet_program
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.types import Message, TypeRegistry
+from rce_fleet.planning.grid import GridMap
 from rce_fleet.station.api import GridRequest
 from rce_fleet.station.client import StationClient
 from rce_fleet.station.feed import Feed
@@ -91,6 +92,9 @@ async def test_planner_and_move_client_change_the_grid() -> None:
     async with running_floor() as floor:
         async with fleet_program(floor.core, "fleet_planner.py", WALLS) as planner:
             await floor.robot.until("idle", 26)
+            requested = await floor.node.subscribe("/fleet/requestedCells", "std_msgs/Int32MultiArray")
+            block = floor.node.service_client("/fleet/block_cell", "fleet/BlockCell")
+            assert (await block(cell=63, blocked=True)).ok
             seen = await floor.set_grid(preview=True)
             assert (seen.ok, seen.rows, seen.columns) == (True, 10, 11)
             assert {88, 89, 99} <= set(seen.walls)  # the wall at the floor's corner, and beside the floor
@@ -101,6 +105,17 @@ async def test_planner_and_move_client_change_the_grid() -> None:
             reply = await floor.change()
             assert reply.ok, reply.message
             await floor.robot.until("idle", TURNED_CELL)
+            async with asyncio.timeout(50):
+                layouts = {""}
+                async for message in requested:
+                    (dimension,) = message.layout.dim
+                    layouts.add(dimension.label)
+                    grid = GridMap.from_layout(dimension.label)
+                    if grid.rows == 10:
+                        break
+            # The cell is now one of other numbers, which the layout finds again.
+            assert GridMap(rows=8, columns=8).layout in layouts
+            assert 63 in {GridMap(rows=8, columns=8).cell_at(*grid.centre(cell)) for cell in message.data}
             made = floor.grids[-1].info
             assert (made.width, made.height, made.origin.position.x) == (11, 10, 7.7)
             assert made.origin.orientation.z == pytest.approx(2**-0.5)
@@ -111,7 +126,9 @@ async def test_planner_and_move_client_change_the_grid() -> None:
             async with asyncio.timeout(50):
                 place = (await floor.goals.get()).goal.target_pose.pose.position
             assert (place.x, place.y) in [pytest.approx(centre) for centre in TURNED_CENTRES]
-            assert "Robot1 is" in (await floor.set_grid(cell_size=1.0)).message
+            refusal = await floor.set_grid(cell_size=1.0)
+            assert not refusal.ok
+            assert "Robot1" in refusal.message, "it drives"
             planner.kill()
             await planner.wait()
         async with fleet_program(floor.core, "fleet_planner.py", WALLS):

@@ -15,7 +15,7 @@ from rce_fleet.station import fleet_link
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.planner_client import PlannerUnavailableError
 from rce_fleet.station.ros_planner_client import RosPlannerClient
-from rce_fleet.station.view import FleetView, ViewChange
+from rce_fleet.station.view import FleetView, Pose, ViewChange
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -77,7 +77,7 @@ class Station:
             self.client,
             self.view,
             on_change=self._take,
-            on_pose=lambda _: None,
+            on_pose=lambda _: self._changed.set(),
             on_event=lambda text, _: self.events.append(text),
         )
         self._changed = asyncio.Event()
@@ -138,6 +138,7 @@ async def test_a_station_follows_changes_and_stops_whole_states() -> None:
             await first.until(lambda: first.client.follows_changes)
             await put_robot(core, stack, "Robot1", 0.5, 0.5)
             await first.until(lambda: first.view.robot_ids() == ["Robot1"])
+            await first.until(lambda: first.view.poses == {"Robot1": Pose(0.5, 0.5, 0.0)})
             await first.block(9)
             await first.until(lambda: first.view.blocked() == [9])
             states = first.link.states
@@ -155,6 +156,7 @@ async def test_a_station_follows_changes_and_stops_whole_states() -> None:
             await late.until(lambda: late.client.follows_changes)
             assert late.view.blocked() == [9, 10, 11, 12]
             assert late.view.robot_ids() == ["Robot1"]
+            await late.until(lambda: late.view.poses == {"Robot1": Pose(0.5, 0.5, 0.0)})
 
 
 async def test_missed_last_change_makes_a_station_ask_for_the_state() -> None:

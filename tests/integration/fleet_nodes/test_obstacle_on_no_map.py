@@ -13,13 +13,12 @@ from support.robot_in_world import robot_in_world, room
 
 from rce.ros.core import Core
 from rce.ros.node import Node
-from rce.ros.types import TypeRegistry
+from rce.ros.types import Message, TypeRegistry
 from rce_fleet.geometry.poses import Pose
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.ros.types import Message
 
 pytestmark = pytest.mark.timeout(300)
 

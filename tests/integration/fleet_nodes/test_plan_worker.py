@@ -12,7 +12,8 @@ import sys
 import psutil
 import pytest
 
-from rce_fleet.coordination.replanning import NO_CELL, PlanRequest, compute_plan
+from rce_fleet.coordination.replanning import PlanRequest, compute_plan
+from rce_fleet.coordination.rerouting import NO_CELL
 from rce_fleet.exceptions import PlanWorkerError
 from rce_fleet.nodes.plan_worker import PlanWorker
 
@@ -35,14 +36,26 @@ def request_of(number: int, robots: int = 3, *, size: int = 8, effort: int = 20_
     )
 
 
+COMPILES_NOTHING = """
+import sys
+from rce_fleet.nodes.plan_worker import serve
+from rce_fleet.planning import lacam
+lacam.KERNELS = ()
+if "--compile" not in sys.argv:
+    serve(sys.stdin.buffer, sys.stdout.buffer)
+"""
+
+
+def children_with(word: str) -> list[psutil.Process]:
+    return [child for child in psutil.Process().children() if word in child.cmdline()]
+
+
 def workers() -> list[psutil.Process]:
-    return [
-        child for child in psutil.Process().children() if "rce_fleet.nodes.plan_worker" in child.cmdline()
-    ]
+    return children_with("rce_fleet.nodes.plan_worker")
 
 
 async def test_makes_the_plans_that_this_process_makes() -> None:
-    async with PlanWorker(LOG) as worker:
+    async with PlanWorker(LOG, compiled=False) as worker:
         for number in range(3):
             request = request_of(number, robots=number + 1)
             assert await worker.compute(request) == compute_plan(request)
@@ -50,8 +63,19 @@ async def test_makes_the_plans_that_this_process_makes() -> None:
     assert not psutil.pid_exists(process.pid)
 
 
+async def test_the_compiling_process_ends_with_its_input() -> None:
+    """A node that is killed leaves none."""
+    command = (sys.executable, "-P", "-m", "rce_fleet.nodes.plan_worker", "--compile")
+    process = await asyncio.create_subprocess_exec(*command, stdin=asyncio.subprocess.PIPE)
+    assert process.stdin is not None
+    process.stdin.close()
+    async with asyncio.timeout(60):
+        assert await process.wait() == 0
+    # It ended before it had compiled anything; a whole run takes half a minute and more.
+
+
 async def test_a_process_that_ended_is_started_again(caplog: pytest.LogCaptureFixture) -> None:
-    async with PlanWorker(LOG) as worker:
+    async with PlanWorker(LOG, compiled=False) as worker:
         (first,) = workers()
         os.kill(first.pid, signal.SIGKILL)
         request = request_of(1)
@@ -63,7 +87,7 @@ async def test_a_process_that_ended_is_started_again(caplog: pytest.LogCaptureFi
 
 async def test_a_request_that_ends_the_process_twice_is_an_error() -> None:
     command = (sys.executable, "-c", "import sys; sys.stdin.buffer.read(9); sys.exit(3)")
-    async with PlanWorker(LOG, command=command) as worker:
+    async with PlanWorker(LOG, command=command, compiled=False) as worker:
         with pytest.raises(PlanWorkerError, match=r"plan 7 for 3 robots .*status 3"):
             await worker.compute(request_of(7))
 
@@ -88,7 +112,7 @@ async def test_other_work_goes_on_while_a_plan_is_made() -> None:
             steps += 1
             await asyncio.sleep(0)
 
-    async with PlanWorker(LOG) as worker:
+    async with PlanWorker(LOG, compiled=False) as worker:
         await worker.compute(request_of(1))
         counting = asyncio.create_task(count())
         await worker.compute(request_of(2, robots=40, size=40))
@@ -96,3 +120,38 @@ async def test_other_work_goes_on_while_a_plan_is_made() -> None:
         with contextlib.suppress(asyncio.CancelledError):
             await counting
     assert steps > 100
+
+
+LARGE = request_of(0, robots=20, size=21)
+
+
+async def test_a_process_with_compiled_loops_takes_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loops of the process are left out here: to compile them takes half a minute."""
+    pytest.importorskip("numba")
+    monkeypatch.delenv("RCE_COMPILED", raising=False)
+    command = (sys.executable, "-P", "-c", COMPILES_NOTHING)
+    async with PlanWorker(LOG, command=command) as worker:
+        assert await worker.compute(request_of(1)) == compute_plan(request_of(1))
+        assert len(children_with(COMPILES_NOTHING)) == 1, "a few robots need no compiled loops"
+        assert await worker.compute(LARGE) == compute_plan(LARGE)
+        async with asyncio.timeout(60):
+            while not worker.is_compiled:
+                await asyncio.sleep(0.05)
+        for number in (2, 3):
+            request = request_of(number)
+            assert await worker.compute(request) == compute_plan(request)
+        children = children_with(COMPILES_NOTHING)
+        assert len(children) == 1
+        os.kill(children[0].pid, signal.SIGKILL)
+        assert await worker.compute(request_of(4)) == compute_plan(request_of(4))
+
+
+async def test_plans_are_made_if_nothing_can_be_compiled(caplog: pytest.LogCaptureFixture) -> None:
+    script = "import os, sys\nif os.environ.get('RCE_COMPILED') != 'no': sys.exit(1)\n" + COMPILES_NOTHING
+    async with PlanWorker(LOG, command=(sys.executable, "-P", "-c", script), compiled=True) as worker:
+        assert await worker.compute(LARGE) == compute_plan(LARGE)
+        async with asyncio.timeout(60):
+            while "without compiled loops" not in caplog.text:
+                await asyncio.sleep(0.05)
+        assert await worker.compute(request_of(1)) == compute_plan(request_of(1))
+        assert not worker.is_compiled

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from math import nan
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +16,8 @@ from rce.ros.node import Node
 from rce.ros.tf import Transform, TransformBroadcaster
 from rce.ros.types import Message, Time
 from rce_fleet.geometry.poses import Pose
-from rce_fleet.nodes.pose_keeper import KeptPose, PoseKeeper, PoseKeeperParameters, ask_for_last_pose
+from rce_fleet.nodes.kept_pose import BOOT_ID, KeptPose, StoredPose, default_path, read_stored_pose
+from rce_fleet.nodes.pose_keeper import PoseKeeper, PoseKeeperParameters, ask_for_last_pose
 from rce_fleet.nodes.pose_messages import pose_with_covariance_fields, read_pose_with_covariance
 
 PATIENCE = 60.0
@@ -65,14 +67,15 @@ class Graph:
 
 
 @asynccontextmanager
-async def graph() -> AsyncIterator[Graph]:
+async def graph(path: Path | None = None) -> AsyncIterator[Graph]:
     async with AsyncExitStack() as stack:
         core = await stack.enter_async_context(Core(port=0))
         judge, keeper = [
             await stack.enter_async_context(Node(name, argv=[], master_uri=core.uri, signals=False))
             for name in ("judge", "pose_keeper")
         ]
-        running = asyncio.create_task(PoseKeeper(keeper, PoseKeeperParameters()).run())
+        parameters = PoseKeeperParameters(store=path is not None, pose_file=str(path or ""))
+        running = asyncio.create_task(PoseKeeper(keeper, parameters).run())
         try:
             made = Graph(judge, await stack.enter_async_context(TransformBroadcaster(judge)))
             await made.start()
@@ -101,6 +104,74 @@ async def test_last_pose_stays_when_the_odometry_jumps() -> None:
         await here.says(Pose(3.0, 4.0, 0.0))
         here.publish_odometry(Pose(-90.0, 20.0, 1.0).compose(Pose(0.25, 0.0, 0.0)))
         await here.says(Pose(3.25, 4.0, 0.0))
+
+
+async def test_last_pose_outlives_a_restart(tmp_path: Path) -> None:
+    """A pose keeper that is started again, and then a robot whose odometry begins anew, too."""
+    path = tmp_path / "kept" / "pose.json"
+    async with graph(path) as here:
+        here.localize(Pose(3.0, 4.0, np.pi / 2), Pose(1.0, 0.0, 0.0))
+        first = await here.says(Pose(3.0, 4.0, np.pi / 2))
+    assert path.exists()
+    async with graph(path) as here:
+        here.publish_odometry(Pose(1.5, 0.0, 0.0))
+        wider = await here.says(Pose(3.0, 4.5, np.pi / 2))
+        assert wider[0, 0] >= first[0, 0] + 0.2**2
+        here.localize(Pose(5.0, 4.0, 0.0), Pose(2.0, 0.0, 0.0))
+        await here.says(Pose(5.0, 4.0, 0.0))
+    async with graph(path) as here:
+        here.publish_odometry(Pose(0.0, 0.0, 0.0))
+        await here.says(Pose(5.0, 4.0, 0.0))
+        here.publish_odometry(Pose(0.3, 0.0, 0.0))
+        await here.says(Pose(5.3, 4.0, 0.0))
+
+
+async def test_damaged_file_of_the_pose_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "pose.json"
+    path.write_text('{"pose": [1, 2]}')
+    async with graph(path) as here:
+        logs = await here.node.subscribe("/rosout", "rosgraph_msgs/Log")
+        async with asyncio.timeout(PATIENCE):
+            async for line in logs:
+                if "the stored pose is not used" in line.msg and str(path) in line.msg:
+                    break
+        assert not (await here.last_pose()).known
+
+
+def test_stored_pose_of_another_boot_stands() -> None:
+    kept = KeptPose("map", Pose(1.0, 2.0, 0.0), EXACT, Pose(4.0, 0.0, 0.0))
+    stored = StoredPose(kept, "one")
+    assert stored.resume(Pose(5.0, 0.0, 0.0), "one").odometry == Pose(4.0, 0.0, 0.0)
+    assert stored.resume(Pose(5.0, 0.0, 0.0), "two").odometry == Pose(5.0, 0.0, 0.0)
+    assert stored.resume(Pose(0.0, 0.0, 0.0), "one").odometry == Pose(0.0, 0.0, 0.0)
+    assert BOOT_ID.read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("{", "Expecting"),
+        ("{}", "no usable 'pose'"),
+        ('{"pose": [1], "odometry": [1, 2, 3], "covariance": [], "frame": "map", "boot": ""}', "3 numbers"),
+        ("[]", "no usable"),
+    ],
+)
+def test_unusable_file_of_a_pose_is_refused(text: str, expected: str, tmp_path: Path) -> None:
+    path = tmp_path / "pose.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=expected):
+        read_stored_pose(path)
+
+
+def test_each_master_and_node_has_its_own_file(tmp_path: Path) -> None:
+    home = {"ROS_HOME": str(tmp_path)}
+    made = {
+        default_path(uri, node, home)
+        for uri in ("http://127.0.0.1:11311/", "http://127.0.0.1:11312/")
+        for node in ("/pose_keeper", "/Robot1/pose_keeper")
+    }
+    assert len(made) == 4
+    assert all(path.parent == tmp_path / "last_pose" for path in made)
 
 
 async def test_pose_that_is_not_finite_is_not_kept() -> None:

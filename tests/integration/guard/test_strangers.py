@@ -13,7 +13,7 @@ from aiohttp import ClientSession, web
 from support.cloud import DIGEST, SECRET, running_cloud
 from websockets.asyncio.client import connect
 
-from rce.control.server import ControlServer
+from rce.control_channel.server import ControlServer
 from rce.guard.lobby import Lobby
 from rce.link.exceptions import LinkRefusedError
 from rce.link.frame_reader import FrameReader
@@ -22,14 +22,13 @@ from rce.link.handshake import check_answer, encode_hello
 from rce.link.hub import LinkHub
 from rce.link.settings import LinkLimits, LinkTimeouts
 from rce.tls.folder import CertificateFolder
-from rce.tls.identity import TlsFiles, TlsIdentity
+from rce.tls.identity import Context, TlsFiles, TlsIdentity
 from rce.web.server import HttpServer
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from rce.tls.identity import Context
 
 ADDRESS = "127.0.0.1"
 FEW = 8
@@ -159,7 +158,7 @@ async def test_http_streams_go_on() -> None:
 
 
 async def test_task_sets_come_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rce.control.server.UNAUTHENTICATED_PER_ADDRESS", FEW)
+    monkeypatch.setattr("rce.control_channel.server.UNAUTHENTICATED_PER_ADDRESS", FEW)
 
     async def nothing(*_: object) -> None:
         pass

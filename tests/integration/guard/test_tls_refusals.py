@@ -13,7 +13,7 @@ from support.cloud import SECRET, running_cloud
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
-from rce.control.server import ControlServer
+from rce.control_channel.server import ControlServer
 from rce.tls.faults import explain_to_client
 from rce.tls.folder import CertificateFolder
 from rce.tls.identity import TlsFiles, TlsIdentity

@@ -21,10 +21,11 @@ MEMORY = {
     "home": NO_SPACE,
     "tmp": NODE_OR_CONTAINER,
     "shm": NODE_OR_CONTAINER,
-    "memfd": KILLED,
     "shared": KILLED,
-    "pipes": KILLED,
-    "unix": KILLED,
+    # What descriptors hold is given back last: before that, the kernel may kill the next one.
+    "memfd": NODE_OR_CONTAINER,
+    "pipes": NODE_OR_CONTAINER,
+    "unix": NODE_OR_CONTAINER,
     # The kernel frees page tables late: before a killed node has given them back, it may kill the next one.
     "tables": NODE_OR_CONTAINER,
 }

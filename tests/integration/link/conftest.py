@@ -15,7 +15,17 @@ from support.patches import patch_between
 
 from rce.aio.backoff import Backoff
 from rce.control.model import ConnectionSpec, EndpointKind, EndpointSpec, LinkAddress, LinkSpec
-from rce.link import Endpoint, Interface, InterfaceError, LinkHub, LinkLimits, LinkTimeouts, PeerFaultError
+from rce.link import (
+    Buffer,
+    Endpoint,
+    Interface,
+    InterfaceError,
+    LinkHub,
+    LinkLimits,
+    LinkTimeouts,
+    PeerFaultError,
+    Port,
+)
 from rce.link.handover import HandoverReceiver, HandoverSender, LinkAcceptor
 from rce.model.names import EndpointId
 from rce.model.specs import InterfaceSpec
@@ -23,7 +33,6 @@ from rce.model.specs import InterfaceSpec
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator
 
-    from rce.link import Buffer, Port
 
 WAYS = ("local", "unix", "tcp", "handed-over", "secure", "handed-over-secure")
 TIMEOUTS = LinkTimeouts(redial=Backoff(0.005, 0.05, jitter=0.5), unknown_link=0.5, flush=0.2, close=1.0)

@@ -204,6 +204,9 @@ async def test_bad_input_is_told_and_the_node_lives() -> None:
         robot.odometry[2] = (0.1, 0.0, 0.0)
         robot.send(2)
         await world.until(lambda: world.mapped(robot) >= 2)
+        robot.odometry[3] = (500.0, 0.0, 0.0)
+        robot.send(3)
+        await world.until(lambda: any("the odometry jumped" in text for text in world.heard))
         await world.until(
             lambda: any("mapping" in status.name for state in world.states for status in state.status)
         )

@@ -13,7 +13,6 @@ from argon2 import PasswordHasher
 
 from rce.config.secret import Secret
 from rce.config.settings import LOOPBACK
-from rce.control.channel import TaskSetChannel
 from rce.control.messages import (
     CONTROL_VERSION,
     Hello,
@@ -26,6 +25,7 @@ from rce.control.messages import (
     ToTaskSet,
 )
 from rce.control.model import EndpointStatus
+from rce.control_channel.channel import TaskSetChannel
 from rce_master.master import Master, RunningMaster
 from rce_master.quotas import QuotaSettings
 from rce_master.settings import MasterSettings

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rce.config.secret import Secret
-from rce.control.contents import ContentClient
 from rce.control.exceptions import ContentError
 from rce.control.messages import Put
 from rce.control.model import EndpointSpec
+from rce.control_channel.contents import ContentClient
 from rce.masters import Masters
 from rce.packages.folder import look_into
 from rce.packages.signing import SigningKey, key_id, statement
@@ -64,7 +64,7 @@ def stored(folder: Path) -> set[str]:
 
 
 async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while not condition():
             await asyncio.sleep(0.01)
 
@@ -219,7 +219,7 @@ async def test_a_users_packages_have_limits(
     settings = StateSettings(max_package_size=11)
     async with run_site(state_dir=tmp_path / "master", state=settings) as site:
         log_in(site, tmp_path, monkeypatch)
-        with pytest.raises(ApiError, match=r"the files of your packages .* 11 are allowed"):
+        with pytest.raises(ApiError, match=r"your packages and volumes would have .* 11 are allowed"):
             await push(package)
         await until(lambda: not stored(tmp_path))
 

@@ -22,7 +22,7 @@ from rce_master.cli.client import ApiClient
 from rce_master.cli.credentials import FILE_VARIABLE, Credentials, save
 from rce_master.cli.exceptions import ApiError
 from rce_master.exceptions import StoreError
-from rce_master.store import MemoryStore
+from rce_master.store import MemoryStore, Row
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from integration.master.conftest import RunSite, Site, TaskSet
 
-    from rce_master.store import Row
 
 MB = 1 << 20
 

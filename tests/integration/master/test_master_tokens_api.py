@@ -33,7 +33,7 @@ async def test_revoked_token_ends_its_streams_with_reason(site: Site) -> None:
         await events.content.readuntil(b"hello\n\n")
         await usage.content.readuntil(b"\n\n")
         await site.api("DELETE", f"/tokens/{other_id}", status=204)
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             said = await events.content.read(), await usage.content.read()
     assert b"event: stream_ended" in said[0]
     assert b"revoked or expired" in said[0]
@@ -70,3 +70,22 @@ async def test_users_see_and_revoke_their_own_tokens_only(site: Site) -> None:
     await site.api("DELETE", f"/tokens/{own['id']}", token=anna, status=404)
     await site.api("POST", "/tokens", {"scope": "metrics"}, token=anna, status=403)
     assert len((await site.api("GET", "/tokens", user="anna"))["tokens"]) == 1
+
+
+async def test_a_fleet_token_is_for_stations_only(site: Site) -> None:
+    """A station may ask whose it is, and note what its user did; the engine refuses it for all else."""
+    await site.api("POST", "/users", {"name": "erp", "password": "one", "role": "operator"}, status=201)
+    made = await site.api("POST", "/tokens", {"scope": "fleet", "label": "hall 3"}, status=201, user="erp")
+    assert (made["userID"], made["scope"], made["expires"]) == ("erp", "fleet", 0)
+    token = made["token"]
+    assert (await site.api("GET", "/user", token=token))["role"] == "operator"
+    noted = {"action": "create_task", "subject": "T1", "detail": "", "address": "", "outcome": "done"}
+    await site.api("POST", "/audit", noted, token=token, status=204)
+    refusal = await site.api("GET", "/containers", token=token, status=403)
+    assert "good for operator stations only" in refusal["error"]
+    await site.api("POST", "/tokens", {"scope": "fleet"}, token=token, status=403)
+    erp = await site.login("erp", "one")
+    assert (await site.api("POST", "/tokens", {"scope": "fleet"}, token=erp, status=201))["userID"] == "erp"
+    await site.api("POST", "/tokens", {"scope": "fleet"}, token=erp, status=403, user="testUser")
+    await site.api("DELETE", f"/tokens/{made['id']}", status=204, user="erp")
+    await site.api("GET", "/user", token=token, status=401)

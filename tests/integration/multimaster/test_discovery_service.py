@@ -22,7 +22,7 @@ from rce.ros.xmlrpc import RpcClient
 
 
 def program(name: str, *arguments: str, folder: Path) -> Program:
-    text = f"import typer; from rce.cli.{name} import {name}; typer.run({name})"
+    text = f"import typer; from rce.ros.cli.{name} import {name}; typer.run({name})"
     return Program(name, [sys.executable, "-c", text, *arguments], {"ROS_IP": "127.0.0.1"}, folder)
 
 
@@ -32,7 +32,7 @@ async def test_a_core_of_the_same_process_is_watched(network: DiscoveryNetwork) 
         async with Discovery(settings, core=core) as discovery, node("n", core.uri) as talker:
             with discovery.watch() as events:
                 await talker.advertise("said", STRING)
-                async with asyncio.timeout(20):
+                async with asyncio.timeout(60):
                     async for _ in events:
                         if discovery.info is not None and "/said" in discovery.info.publishers:
                             break
@@ -50,7 +50,7 @@ async def test_masters_and_changes_are_shown_in_the_graph(network: DiscoveryNetw
                 changes = await watching.subscribe("/master_discovery/changes", messages.MASTER_STATE)
                 links = await watching.subscribe("/master_discovery/linkstats", messages.LINK_STATES)
                 await changes.wait_for_publishers(timeout=20)
-                async with asyncio.timeout(20), Discovery(network.settings(b.uri, name="b")):
+                async with asyncio.timeout(60), Discovery(network.settings(b.uri, name="b")):
                     async for change in changes:
                         if change.state == "new" and change.master.name == "b":
                             break
@@ -61,7 +61,7 @@ async def test_masters_and_changes_are_shown_in_the_graph(network: DiscoveryNetw
                         "a": True,
                         "b": True,
                     }
-                async with asyncio.timeout(20):
+                async with asyncio.timeout(60):
                     async for change in changes:
                         if change.state == "removed":
                             break
@@ -89,7 +89,7 @@ async def test_installed_messages_of_fkie_win(
         Core(port=0) as core,
         Discovery(network.settings(core.uri, name="a")),
         node("watcher", core.uri, types=messages.registry()) as watching,
-        asyncio.timeout(20),
+        asyncio.timeout(60),
     ):
         links = await watching.subscribe("/master_discovery/linkstats", messages.LINK_STATES)
         async for stats in links:
@@ -114,7 +114,7 @@ async def test_robot_hosts_find_each_other_without_multicast(network: DiscoveryN
             )
             for core, name, own, other in ((a, "a", ports[0], ports[1]), (b, "b", ports[1], ports[0]))
         )
-        async with Discovery(first) as one, Discovery(second) as two, asyncio.timeout(20):
+        async with Discovery(first) as one, Discovery(second) as two, asyncio.timeout(60):
             for discovery in (one, two):
                 while {master.name for master in discovery.masters} != {"a", "b"}:
                     await asyncio.sleep(0.02)
@@ -151,7 +151,7 @@ async def test_the_relay_program(tmp_path: Path) -> None:
         running = program("relay", "/from", "/to", "--latch", "--master-uri", core.uri, folder=tmp_path)
         await running.start(ready="")
         try:
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(60):
                 assert (await anext(aiter(heard))).data == "kept"
         finally:
             assert await running.stop() == 0

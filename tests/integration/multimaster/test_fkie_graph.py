@@ -42,7 +42,7 @@ async def words_that(output: asyncio.StreamReader, *beginning: str) -> list[str]
 
 
 def cli(name: str, folder: Path, *arguments: str) -> Program:
-    text = f"import typer; from rce.cli.{name} import {name}; typer.run({name})"
+    text = f"import typer; from rce.ros.cli.{name} import {name}; typer.run({name})"
     return Program(name, [sys.executable, "-c", text, *arguments], {"ROS_IP": "127.0.0.1"}, folder)
 
 

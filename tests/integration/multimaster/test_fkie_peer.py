@@ -35,7 +35,7 @@ async def fkie_peer(master_uri: str, mcast_port: int) -> AsyncIterator[asyncio.s
 
 async def line(peer: asyncio.subprocess.Process) -> list[str]:
     assert peer.stdout is not None
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(60):
         return (await peer.stdout.readline()).decode().split()
 
 
@@ -62,7 +62,7 @@ async def test_it_and_ours_find_and_synchronize_each_other(network: DiscoveryNet
         for publisher, subscriber in ((said, heard), (answered, got)):
             await publisher.wait_for_subscribers(timeout=20)
             publisher.publish(data="across")
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(60):
                 assert (await anext(aiter(subscriber))).data == "across"
         await ours.until(lambda graph: graph.service("/theirs") is not None)
         await theirs.wait_until(lambda graph: graph.service("/ours") is not None, timeout=20)

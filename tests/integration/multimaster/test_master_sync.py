@@ -132,7 +132,7 @@ async def test_a_restarted_node_is_registered_anew(network: DiscoveryNetwork) ->
                 publisher = await talker.advertise("chatter", STRING)
                 await publisher.wait_for_subscribers(timeout=20)
                 publisher.publish(data=word)
-                async with asyncio.timeout(20):
+                async with asyncio.timeout(60):
                     assert (await anext(aiter(heard))).data == word
 
 

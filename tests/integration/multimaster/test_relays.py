@@ -65,11 +65,11 @@ async def test_what_is_latched_stays_latched(core: Core) -> None:
         (await talker.advertise("from", STRING, latch=True)).publish(data="kept")
         async with node("late", core.uri) as late:
             heard = await late.subscribe("to", STRING)
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(60):
                 assert (await anext(aiter(heard))).data == "kept"
             async with node("later", core.uri) as later:
                 heard = await later.subscribe("to", STRING)
-                async with asyncio.timeout(20):
+                async with asyncio.timeout(60):
                     assert (await anext(aiter(heard))).data == "kept"
 
 
@@ -86,7 +86,7 @@ async def test_a_lazy_relay_listens_only_while_somebody_listens_to_it(core: Core
             heard = await listener.subscribe("to", STRING)
             await publisher.wait_for_subscribers(timeout=20)
             publisher.publish(data=word)
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(60):
                 assert (await anext(aiter(heard))).data == word
             await heard.close()
             while publisher.connections:
@@ -108,7 +108,7 @@ async def test_a_throttled_relay_holds_back(core: Core) -> None:
         for number in range(5):
             publisher.publish(data=str(number))
         assert (await anext(aiter(heard))).data == "0"
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             while relay.held_back < 4:
                 await asyncio.sleep(0.02)
         assert relay.passed == 1
@@ -133,11 +133,11 @@ async def test_a_namespace_for_a_master(network: DiscoveryNetwork) -> None:
         await robot.until(lambda graph: bool(graph.subscribers("/amcl_pose")))
         await pose.wait_for_subscribers(timeout=20)
         pose.publish(data="here")
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             assert (await anext(aiter(poses))).data == "here"
         await goal.wait_for_subscribers(timeout=20)
         await robot.until(lambda graph: bool(graph.publishers("/goals")))
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             await goals.wait_for_publishers()
             while not (await heard_within(goals, goal)):
                 pass
@@ -197,7 +197,7 @@ async def test_one_connection_carries_topics_and_services_both_ways() -> None:
             await publisher.wait_for_subscribers(timeout=20)
             body = "x" * 3_000_000
             publisher.publish(data=body)
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(60):
                 assert (await anext(aiter(subscriber))).data == body
         assert base.uri not in cloud.graph.nodes.values()
         assert "/secret" not in cloud.graph.topic_types
@@ -228,7 +228,7 @@ async def test_a_link_brings_messages_only_while_somebody_listens() -> None:
         await robot.wait_until(lambda graph: bool(graph.subscribers("/said")), timeout=20)
         await said.wait_for_subscribers(timeout=20)
         await heard.close()
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             while said.connections:
                 said.publish(data="nobody listens")
                 await asyncio.sleep(0.02)
@@ -246,7 +246,7 @@ async def test_a_broken_link_takes_back_and_comes_back() -> None:
             assert link._transport is not None
             link._transport.abort()
             gone = back = False
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(60):
                 async for event in events:
                     gone = gone or (event.name, event.change.value) == ("/said", "publisher removed")
                     back = gone and (event.name, event.change.value) == ("/said", "publisher added")
@@ -257,7 +257,7 @@ async def test_a_broken_link_takes_back_and_comes_back() -> None:
 async def test_another_token_is_refused(caplog: pytest.LogCaptureFixture) -> None:
     async with linked(token="wrong") as (cloud, robot, one, other), node("base", robot.uri) as base:
         await base.advertise("said", STRING)
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             while "another token" not in caplog.text:
                 await asyncio.sleep(0.02)
         assert one._links.connected == other._links.connected == set()
@@ -267,7 +267,7 @@ async def test_another_token_is_refused(caplog: pytest.LogCaptureFixture) -> Non
 async def read_all(reader: asyncio.StreamReader) -> bytes:
     """Read until the connection ends, however it does."""
     try:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             return await reader.read()
     except ConnectionError:
         return b""
@@ -323,11 +323,11 @@ async def test_stranger_cannot_say_much(caplog: pytest.LogCaptureFixture) -> Non
 
 async def test_strangers_are_bounded_in_number() -> None:
     async with linked() as (_, _, one, other):
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             while "cloud" not in other._links.connected:
                 await asyncio.sleep(0.02)
         connections = [await asyncio.open_connection("127.0.0.1", one.relay_port) for _ in range(60)]
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             while one._links._lobby.turned_away < 60 - UNAUTHENTICATED_PER_ADDRESS:
                 await asyncio.sleep(0.02)
         assert len(one._links._lobby) <= UNAUTHENTICATED_PER_ADDRESS

@@ -53,7 +53,7 @@ async def test_near_and_far_subscribers_get_the_same(core: Core, near: MakeNode)
         publisher.publish(publisher.type.new(data="one"))
         publisher.publish(data="two")
         for subscriber in (nearby, distant):
-            async with asyncio.timeout(10):
+            async with asyncio.timeout(60):
                 assert [(await anext(aiter(subscriber))).data for _ in range(2)] == ["one", "two"]
         late, later = await b.subscribe("t", STRING), await b.subscribe_serialized("t", "*", lambda *_: None)
         assert (await asyncio.wait_for(anext(aiter(late)), 10)).data == "two"
@@ -81,7 +81,7 @@ async def test_too_many_at_once_lose_the_oldest(near: MakeNode) -> None:
         await publisher.wait_for_subscribers(timeout=10)
         for number in range(10):
             publisher.publish(data=str(number))
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             assert [(await anext(aiter(subscriber))).data for _ in range(3)] == ["7", "8", "9"]
         assert publisher.dropped == 7
 

@@ -19,7 +19,7 @@ STRING = "std_msgs/String"
 
 async def collect(subscriber: Subscriber, count: int) -> list[str]:
     found = []
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(60):
         async for message in subscriber:
             found.append(message.data)
             if len(found) == count:
@@ -143,7 +143,7 @@ class Ear:
         self.events.put_nowait((source, b""))
 
     async def next(self) -> tuple[str, bytes]:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             return await self.events.get()
 
 
@@ -245,7 +245,7 @@ async def test_stalled_subscriber_loses_its_oldest_messages(make_node: MakeNode)
 
 
 async def read_frame(reader: asyncio.StreamReader) -> bytes:
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(60):
         return await reader.readexactly(int.from_bytes(await reader.readexactly(4), "little"))
 
 
@@ -336,7 +336,7 @@ async def test_log_records_are_published(make_node: MakeNode) -> None:
         a.log.warning("early %d", 1)
         heard = await b.subscribe("/rosout", "rosgraph_msgs/Log")
         found = []
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             async for record in heard:
                 found.append((record.name, record.level, record.msg))
                 if len(found) == 2:

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.needs("netns")
 
 STRING = "std_msgs/String"
 HOST = "robot-without-a-name.example"
-RELAY = "import typer; from rce.cli.relay import relay; typer.run(relay)"
+RELAY = "import typer; from rce.ros.cli.relay import relay; typer.run(relay)"
 
 
 async def test_a_cancelled_lookup_leaves_no_exception(core: Core, tmp_path: Path) -> None:

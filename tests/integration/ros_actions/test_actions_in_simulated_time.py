@@ -27,7 +27,7 @@ class World:
 
     async def set(self, seconds: float) -> None:
         self._publisher.publish(clock=Time.from_sec(seconds))
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while any(node.time() != seconds for node in self._nodes):
                 await asyncio.sleep(0)
 

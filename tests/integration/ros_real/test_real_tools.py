@@ -218,7 +218,7 @@ async def test_rosbag(graph: Graph, make_node: MakeGraphNode) -> None:
         heard = await listener.subscribe("text", STRING)
         frames = await listener.subscribe("pose", "geometry_msgs/PoseStamped")
         await graph.tool("rosbag", "play", "--wait-for-subscribers", str(bag))
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             assert [(await anext(aiter(heard))).data for _ in range(20)] == [str(n) for n in range(20)]
             assert (await anext(aiter(frames))).header.frame_id == "map"
 

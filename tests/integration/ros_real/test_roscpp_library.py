@@ -15,7 +15,7 @@ from rce.ros.errors import ServiceFaultError
 from rce.ros.node import Node, Publisher
 from rce.ros.types import Message, Time
 
-pytestmark = [pytest.mark.needs("roscpp", "roslaunch"), pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.needs("roscpp", "roslaunch"), pytest.mark.timeout(600)]
 
 STRING = "std_msgs/String"
 SET_BOOL = "std_srvs/SetBool"
@@ -175,6 +175,7 @@ async def test_services(graph: Graph, make_node: MakeGraphNode, roscpp_library: 
                 assert (await client.call({"data": True}, timeout=TIMEOUT_S)).message == "cpp"
             with pytest.raises(ServiceFaultError):
                 await client.call({"data": False}, timeout=TIMEOUT_S)
+            await node.set_param("/lib/called", True)
             await until_set(node, "/lib/served", 1)
             assert await graph.service("/cpp_set") is None
             assert await program.says() == [
@@ -194,6 +195,7 @@ async def test_services(graph: Graph, make_node: MakeGraphNode, roscpp_library: 
                 "exists 0",
                 "opened 1",
                 "call of an opened one 1",
+                "served 202",
                 "exists then 0",
                 "done",
             ]

@@ -132,6 +132,7 @@ async def test_things_come_move_and_go_by_services(tmp_path: Path) -> None:
         place["position"] = {"x": 5.0, "y": 2.0}
         made = await spawn(model_name="R", model_xml="{robot: turtlebot2}", initial_pose=place)
         assert made.success, made.status_message
+        assert running.uri("robot R") in made.status_message
         async with running.node("robot R") as robot:
             assert len((await one(robot, "/scan", "sensor_msgs/LaserScan")).ranges) == 640
         for name, xml, words in (
@@ -139,7 +140,7 @@ async def test_things_come_move_and_go_by_services(tmp_path: Path) -> None:
             ("S", "<sdf/>", "not XML"),
             ("S", "{robot: boat}", "no robot model 'boat'"),
             ("S", "{boxes: 3}", "boxes"),
-            ("S", "{}", "either a robot's model or a box"),
+            ("S", "{}", "either a robot's model, a box or a walker"),
         ):
             answer = await spawn(model_name=name, model_xml=xml, initial_pose=place)
             assert not answer.success

@@ -59,6 +59,7 @@ ANSWERS: dict[str, Any] = {
     },
     "nodes": {"nodes": [{"container": "c", "tag": "n", "state": "waiting", "detail": "again in 2 s"}]},
     "connections": {"connections": []},
+    "interfaces": {"interfaces": []},
     "usage": {"time": 0.0, "containers": [USAGE], "machines": [MACHINE]},
 }
 
@@ -105,7 +106,11 @@ async def test_the_page_shows_bars_and_advice() -> None:
     from playwright.async_api import async_playwright
 
     pages = Broadcast()
-    pages.send("engine", json.dumps({"type": "engine", **await watched()}))
+    rates = [{"messages_s": 2.5, "bytes_s": 900}, {"messages_s": 40.0, "bytes_s": 51_000}]
+    connections = [{"tag_a": f"a/{n}", "tag_b": f"b/{n}", "established": True, **rates[n]} for n in (0, 1)]
+    connections.append({"tag_a": "a/2", "tag_b": "b/2", "established": False})
+    engine = {**await watched(), "connections": connections}
+    pages.send("engine", json.dumps({"type": "engine", **engine}))
     view = FleetView()
     fleet = FleetLink.__new__(FleetLink)  # nobody steers
     args = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
@@ -118,6 +123,10 @@ async def test_the_page_shows_bars_and_advice() -> None:
             meters = await page.eval_on_selector_all(
                 "#engine meter", "all => all.map(m => [m.value / m.max, m.ariaLabel])"
             )
+            await page.locator("#connections summary").click()
+            await page.locator("#connections tr").nth(2).wait_for()
+            pages.send("engine", json.dumps({"type": "engine", "error": "", **engine}))
+            rows = await page.locator("#connections td").all_inner_texts()
             text = await page.inner_text("#engine")
         finally:
             await browser.close()
@@ -128,7 +137,13 @@ async def test_the_page_shows_bars_and_advice() -> None:
         [0.375, "Cores: 1.5 of 4"],
         [0.25, "Memory: 250 MB of 1000 MB"],
     ]
+    assert rows == [
+        *("a/1 \u2194 b/1", "40/s, 51 kB/s"),
+        *("a/0 \u2194 b/0", "2.5/s, 0.9 kB/s"),
+        *("a/2 \u2194 b/2", "not established"),
+    ]
     for part in (
+        "2 of 3 connections established, 43 messages/s, 52 kB/s",
         "c degraded m1",
         "2 restarts",
         "too small: uses 95 MB",

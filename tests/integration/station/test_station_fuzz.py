@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from support.fuzzing import Tracebacks, exchange, requests
 
@@ -16,7 +18,8 @@ COUNT = 300
 PATHS = [
     *("/", "/static/{file}", "/static/../{file}", "/api/v1/openapi.json", "/api/v1/live", "/api/v1/fleet"),
     *("/api/v1/robots/{robot}", "/api/v1/robots/{robot}/goal", "/api/v1/cells/{cell}", "/api/v1/cells/1"),
-    *("/?token={token}", "*"),
+    *("/api/v1/tasks", "/api/v1/tasks/{robot}/hold", "/api/v1/events", "/api/v1/history?format={file}"),
+    *("/api/v1/webhooks", "/api/v1/webhooks/{robot}", "/?token={token}", "*"),
 ]
 LOGINS = ([b"Authorization: Bearer token"], [b"Cookie: rce_station=token"])
 UPGRADE = [
@@ -26,15 +29,22 @@ UPGRADE = [
     b"Sec-WebSocket-Version: 13",
 ]
 
+EVENTS = '{"events": [], "next": 0, "journal": "ab", "newest": 0}'
+
 
 class Planner(FleetLink):
     """Does all that it is asked for."""
+
+    can_ask_manager = expects_manager = False
 
     def __init__(self) -> None:
         """Need no wire to a planner."""
 
     async def set_goal(self, robot: str, cell: int | None) -> str:
         return f"{robot} {cell}"
+
+    async def request(self, request: dict[str, Any]) -> dict[str, Any]:
+        return {"status": 200, "body": EVENTS, "revision": '"1"'}
 
     async def block_cell(self, cell: int, *, blocked: bool) -> str:
         return f"{cell} {blocked}"

@@ -14,7 +14,7 @@ from aiohttp.test_utils import TestServer
 from support.engine import until
 from support.master_program import master
 
-from rce_fleet.station import server as station_server
+from rce_fleet.station import page_socket
 from rce_fleet.station.engine_authenticator import CACHE_S, EngineAuthenticator, StationAccount
 from rce_fleet.station.live import Broadcast
 from rce_fleet.station.server import Station
@@ -28,6 +28,8 @@ ROLES = ("viewer", "user", "operator", "admin")
 
 class RecordingFleet:
     """Takes requests in place of a planner."""
+
+    can_ask_manager = expects_manager = False
 
     def __init__(self) -> None:
         self.desired: list[tuple[Any, ...]] = []
@@ -127,6 +129,10 @@ async def test_roles_at_station_and_audit(tmp_path: Path) -> None:
         robot = (await site.master("POST", "/robot-tokens", {"robot": "R1"}, status=201))["token"]
         assert await site.look(robot) == 401, "a robot's token is for robots"
 
+        for who in ("viewer", "operator"):
+            made = await site.master("POST", f"/tokens?user={who}", {"scope": "fleet"}, status=201)
+            assert (await site.look(made["token"]), await site.steer(made["token"])) == expected[who]
+
         actions = ("set_goal", "set_grid")
 
         async def noted() -> list[tuple[str, str, str]]:
@@ -148,7 +154,7 @@ async def test_roles_at_station_and_audit(tmp_path: Path) -> None:
 
 
 async def test_revoked_token_ends_open_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(station_server, "CHECK_S", 0.2)
+    monkeypatch.setattr(page_socket, "CHECK_S", 0.2)
     async with running_site(tmp_path) as site:
         headers = {"Authorization": f"Bearer {site.tokens['operator']}"}
         async with site.session.ws_connect(f"{site.station}api/v1/live", headers=headers) as socket:

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from rce.aio.tasks import BackgroundTasks, TaskScope, cancel_and_wait, run_until_first
+from rce.aio.tasks import BackgroundTasks, TaskScope, cancel_and_wait, finish, run_until_first
 
 Reported = list[BaseException]
 
@@ -228,3 +228,30 @@ async def test_cancelling_run_until_first_cancels_all() -> None:
     with pytest.raises(asyncio.CancelledError):
         await running
     assert sorted(ended) == [1, 2]
+
+
+async def test_finish_ends_its_work_before_the_caller_is_cancelled() -> None:
+    steps: list[int] = []
+
+    async def clean_up() -> int:
+        for step in range(4):
+            steps.append(step)
+            await asyncio.sleep(0.01)
+        return 7
+
+    task = asyncio.create_task(finish(clean_up()))
+    for _ in range(2):
+        await asyncio.sleep(0)
+        task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert steps == [0, 1, 2, 3]
+    assert await finish(clean_up()) == 7
+
+
+async def test_finish_raises_the_error_of_its_work() -> None:
+    async def fail() -> None:
+        raise ValueError("no room")
+
+    with pytest.raises(ValueError, match="no room"):
+        await finish(fail())

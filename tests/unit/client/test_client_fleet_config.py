@@ -10,6 +10,7 @@ from rce.config.client import ClientConfig, load, loads
 from rce.config.documents import write_items
 from rce.model.names import Role
 from rce_client.ros_bridge.explain import wires
+from rce_fleet.station.commands.kinds import COMMANDS
 from rce_fleet.station.layers.kinds import TOPICS
 from rce_fleet.wiring import FleetAccount, fleet_config, robot_config
 
@@ -50,7 +51,10 @@ def test_any_number_of_robots(number: int) -> None:
         "/fleet/map",
         *(
             f"/Robot{number}/{topic}"
-            for topic in ("amcl_pose", "blockedCells", "goalNodesList", "cancelGoal", "moveClient/status")
+            for topic in (
+                *("amcl_pose", "battery_state", "blockedCells", "goalNodesList", "cancelGoal"),
+                "moveClient/status",
+            )
         ),
     }
 
@@ -70,6 +74,6 @@ def test_every_interface_is_connected_with_its_complement() -> None:
         assert (a.kind.role, b.kind.role) == (Role.SUBSCRIBER, Role.PUBLISHER)
         assert a.message_type == b.message_type
         used |= {link.tag_a, link.tag_b}
-    offered = {path for path in interfaces if "/layer_" in path}
-    assert len(offered) == len(TOPICS)
+    offered = {path for path in interfaces if "/layer_" in path or "/command_" in path}
+    assert len(offered) == len(TOPICS) + len(COMMANDS)
     assert used == set(interfaces) - offered

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from rce.model.requests import AddInterface, AddNode, CreateContainer, ResizeContainer
+from rce.model.requests import AddInterface, AddNode, CreateContainer, Item, Request, ResizeContainer
 from rce.model.spelling import fields_of
 from rce.protocol.messages import type_of
 from rce.protocol.requests import write_request
@@ -17,7 +17,6 @@ from rce_client.requests import Requests
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rce.model.requests import Item, Request
 
 METHODS: list[tuple[Callable[..., Any], type[Request | Item]]] = [
     (Requests.create_container, CreateContainer),

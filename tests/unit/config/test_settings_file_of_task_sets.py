@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from rce.cli.up import OPTIONS as UP
 from rce.config.folders import configs_dir
-from rce.config.settings import Runtime
+from rce.config.settings import EngineSettings, Runtime
 from rce_container.command import OPTIONS as CONTAINER
 from rce_container.command import app as container
 from rce_master.command import OPTIONS as MASTER
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rce.cli.settings import SettingsOptions
-    from rce.config.settings import EngineSettings
 
 FILE = """
 secret_file: /etc/secret

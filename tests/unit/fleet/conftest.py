@@ -149,6 +149,8 @@ class SimulatedClients:
         self.hidden: set[int] = set()
         self.blocked: set[int] = set()
         self.silent: set[str] = set()
+        self.mute: set[str] = set()
+        """Robots whose move clients answer nothing."""
         self.robots: dict[str, MakeBelieveRobot] = {}
         self.clients: dict[str, MoveClient] = {}
         self.replies: list[Reply] = []
@@ -200,6 +202,7 @@ class SimulatedClients:
         for number, goal in enumerate(goals, start=1):
             reply = self.ask(GoalSet(f"Robot{number}", goal))
             assert reply.ok, reply.message
+        self.tell(Tick())  # Paths are found at the next tick.
 
     def newcomers_cells(self) -> set[int]:
         """The cells of robots that the planner has given no place yet; boxes must not be put there."""
@@ -348,6 +351,8 @@ class SimulatedClients:
                     self._post("goal", robot, self.robots[robot].take_goal, instruction)
                 case SendStop():
                     self._post("stop", robot, self.robots[robot].take_stop, instruction)
+                case ClientReport() if robot in self.mute:
+                    pass
                 case ClientReport():
                     is_driving = instruction.state is ClientState.DRIVING
                     sign = self.signs[robot].sign(self.now, is_driving=is_driving)

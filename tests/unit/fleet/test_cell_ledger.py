@@ -20,7 +20,7 @@ def adopt(ledger: CellLedger, routes: dict[str, list[tuple[int, int]]]) -> None:
     visits = sorted((step, robot, cell) for robot, route in routes.items() for step, cell in route[1:])
     starts = {robot: route[0][1] for robot, route in routes.items()}
     ledger.begin_plan(starts)
-    ledger.extend_plan((robot, cell) for _, robot, cell in visits)
+    ledger.extend_plan((robot, cell, step) for step, robot, cell in visits)
 
 
 def test_a_cell_is_granted_in_the_order_of_the_plan() -> None:

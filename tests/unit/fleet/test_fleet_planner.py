@@ -85,17 +85,29 @@ def test_robot_on_anothers_goal_moves_away_and_stays_away(make: Make) -> None:
     assert robot(fleet).cell in GridMap().neighbours[27]
 
 
-def test_blocking_a_cell_of_a_path_cancels_it_and_brings_another(make: Make) -> None:
+def test_a_cell_blocked_beyond_the_base_stops_no_robot(make: Make) -> None:
+    """The robot drives on in its granted cells, and has another path with the next tick."""
     fleet = make(GridMap(), [24], [31])
-    cell = robot(fleet).plan[5]
+    cell, base = robot(fleet).plan[5], robot(fleet).granted
     out = fleet.tell(CellBlocked(cell))
-    assert SendCancel("Robot1") in out
+    assert SendCancel("Robot1") not in out
     assert BlockedChanged((cell,)) in out
     fleet.blocked = {cell}
-    assert robot(fleet).state is RobotState.STOPPING
-    fleet.run(lambda: len(robot(fleet).plan) > 1)
+    fleet.tell(Tick())
+    assert robot(fleet).plan[: len(base)] == base
+    assert robot(fleet).plan[-1] == 31
     assert cell not in robot(fleet).plan
     assert robot(fleet).replans == 1
+    fleet.run(fleet.all_arrived)
+
+
+def test_a_cell_blocked_within_the_base_stops_its_robot(make: Make) -> None:
+    fleet = make(GridMap(), [24], [31])
+    cell = robot(fleet).granted[-1]
+    assert SendCancel("Robot1") in fleet.tell(CellBlocked(cell))
+    assert robot(fleet).state is RobotState.STOPPING
+    fleet.run(lambda: robot(fleet).plan[-1] == 31)
+    assert cell not in robot(fleet).plan
     fleet.run(fleet.all_arrived)
 
 
@@ -249,12 +261,12 @@ def test_robot_off_its_path_is_stopped_and_placed_again(make: Make, monkeypatch:
     fleet = make(GridMap(), [0])
     fleet.run(lambda: fleet.clients["Robot1"].report.reached == 0)
     monkeypatch.setattr(fleet, "check", lambda: None)  # The robot is where it must not be: that is the point.
-    fleet.robots["Robot1"].x, fleet.robots["Robot1"].y = 5.5, 5.5
-    fleet.tell(PoseSeen("Robot1", 5.5, 5.5, 0.0))
+    fleet.robots["Robot1"].x, fleet.robots["Robot1"].y = 1.5, 1.5
+    fleet.tell(PoseSeen("Robot1", 1.5, 1.5, 0.0))
     assert robot(fleet).state is RobotState.STOPPING
     assert robot(fleet).reason == "it left its path"
     fleet.run(lambda: robot(fleet).state is RobotState.IDLE)
-    assert robot(fleet).cell == 45
+    assert robot(fleet).cell == 9
 
 
 def test_a_removed_robot_leaves_its_cells(make: Make) -> None:

@@ -9,8 +9,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rce_fleet.coordination.events import CellBlocked, CellFreed, GoalSet
+from rce_fleet.coordination.events import CellBlocked, CellFreed, GoalSet, ModeSet, ZonesSet
+from rce_fleet.coordination.modes import RobotMode
 from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.zones import Direction, Zone, ZoneKind
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map, read_scenario
 
@@ -70,6 +72,9 @@ def test_indexes_equal_a_recomputation_whatever_happens(
         disturb(fleet, rng)
         fleet.step()
     fleet.silent.clear()
+    assert fleet.ask(ZonesSet((), replace=True)).ok
+    for robot in (None, *sorted(fleet.planner.state.robots)):
+        assert fleet.ask(ModeSet(robot, RobotMode.AUTOMATIC)).ok
     for cell in sorted(fleet.blocked | fleet.planner.state.pending):
         assert fleet.ask(CellFreed(cell)).ok
     if fleet.robots:
@@ -93,14 +98,48 @@ def disturb(fleet: SimulatedClients, rng: Random) -> None:
             fleet.ask(CellBlocked(cell))
     elif what < 14 and fleet.blocked:
         fleet.ask(CellFreed(rng.choice(sorted(fleet.blocked))))
-    elif what == 14 and robots:
-        fleet.silent ^= {rng.choice(robots)}
-    elif what == 15 and robots:
-        fleet.restart_client(rng.choice(robots))
-    elif what == 16 and len(robots) > 1:
-        robot = rng.choice(robots)
-        if robot in fleet.planner.state.robots:
-            fleet.remove(robot)
+    elif what in (14, 15, 16) and robots:
+        lose(fleet, rng.choice(robots), what)
+    else:
+        change_rules(fleet, rng, what)
+
+
+def lose(fleet: SimulatedClients, robot: str, what: int) -> None:
+    """Let a robot fall silent or be heard again, restart its move client, or take it off the floor."""
+    if what == 14:
+        fleet.silent ^= {robot}
+    elif what == 15:
+        fleet.restart_client(robot)
+    elif len(fleet.robots) > 1 and robot in fleet.planner.state.robots:
+        fleet.remove(robot)
+
+
+def change_rules(fleet: SimulatedClients, rng: Random, what: int) -> None:
+    """Change modes of robots or zones, mostly nothing."""
+    robots = sorted(fleet.robots)
+    if what in (17, 18) and robots:
+        mode = rng.choice(
+            [RobotMode.AUTOMATIC, RobotMode.AUTOMATIC, RobotMode.PAUSED, RobotMode.OUT_OF_SERVICE]
+        )
+        fleet.ask(ModeSet(rng.choice([None, *robots]) if mode.takes_goals else rng.choice(robots), mode))
+    elif what in (19, 20):
+        put_zone(fleet, rng)
+
+
+def put_zone(fleet: SimulatedClients, rng: Random) -> None:
+    """Make or remove a zone."""
+    cells = tuple(sorted(set(rng.sample(fleet.grid.free, 3)) - fleet.newcomers_cells()))
+    name = rng.choice("abc")
+    zone = rng.choice(
+        [
+            Zone(name, ZoneKind.BLOCKED, cells, expires=fleet.now + 5.0),
+            Zone(name, ZoneKind.BLOCKED, cells, robots=("Robot1", "Robot2")),
+            Zone(name, ZoneKind.ONE_WAY, cells, direction=rng.choice(list(Direction))),
+            Zone(name, ZoneKind.SLOW, cells, speed=0.2),
+            Zone(name, ZoneKind.LIMITED, cells, capacity=1),
+        ]
+    )
+    fleet.ask(ZonesSet((zone,) if cells and rng.random() < 0.7 else (), remove=(rng.choice("abc"),)))
 
 
 @pytest.mark.needs("data")

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rce_fleet.planning.grid import GridMap
-from rce_fleet.planning.lacam import JointPlan, plan
+from rce_fleet.planning.lacam import plan
+from rce_fleet.planning.planner import JointPlan
 
 
 def check(grid: GridMap, joint: JointPlan, starts: list[int]) -> None:
@@ -85,7 +86,7 @@ def test_a_single_robot_takes_the_shortest_way() -> None:
 
 def test_the_same_seed_makes_the_same_plan() -> None:
     starts, goals = list(range(8)), list(range(56, 64))[::-1]
-    assert plan(GridMap(), starts, goals, seed=5) == plan(GridMap(), starts, goals, seed=5)
+    assert plan(GridMap(), starts, goals, seed=5).steps == plan(GridMap(), starts, goals, seed=5).steps
 
 
 def test_plan_without_robots_is_empty() -> None:
@@ -94,5 +95,5 @@ def test_plan_without_robots_is_empty() -> None:
 
 @pytest.mark.parametrize(("starts", "goals"), [([0, 0], [1, 2]), ([0, 1], [2, 2]), ([0], [1, 2])])
 def test_cells_that_are_not_all_different_are_refused(starts: list[int], goals: list[int]) -> None:
-    with pytest.raises(ValueError, match="different"):
+    with pytest.raises(ValueError, match=r"different|each robot"):
         plan(GridMap(), starts, goals)

@@ -25,13 +25,15 @@ from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.replanning import PlanRequest, PlanResult, compute_plan
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.guidance import RIGHT, UP
 
 
 class PlannerHarness:
     """A planner whose plans are made when a test says so, and robots that stand in their cells."""
 
     def __init__(self, *starts: int, settings: FleetSettings | None = None) -> None:
-        self.planner = FleetPlanner(GridMap(1, 8) if len(starts) == 1 else GridMap(), settings)
+        grid = GridMap(1, 8) if len(starts) == 1 else GridMap()
+        self.planner = FleetPlanner(grid, settings or FleetSettings(repairs=0))
         self.now = 0.0
         self.requests: list[PlanRequest] = []
         self.sent: dict[str, tuple[int, ...]] = {}
@@ -198,7 +200,7 @@ def test_hindered_robot_gets_its_place_once_the_cell_is_free() -> None:
 @pytest.fixture
 def slow() -> PlannerHarness:
     """The same two robots; each event takes over three entries of a plan, and one robot gets cells."""
-    harness = PlannerHarness(0, 7, settings=FleetSettings(visits_per_step=3, robots_per_step=1))
+    harness = PlannerHarness(0, 7, settings=FleetSettings(visits_per_step=3, robots_per_step=1, repairs=0))
     for _ in range(3):
         harness.finish()
         harness.events(10)
@@ -237,3 +239,72 @@ def test_what_changes_between_two_parts_of_a_plan_counts(slow: PlannerHarness, p
     assert routes.route("R1")[-1] == 3
     assert routes.route("R2")[-1] == 63
     assert 23 not in routes.route("R2")
+
+
+def test_plans_count_turns_from_the_robots_headings() -> None:
+    """A robot faces where its pose does, and one with granted cells in the direction of the last two."""
+    harness = PlannerHarness(0, 7, settings=FleetSettings(repairs=0, quarter_turn=1.0, stop=0.5))
+    harness.finish_all()
+    harness.tell(GoalSet("R1", 59))
+    assert harness.requests[-1].headings == (RIGHT, RIGHT)
+    result = harness.finish()
+    route = [cell for robot, cell in zip(result.visitors, result.cells, strict=True) if robot == 0]
+    assert route == [1, 2, 3, 11, 19, 27, 35, 43, 51, 59]
+    harness.events(3)
+    assert harness.sent["R1"] == (0, 1, 2, 3, 11)
+    harness.tell(GoalSet("R2", 62))
+    assert harness.requests[-1].headings == (UP, RIGHT)
+
+
+@pytest.fixture
+def row() -> PlannerHarness:
+    """Five robots in a row, all sent upwards; new paths for them are asked for, and not there."""
+    harness = PlannerHarness(0, 1, 2, 3, 4, settings=FleetSettings())
+    for number in range(1, 6):  # None of them is silent meanwhile.
+        harness.tell(PoseSeen(f"R{number}", *harness.planner.state.grid.centre(number - 1), 0.0))
+        harness.tell(
+            ReportSeen(f"R{number}", ClientReport(harness.revisions[f"R{number}"], ClientState.IDLE))
+        )
+    for number in range(1, 6):
+        assert isinstance(harness.tell(GoalSet(f"R{number}", 55 + number))[0], Reply)
+    harness.tell(Tick())
+    assert harness.requests[-1].copy is not None, "more robots than the planner repairs by itself"
+    return harness
+
+
+def test_new_paths_for_some_are_entered_without_a_plan_for_all(row: PlannerHarness) -> None:
+    asked = len(row.requests)
+    row.finish()
+    for number in range(1, 6):
+        assert row.planner.state.ledger.route(f"R{number}")[-1] == 55 + number
+    assert len(row.requests) == asked
+
+
+def test_new_path_over_a_cell_blocked_meanwhile_is_cut(row: PlannerHarness) -> None:
+    row.tell(CellBlocked(24))
+    result = row.finish()
+    assert result.rerouting is not None
+    assert any(cell == 24 for path in result.rerouting.paths for cell, _ in path), "it is on a new path"
+    assert 24 not in {cell for number in range(1, 6) for cell in row.planner.state.ledger.route(f"R{number}")}
+    row.tell(Tick())
+    if row.requests[-1].number != result.number:
+        row.finish()
+    assert row.planner.state.ledger.route("R1")[-1] == 56
+
+
+def test_robot_with_another_goal_meanwhile_gets_another_path(row: PlannerHarness) -> None:
+    row.tell(GoalSet("R3", 63))
+    result = row.finish()
+    row.tell(Tick())
+    if row.requests[-1].number != result.number:
+        row.finish()
+    assert row.planner.state.ledger.route("R3")[-1] == 63
+    assert row.planner.state.ledger.route("R1")[-1] == 56
+
+
+def test_robot_removed_meanwhile_leaves_the_others_their_paths(row: PlannerHarness) -> None:
+    row.tell(RobotRemoved("R2"))
+    row.finish()
+    row.tell(Tick())
+    assert row.planner.state.ledger.route("R1")[-1] == 56
+    assert row.planner.state.ledger.route("R3")[-1] == 58

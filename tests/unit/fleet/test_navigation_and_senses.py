@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rce_fleet.coordination.move_client import GoalState
+from rce_fleet.drivers.cell_watch import grid_of
 from rce_fleet.exceptions import OccupiedError
 from rce_fleet.geometry.angles import quaternion_z, wrap, yaw_of
 from rce_fleet.geometry.poses import Pose, Twist
@@ -355,6 +356,41 @@ def test_boxes_follow_blocked_cells() -> None:
     assert list(world.boxes) == [9]
     keeper.follow([])
     assert not world.boxes, "a box that was found is taken away when its cell is freed"
+
+
+def test_boxes_of_another_grid_are_where_its_cells_are() -> None:
+    """After a change of the fleet's grid, numbers are those of other places."""
+    world = World(GridMap())
+    world.add_box(9)
+    keeper = BoxKeeper(world)
+    keeper.follow([20], GridMap())
+    assert list(world.boxes) == [9, 20]
+    turned = GridMap(rows=4, columns=4, cell_size=0.5, origin=(6.0, 2.0), yaw=pi / 2)
+    keeper.follow([0, 5], turned)
+    assert list(world.boxes) == [9], "cell 20 is no cell of the new grid"
+    placed = {name: box for name, box in world.all_boxes.items() if name != "cell_9"}
+    assert [(box.pose.x, box.pose.y) for box in placed.values()] == [
+        pytest.approx((5.75, 2.25)),
+        pytest.approx((5.25, 2.75)),
+    ]
+    assert {box.width for box in placed.values()} == {0.3}
+    assert keeper.update() == ()
+    keeper.follow([5], turned)
+    assert len(world.all_boxes) == 2
+    keeper.follow([5], GridMap())
+    assert list(world.boxes) == [5, 9]
+    assert len(world.all_boxes) == 2
+
+
+def test_a_grid_is_told_by_its_layout() -> None:
+    grid = GridMap(rows=3, columns=5, cell_size=0.7, origin=(-1.5, 2), blocked=frozenset({4}), yaw=0.3)
+    assert GridMap.from_layout(grid.layout) == grid.with_blocked(())
+    for text in ("", "cells", "[1]", '{"rows": 3}', grid.layout.replace("0.7", "-1")):
+        with pytest.raises(ValueError, match="expected the layout of a grid"):
+            GridMap.from_layout(text)
+    assert grid_of([]) is None
+    assert grid_of(["revision=3"]) is None
+    assert grid_of([GridMap().layout]) == GridMap()
 
 
 def test_the_same_seed_makes_the_same_run() -> None:

@@ -37,7 +37,7 @@ def few_particles(monkeypatch: pytest.MonkeyPatch) -> None:
         return ParticleMapper(FilterParameters(particles=2, linear_update=0.2, angular_update=0.2), seed=seed)
 
     monkeypatch.setattr(commands, "_mapper", mapper)
-    monkeypatch.setenv(compiled._SWITCH, "no")
+    monkeypatch.setenv(compiled.COMPILED, "no")
 
 
 def run(*args: Path | str, command: Callable[..., None] = commands.map_log) -> Result:

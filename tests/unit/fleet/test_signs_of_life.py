@@ -9,8 +9,9 @@ import pytest
 
 from rce_fleet.coordination.events import GoalSet, PoseSeen, ReportSeen, RobotHeard, Tick
 from rce_fleet.coordination.move_client import ClientReport, ClientState
-from rce_fleet.coordination.planner import NO_POSE, FleetPlanner
+from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.robot_signs import FRESH, NO_SIGN, RobotSign, RobotSigns
+from rce_fleet.coordination.robot_watch import NO_POSE
 from rce_fleet.coordination.snapshot import RobotState
 from rce_fleet.planning.grid import GridMap
 
@@ -121,3 +122,16 @@ def test_a_pose_of_no_numbers_is_only_a_sign_of_life(x: float) -> None:
     signs = RobotSigns()
     signs.take_pose(x, 2.0, 0.5, 8.0)
     assert signs.sign(8.0, is_driving=False) == RobotSign(0.0)
+
+
+def test_the_heartbeat_is_of_whoever_was_silent_longer() -> None:
+    """A robot that stands is as old as what its move client heard of it, and as the report about it."""
+    client = ClientOnly()
+    client.planner.handle(PoseSeen("Robot1", 2.5, 3.5, 0.0), client.now)
+    client.run(10.0, age=0.3)
+    record = client.planner.state.robots["Robot1"]
+    reported = client.now - 0.5
+    assert record.heartbeat_age(reported) == pytest.approx(0.3)
+    assert record.heartbeat_age(reported + 7.0) == pytest.approx(7.3)
+    client.planner.handle(PoseSeen("Robot1", 2.5, 3.5, 0.0), reported + 7.0)
+    assert record.heartbeat_age(reported + 7.0) == pytest.approx(7.0), "its move client is silent"

@@ -22,11 +22,13 @@ from rce_fleet.coordination.events import (
     SendCancel,
     SendCells,
     Tick,
+    ZonesSet,
 )
 from rce_fleet.coordination.move_client import ClientReport, MoveClient, SendGoal, SendStop
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.replanning import compute_plan
 from rce_fleet.coordination.snapshot import RobotState
+from rce_fleet.coordination.zones import Zone, ZoneKind
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map, read_scenario
 from rce_fleet.planning.scenario import Scenario, given_scenario, make_scenario, midway_cell
@@ -60,7 +62,8 @@ class SimulatedFleet:
     def plan(self, event: Event) -> None:
         for instruction in self.planner.handle(event, self.world.time):
             match instruction:
-                case SendCells(robot, revision, cells):
+                case SendCells(robot, revision, cells, speed):
+                    self.bases[robot].limit_speed(speed)
                     self.tell(robot, self.clients[robot].take_cells(revision, list(cells), self.world.time))
                 case SendCancel(robot):
                     self.tell(robot, self.clients[robot].cancel(self.world.time))
@@ -140,6 +143,26 @@ class SimulatedFleet:
 @pytest.mark.parametrize(("robots", "seed"), [(1, 0), (3, 1), (8, 2), (8, 3)])
 def test_robots_reach_goals_without_collisions(robots: int, seed: int) -> None:
     check_run(SimulatedFleet(make_scenario(GridMap(), robots, seed=seed), seed))
+
+
+def test_robots_drive_slowly_in_a_slow_zone() -> None:
+    """A list of cells carries the zone's speed, and the robot keeps to it until the zone is removed."""
+    fleet = SimulatedFleet(given_scenario(GridMap(1, 6), [(0, 5)]), seed=4)
+    zone = Zone("dock", ZoneKind.SLOW, tuple(range(6)), speed=0.2)
+    fleet.plan(ZonesSet((zone,)))
+    body = fleet.world.robots["Robot1"]
+    top = {True: 0.0, False: 0.0}
+    is_slow = True
+    for number in range(1, 600):
+        fleet.step(number)
+        top[is_slow] = max(top[is_slow], abs(body.twist.speed))
+        if number == 60:
+            fleet.plan(GoalSet("Robot1", 5))
+        if number == 300:
+            is_slow = False
+            fleet.plan(ZonesSet((), remove=("dock",)))
+    assert 0.15 < top[True] <= 0.21
+    assert top[False] > 0.4
 
 
 @pytest.mark.needs("data")

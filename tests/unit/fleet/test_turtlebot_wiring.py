@@ -71,8 +71,18 @@ def test_every_interface_is_connected_with_its_complement(name: str) -> None:
         assert b.kind.role is a.kind.role.complement
         assert a.message_type == b.message_type
         used |= {link.tag_a, link.tag_b}
-    layers = {path for path in interfaces if "/layer_" in path}
-    assert used | layers == set(interfaces)
+    of_the_station = {path for path in interfaces if "/layer_" in path or "/command_" in path}
+    assert used | of_the_station == set(interfaces)
+
+
+@pytest.mark.parametrize("own_map", [True, False])
+def test_the_maps_layer_comes_from_where_the_map_is(own_map: bool) -> None:
+    """A container's interface does not receive what another of its interfaces publishes."""
+    made = offloaded_config(1, own_map=own_map)
+    (endpoint,) = [each["eTag"] for each in made["interfaces"] if each["iTag"] == "layer_Robot1_map"]
+    assert endpoint == ("testRobot_1" if own_map else "cTag_01")
+    into_box = [each for each in made["bridges"] if each.get("topic") == "/map" and each["to"] == "cTag_01"]
+    assert bool(into_box) == own_map
 
 
 def test_a_robot_with_its_own_nodes_sends_poses_and_cells() -> None:
@@ -86,7 +96,8 @@ def test_a_robot_with_its_own_nodes_sends_poses_and_cells() -> None:
 def test_an_offloaded_robot_sends_sensors_and_takes_velocities() -> None:
     config = shipped("robot1-offload")
     up = {"/scan", "/odom", "/tf", "/tf_static", "/initialpose", "/move_base_simple/goal"}
-    assert at_robot(config) == {*up, "/raw_cmd_vel", "/amcl_pose", "/last_pose"}
+    down = {"/raw_cmd_vel", "/speed_limit", "/amcl_pose", "/last_pose"}
+    assert at_robot(config) == {*up, *down, "/battery_state"}
     nodes = [f"{item.node.pkg}/{item.node.exe}" for item in config.nodes]
     assert nodes == [
         *("map_server/map_server", "amcl/amcl", "move_base/move_base"),

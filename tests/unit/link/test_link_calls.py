@@ -9,7 +9,7 @@ import pytest
 
 from rce.guard.holdings import Holdings
 from rce.link.calls import CallServer, PendingCalls
-from rce.link.carrier import LocalCarrier
+from rce.link.carrier import Carrier, LocalCarrier
 from rce.link.exceptions import (
     MessageTooLargeError,
     NotConnectedError,
@@ -22,7 +22,6 @@ from rce.link.frames import Frame, FrameType
 from rce.link.settings import LinkLimits
 
 if TYPE_CHECKING:
-    from rce.link.carrier import Carrier
     from rce.link.channel import Channel
 
 

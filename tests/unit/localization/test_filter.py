@@ -13,9 +13,10 @@ from rce_fleet.exceptions import MapError
 from rce_fleet.geometry.angles import wrap
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.localization.amcl import Amcl, Estimate
+from rce_fleet.localization.contradiction import contradicts_map, explained_shares
 from rce_fleet.localization.parameters import AmclParameters, LaserModel, OdometryModel
 from rce_fleet.localization.replay import Recorded, replay
-from rce_fleet.localization.scan import LaserScan
+from rce_fleet.localization.scan import LaserScan, select_beams
 from rce_fleet.maps.occupancy_map import OccupancyMap
 from rce_fleet.maps.ray_casting import cast_rays
 
@@ -170,6 +171,39 @@ def test_a_robot_that_was_moved_by_hand_is_found() -> None:
     amcl.request_update()
     estimate = drive(amcl, moved)
     assert error(estimate, moved[-1])[0] < 0.25
+
+
+def test_robots_around_one_do_not_look_like_elsewhere() -> None:
+    """Half of the beams end at things on no map: the robot stays where it is, and draws nothing elsewhere."""
+    amcl = filtered(replace(SMALL, recovery_alpha_slow=0.001, recovery_alpha_fast=0.1))
+    seen, stand = scan(START), Pose(0.0, 0.0, 0.0)
+    around = np.arange(BEAMS) % 10 < 5
+    among = replace(seen, ranges=np.where(around, 0.6 * seen.ranges, seen.ranges))
+    for each in [seen] * 20 + [among] * 10:
+        amcl.update(stand, each)
+        amcl.request_update()
+    assert np.ptp(amcl.particles[:, 0]) < 1
+    assert np.ptp(amcl.particles[:, 1]) < 1
+
+
+@pytest.mark.parametrize(
+    ("pose", "factor", "contradicted"),
+    [
+        (START, 1.0, False),
+        (START, 0.5, True),  # everything is nearer: nothing of the map is seen
+        (START, 1.3, True),  # walls are seen through
+        (Pose(3.0, 2.5, 1.0), 1.0, True),
+    ],
+)
+def test_scan_contradicts_the_map(pose: Pose, factor: float, contradicted: bool) -> None:
+    seen = scan(START)
+    scaled = replace(seen, ranges=np.minimum(factor * seen.ranges, seen.range_max))
+    assert contradicts_map(GRID, pose, select_beams(scaled, SMALL)) is contradicted
+
+
+def test_scan_without_returns_contradicts_nothing() -> None:
+    empty = replace(scan(START), ranges=np.full(BEAMS, np.inf))
+    assert explained_shares(GRID, START, select_beams(empty, SMALL)) == (0.0, 1.0)
 
 
 def test_recovery_is_off_by_default() -> None:

@@ -15,14 +15,13 @@ from rce_fleet.mapping.graph import search
 from rce_fleet.mapping.graph.alignment import Reference, align
 from rce_fleet.mapping.graph.correlative import Window, find_match
 from rce_fleet.mapping.graph.fields import make_field, paint
-from rce_fleet.mapping.graph.scan_points import prepare_scan
+from rce_fleet.mapping.graph.scan_points import ScanPoints, prepare_scan
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from support.walls import Poses
 
-    from rce_fleet.mapping.graph.scan_points import ScanPoints
 
 ROOM = [*box(-4, -3, 9, 7), *box(2, 1, 1, 1), *polyline((-4, 1), (-2.5, 1), (-2.5, 1.4))]
 

@@ -81,6 +81,8 @@ def test_colours_and_transparent_pixels(tmp_path: Path) -> None:
     ("keys", "fault"),
     [
         ({"resolution": -0.05}, "'resolution' must be a positive number of metres, not -0.05"),
+        ({"resolution": 0}, "'resolution' must be a positive number of metres, not 0"),
+        ({"resolution": True}, "'resolution' must be a number, not True"),
         ({"resolution": "wide"}, "'resolution' must be a number, not 'wide'"),
         ({"resolution": float("nan")}, "'resolution' must be a number, not nan"),
         ({"origin": [0, 0]}, r"'origin' must be \[x, y, yaw\]"),
@@ -105,6 +107,10 @@ def test_a_faulty_header_names_the_key(tmp_path: Path, keys: dict[str, object], 
         (b"hello", "is not an image"),
         (b"P5\n4 4\n255\n123", "cannot be read"),
         (b"P5\n-3 4\n255\n123", "read|image"),
+        (b"P5\n0 4\n255\n", "is not an image"),
+        (b"P5\nwide 4\n255\n123", "cannot be read"),
+        (b"P5\n100000 100000\n255\n123", "cannot be read: Image size"),
+        (b"P9\n4 4\n255\n" + bytes(16), "is not an image"),
         (b"", "is not an image"),
     ],
 )
@@ -114,6 +120,13 @@ def test_a_faulty_image_names_the_file(tmp_path: Path, image: bytes, fault: str)
     with pytest.raises(MapError, match=fault) as caught:
         load_map(path)
     assert "map.pgm" in str(caught.value)
+
+
+@pytest.mark.parametrize(("negate", "value"), [(True, 0), (False, 100), (1, 0), (0, 100)])
+def test_negate_may_be_a_number_or_a_bool(tmp_path: Path, negate: bool | int, value: int) -> None:
+    path = write(tmp_path, [[0]])
+    path.write_text(yaml.safe_dump({**HEADER, "negate": negate}))
+    assert load_map(path).data.tolist() == [[value]]
 
 
 def test_files_that_hold_no_map(tmp_path: Path) -> None:

@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rce_master.exceptions import StaleTermError, StoreBusyError, StoreError
-from rce_master.store import MemoryStore, Row, SqliteStore
+from rce_master.store import MemoryStore, Row, SqliteStore, Store
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from rce_master.store import Store
 
 
 async def check_round_trip(store: Store) -> None:

@@ -20,6 +20,7 @@ from rce.config import items
 from rce.config.client import loads
 from rce.control.messages import ClientRequest, Put, decode_to_master, decode_to_task_set, encode
 from rce.control.model import EndpointKind, EndpointSpec
+from rce.model import Volume
 from rce.model.requests import (
     AddInterface,
     AddNode,
@@ -45,6 +46,7 @@ SAMPLES: dict[str, Any] = {
     "group_ip": "10.0.0.2",
     "tag_a": "a/x",
     "tag_b": "b/x",
+    "volumes": (Volume(name="x", path="/data", size=64 << 20),),
     "value": [1, 2.5, "x", True],
 }
 """Where any value of the type will not do."""

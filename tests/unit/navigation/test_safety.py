@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from rce_fleet.geometry.poses import Pose, Twist
 from rce_fleet.navigation.costmap.footprint import Footprint
+from rce_fleet.navigation.navigation import read_speed_limit
 from rce_fleet.navigation.safety.limiter import VelocityLimiter, allowed_speed
 from rce_fleet.navigation.safety.parameters import SafetyParameters
 from rce_fleet.navigation.safety.seen import Scan
@@ -49,6 +50,23 @@ def test_a_command_in_the_open_passes() -> None:
     stage.take_command(Twist(0.5, 0.3), 0.0)
     assert stage.limit(0.0).twist == Twist(0.5, 0.3)
     assert stage.limit(0.0).reason == ""
+
+
+def test_a_speed_limit_counts_until_it_ends() -> None:
+    stage = limiter()
+    stage.take_command(Twist(0.5, 0.3), 0.0)
+    stage.speed_limit = read_speed_limit(0.2)
+    slow = stage.limit(0.0).twist
+    assert slow.speed == 0.2
+    assert slow.turn_rate == pytest.approx(0.12)  # on the same arc
+    stage.speed_limit = read_speed_limit(0.0)
+    assert stage.limit(0.0).twist == Twist(0.5, 0.3)
+
+
+@pytest.mark.parametrize("value", [-0.1, nan, inf])
+def test_a_speed_limit_that_is_none_is_refused(value: float) -> None:
+    with pytest.raises(ValueError, match="expected a speed in m/s"):
+        read_speed_limit(value)
 
 
 def test_an_obstacle_ahead_limits_the_speed() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rce.protocol.printable import REPLACEMENT, for_terminal, one_line
+from rce.printable import REPLACEMENT, for_terminal, one_line
 
 CLIPBOARD = "\x1b]52;c;cm0gLXJm\x07"
 CLEAR = "\x1b[2J\x1b[H"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rce.control.messages import ClientReply, RequestFault
 from rce.model import FaultCode
 from rce.protocol.messages import ErrorReport
-from rce_robot.refusals import reports_of
+from rce_robot.master_requests import reports_of
 
 
 def test_a_refusal_has_its_code_and_the_keys_of_the_request() -> None:

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from rce.launching import StopTimeouts
-from rce.launching.command import NodeCommand, node_command
-from rce.launching.hosted import HostedNode, can_host
 from rce.ros.launch.exceptions import Place
 from rce.ros.launch.plan import NodePlan
+from rce.ros.launching import StopTimeouts
+from rce.ros.launching.command import NodeCommand, node_command
+from rce.ros.launching.hosted import HostedNode, can_host
 from rce.ros.node import Node
 from rce.ros.node.hosting import HostedProgram, program_arguments, program_environ
 from rce.ros.node.running import stop_signals

@@ -72,16 +72,19 @@ def engine(state: str, *nodes: tuple[str, str]) -> dict[str, Any]:
     return {"containers": [{"tag": "cTag_fleet", "state": state, "nodes": listed}]}
 
 
+MANAGER = ("fleetManager", "running")
+
+
 def test_a_running_node_needs_nothing() -> None:
     for status in ("running", "starting", "stopping", "unknown"):
-        assert node_requests(CONFIG, engine("running", ("fleetPlanner", status))) == []
+        assert node_requests(CONFIG, engine("running", ("fleetPlanner", status), MANAGER)) == []
 
 
 def test_a_node_that_failed_is_removed_and_then_added() -> None:
-    (request,) = node_requests(CONFIG, engine("running", ("fleetPlanner", "failed")))
+    (request,) = node_requests(CONFIG, engine("running", ("fleetPlanner", "failed"), MANAGER))
     assert isinstance(request, ConfigureComponents)
     assert request.remove_nodes == (RemoveNode(container="cTag_fleet", tag="fleetPlanner"),)
-    (request,) = node_requests(CONFIG, engine("running"))
+    (request,) = node_requests(CONFIG, engine("running", MANAGER))
     assert isinstance(request, ConfigureComponents)
     assert [node.node.tag for node in request.add_nodes] == ["fleetPlanner"]
 

@@ -111,3 +111,14 @@ async def test_a_new_map_is_sent(site: Site) -> None:
     grid, change = await site.take()
     assert (grid["type"], grid["rows"]) == ("map", 4)
     assert (change["type"], change["robots"]) == ("changes", [])
+
+
+def test_a_feed_knows_whether_a_page_is_open() -> None:
+    """The truth of a simulated world is received only then."""
+    pages = Feed(FleetView()).pages
+    assert not pages.are_open.is_set()
+    first, second = pages.open(), pages.open(compact=True)
+    pages.close(first)
+    assert pages.are_open.is_set()
+    pages.close(second)
+    assert not pages.are_open.is_set()

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rce_fleet.station.following import MOST_EARLY, ChangeFollower
+from rce_fleet.coordination.following import MOST_EARLY, ChangeFollower
 
 A, B = "10.000000001", "20.000000002"
 """When two planners began."""

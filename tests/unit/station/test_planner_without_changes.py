@@ -1,4 +1,7 @@
-"""What the link asks of a planner that publishes no changes, with a client that lives in the test."""
+"""What the link asks of planners of earlier releases: no changes, no common topic of poses.
+
+The client lives in the test.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from rce_fleet.station.planner_client import (
     PlannerListener,
     PlannerUnavailableError,
 )
-from rce_fleet.station.view import FleetView
+from rce_fleet.station.view import FleetView, Pose
 
 GRID = {
     "rows": 2,
@@ -36,6 +39,10 @@ def state(*blocked: int, started: str = "1.0") -> dict[str, Any]:
     return {**GRID, "started": started, "blocked": list(blocked), "robots": []}
 
 
+def with_robots(*names: str, started: str = "1.0") -> dict[str, Any]:
+    return {**state(started=started), "robots": [{"id": name} for name in names]}
+
+
 def repeated(sequence: int) -> dict[str, Any]:
     parts: dict[str, Any] = {"robots": [], "removed": [], "blocked": [], "pending": [], "freed": []}
     return {**parts, "started": "1.0", "sequence": sequence}
@@ -47,6 +54,7 @@ class Planner(PlannerClient):
     def __init__(self) -> None:
         super().__init__("away")
         self.asked: list[float] = []
+        self.followed: list[str] = []
         self.answer: dict[str, Any] | None = None
         self._calls[GET_STATE] = self._get_state
 
@@ -60,6 +68,9 @@ class Planner(PlannerClient):
         if self.answer is None:
             raise PlannerUnavailableError("no such service")
         return self.answer
+
+    def follow(self, robot: str) -> None:
+        self.followed.append(robot)
 
     @property
     def receives_states(self) -> bool:
@@ -140,3 +151,37 @@ async def test_a_planner_that_falls_silent_is_asked(monkeypatch: pytest.MonkeyPa
         await until(lambda: station.planner.receives_states)
         station.link.take_state(state(1, started="2.0"))
         assert station.view.blocked() == [1]
+
+
+def poses(*names: str) -> dict[str, Any]:
+    return {
+        "robots": list(names),
+        "x": [1.0] * len(names),
+        "y": [2.0] * len(names),
+        "yaw": [0.5] * len(names),
+    }
+
+
+async def test_poses_of_all_robots_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet_link, "POSES_WAIT_S", 0.05)
+    station = Station()
+    station.link.take_state(with_robots("Robot1"))
+    station.link.take_poses(poses("Robot1", "Stranger"))
+    assert station.view.poses == {"Robot1": Pose(1.0, 2.0, 0.5)}
+    await asyncio.sleep(0.06)
+    station.link.take_state(with_robots("Robot1", "Robot2"))
+    assert station.planner.followed == []
+
+
+async def test_robots_are_followed_one_by_one_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A planner that is started again has as much time as the first one."""
+    monkeypatch.setattr(fleet_link, "POSES_WAIT_S", 0.05)
+    station = Station()
+    station.link.take_state(with_robots("Robot1"))
+    station.link.take_poses(poses("Robot1"))
+    await asyncio.sleep(0.06)
+    station.link.take_state(with_robots("Robot1", started="2.0"))
+    assert station.planner.followed == []
+    await asyncio.sleep(0.06)
+    station.link.take_state(with_robots("Robot1", "Robot2", started="2.0"))
+    assert station.planner.followed == ["Robot1", "Robot2"]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import cast
 
 from rce.aio.queues import BoundedQueue
-from rce.guard.lobby import Guest, Lobby, address_of
+from rce.guard import Guest, Lobby, address_of
 from rce.ros.multimaster.errors import LinkBrokenError
 from rce.ros.multimaster.relay.frames import (
     MAX_FRAME_SIZE,

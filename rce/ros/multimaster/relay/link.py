@@ -11,8 +11,7 @@ from rce.aio.backoff import Backoff
 from rce.aio.servers import close_servers
 from rce.aio.tasks import TaskScope
 from rce.dialing import open_socket
-from rce.guard.lobby import Lobby
-from rce.guard.rates import LogThrottle
+from rce.guard import Lobby, LogThrottle
 from rce.ros.multimaster.errors import LinkBrokenError, MultimasterError
 from rce.ros.multimaster.relay.connection import RelayConnection
 from rce.ros.multimaster.relay.exporter import Exporter

@@ -17,7 +17,7 @@ static void say(const std::string& words, long number) { say(words + " " + std::
 
 // Waits for a condition by the machine's clock; says what did not come.
 static bool until(const std::string& what, const std::function<bool()>& condition) {
-  for (int i = 0; i < 6000 && ros::ok(); ++i) {
+  for (int i = 0; i < 12000 && ros::ok(); ++i) {
     if (condition()) return true;
     ros::WallDuration(0.005).sleep();
   }
@@ -193,7 +193,8 @@ static void services(ros::NodeHandle& node) {
   kept = node.serviceClient<std_srvs::SetBool>("our_set", true);
   say("call of an opened one", call(kept, true));
   ros::param::set("/lib/served", 0);
-  until("calls of ours", [&] { return served > 200; });
+  until("the end of our calls", [] { return ros::param::has("/lib/called"); });
+  say("served", served);
   server.shutdown();
   say("exists then", ros::service::exists("cpp_set", false));
   ros::param::set("/lib/served", 1);

@@ -1,0 +1,76 @@
+"""A task set's connections to the master for single runs (:mod:`rce.control.execution`)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING
+
+from websockets.asyncio.client import connect
+
+from rce.control.execution import MAX_DATA, path_of
+from rce.control_channel.timeouts import DEFAULT_TIMEOUTS, ControlTimeouts
+from rce.dialing import open_url_socket
+from rce.tls.websocket import TlsClientConnection
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from websockets.asyncio.client import ClientConnection
+
+    from rce.config import Secret
+    from rce.masters import Masters
+    from rce.tls import Context
+
+
+class RunDialer:
+    """Dials the master for runs.
+
+    Args:
+        masters: Where the masters are, as for :class:`~rce.control_channel.channel.TaskSetChannel`,
+            whose master asks.
+        secret: Proves that this is a task set of the same engine.
+        timeouts: Times of this end.
+        tls: Gives the TLS context for each connection to a ``wss://`` URL.
+    """
+
+    def __init__(
+        self,
+        masters: Masters,
+        secret: Secret,
+        timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
+        *,
+        tls: Context | None = None,
+    ) -> None:
+        self._tls = tls
+        self._masters = masters
+        self._secret = secret
+        self._timeouts = timeouts
+
+    @contextlib.asynccontextmanager
+    async def dial(self, run: str) -> AsyncIterator[ClientConnection]:
+        """Connect for a run.
+
+        Raises:
+            OSError: The master cannot be reached; ``TimeoutError`` if it does not answer.
+            WebSocketException: It does not take the connection.
+        """
+        url = self._masters.current.rstrip("/")
+        async with asyncio.timeout(self._timeouts.open):
+            sock = await open_url_socket(url)
+        async with connect(
+            url + path_of(run),
+            sock=sock,
+            additional_headers={"Authorization": f"Bearer {self._secret.reveal()}"},
+            ssl=None if self._tls is None else self._tls(),
+            compression=None,
+            proxy=None,
+            open_timeout=self._timeouts.open,
+            ping_interval=self._timeouts.ping_interval,
+            ping_timeout=None,
+            close_timeout=self._timeouts.close,
+            max_size=MAX_DATA + 2,
+            max_queue=4,
+            create_connection=TlsClientConnection,
+        ) as master:
+            yield master

@@ -1,0 +1,132 @@
+"""The master's view of one task set."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+from typing import TYPE_CHECKING
+
+from rce.control import (
+    Hello,
+    LogChunk,
+    LogQuery,
+    PeerGoneError,
+    PeerTimeoutError,
+    ReadLog,
+    TaskSetKind,
+    ToTaskSet,
+    encode,
+)
+from rce.control_channel.timeouts import MAX_QUEUED, ControlTimeouts
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+
+
+_log = logging.getLogger(__name__)
+
+
+class Peer:
+    """A task set that is connected."""
+
+    def __init__(self, hello: Hello, socket: ServerConnection, timeouts: ControlTimeouts) -> None:
+        self.hello = hello
+        self._socket = socket
+        self._timeouts = timeouts
+        self._outbox: asyncio.Queue[str] = asyncio.Queue(MAX_QUEUED)
+        self._numbers = itertools.count(1)
+        self._reads: dict[int, asyncio.Future[LogChunk]] = {}
+        self._left = False
+        self.finished = asyncio.Event()
+        """Set by the server when it is done with this peer."""
+
+    def __repr__(self) -> str:
+        return f"<Peer {self.kind.value} {self.process}>"
+
+    @property
+    def process(self) -> str:
+        """The task set's name."""
+        return self.hello.process
+
+    @property
+    def kind(self) -> TaskSetKind:
+        """Which kind of task set it is."""
+        return self.hello.kind
+
+    @property
+    def features(self) -> frozenset[str]:
+        """The features of this task set that one of an earlier release did not have."""
+        return frozenset(self.hello.features)
+
+    def send(self, message: ToTaskSet) -> None:
+        """Send a message; never blocks. A peer that is too far behind is disconnected, and dials again."""
+        if self._left:
+            return
+        try:
+            self._outbox.put_nowait(encode(message))
+        except asyncio.QueueFull:
+            _log.warning("%r takes no messages; cut off", self)
+            self.abort()
+            self.leave()
+
+    def abort(self) -> None:
+        """Abort the connection."""
+        self._socket.transport.abort()
+
+    async def read_log(
+        self,
+        id: str,  # noqa: A002 - wire name
+        node: str,
+        offset: int = 0,
+        limit: int = 65536,
+        query: LogQuery = LogQuery(),  # noqa: B008 - it is frozen
+    ) -> LogChunk:
+        """Read a piece of a node's log.
+
+        Args:
+            id: Endpoint id of the container.
+            node: Node tag; empty for the environment's own log.
+            offset: Where to start, in bytes; negative: that many before the end.
+            limit: At most so many bytes.
+            query: Of which incarnation of the container, and what of it.
+
+        Raises:
+            PeerGoneError: The task set left.
+            PeerTimeoutError: It did not answer in time.
+        """
+        if self._left:
+            raise PeerGoneError(self.process)
+        number = next(self._numbers)
+        reply: asyncio.Future[LogChunk] = asyncio.get_running_loop().create_future()
+        self._reads[number] = reply
+        self.send(ReadLog(request=number, id=id, node=node, offset=offset, limit=limit, query=query))
+        try:
+            async with asyncio.timeout(self._timeouts.log):
+                return await reply
+        except TimeoutError as error:
+            raise PeerTimeoutError(self.process, self._timeouts.log) from error
+        finally:
+            del self._reads[number]
+
+    async def pump(self) -> None:
+        """Send what waits, until the connection ends (for the server).
+
+        Raises:
+            ConnectionClosed: The connection ended.
+        """
+        while True:
+            await self._socket.send(await self._outbox.get())
+
+    def answer(self, chunk: LogChunk) -> None:
+        """Take an answer to :meth:`read_log` (for the server)."""
+        reply = self._reads.get(chunk.request)
+        if reply is not None and not reply.done():
+            reply.set_result(chunk)
+
+    def leave(self) -> None:
+        """Note that the peer is gone, and fail the calls that wait for it (for the server)."""
+        self._left = True
+        for reply in self._reads.values():
+            if not reply.done():
+                reply.set_exception(PeerGoneError(self.process))

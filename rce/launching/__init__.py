@@ -1,9 +1,0 @@
-"""Carries out a launch plan: a master if there is none, parameters, and nodes as processes until they end.
-
-:class:`~rce.launching.launcher.Launcher` does what ``roslaunch`` does with its files.
-"""
-
-from rce.launching.launched import StopTimeouts
-from rce.launching.launcher import Launcher
-
-__all__ = ["Launcher", "StopTimeouts"]

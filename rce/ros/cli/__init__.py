@@ -1,0 +1,1 @@
+"""Commands of ``rce`` about ROS graphs: ``core``, ``discovery``, ``relay``, ``run``, ``sync``."""

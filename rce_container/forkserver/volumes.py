@@ -1,0 +1,106 @@
+"""Mounts the volumes of a container inside it, and gives them to its user.
+
+The loop device of an image detaches itself when its only mount ends, which is in the container's namespaces:
+nothing is left on the machine, whichever process is killed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import struct
+from collections.abc import Iterator, Sequence
+
+from rce_container.forkserver.kernel import Mount, mount
+from rce_container.forkserver.messages import VolumeOrder
+
+# Linux, include/uapi/linux/loop.h
+_CONTROL_GET_FREE = 0x4C82
+_CONFIGURE = 0x4C0A
+_AUTOCLEAR = 4
+_CONFIG = struct.Struct("=II 5Q 4I 64s 64s 32s 2Q 8Q")
+_ATTEMPTS = 64
+_FLAGS = Mount.NO_SUID | Mount.NO_DEV
+_OPTIONS = "noinit_itable"  # the kernel would free space of the image that is reserved for inodes
+
+
+@contextlib.contextmanager
+def attached(volumes: Sequence[VolumeOrder]) -> Iterator[list[tuple[VolumeOrder, int]]]:
+    """Attach the images to loop devices; to be entered while the machine's files can be seen.
+
+    Yields:
+        Each volume, with a descriptor of its device; -1 for one that is a folder and mounted already.
+
+    Raises:
+        OSError: An image cannot be attached.
+    """
+    with contextlib.ExitStack() as stack:
+        found: list[tuple[VolumeOrder, int]] = []
+        for volume in volumes:
+            device = _attach(volume.image) if volume.image else -1
+            if device >= 0:
+                stack.callback(os.close, device)
+            found.append((volume, device))
+        yield found
+
+
+def mount_volumes(volumes: Sequence[tuple[VolumeOrder, int]], procfs: int, owner: int) -> None:
+    """Mount the volumes, and give all of their files to the container's user.
+
+    Args:
+        volumes: As :func:`attached` yields them.
+        procfs: A descriptor of the machine's ``/proc``.
+        owner: User and group outside of the container.
+
+    Raises:
+        OSError: A file system cannot be mounted.
+    """
+    for volume, device in volumes:
+        if device >= 0:
+            os.fchdir(procfs)  # the container's own /proc does not know this process
+            try:
+                mount(volume.path, _FLAGS, source=f"self/fd/{device}", kind="ext4", options=_OPTIONS)
+            except OSError as error:
+                raise OSError(error.errno, f"volume at {volume.path}: {error.strerror}") from error
+            finally:
+                os.chdir("/")
+            with contextlib.suppress(OSError):
+                os.rmdir(os.path.join(volume.path, "lost+found"))  # noqa: PTH106, PTH118 - like its neighbours
+        _give(volume.path, owner)
+
+
+def _attach(image: str) -> int:
+    """Attach an image to a free loop device; return a descriptor of the device."""
+    file = os.open(image, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+    control = os.open("/dev/loop-control", os.O_RDWR | os.O_CLOEXEC)
+    try:
+        for _ in range(_ATTEMPTS):
+            number = fcntl.ioctl(control, _CONTROL_GET_FREE)
+            device = os.open(f"/dev/loop{number}", os.O_RDWR | os.O_CLOEXEC)
+            name = os.fsencode(image)[:63]
+            config = _CONFIG.pack(file, 0, *[0] * 5, *(0, 0, 0, _AUTOCLEAR), name, b"", b"", *[0] * 10)
+            try:
+                fcntl.ioctl(device, _CONFIGURE, config)
+            except OSError as error:
+                os.close(device)
+                if error.errno != errno.EBUSY:  # another container took this device
+                    raise
+            else:
+                return device
+        raise OSError(errno.EBUSY, "no loop device is free")
+    finally:
+        os.close(control)
+        os.close(file)
+
+
+def _give(folder: str, owner: int) -> None:
+    """Give a folder and what is in it to a user; each container may run as another one. Follows no links."""
+    if os.lstat(folder).st_uid == owner:  # changed last, so that an interrupted change is repeated
+        return
+    for _, folders, files, fd in os.fwalk(folder, follow_symlinks=False):
+        for name in (*folders, *files):
+            os.chown(name, owner, owner, dir_fd=fd, follow_symlinks=False)
+    os.chown(folder, owner, owner)
+    os.chmod(folder, 0o700)  # noqa: PTH101 - like its neighbours

@@ -1,0 +1,1 @@
+"""Volumes: folders of users on this machine that outlive their containers."""

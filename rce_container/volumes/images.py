@@ -1,0 +1,159 @@
+"""Volumes as file systems of their size, in image files.
+
+The container's own mounts hold the only mount of an image (:mod:`rce_container.forkserver.volumes`), so it
+ends with the container, however that ends. All functions block.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+from rce_container.exceptions import VolumeError
+
+_MAKE = ("mkfs.ext4", "-q", "-F", "-m", "0", "-E", "nodiscard,lazy_itable_init=1")
+_CHECK = ("e2fsck", "-f", "-p")
+_GROW = ("resize2fs",)
+_TIMEOUT_S = 60.0
+_POLL_S = 0.02
+_SUPERBLOCK = 1024
+"""Offset of ext4's superblock; the fields below are relative to it (Linux, ``fs/ext4/ext4.h``)."""
+_MAGIC = 0xEF53
+_PROBE_BYTES = 4 << 20
+
+
+def unavailable() -> str:
+    """Say why this machine cannot mount images; empty if it can."""
+    if os.geteuid() != 0:
+        return "it needs root"
+    missing = [
+        one for one in (_MAKE[0], _CHECK[0], _GROW[0], "unshare", "mount") if shutil.which(one) is None
+    ]
+    if missing:
+        return f"{', '.join(missing)} not found (Debian, Ubuntu: apt install e2fsprogs util-linux mount)"
+    if not Path("/dev/loop-control").exists():
+        return "there are no loop devices (/dev/loop-control)"
+    with tempfile.TemporaryDirectory() as scratch:
+        image, point = Path(scratch) / "image", Path(scratch) / "point"
+        point.mkdir()
+        try:
+            make(image, _PROBE_BYTES)
+            _run("unshare", "-m", "mount", "-o", "loop,nosuid,nodev", str(image), str(point))
+            wait_until_unused(image, time.monotonic() + _TIMEOUT_S)
+        except VolumeError as error:
+            return str(error)
+    return ""
+
+
+def make(image: Path, size: int) -> None:
+    """Make an image with an empty file system; its room is taken from the disk at once.
+
+    Raises:
+        VolumeError: The disk has not enough room, or the file system cannot be made.
+    """
+    new = image.with_suffix(".new")
+    try:
+        _extend(new, size)
+        _run(*_MAKE, str(new))
+        new.replace(image)
+    finally:
+        new.unlink(missing_ok=True)
+
+
+def grow(image: Path, size: int) -> None:
+    """Enlarge an image that is not mounted; one that is large enough stays as it is.
+
+    Raises:
+        VolumeError: The disk has not enough room, or the file system is damaged.
+    """
+    if image.stat().st_size >= size and not _is_smaller_inside(image):
+        return
+    _extend(image, size)
+    _run(*_CHECK, str(image), ok=(0, 1))  # 1: faults were found and corrected
+    _run(*_GROW, str(image))
+
+
+def wait_until_unused(image: Path, deadline: float) -> None:
+    """Wait until no container has an image mounted: the kernel writes the last data after its end.
+
+    Args:
+        image: The image.
+        deadline: Seconds of the monotonic clock.
+
+    Raises:
+        VolumeError: It is mounted still.
+    """
+    while is_attached(image):
+        if time.monotonic() > deadline:
+            raise VolumeError(f"the volume {image.stem!r} of a former container is still mounted")
+        time.sleep(_POLL_S)
+
+
+def is_attached(image: Path) -> bool:
+    """Whether a loop device has an image."""
+    wanted = str(image.resolve())
+    for file in Path("/sys/block").glob("loop*/loop/backing_file"):
+        try:
+            if file.read_text().strip() == wanted:
+                return True
+        except OSError:  # detached just now
+            continue
+    return False
+
+
+def used(image: Path) -> int:
+    """Return how many bytes the files of an image that is not mounted take."""
+    with image.open("rb") as file:
+        file.seek(_SUPERBLOCK)
+        block = file.read(1024)
+    (magic,) = struct.unpack_from("<H", block, 0x38)
+    if magic != _MAGIC:
+        raise VolumeError(f"{image} does not hold a file system")
+    free, overhead = (int(struct.unpack_from("<I", block, offset)[0]) for offset in (0xC, 0x248))
+    return max(0, _blocks(block) - free - overhead) * _block_size(block)
+
+
+def _is_smaller_inside(image: Path) -> bool:
+    """Whether the file grew, but not the file system in it: growing was interrupted."""
+    with image.open("rb") as file:
+        file.seek(_SUPERBLOCK)
+        block = file.read(1024)
+    return (_blocks(block) + 1) * _block_size(block) <= image.stat().st_size
+
+
+def _blocks(block: bytes) -> int:
+    low, high = struct.unpack_from("<I", block, 0x4)[0], struct.unpack_from("<I", block, 0x150)[0]
+    return int(low | high << 32)
+
+
+def _block_size(block: bytes) -> int:
+    return 1024 << int(struct.unpack_from("<I", block, 0x18)[0])
+
+
+def _extend(file: Path, size: int) -> None:
+    fd = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        os.posix_fallocate(fd, 0, size)
+    except OSError as error:
+        raise VolumeError(
+            f"the disk has no room for a volume of {size >> 20} MB: {error.strerror}"
+        ) from error
+    finally:
+        os.close(fd)
+
+
+def _run(*command: str, ok: tuple[int, ...] = (0,)) -> None:
+    try:
+        done = subprocess.run(  # noqa: S603
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise VolumeError(f"{command[0]}: {error}") from error
+    if done.returncode not in ok:
+        words = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:]
+        raise VolumeError(f"{command[0]} failed with {done.returncode}: {' '.join(words)}")

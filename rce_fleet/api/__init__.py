@@ -1,0 +1,1 @@
+"""The models of the fleet's HTTP API below ``/api/v1``."""

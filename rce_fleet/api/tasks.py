@@ -1,0 +1,162 @@
+"""Models of tasks below ``/api/v1/tasks``."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+CELL = Field(ge=0, le=2**31 - 1)
+ActionName = Literal["go", "pick", "deliver", "charge", "park"]
+StateName = Literal[
+    "queued", "assigned", "running", "held", "suspended", "cancelling", "done", "failed", "cancelled"
+]
+
+
+class ApiModel(BaseModel):
+    """Base of the models: unknown fields and numbers without end are refused."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class StopModel(ApiModel):
+    """One stop of a task. Give ``cell``, or ``cells`` of which any one serves."""
+
+    action: ActionName = Field(default="go", description="What the robot does there.")
+    cell: int | None = Field(default=None, description="Where.", ge=0, le=2**31 - 1)
+    cells: list[int] = Field(
+        default_factory=list,
+        description="Any one of these cells. A charge or park stop without cells takes any charger or"
+        " parking place.",
+        max_length=100,
+    )
+    duration: float = Field(default=0.0, description="How long the action takes, seconds.", ge=0, le=604800)
+    confirm: bool = Field(default=False, description="The action ends by POST /tasks/{id}/confirm.")
+    label: str = Field(default="", description="What the action is, for people.", max_length=200)
+
+
+class RepeatModel(ApiModel):
+    """How a task recurs."""
+
+    every: float = Field(description="Seconds from one occurrence to the next.", ge=1, le=31622400)
+    count: int | None = Field(
+        default=None, description="Occurrences in all; null: until it is cancelled.", ge=1
+    )
+
+
+class OrderFields(ApiModel):
+    """What a task asks for, beside its stops. Times are seconds since 1970."""
+
+    name: str = Field(default="", description="For people.", max_length=200)
+    rounds: int = Field(default=1, description="How often the stops are made: a patrol.", ge=1, le=500)
+    priority: int = Field(default=0, description="Larger numbers come first.", ge=-100, le=100)
+    deadline: float | None = Field(default=None, description="When it should be done.")
+    when_late: Literal["continue", "fail"] = Field(
+        default="continue", description="At the deadline: carry it out late, or fail if no robot has begun."
+    )
+    earliest_start: float | None = Field(default=None, description="No robot begins before.")
+    capabilities: list[str] = Field(
+        default_factory=list, description="What the robot must have.", max_length=50
+    )
+    payload: float = Field(default=0.0, description="What the robot must carry, kilograms.", ge=0)
+    after: list[str] = Field(
+        default_factory=list, description="Tasks that must be done before, by id.", max_length=100
+    )
+    robot: str = Field(default="", description="The only robot that may do it; empty: any.", max_length=128)
+    return_cells: list[int] = Field(
+        default_factory=list,
+        description="Where the load is brought if the task is cancelled; empty: the fleet's return cells, or"
+        " where it came from.",
+        max_length=100,
+    )
+    repeat: RepeatModel | None = Field(default=None, description="How it recurs; null: it does not.")
+
+
+class TaskRequest(OrderFields):
+    """A new task."""
+
+    stops: list[StopModel] = Field(description="In order.", min_length=1, max_length=500)
+    key: str = Field(
+        default="",
+        description="The client's own key, as the header Idempotency-Key: a second request with it returns"
+        " the first task.",
+        max_length=200,
+    )
+
+
+class TaskChange(ApiModel):
+    """A change of a task; what is left out stays as it is. Stops that were made must stay."""
+
+    stops: list[StopModel] | None = Field(default=None, min_length=1, max_length=500)
+    name: str | None = Field(default=None, max_length=200)
+    rounds: int | None = Field(default=None, ge=1, le=500)
+    priority: int | None = Field(default=None, ge=-100, le=100)
+    deadline: float | None = None
+    when_late: Literal["continue", "fail"] | None = None
+    earliest_start: float | None = None
+    capabilities: list[str] | None = Field(default=None, max_length=50)
+    payload: float | None = Field(default=None, ge=0)
+    after: list[str] | None = Field(default=None, max_length=100)
+    robot: str | None = Field(default=None, max_length=128)
+    return_cells: list[int] | None = Field(default=None, max_length=100)
+    repeat: RepeatModel | None = None
+
+
+class VisitModel(ApiModel):
+    """A stop that a robot reached."""
+
+    stop: int = Field(description="Its number from 0, over all rounds; -1: the return of the load.")
+    robot: str
+    cell: int
+    started_at: float
+    ended_at: float | None = Field(description="null: the action is under way.")
+
+
+class TaskModel(OrderFields):
+    """A task."""
+
+    id: str
+    stops: list[StopModel]
+    state: StateName
+    reason: str = Field(description="Why it waits, is held, suspended, or has failed.")
+    question: str = Field(
+        description="What people have to decide: where a load is whose robot does not come back"
+        " (POST /tasks/{id}/load). Empty: nothing."
+    )
+    robot_assigned: str = Field(description="The robot that does it, or in whose queue it is; empty: none.")
+    target: int | None = Field(description="The cell that the robot goes to or acts in.")
+    position: int = Field(description="Number of stops that were made, over all rounds.")
+    loads: int = Field(description="Loads of this task on its robot.")
+    visits: list[VisitModel]
+    requester: str
+    key: str
+    created_at: float
+    changed_at: float = Field(description="When the state changed last.")
+    started_at: float | None
+    expected_end: float | None = Field(description="When it will be done, if that is known.")
+    late: bool = Field(description="Its deadline passed before it was done.")
+    occurrence: int = Field(description="Number of this occurrence of a recurring task, from 1.")
+    revision: int = Field(description="Grows with each change; also the ETag.")
+
+
+class TaskPage(ApiModel):
+    """Some of the tasks, by growing number."""
+
+    tasks: list[TaskModel]
+    next: str | None = Field(description="The cursor of the next page; null: this is the last.")
+
+
+class LoadRequest(ApiModel):
+    """Where the load of a task is whose robot does not come back."""
+
+    cell: int | None = Field(
+        description="Any robot picks it up there, and continues; null: the load is lost, and the task fails.",
+        ge=0,
+        le=2**31 - 1,
+    )
+
+
+class HoldRequest(ApiModel):
+    """Why a task is held, a robot is paused or taken out."""
+
+    reason: str = Field(default="", description="For people.", max_length=500)

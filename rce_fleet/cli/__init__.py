@@ -1,0 +1,1 @@
+"""``rce fleet``: tasks, robots and cells of a fleet on the command line."""

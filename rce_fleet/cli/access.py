@@ -1,0 +1,83 @@
+"""How ``rce fleet`` reaches a station: its URL, the token, and errors as one line."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine, Sequence
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rce.tls import CertificateError, client_context
+from rce_fleet.client import FleetClient
+from rce_fleet.exceptions import StationError
+from rce_master.cli import credentials
+from rce_master.cli.exceptions import CliError, NotLoggedInError
+
+STATION = "http://127.0.0.1:9080"
+TOKEN_VARIABLE = "RCE_STATION_TOKEN"  # noqa: S105 - its name
+
+_TOKEN: ContextVar[str] = ContextVar("token", default="")
+Token = Annotated[
+    str,
+    typer.Option(
+        "--token",
+        envvar=TOKEN_VARIABLE,
+        help="Token for the station; prefer the variable, which other users cannot see.",
+    ),
+]
+
+Work = Callable[[FleetClient], Coroutine[Any, Any, None]]
+
+Station = Annotated[
+    str,
+    typer.Option("--station", envvar="RCE_STATION", help="URL of the operator station (rce ui)."),
+]
+
+
+def set_token(token: str) -> None:
+    """Use a token for the command."""
+    _TOKEN.set(token)
+
+
+def do(station: str, work: Work) -> None:
+    """Run a command with a client; print why if it fails.
+
+    The token is ``--token`` or ``RCE_STATION_TOKEN``, or else that of ``rce login``.
+
+    Raises:
+        typer.Exit: It failed, with code 1, or was interrupted, with code 130.
+    """
+    try:
+        asyncio.run(_do(station, work, _TOKEN.get()))
+    except (StationError, CliError, CertificateError) as error:
+        typer.echo(f"rce fleet: {error}", err=True)
+        raise typer.Exit(1) from None
+    except BrokenPipeError:
+        raise typer.Exit(1) from None
+    except KeyboardInterrupt:
+        raise typer.Exit(130) from None
+
+
+async def _do(station: str, work: Work, token: str) -> None:
+    authority = ""
+    try:
+        login = credentials.load()
+    except NotLoggedInError:
+        pass  # a station on loopback asks for no login
+    else:
+        token, authority = token or login.token, login.authority
+    tls = client_context(Path(authority) if authority else None)
+    async with FleetClient(station, token, tls=tls, attempts=3) as client:
+        await work(client)
+
+
+def echo_table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
+    """Print columns of the width that they need."""
+    lines: list[tuple[str, ...]] = [header, *rows]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(header))]
+    for line in lines:
+        cells = (text.ljust(width) for text, width in zip(line, widths, strict=True))
+        typer.echo("  ".join(cells).rstrip())

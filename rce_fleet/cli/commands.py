@@ -1,0 +1,167 @@
+"""``rce fleet``: robots, cells and events; tasks are in :mod:`rce_fleet.cli.tasks`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rce_fleet.cli import tasks
+from rce_fleet.cli.access import STATION, Station, Token, do, echo_table, set_token
+from rce_fleet.exceptions import EventsRestartedError
+
+if TYPE_CHECKING:
+    from rce_fleet.client import FleetClient
+
+app = typer.Typer(no_args_is_help=True)
+app.add_typer(tasks.app, name="task")
+app.command("tasks")(tasks.tasks)
+
+
+@app.callback()
+def fleet(token: Token = "") -> None:
+    """Control a fleet through its station."""
+    set_token(token)
+
+
+Robot = Annotated[str, typer.Argument(help="The robot.")]
+Cells = Annotated[list[int], typer.Argument(metavar="CELL...", help="Numbers of cells.")]
+Reason = Annotated[str, typer.Option(help="For people.")]
+
+
+@app.command("robots")
+def robots(station: Station = STATION) -> None:
+    """List robots with their tasks and batteries."""
+
+    async def work(client: FleetClient) -> None:
+        rows = []
+        for robot in await client.robots():
+            battery = "-" if robot.battery is None else f"{robot.battery:.0%}"
+            cell, goal = ("-" if number is None else str(number) for number in (robot.cell, robot.goal))
+            task = " ".join(filter(None, (robot.task, *robot.queue))) or "-"
+            rows.append((robot.id, robot.state, robot.activity, cell, goal, battery, task, robot.reason))
+        echo_table(("robot", "state", "activity", "cell", "goal", "battery", "tasks", "reason"), rows)
+
+    do(station, work)
+
+
+@app.command("send")
+def send(
+    robot: Robot,
+    cell: Annotated[int, typer.Option(help="Number of the cell.")],
+    station: Station = STATION,
+) -> None:
+    """Send a robot to a cell by hand, without a task."""
+
+    async def work(client: FleetClient) -> None:
+        await client.send(robot, cell)
+        typer.echo(f"{robot} goes to cell {cell}")
+
+    do(station, work)
+
+
+@app.command("stop")
+def stop(robot: Robot, station: Station = STATION) -> None:
+    """Stop a robot that was sent by hand."""
+
+    async def work(client: FleetClient) -> None:
+        await client.send(robot, None)
+        typer.echo(f"{robot} stops")
+
+    do(station, work)
+
+
+@app.command("take-out")
+def take_out(robot: Robot, reason: Reason = "", station: Station = STATION) -> None:
+    """Take a robot out of service; others get its tasks."""
+
+    async def work(client: FleetClient) -> None:
+        typer.echo(f"{robot} is {(await client.take_out(robot, reason)).activity}")
+
+    do(station, work)
+
+
+@app.command("put-in")
+def put_in(robot: Robot, station: Station = STATION) -> None:
+    """Put a robot into service again."""
+
+    async def work(client: FleetClient) -> None:
+        typer.echo(f"{robot} is {(await client.put_in(robot)).activity}")
+
+    do(station, work)
+
+
+@app.command("block")
+def block(cells: Cells, station: Station = STATION) -> None:
+    """Block cells for all robots."""
+    _set_blocked(cells, station, blocked=True)
+
+
+@app.command("free")
+def free(cells: Cells, station: Station = STATION) -> None:
+    """Free blocked cells."""
+    _set_blocked(cells, station, blocked=False)
+
+
+def _set_blocked(cells: list[int], station: str, *, blocked: bool) -> None:
+    async def work(client: FleetClient) -> None:
+        for cell in cells:
+            await client.set_blocked(cell, blocked=blocked)
+            typer.echo(f"cell {cell} is {'blocked' if blocked else 'free'}")
+
+    do(station, work)
+
+
+@app.command("watch")
+def watch(
+    after: Annotated[
+        int | None, typer.Option(help="Begin after the event of this number [the newest].")
+    ] = None,
+    station: Station = STATION,
+) -> None:
+    """Follow what happens until Ctrl-C."""
+
+    async def work(client: FleetClient) -> None:
+        number = after
+        while True:
+            try:
+                async for event in client.events(number):
+                    clock = time.strftime("%H:%M:%S", time.localtime(event.time))
+                    typer.echo(f"{event.number}  {clock}  {event.text or f'{event.id}: {event.name}'}")
+                    sys.stdout.flush()
+            except EventsRestartedError as error:
+                typer.echo(f"rce fleet: {error}", err=True)
+                number = 0
+
+    do(station, work)
+
+
+@app.command("history")
+def history(
+    hours: Annotated[float, typer.Option(help="How far back.", min=0.0)] = 24.0,
+    station: Station = STATION,
+) -> None:
+    """Print what happened as CSV."""
+
+    async def work(client: FleetClient) -> None:
+        async for line in client.history_csv(since=time.time() - 3600.0 * hours):
+            typer.echo(line, nl=False)
+
+    do(station, work)
+
+
+@app.command("statistics")
+def statistics(
+    hours: Annotated[float, typer.Option(help="How far back.", min=0.001)] = 1.0,
+    station: Station = STATION,
+) -> None:
+    """Show what the fleet did."""
+
+    async def work(client: FleetClient) -> None:
+        found = await client.statistics(3600.0 * hours)
+        rows = [(name, "-" if value is None else f"{value:g}") for name, value in found]
+        echo_table(("figure", "value"), rows)
+
+    do(station, work)

@@ -1,0 +1,188 @@
+"""``rce fleet task`` and ``rce fleet tasks``."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rce_fleet.api.tasks import StopModel, TaskChange, TaskModel, TaskRequest
+from rce_fleet.cli.access import STATION, Station, do, echo_table
+
+if TYPE_CHECKING:
+    from rce_fleet.client import FleetClient
+
+app = typer.Typer(no_args_is_help=True, help="Add, show, change, hold and cancel tasks.")
+
+Id = Annotated[str, typer.Argument(metavar="TASK", help="Its id, as rce fleet tasks lists it.")]
+
+
+def tasks(
+    state: Annotated[
+        str, typer.Option(help="States, separated by commas; also open, ended and all.")
+    ] = "open",
+    robot: Annotated[str, typer.Option(help="Only tasks that this robot does.")] = "",
+    station: Station = STATION,
+) -> None:
+    """List tasks."""
+
+    async def work(client: FleetClient) -> None:
+        wanted = () if state == "all" else state.split(",")
+        rows = [_row(task) async for task in client.tasks(state=wanted, robot=robot)]
+        echo_table(("task", "state", "robot", "target", "priority", "until", "what"), rows)
+
+    do(station, work)
+
+
+def _row(task: TaskModel) -> tuple[str, ...]:
+    where = "-" if task.target is None else str(task.target)
+    what = task.name or _stops(task.stops)
+    return (
+        *(task.id, task.state, task.robot_assigned or "-", where, str(task.priority)),
+        *(_clock(task.expected_end), f"{what} ({task.reason})" if task.reason else what),
+    )
+
+
+def _stops(stops: list[StopModel]) -> str:
+    return ", ".join(f"{stop.action} {_cells(stop)}".strip() for stop in stops)
+
+
+def _cells(stop: StopModel) -> str:
+    return str(stop.cell) if stop.cell is not None else "/".join(map(str, stop.cells))
+
+
+def _clock(seconds: float | None) -> str:
+    return "-" if seconds is None else time.strftime("%H:%M:%S", time.localtime(seconds))
+
+
+@app.command("add")
+def add(
+    cell: Annotated[list[int] | None, typer.Option(help="Go to this cell; may be repeated.")] = None,
+    pick: Annotated[int | None, typer.Option(help="Pick a load up here first.")] = None,
+    deliver: Annotated[int | None, typer.Option(help="Deliver the load here at the end.")] = None,
+    duration: Annotated[float, typer.Option(help="Seconds of each action.")] = 0.0,
+    priority: Annotated[int, typer.Option(help="Larger numbers come first.")] = 0,
+    deadline: Annotated[float, typer.Option(help="Seconds from now; 0: none.")] = 0.0,
+    start: Annotated[float, typer.Option(help="Seconds from now before which no robot begins.")] = 0.0,
+    robot: Annotated[str, typer.Option(help="The only robot that may do it.")] = "",
+    after: Annotated[list[str] | None, typer.Option(help="A task that must be done before.")] = None,
+    rounds: Annotated[int, typer.Option(help="How often the stops are made.")] = 1,
+    name: Annotated[str, typer.Option(help="For people.")] = "",
+    key: Annotated[str, typer.Option(help="Your own key: the same key makes one task only.")] = "",
+    station: Station = STATION,
+) -> None:
+    """Create a task; print its id."""
+    stops = [StopModel(action="pick", cell=pick, duration=duration)] if pick is not None else []
+    stops += [StopModel(cell=one, duration=duration) for one in cell or ()]
+    stops += [StopModel(action="deliver", cell=deliver, duration=duration)] if deliver is not None else []
+    if not stops:
+        raise typer.BadParameter("say where: --cell CELL, or --pick CELL --deliver CELL")
+    now = time.time()
+    task = TaskRequest(
+        stops=stops,
+        name=name,
+        rounds=rounds,
+        priority=priority,
+        deadline=now + deadline if deadline else None,
+        earliest_start=now + start if start else None,
+        robot=robot,
+        after=after or [],
+    )
+
+    async def work(client: FleetClient) -> None:
+        typer.echo((await client.create_task(task, key=key)).id)
+
+    do(station, work)
+
+
+@app.command("show")
+def show(task_id: Id, station: Station = STATION) -> None:
+    """Show a task."""
+
+    async def work(client: FleetClient) -> None:
+        task = await client.task(task_id)
+        echo_table(("task", "state", "robot", "target", "priority", "until", "what"), [_row(task)])
+        for visit in task.visits:
+            end = _clock(visit.ended_at)
+            typer.echo(
+                f"stop {visit.stop}: {visit.robot} in cell {visit.cell}, {_clock(visit.started_at)} to {end}"
+            )
+
+    do(station, work)
+
+
+@app.command("change")
+def change(
+    task_id: Id,
+    priority: Annotated[int | None, typer.Option(help="Larger numbers come first.")] = None,
+    deadline: Annotated[float | None, typer.Option(help="Seconds from now; 0: none.")] = None,
+    name: Annotated[str | None, typer.Option(help="For people.")] = None,
+    station: Station = STATION,
+) -> None:
+    """Change a task, unless it is changed by others meanwhile."""
+    changes: dict[str, object] = {}
+    if priority is not None:
+        changes["priority"] = priority
+    if deadline is not None:
+        changes["deadline"] = time.time() + deadline if deadline else None
+    if name is not None:
+        changes["name"] = name
+    if not changes:
+        raise typer.BadParameter("say what to change, such as --priority 5")
+
+    async def work(client: FleetClient) -> None:
+        known = await client.task(task_id)
+        made = TaskChange.model_validate(changes)
+        task = await client.change_task(task_id, made, revision=known.revision)
+        typer.echo(f"{task.id} is {task.state}, priority {task.priority}")
+
+    do(station, work)
+
+
+@app.command("hold")
+def hold(
+    task_id: Id,
+    reason: Annotated[str, typer.Option(help="For people.")] = "",
+    station: Station = STATION,
+) -> None:
+    """Hold a task."""
+
+    async def work(client: FleetClient) -> None:
+        task = await client.hold_task(task_id, reason)
+        typer.echo(f"{task.id} is {task.state}")
+
+    do(station, work)
+
+
+@app.command("resume")
+def resume(task_id: Id, station: Station = STATION) -> None:
+    """End the hold of a task."""
+
+    async def work(client: FleetClient) -> None:
+        task = await client.resume_task(task_id)
+        typer.echo(f"{task.id} is {task.state}")
+
+    do(station, work)
+
+
+@app.command("reassign")
+def reassign(task_id: Id, station: Station = STATION) -> None:
+    """Give a task to another robot."""
+
+    async def work(client: FleetClient) -> None:
+        task = await client.reassign_task(task_id)
+        typer.echo(f"{task.id} is {task.state}")
+
+    do(station, work)
+
+
+@app.command("cancel")
+def cancel(task_id: Id, station: Station = STATION) -> None:
+    """Cancel a task; a loaded robot brings its load back."""
+
+    async def work(client: FleetClient) -> None:
+        task = await client.cancel_task(task_id)
+        typer.echo(f"{task.id} is {task.state}")
+
+    do(station, work)

@@ -1,0 +1,100 @@
+"""Requests of the fleet's API about the floor: the map, blocked cells, zones and chargers."""
+
+from __future__ import annotations
+
+from rce_fleet.api.fleet import (
+    ChargersModel,
+    ChargersState,
+    FleetMapModel,
+    ZoneList,
+    ZoneModel,
+    ZoneRequest,
+)
+from rce_fleet.client.requests import ApiRequests, path_part
+from rce_fleet.station.api import CellRequest, FleetModel
+
+
+class FloorRequests(ApiRequests):
+    """Reads and changes what robots may drive on."""
+
+    async def fleet(self) -> FleetModel:
+        """Return the planner's view: robots with poses and paths, and blocked cells.
+
+        Example:
+            ```python
+            print((await fleet.fleet()).blocked)
+            ```
+        """
+        return await self._read("/fleet", FleetModel)
+
+    async def set_blocked(self, cell: int, *, blocked: bool) -> None:
+        """Block or free a cell.
+
+        Example:
+            ```python
+            await fleet.set_blocked(17, blocked=True)
+            ```
+        """
+        await self._transport.request(
+            "PUT", f"/cells/{cell}", body=CellRequest(blocked=blocked).model_dump_json()
+        )
+
+    async def map(self) -> FleetMapModel:
+        """Return the grid.
+
+        Example:
+            ```python
+            grid = await fleet.map()
+            ```
+        """
+        return await self._read("/map", FleetMapModel)
+
+    async def zones(self) -> list[ZoneModel]:
+        """Return all zones.
+
+        Example:
+            ```python
+            print([zone.id for zone in await fleet.zones()])
+            ```
+        """
+        return (await self._read("/zones", ZoneList)).zones
+
+    async def set_zone(self, name: str, zone: ZoneRequest, *, revision: int | None = None) -> ZoneModel:
+        """Make or replace a zone.
+
+        Example:
+            ```python
+            await fleet.set_zone("gate", ZoneRequest(kind="slow", cells=[4, 5], value=0.2))
+            ```
+        """
+        return await self._change("PUT", f"/zones/{path_part(name)}", ZoneModel, zone, revision)
+
+    async def remove_zone(self, name: str, *, revision: int | None = None) -> None:
+        """Remove a zone.
+
+        Example:
+            ```python
+            await fleet.remove_zone("gate")
+            ```
+        """
+        await self._change("DELETE", f"/zones/{path_part(name)}", ZoneModel, None, revision)
+
+    async def chargers(self) -> ChargersState:
+        """Return chargers, parking places and return cells, and who charges.
+
+        Example:
+            ```python
+            print((await fleet.chargers()).waiting)
+            ```
+        """
+        return await self._read("/chargers", ChargersState)
+
+    async def set_chargers(self, places: ChargersModel, *, revision: int | None = None) -> ChargersState:
+        """Replace chargers, parking places and return cells.
+
+        Example:
+            ```python
+            await fleet.set_chargers(ChargersModel(chargers=[0, 7]))
+            ```
+        """
+        return await self._change("PUT", "/chargers", ChargersState, places, revision)

@@ -1,0 +1,122 @@
+"""Requests of the fleet's API about what happened, and about webhooks, which receive what happens."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+
+from rce_fleet.api.fleet import EventModel, EventPage, StatisticsModel
+from rce_fleet.api.webhooks import NewWebhookModel, WebhookList, WebhookModel, WebhookRequest
+from rce_fleet.client.event_stream import follow_events
+from rce_fleet.client.requests import ApiRequests, parsed, path_part
+
+
+class HistoryRequests(ApiRequests):
+    """Reads statistics and the history, follows events, and manages webhooks."""
+
+    async def statistics(self, seconds: float = 3600.0) -> StatisticsModel:
+        """Return what the fleet did in the last seconds.
+
+        Example:
+            ```python
+            print((await fleet.statistics()).tasks_per_hour)
+            ```
+        """
+        return await self._read("/statistics", StatisticsModel, {"seconds": f"{seconds:g}"})
+
+    async def history(
+        self, *, since: float | None = None, until: float | None = None, subject: str = ""
+    ) -> AsyncIterator[EventModel]:
+        """Yield events of a time, the oldest first.
+
+        Args:
+            since: Seconds since 1970; None: from the beginning.
+            until: Seconds since 1970; None: until now.
+            subject: Only of this task, robot or zone.
+
+        Example:
+            ```python
+            async for event in fleet.history(since=time.time() - 3600):
+                print(event.text)
+            ```
+        """
+        times = {"since": since, "until": until}
+        query = {name: repr(value) for name, value in times.items() if value is not None}
+        query |= {"limit": "1000"} | ({"id": subject} if subject else {})
+        while True:
+            page = await self._read("/history", EventPage, query)
+            for event in page.events:
+                yield event
+            if not page.events:
+                return
+            query["after"] = str(page.next)
+
+    async def history_csv(
+        self, *, since: float | None = None, until: float | None = None
+    ) -> AsyncIterator[str]:
+        """Yield the lines of the history as CSV, the names of the columns first.
+
+        Args:
+            since: Seconds since 1970; None: from the beginning.
+            until: Seconds since 1970; None: until now.
+
+        Example:
+            ```python
+            lines = [line async for line in fleet.history_csv(since=time.time() - 86400)]
+            ```
+        """
+        times = {"since": since, "until": until}
+        query = "&".join(f"{name}={value!r}" for name, value in times.items() if value is not None)
+        path = f"/history?format=csv{'&' if query else ''}{query}"
+        async for line in self._transport.stream(path, accept="text/csv", headers={}):
+            yield line.decode()
+
+    async def events(self, after: int | None = None) -> AsyncIterator[EventModel]:
+        """Follow events until the numbers begin anew; a broken stream is resumed where it broke.
+
+        Args:
+            after: Begin after this number; None: with the next event.
+
+        Raises:
+            ApiError: The station refused, for example because the login has ended.
+            EventsRestartedError: The fleet manager lost its journal; ``events(0)`` follows the new one.
+
+        Example:
+            ```python
+            async for event in fleet.events():
+                print(event.number, event.text)
+            ```
+        """
+        async for text in follow_events(self._transport, after):
+            yield parsed(EventModel, text)
+
+    # Webhooks (administrators)
+
+    async def webhooks(self) -> list[WebhookModel]:
+        """Return all receivers of events.
+
+        Example:
+            ```python
+            print([hook.error for hook in await fleet.webhooks()])
+            ```
+        """
+        return (await self._read("/webhooks", WebhookList)).webhooks
+
+    async def add_webhook(self, webhook: WebhookRequest) -> NewWebhookModel:
+        """Send events to a URL from now on; sent once.
+
+        Example:
+            ```python
+            hook = await fleet.add_webhook(WebhookRequest(url="https://erp.example.com/fleet"))
+            ```
+        """
+        return await self._send("POST", "/webhooks", NewWebhookModel, webhook, repeatable=False)
+
+    async def remove_webhook(self, webhook_id: str) -> None:
+        """Remove a receiver of events.
+
+        Example:
+            ```python
+            await fleet.remove_webhook(hook.id)
+            ```
+        """
+        await self._transport.request("DELETE", f"/webhooks/{path_part(webhook_id)}", repeatable=False)

@@ -1,0 +1,90 @@
+"""Requests of the fleet's API about robots."""
+
+from __future__ import annotations
+
+from rce_fleet.api.fleet import FleetRobotModel, ProfileModel, RobotChange, RobotList
+from rce_fleet.api.tasks import HoldRequest
+from rce_fleet.client.requests import ApiRequests, path_part
+from rce_fleet.station.api import GoalRequest
+
+
+class RobotRequests(ApiRequests):
+    """Reads robots, pauses them, takes them out of service and sends them by hand."""
+
+    async def robots(self) -> list[FleetRobotModel]:
+        """Return all robots.
+
+        Example:
+            ```python
+            low = [robot.id for robot in await fleet.robots() if (robot.battery or 1) < 0.2]
+            ```
+        """
+        return (await self._read("/robots", RobotList)).robots
+
+    async def change_robot(
+        self, robot: str, profile: ProfileModel | None, *, revision: int | None = None
+    ) -> FleetRobotModel:
+        """Set what a robot can do; None: the fleet's default.
+
+        Example:
+            ```python
+            await fleet.change_robot("Robot1", ProfileModel(capabilities=["lift"], payload=20))
+            ```
+        """
+        change = RobotChange(profile=profile)
+        return await self._change("PATCH", f"/robots/{path_part(robot)}", FleetRobotModel, change, revision)
+
+    async def pause_robot(self, robot: str, reason: str = "") -> FleetRobotModel:
+        """Let a robot stand still; it keeps its task.
+
+        Example:
+            ```python
+            await fleet.pause_robot("Robot1", "visitors")
+            ```
+        """
+        return await self._robot(robot, "pause", reason)
+
+    async def resume_robot(self, robot: str) -> FleetRobotModel:
+        """End the pause of a robot.
+
+        Example:
+            ```python
+            await fleet.resume_robot("Robot1")
+            ```
+        """
+        return await self._robot(robot, "resume", None)
+
+    async def take_out(self, robot: str, reason: str = "") -> FleetRobotModel:
+        """Take a robot out of service; others get its tasks.
+
+        Example:
+            ```python
+            await fleet.take_out("Robot1", "wheel broken")
+            ```
+        """
+        return await self._robot(robot, "take-out", reason)
+
+    async def put_in(self, robot: str) -> FleetRobotModel:
+        """Put a robot into service again.
+
+        Example:
+            ```python
+            await fleet.put_in("Robot1")
+            ```
+        """
+        return await self._robot(robot, "put-in", None)
+
+    async def send(self, robot: str, cell: int | None) -> None:
+        """Send a robot to a cell by hand, without a task; None: stop and stay.
+
+        Example:
+            ```python
+            await fleet.send("Robot1", 42)
+            ```
+        """
+        body = GoalRequest(cell=cell).model_dump_json()
+        await self._transport.request("PUT", f"/robots/{path_part(robot)}/goal", body=body)
+
+    async def _robot(self, robot: str, action: str, reason: str | None) -> FleetRobotModel:
+        body = None if reason is None else HoldRequest(reason=reason)
+        return await self._send("POST", f"/robots/{path_part(robot)}/{action}", FleetRobotModel, body)

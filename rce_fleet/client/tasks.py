@@ -1,0 +1,132 @@
+"""Requests of the fleet's API about tasks."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import AsyncIterator, Iterable
+
+from rce_fleet.api.tasks import HoldRequest, TaskChange, TaskModel, TaskPage, TaskRequest
+from rce_fleet.client.requests import ApiRequests, if_match, path_part
+
+
+class TaskRequests(ApiRequests):
+    """Creates, reads and changes tasks."""
+
+    async def create_task(self, task: TaskRequest, *, key: str = "") -> TaskModel:
+        """Create a task.
+
+        Args:
+            task: The task.
+            key: The caller's own key, such as the number of an order: a second request with the same key and
+                content returns the first task. A random one if empty.
+
+        Example:
+            ```python
+            stops = [StopModel(action="pick", cell=12), StopModel(action="deliver", cell=40)]
+            task = await fleet.create_task(TaskRequest(stops=stops, priority=5), key="order-4711")
+            ```
+        """
+        headers = {"Idempotency-Key": key or task.key or secrets.token_hex(16)}
+        return await self._send("POST", "/tasks", TaskModel, task, headers=headers)
+
+    async def task(self, task_id: str) -> TaskModel:
+        """Return a task.
+
+        Example:
+            ```python
+            print((await fleet.task("7")).state)
+            ```
+        """
+        return await self._read(f"/tasks/{path_part(task_id)}", TaskModel)
+
+    async def tasks(
+        self, *, state: Iterable[str] = (), robot: str = "", requester: str = "", newest_first: bool = False
+    ) -> AsyncIterator[TaskModel]:
+        """Yield tasks, page by page.
+
+        Args:
+            state: States to include, also ``open`` and ``ended``; empty: all.
+            robot: Only tasks that this robot does.
+            requester: Only tasks of this user.
+            newest_first: The newest first instead of the oldest.
+
+        Example:
+            ```python
+            async for task in fleet.tasks(state=["open"]):
+                print(task.id, task.state)
+            ```
+        """
+        query = {"state": ",".join(state), "robot": robot, "requester": requester, "limit": "500"}
+        query["order"] = "desc" if newest_first else "asc"
+        while True:
+            page = await self._read("/tasks", TaskPage, {key: text for key, text in query.items() if text})
+            for task in page.tasks:
+                yield task
+            if page.next is None:
+                return
+            query["cursor"] = page.next
+
+    async def change_task(
+        self, task_id: str, change: TaskChange, *, revision: int | None = None
+    ) -> TaskModel:
+        """Change a task; with a revision, only if it was not changed since.
+
+        Example:
+            ```python
+            task = await fleet.change_task("7", TaskChange(priority=9), revision=task.revision)
+            ```
+        """
+        return await self._change("PATCH", f"/tasks/{path_part(task_id)}", TaskModel, change, revision)
+
+    async def cancel_task(self, task_id: str, *, revision: int | None = None) -> TaskModel:
+        """Cancel a task; a loaded robot brings its load back.
+
+        Example:
+            ```python
+            await fleet.cancel_task("7")
+            ```
+        """
+        return await self._change("DELETE", f"/tasks/{path_part(task_id)}", TaskModel, None, revision)
+
+    async def hold_task(self, task_id: str, reason: str = "", *, revision: int | None = None) -> TaskModel:
+        """Hold a task until :meth:`resume_task`.
+
+        Example:
+            ```python
+            await fleet.hold_task("7", "the gate is closed")
+            ```
+        """
+        path = f"/tasks/{path_part(task_id)}/hold"
+        return await self._change("POST", path, TaskModel, HoldRequest(reason=reason), revision)
+
+    async def resume_task(self, task_id: str, *, revision: int | None = None) -> TaskModel:
+        """End the hold of a task.
+
+        Example:
+            ```python
+            await fleet.resume_task("7")
+            ```
+        """
+        return await self._change("POST", f"/tasks/{path_part(task_id)}/resume", TaskModel, None, revision)
+
+    async def confirm_action(self, task_id: str, *, revision: int | None = None) -> TaskModel:
+        """Confirm the action of a task that is under way; sent once.
+
+        Example:
+            ```python
+            await fleet.confirm_action("7")
+            ```
+        """
+        path = f"/tasks/{path_part(task_id)}/confirm"
+        return await self._send("POST", path, TaskModel, headers=if_match(revision), repeatable=False)
+
+    async def reassign_task(self, task_id: str, *, revision: int | None = None) -> TaskModel:
+        """Take a task from its robot, so that another one gets it; sent once.
+
+        Example:
+            ```python
+            await fleet.reassign_task("T7")
+            ```
+        """
+        path = f"/tasks/{path_part(task_id)}/reassign"
+        return await self._send("POST", path, TaskModel, headers=if_match(revision), repeatable=False)

@@ -1,0 +1,220 @@
+"""New paths for the robots that need some, made by the planner's process; the others keep theirs.
+
+Like a plan for all (see :mod:`rce_fleet.coordination.replanning`) it is made in three steps:
+:func:`copy_ledger` copies all visits of the ledger to flat arrays, :func:`compute_rerouting` finds paths
+between them (see :mod:`rce_fleet.planning.rerouting`), and :func:`adopt_rerouting` enters these into the
+ledger. All visits stay in one order of steps, so no robots wait for each other in a circle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rce_fleet.coordination.robot import Phase
+from rce_fleet.planning.graph import PlanningGraph
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.rerouting import RoutedRobots, reroute
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from rce_fleet.coordination.fleet_state import FleetState
+    from rce_fleet.coordination.replanning import PlanRequest
+
+NO_CELL = -1
+"""In a request: the robot has no such cell."""
+_MOST_EFFORT = 150_000
+"""Work after which a plan for all is made instead: it takes no longer."""
+
+
+@dataclass(frozen=True, slots=True)
+class LedgerCopy:
+    """What :class:`~rce_fleet.coordination.replanning.PlanRequest` adds for new paths of some robots.
+
+    Arrays are the bytes of 32-bit integers and of 64-bit floating-point numbers.
+
+    Attributes:
+        members: Robots that need new paths, the first ones first, as indexes of the request's ``robots``.
+        begins: Step of each robot's last granted cell.
+        lengths: Number of cells of each robot's path after it.
+        cells: These cells, one robot's after another's.
+        steps: Their steps.
+        granted: Granted cells before the last one of each robot.
+        leaves: Steps at which these are left.
+        clock: The ledger's clock.
+    """
+
+    members: tuple[int, ...]
+    begins: bytes
+    lengths: bytes
+    cells: bytes
+    steps: bytes
+    granted: bytes
+    leaves: bytes
+    clock: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rerouting:
+    """New paths of some robots.
+
+    Attributes:
+        found: Whether all of them have one; if not, one plan has to be made for all.
+        robots: The robots, as indexes of the request's ``robots``.
+        paths: Cells and steps of each.
+        unreachable: Those of them whose goal cannot be reached.
+    """
+
+    found: bool
+    robots: tuple[int, ...] = ()
+    paths: tuple[tuple[tuple[int, float], ...], ...] = ()
+    unreachable: frozenset[int] = frozenset()
+
+
+def copy_ledger(state: FleetState, robots: Sequence[str], members: Sequence[str]) -> LedgerCopy:
+    """Return a copy of the visits of the active robots.
+
+    Args:
+        state: The fleet.
+        robots: The active robots.
+        members: Those of them that need new paths, in order.
+    """
+    places = {robot: index for index, robot in enumerate(robots)}
+    begins: list[float] = []
+    lengths: list[int] = []
+    cells: list[int] = []
+    steps: list[float] = []
+    granted: list[int] = []
+    leaves: list[float] = []
+    for robot in robots:
+        account = state.ledger.account(robot)
+        end = account.granted
+        begins.append(account.steps[end - 1])
+        lengths.append(len(account.route) - end)
+        cells += account.route[end:]
+        steps += account.steps[end:]
+        granted += account.route[: end - 1]
+        leaves += account.steps[1:end]
+    return LedgerCopy(
+        members=tuple(places[robot] for robot in members),
+        begins=np.array(begins, np.float64).tobytes(),
+        lengths=np.array(lengths, np.int32).tobytes(),
+        cells=np.array(cells, np.int32).tobytes(),
+        steps=np.array(steps, np.float64).tobytes(),
+        granted=np.array(granted, np.int32).tobytes(),
+        leaves=np.array(leaves, np.float64).tobytes(),
+        clock=state.ledger.clock,
+    )
+
+
+def compute_rerouting(request: PlanRequest) -> Rerouting:
+    """Return new paths for the members of the request's copy; the same request gives the same paths."""
+    copy = request.copy
+    assert copy is not None
+    grid = GridMap(request.rows, request.columns, blocked=frozenset(request.blocked))
+    costs = np.ones(len(grid), dtype=np.int32)
+    for cell, cost in request.costs:
+        costs[cell] = cost
+    found = reroute(
+        PlanningGraph.from_grid(grid, costs=costs, closed=request.closed),
+        RoutedRobots(
+            starts=np.array(request.starts, np.int32),
+            begins=_floats(copy.begins),
+            goals=np.array(request.goals, np.int32),
+            rests=np.array(request.rests, np.int32),
+            lengths=_ints(copy.lengths),
+            nodes=_ints(copy.cells),
+            steps=_floats(copy.steps),
+            fixed=(_ints(copy.granted), _floats(copy.leaves)),
+            clock=copy.clock,
+        ),
+        copy.members,
+        effort=min(request.effort, _MOST_EFFORT),
+        seed=request.seed,
+        forbidden={index: frozenset(cells) for index, cells in request.forbidden} or None,
+    )
+    if found is None:
+        return Rerouting(found=False)
+    return Rerouting(
+        True,
+        tuple(found.paths),
+        tuple(tuple(zip(cells.tolist(), at.tolist(), strict=True)) for cells, at in found.paths.values()),
+        found.unreachable,
+    )
+
+
+def _ints(stored: bytes) -> NDArray[np.int32]:
+    return np.frombuffer(stored, np.int32).copy()  # Compiled loops do not take arrays of constant bytes.
+
+
+def _floats(stored: bytes) -> NDArray[np.float64]:
+    return np.frombuffer(stored, np.float64).copy()
+
+
+def adopt_rerouting(
+    state: FleetState, request: PlanRequest, rerouting: Rerouting, versions: Mapping[str, int]
+) -> set[str]:
+    """Enter new paths into the ledger.
+
+    Robots that are not where their path begins any more, or that have another goal, get none, and a path
+    ends before a cell that the robot may not enter any more.
+
+    Args:
+        state: The fleet; its ledger and the robots' ``unreachable`` and ``rest`` are changed.
+        request: The request; no cells were granted since then.
+        rerouting: The paths.
+        versions: The ledger's versions of the robots at the time of the request.
+
+    Returns:
+        Robots that still need new paths.
+    """
+    left: set[str] = set()
+    present = []
+    for index, path in zip(rerouting.robots, rerouting.paths, strict=True):
+        robot = request.robots[index]
+        record = state.robots.get(robot)
+        if record is None or record.phase is not Phase.ACTIVE:
+            continue  # It has no path, and is looked at when it is active again.
+        goal = NO_CELL if record.goal is None else record.goal
+        if state.ledger.version(robot) == versions[robot] and goal == request.goals[index]:
+            present.append((index, record, path))
+        else:
+            left.add(robot)
+        # All of them first: where one has its old path, another may have its new one.
+        state.ledger.truncate(robot)
+    closed = state.zones.closed(state.grid)
+    for index, record, path in present:
+        possible = list(_possible(state, record.id, request.starts[index], path, closed))
+        if len(possible) < len(path):
+            left.add(record.id)
+        state.ledger.insert(record.id, possible)
+        is_unreachable = index in rerouting.unreachable
+        has_goal = record.goal is not None and not is_unreachable
+        record.rest = None if has_goal else state.ledger.route(record.id)[-1]
+        if record.unreachable != is_unreachable:
+            record.unreachable = is_unreachable
+            state.touch(record)
+    return left
+
+
+def _possible(
+    state: FleetState,
+    robot: str,
+    start: int,
+    path: Sequence[tuple[int, float]],
+    closed: frozenset[tuple[int, int]],
+) -> Iterator[tuple[int, float]]:
+    """Yield the visits of a path up to the first one that is not allowed any more."""
+    forbidden = state.forbidden(robot)
+    before = start
+    for cell, step in path:
+        is_barred = cell in forbidden and before not in forbidden
+        if state.is_shut(cell) or is_barred or (before, cell) in closed:
+            return
+        yield cell, step
+        before = cell

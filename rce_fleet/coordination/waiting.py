@@ -1,0 +1,61 @@
+"""Robots that wait for each other when cells are granted in no order. Pure.
+
+An ordered ledger has no such robots. With the planner ``dijkstra`` two robots can meet head on, or one can
+wait for another that rests on its path.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce_fleet.coordination.robot import Phase
+
+if TYPE_CHECKING:
+    from rce_fleet.coordination.fleet_state import FleetState
+
+
+def find_deadlocks(state: FleetState) -> dict[str, str]:
+    """Return the robots that cannot drive on unless another robot gives way, and why, for people.
+
+    Args:
+        state: The fleet.
+    """
+    waits = _waits(state)
+    found: dict[str, str] = {}
+    for robot in sorted(waits):
+        chain = [robot]
+        while chain[-1] in waits and waits[chain[-1]] not in chain:
+            chain.append(waits[chain[-1]])
+        last = chain[-1]
+        if last in waits:
+            circle = chain[chain.index(waits[last]) :]
+            found[robot] = f"deadlock: {', '.join(sorted(circle))} wait for each other"
+        elif _rests(state, last):
+            found[robot] = f"deadlock: {last} rests on its path, in cell {state.ledger.route(last)[0]}"
+    return found
+
+
+def _waits(state: FleetState) -> dict[str, str]:
+    """Return for each robot that stands at the end of its granted cells the robot that it waits for."""
+    waits = {}
+    for robot, record in state.robots.items():
+        granted = state.ledger.granted(robot)
+        if record.phase is not Phase.ACTIVE or not record.centred or len(granted) != 1:
+            continue
+        route = state.ledger.route(robot)
+        owner = state.ledger.owner(route[1]) if len(route) > 1 else None
+        if owner is not None and owner != robot:
+            waits[robot] = owner
+    return waits
+
+
+def _rests(state: FleetState, robot: str) -> bool:
+    """Return whether a robot stays where it is."""
+    record = state.robots.get(robot)
+    return (
+        record is not None
+        and record.phase is Phase.ACTIVE
+        and record.centred
+        and state.ledger.length(robot) == 1
+        and record.goal in (None, state.ledger.end_of_grant(robot))
+    )

@@ -1,0 +1,256 @@
+"""Zones: parts of the map with rules of their own. Pure.
+
+A zone blocks cells or moves, slows robots down, has one direction, or has room for a few robots. It has a
+reason and an author, may expire, and may apply to some robots only. The same id replaces a zone, so setting
+it twice is harmless. All zones together have a revision, against lost updates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+from math import ceil, inf, isfinite
+from typing import TYPE_CHECKING
+
+from rce_fleet.exceptions import ZoneError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from rce_fleet.planning.grid import GridMap
+
+NOMINAL_SPEED = 0.5
+"""Speed of robots outside slow zones, metres per second, when costs of slow zones are computed."""
+_MAX_COST = 20
+
+
+class ZoneKind(Enum):
+    """What a zone does."""
+
+    BLOCKED = "blocked"
+    """Robots may not enter its cells, nor drive its edges."""
+    SLOW = "slow"
+    """Robots drive at most at its speed, and prefer other ways."""
+    ONE_WAY = "one_way"
+    """Robots do not drive against its direction."""
+    LIMITED = "limited"
+    """It has room for a few robots."""
+
+
+class Direction(Enum):
+    """Direction of a one-way zone, along the grid's columns or rows: ``(rows, columns)`` of a move."""
+
+    PLUS_X = "+x"
+    MINUS_X = "-x"
+    PLUS_Y = "+y"
+    MINUS_Y = "-y"
+
+    def against(self, columns: int) -> int:
+        """Return the difference of cell numbers of a move against the direction."""
+        return {"+x": -1, "-x": 1, "+y": -columns, "-y": columns}[self.value]
+
+
+@dataclass(frozen=True, slots=True)
+class Zone:
+    """A part of the map with a rule.
+
+    Attributes:
+        id: Its name; a zone with the same name replaces it.
+        kind: What it does.
+        cells: Its cells, ascending.
+        edges: Moves ``(from, to)`` that are blocked; of a blocked zone only.
+        robots: Robots that it applies to; empty: all. Not of one-way zones, or of zones with edges.
+        speed: Greatest speed in a slow zone, metres per second.
+        direction: Of a one-way zone.
+        capacity: Robots for which a limited zone has room.
+        reason: Why it was made, for people.
+        by: Who made it.
+        expires: When it ends, seconds of the planner's clock; infinity: when it is removed.
+    """
+
+    id: str
+    kind: ZoneKind
+    cells: tuple[int, ...] = ()
+    edges: tuple[tuple[int, int], ...] = ()
+    robots: tuple[str, ...] = ()
+    speed: float = 0.0
+    direction: Direction | None = None
+    capacity: int = 0
+    reason: str = ""
+    by: str = ""
+    expires: float = inf
+
+    def applies_to(self, robot: str) -> bool:
+        """Return whether the zone's rule is for this robot."""
+        return not self.robots or robot in self.robots
+
+    def check(self, grid: GridMap) -> None:
+        """Check that the zone can be on a map.
+
+        Raises:
+            ZoneError: It cannot; the text says why.
+        """
+        where = f"zone {self.id!r}"
+        outside = [
+            cell for cell in (*self.cells, *(c for edge in self.edges for c in edge)) if cell not in grid
+        ]
+        far = [
+            edge for edge in self.edges if edge[0] in grid and edge[1] in grid and not grid.adjacent(*edge)
+        ]
+        checks = (
+            (not self.id, "a zone needs an id"),
+            (bool(outside), f"{where}: cells {sorted(set(outside))} are not on the map of {len(grid)} cells"),
+            (bool(far), f"{where}: cells of edge {far[:1]} are not neighbours"),
+            (not self.cells and not self.edges, f"{where} has no cells"),
+            (
+                bool(self.edges) and self.kind is not ZoneKind.BLOCKED,
+                f"{where}: only a blocked zone has edges",
+            ),
+            (
+                bool(self.robots) and (bool(self.edges) or self.kind is ZoneKind.ONE_WAY),
+                f"{where}: edges and one-way zones apply to all robots; leave its robots empty",
+            ),
+            (
+                self.kind is ZoneKind.SLOW and not (isfinite(self.speed) and self.speed > 0),
+                f"{where}: a slow zone needs a speed above 0 m/s, not {self.speed}",
+            ),
+            (
+                self.kind is ZoneKind.ONE_WAY and self.direction is None,
+                f"{where}: a one-way zone needs a direction: +x, -x, +y or -y",
+            ),
+            (
+                self.kind is ZoneKind.LIMITED and self.capacity < 1,
+                f"{where}: a limited zone needs a capacity of at least 1, not {self.capacity}",
+            ),
+        )
+        for is_wrong, text in checks:
+            if is_wrong:
+                raise ZoneError(text)
+
+
+class ZoneBook:
+    """The zones of a map, and what they mean for a cell, a move or a robot.
+
+    Attributes:
+        zones: By id.
+        revision: Grows with each change; 0 before the first.
+    """
+
+    def __init__(self) -> None:
+        self.zones: dict[str, Zone] = {}
+        self.revision = 0
+        self._closed: frozenset[tuple[int, int]] | None = None
+        self._costs: dict[int, int] | None = None
+
+    # Changes
+
+    def put(self, zones: Iterable[Zone], remove: Iterable[str] = ()) -> tuple[list[Zone], list[Zone]]:
+        """Add or replace zones, and remove others; return the zones that are gone, and the new ones."""
+        gone = [self.zones.pop(name) for name in sorted(set(remove)) if name in self.zones]
+        made = []
+        for zone in zones:
+            before = self.zones.get(zone.id)
+            if before == zone:
+                continue
+            if before is not None:
+                gone.append(before)
+            self.zones[zone.id] = zone
+            made.append(zone)
+        if gone or made:
+            self.revision += 1
+            self._closed = self._costs = None
+        return gone, made
+
+    def expired(self, now: float) -> list[str]:
+        """Return the ids of zones that have ended."""
+        return sorted(zone.id for zone in self.zones.values() if zone.expires <= now)
+
+    # What they mean
+
+    def of_kind(self, kind: ZoneKind) -> list[Zone]:
+        """Return the zones of a kind."""
+        return [zone for zone in self.zones.values() if zone.kind is kind]
+
+    def blocks(self, cell: int) -> Zone | None:
+        """Return a zone that blocks a cell for all robots."""
+        for zone in self.of_kind(ZoneKind.BLOCKED):
+            if not zone.robots and cell in zone.cells:
+                return zone
+        return None
+
+    def forbidden(self, robot: str) -> frozenset[int]:
+        """Return the cells that are blocked for one robot, but not for all."""
+        found: set[int] = set()
+        for zone in self.of_kind(ZoneKind.BLOCKED):
+            if zone.robots and zone.applies_to(robot):
+                found.update(zone.cells)
+        return frozenset(found)
+
+    def closed(self, grid: GridMap) -> frozenset[tuple[int, int]]:
+        """Return the moves ``(from, to)`` that no robot may make.
+
+        Args:
+            grid: The map, always the same one.
+        """
+        if self._closed is None:
+            closed: set[tuple[int, int]] = set()
+            for zone in self.of_kind(ZoneKind.BLOCKED):
+                closed.update(zone.edges)
+            for zone in self.of_kind(ZoneKind.ONE_WAY):
+                assert zone.direction is not None
+                against = zone.direction.against(grid.columns)
+                for cell in zone.cells:
+                    closed |= {(cell, cell + against), (cell - against, cell)}
+            self._closed = frozenset(
+                (start, end)
+                for start, end in closed
+                if start in grid and end in grid and grid.adjacent(start, end)
+            )
+        return self._closed
+
+    def costs(self) -> dict[int, int]:
+        """Return the cost of entering cells of slow zones; all others cost 1."""
+        if self._costs is None:
+            costs: dict[int, int] = {}
+            for zone in self.of_kind(ZoneKind.SLOW):
+                cost = min(max(ceil(NOMINAL_SPEED / zone.speed), 1), _MAX_COST)
+                for cell in zone.cells:
+                    costs[cell] = max(costs.get(cell, 1), cost)
+            self._costs = costs
+        return self._costs
+
+    def speed_limit(self, robot: str, cells: Sequence[int]) -> float:
+        """Return the greatest speed of a robot in some cells, metres per second; infinity without a limit."""
+        inside = set(cells)
+        limits = [
+            zone.speed
+            for zone in self.of_kind(ZoneKind.SLOW)
+            if zone.applies_to(robot) and not inside.isdisjoint(zone.cells)
+        ]
+        return min(limits, default=inf)
+
+    def full(self, robot: str, users: Callable[[Zone], set[str]]) -> frozenset[int]:
+        """Return the cells of limited zones that have no room for a robot.
+
+        Args:
+            robot: The robot.
+            users: Returns the robots that are in a zone, or have a path into it.
+        """
+        found: set[int] = set()
+        for zone in self.of_kind(ZoneKind.LIMITED):
+            if zone.applies_to(robot):
+                others = {other for other in users(zone) if zone.applies_to(other)} - {robot}
+                if len(others) >= zone.capacity:
+                    found.update(zone.cells)
+        return frozenset(found)
+
+
+def carried_zones(zones: Iterable[Zone], carry: Callable[[Iterable[int]], set[int]]) -> list[Zone]:
+    """Return zones on another grid: their cells are those that overlap the cells before; edges are dropped.
+
+    Args:
+        zones: The zones until now.
+        carry: Returns the new cells that overlap old ones.
+    """
+    moved = [replace(zone, cells=tuple(sorted(carry(zone.cells))), edges=()) for zone in zones]
+    return [zone for zone in moved if zone.cells]

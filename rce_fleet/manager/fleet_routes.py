@@ -1,0 +1,240 @@
+"""The routes of robots, map, statistics and events; and those of places and zones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from rce_fleet.api.fleet import (
+    EventModel,
+    EventPage,
+    FleetMapModel,
+    FleetRobotModel,
+    GoalAnswer,
+    GoalChange,
+    RobotChange,
+    RobotList,
+)
+from rce_fleet.api.tasks import HoldRequest
+from rce_fleet.exceptions import TaskRefusedError, UnknownTaskError
+from rce_fleet.journal.journal import EventQuery
+from rce_fleet.manager.convert import read_profile, show_profile
+from rce_fleet.manager.goals import NO_ANSWER
+from rce_fleet.manager.place_routes import ROUTES as PLACE_ROUTES
+from rce_fleet.manager.place_routes import check_cells
+from rce_fleet.manager.planner_sync import SetMode
+from rce_fleet.manager.requests import BadRequestError, Call, FleetAnswer, Route, problem, shown
+from rce_fleet.tasks.facts import RobotFacts
+from rce_fleet.tasks.loads import carried
+from rce_fleet.tasks.records import AUTOMATIC, RobotEntry
+
+MOST_EVENTS = 5000
+
+
+# Robots
+
+
+async def robots(call: Call) -> FleetAnswer:
+    """Return all robots."""
+    call.only()
+    names = sorted({*call.manager.facts.robots, *call.manager.book.robots})
+    queues = _queues(call)
+    return shown(RobotList(robots=[_show_robot(call, name, queues) for name in names]))
+
+
+async def robot(call: Call) -> FleetAnswer:
+    """Return a robot."""
+    name = _robot(call)
+    return _robot_answer(call, name)
+
+
+async def change_robot(call: Call) -> FleetAnswer:
+    """Change a robot's profile."""
+    model = call.model(RobotChange)
+    profile = None if model.profile is None else read_profile(model.profile)
+    name, entry = _entry(call)
+    if profile != entry.profile:
+        changed = replace(entry, profile=profile, revision=entry.revision + 1)
+        call.manager.book.emit(changed, "profile", call.now, user=call.request.user, text=f"{name}: profile")
+        await call.manager.commit()
+    return _robot_answer(call, name)
+
+
+async def pause(call: Call) -> FleetAnswer:
+    """Let a robot stand still; it keeps its task."""
+    return await _set_mode(call, "paused", "paused")
+
+
+async def resume(call: Call) -> FleetAnswer:
+    """Let the planner drive a robot again that was paused, stopped or driven by hand."""
+    return await _set_mode(call, AUTOMATIC, "resumed", unless_out=True)
+
+
+async def take_out(call: Call) -> FleetAnswer:
+    """Take a robot out of service: others get its tasks, but not its load."""
+    return await _set_mode(call, "out_of_service", "taken out")
+
+
+async def put_in(call: Call) -> FleetAnswer:
+    """Put a robot into service again."""
+    return await _set_mode(call, AUTOMATIC, "put in")
+
+
+async def set_goal(call: Call) -> FleetAnswer:
+    """Send a robot to a cell, or let it stop; if the planner refuses, its goal stays as it was."""
+    name, cell, manager = _robot(call), call.model(GoalChange).cell, call.manager
+    check_cells(call, () if cell is None else (cell,))
+    refusal = await manager.set_goal(name, cell, call.request.user)
+    if refusal.startswith(NO_ANSWER):
+        return problem(503, refusal)
+    if refusal:
+        raise TaskRefusedError(refusal)
+    text = f"{name} stops" if cell is None else f"{name} goes to cell {cell}"
+    return shown(GoalAnswer(message=text))
+
+
+def _robot(call: Call) -> str:
+    name = call.names[0]
+    if name not in call.manager.facts.robots and name not in call.manager.book.robots:
+        raise UnknownTaskError(f"there is no robot {name!r}")
+    return name
+
+
+def _entry(call: Call) -> tuple[str, RobotEntry]:
+    """Return a robot's name, and what people decided about it."""
+    name = _robot(call)
+    entry = call.manager.book.entry(name)
+    call.check_revision(name, entry.revision)
+    return name, entry
+
+
+async def _set_mode(call: Call, mode: str, what: str, *, unless_out: bool = False) -> FleetAnswer:
+    """Set who drives a robot; if the planner refuses, its mode stays."""
+    (name, entry), manager = _entry(call), call.manager
+    if unless_out and entry.is_out:
+        raise TaskRefusedError(f"{name} is out of service: put it in")
+    reason = call.model(HoldRequest).reason if mode != AUTOMATIC else ""
+    user = call.request.user
+    changed = replace(entry, mode=mode, reason=reason, user=user, revision=entry.revision + 1, unsent=True)
+    if (entry.mode, entry.reason) != (mode, reason):
+        text = f"{name}: {what}" + (f", {reason}" if reason else "")
+        manager.book.emit(changed, what, call.now, user=user, text=text)
+        await manager.commit()
+        refusals = await manager.tell_planner()
+        refusal = next(
+            (why for made, why in refusals.items() if made == SetMode(name, mode, reason, user)), ""
+        )
+        if refusal and manager.facts.is_live and manager.book.entry(name) == changed:
+            back = replace(entry, revision=changed.revision + 1)
+            manager.book.emit(back, entry.mode, manager.clock(), text=f"{name}: {refusal}")
+            await manager.commit()
+            raise TaskRefusedError(refusal)
+    return _robot_answer(call, name)
+
+
+def _robot_answer(call: Call, name: str) -> FleetAnswer:
+    shows = _show_robot(call, name, _queues(call))
+    return shown(shows, revision=shows.revision)
+
+
+def _queues(call: Call) -> dict[str, list[str]]:
+    return {robot: [task.id for task in tasks] for robot, tasks in call.manager.book.queues().items()}
+
+
+def _show_robot(call: Call, name: str, queues: dict[str, list[str]]) -> FleetRobotModel:
+    manager = call.manager
+    facts = manager.facts.robots.get(name) or RobotFacts(name, "away", "the planner does not know it")
+    entry: RobotEntry = manager.book.entry(name)
+    task = manager.book.task_of(name)
+    activity = manager.dispatcher.activity(name)
+    return FleetRobotModel(
+        id=name,
+        state=facts.state,
+        activity="by hand" if facts.by_hand and activity == "idle" else activity,
+        reason=entry.reason or facts.reason,
+        cell=facts.cell,
+        goal=facts.goal,
+        battery=facts.battery,
+        task=None if task is None else task.id,
+        queue=queues.get(name, []),
+        loads=[] if task is None else list(carried(task)),
+        profile=show_profile(manager.dispatcher.profile(name)),
+        mode=entry.mode,
+        revision=entry.revision,
+    )
+
+
+# Map, figures, events
+
+
+async def fleet_map(call: Call) -> FleetAnswer:
+    """Return the grid."""
+    grid = call.manager.facts.grid
+    if grid is None:
+        return problem(503, "the planner has not told its map yet; try again later")
+    return shown(
+        FleetMapModel(
+            rows=grid.rows,
+            columns=grid.columns,
+            cell_size=grid.cell_size,
+            origin=list(grid.origin),
+            yaw=grid.yaw,
+            walls=sorted(grid.blocked),
+            blocked=sorted(call.manager.facts.shut - grid.blocked),
+        )
+    )
+
+
+async def statistics(call: Call) -> FleetAnswer:
+    """Return what the fleet did in the last seconds."""
+    call.only("seconds")
+    seconds = call.number("seconds", 3600.0, 1.0, 366 * 86400.0)
+    if seconds is None:
+        raise BadRequestError("seconds must be a number")
+    manager = call.manager
+    return shown(manager.statistics.show(call.now, seconds, manager.facts, manager.book))
+
+
+async def events(call: Call) -> FleetAnswer:
+    """Return events after a number."""
+    call.only("after", "limit", "id")
+    after = call.count("after", 0, 10**17)
+    query = EventQuery(after, id=call.query.get("id", ""), limit=call.count("limit", 1000, MOST_EVENTS))
+    return await _page(call, query)
+
+
+async def history(call: Call) -> FleetAnswer:
+    """Return events of a time."""
+    call.only("since", "until", "after", "limit", "id")
+    query = EventQuery(
+        call.count("after", 0, 10**17),
+        call.number("since", None),
+        call.number("until", None),
+        call.query.get("id", ""),
+        call.count("limit", 1000, MOST_EVENTS),
+    )
+    return await _page(call, query)
+
+
+async def _page(call: Call, query: EventQuery) -> FleetAnswer:
+    found = await call.manager.events(query)
+    following = found[-1]["number"] if found else query.after
+    manager = call.manager
+    models = [EventModel(**event) for event in found]
+    return shown(EventPage(events=models, next=following, journal=manager.journal_id, newest=manager.written))
+
+
+ROUTES = [
+    Route("GET", "/robots", robots),
+    Route("GET", "/robots/{id}", robot),
+    Route("PATCH", "/robots/{id}", change_robot, changes=True),
+    Route("POST", "/robots/{id}/pause", pause, changes=True),
+    Route("POST", "/robots/{id}/resume", resume, changes=True),
+    Route("POST", "/robots/{id}/take-out", take_out, changes=True),
+    Route("POST", "/robots/{id}/put-in", put_in, changes=True),
+    Route("PUT", "/robots/{id}/goal", set_goal, changes=True),
+    Route("GET", "/map", fleet_map),
+    Route("GET", "/statistics", statistics),
+    Route("GET", "/events", events),
+    Route("GET", "/history", history),
+    *PLACE_ROUTES,
+]

@@ -1,0 +1,370 @@
+"""The fleet manager: the book of tasks, its journal, and the step that is taken again and again.
+
+What changes the book is in the journal before it is answered or has an effect: requests and steps wait for
+:meth:`FleetManager.commit`, which writes the events of all that wait in one transaction.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, Protocol, assert_never
+
+from rce_fleet.exceptions import JournalError
+from rce_fleet.journal.journal import EventQuery, event_fields
+from rce_fleet.manager.goals import GoalKeeper
+from rce_fleet.manager.hand_goals import HandGoals
+from rce_fleet.manager.planner_sync import BlockCell, PlannerCall, PlannerSync, SetMode, SetZone
+from rce_fleet.manager.statistics import BUCKET_S, BUCKETS, FleetStatistics, Minute
+from rce_fleet.tasks.book import TaskBook
+from rce_fleet.tasks.dispatch import Dispatcher, TaskRules
+from rce_fleet.tasks.facts import FleetFacts
+from rce_fleet.tasks.task import Task
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from logging import Logger
+
+    from rce_fleet.journal.journal import Journal
+    from rce_fleet.tasks.records import FleetEvent, PlannerRun, Zone
+
+KEEP_ENDED = 10_000
+"""So many tasks that have ended are kept; older ones are only in the history."""
+KEEP_EVENTS = 200_000
+"""So many events are kept in the journal."""
+_TRIM_EVERY = 10_000
+
+
+class PlannerLink(Protocol):
+    """The planner's services. Each returns why it refused; empty: it did not."""
+
+    async def set_goal(self, robot: str, cell: int | None) -> str:
+        """Send a robot to a cell, or remove its goal."""
+
+    async def block_cell(self, cell: int, *, blocked: bool) -> str:
+        """Block or free a cell."""
+
+    async def set_mode(self, robot: str, mode: str, reason: str, user: str) -> str:
+        """Set who drives a robot, or the fleet's mode (robot empty)."""
+
+    async def set_zone(self, name: str, zone: Zone | None, now: float) -> str:
+        """Make or replace a zone; None: remove it."""
+
+
+class WallClock:
+    """Seconds since 1970 that never go back: a clock of the machine that jumps does not move it.
+
+    Args:
+        least: It begins here at the earliest: the time of the last event of the journal.
+    """
+
+    def __init__(self, least: float = 0.0) -> None:
+        self._offset = max(time.time(), least) - time.monotonic()
+
+    def __call__(self) -> float:
+        """Return the time."""
+        return time.monotonic() + self._offset
+
+
+class FleetManager:
+    """What people and programs asked for, and what becomes of it.
+
+    Args:
+        journal: Where everything is kept.
+        planner: The planner's services.
+        rules: The rules.
+        log: For what people should know.
+        publish: Called with events once they are in the journal.
+        clock: Seconds since 1970.
+
+    Attributes:
+        book: The tasks.
+        facts: What is known of the robots.
+        goals: The goals that were sent.
+        hand_goals: The goals that people set.
+        written: Number of the last event that is in the journal.
+    """
+
+    def __init__(
+        self,
+        journal: Journal,
+        planner: PlannerLink,
+        rules: TaskRules,
+        log: Logger,
+        *,
+        publish: Callable[[list[dict[str, Any]]], None] = lambda _events: None,
+        clock: Callable[[], float] | None = None,
+    ) -> None:
+        self._journal = journal
+        self._planner = planner
+        self._rules = rules
+        self._log = log
+        self._publish = publish
+        self._thread = ThreadPoolExecutor(1, "journal")
+        self._pending: list[FleetEvent] = []
+        self._current: asyncio.Future[None] | None = None
+        """Done when the batch that is being written is on the disk."""
+        self._next: asyncio.Future[None] | None = None
+        """The same of the batch after that, to which events are added meanwhile."""
+        self._writer: asyncio.Task[None] | None = None
+        self._failure = ""
+        self.facts = FleetFacts()
+        self.goals = GoalKeeper()
+        self._load()
+        self._sync = PlannerSync(self.book, self.facts)
+        self.hand_goals = HandGoals(self.book, self.facts, self.goals)
+        last = journal.events(EventQuery(after=self.book.number - 1, limit=1)) if self.book.number else []
+        self.clock = clock or WallClock(last[0]["time"] if last else 0.0)
+        self.statistics = FleetStatistics(self.clock(), (Minute(*row) for row in journal.minutes()))
+
+    def _load(self) -> None:
+        """Make the book from the journal."""
+        self.book = TaskBook()
+        records, self.book.number = self._journal.load()
+        self.written = self.book.number
+        for record in sorted(records, key=lambda each: each.number if isinstance(each, Task) else 0):
+            self.book.put_record(record)
+        self.book.grid = self.facts.grid
+        self.dispatcher = Dispatcher(self.book, self._rules)
+
+    def _reload(self) -> None:
+        """Make the book from the journal again."""
+        self._load()
+        self._sync.take_book(self.book)
+        self.hand_goals.take_book(self.book)
+
+    # Steps
+
+    async def step(self) -> None:
+        """Take over what the robots did, and send them on. To be called several times a second."""
+        if self._failure:
+            await self._try_journal()
+            return
+        now = self.clock()
+        self.book.grid = self.facts.grid or self.book.grid
+        self._sync.adopt(now)
+        if self.facts.is_live:
+            self.hand_goals.adopt(self.dispatcher.goals(), now)
+        self.dispatcher.update(now, self.facts)
+        ended = self.statistics.update(now, self.facts, self.book)
+        try:
+            await self.commit()
+            if ended is not None:
+                await self._in_thread(
+                    *(self._journal.put_minute, ended.began, ended.busy, ended.all, now - BUCKETS * BUCKET_S)
+                )
+        except JournalError:
+            return
+        await self.tell_planner()
+        await self._note_confirmed()
+        if self.facts.is_live:
+            wanted = self.hand_goals.wanted(self.dispatcher.goals())
+            for robot, cell in self.goals.to_send(self.facts, wanted, now):
+                refusal = await self._planner.set_goal(robot, cell)
+                if refusal:
+                    self.goals.refused(robot)
+
+    def planner_began(self, run: PlannerRun) -> None:
+        """Begin with a planner that was started, or is heard for the first time.
+
+        It gets modes, zones, blocked cells and goals with the next step.
+
+        Args:
+            run: The planner.
+        """
+        now, known = self.clock(), self.book.planner
+        is_other_floor = known.floor not in ("", run.floor)
+        is_same = run.started == known.started
+        self.hand_goals.begin(now, is_same=is_same, is_other_floor=is_other_floor)
+        remark = self._sync.begin(run, now)
+        if remark:
+            self._log.warning("%s", remark)
+
+    async def tell_planner(self) -> dict[PlannerCall, str]:
+        """Send modes, zones and blocked cells that the planner does not have yet.
+
+        Returns:
+            Why the planner refused some of them.
+        """
+        refusals = {}
+        for call in self._sync.calls(self.clock()):
+            if not self.facts.is_live:
+                break
+            self._sync.took(call, self.clock(), refused=True)  # no step sends it once more meanwhile
+            refusal = await self._call(call)
+            self._sync.took(call, self.clock(), refused=bool(refusal))
+            if refusal:
+                refusals[call] = refusal
+                self._log.warning("the planner refused %s: %s", call, refusal)
+        return refusals
+
+    async def block_cell(self, cell: int, *, blocked: bool) -> str:
+        """Send a request to block or free a cell, which is in the journal, to the planner at once.
+
+        A cell that only sensors found blocked is freed as well, though the journal does not have it.
+
+        Returns:
+            Why the planner refused; empty: it did not, or gets the request when it is heard again.
+        """
+        if not self.facts.is_live:
+            return ""
+        call = BlockCell(cell, blocked)
+        self._sync.took(call, self.clock(), refused=True)  # no step sends it once more meanwhile
+        refusal = await self._call(call)
+        self._sync.took(call, self.clock(), refused=bool(refusal))
+        return refusal
+
+    async def set_goal(self, robot: str, cell: int | None, user: str) -> str:
+        """Keep a robot's goal in the journal, then send it to the planner.
+
+        Args:
+            robot: Its name.
+            cell: The goal; None: stop and stay.
+            user: Who asks.
+
+        Returns:
+            Why the planner refused, so that the goal is as it was before; empty: it did not, or gets the goal
+            when it is heard again.
+
+        Raises:
+            TaskRefusedError: The robot cannot have a goal of a person now.
+            JournalError: The journal cannot be written.
+        """
+        before = self.book.goals.get(robot)
+        entry = self.hand_goals.request(robot, cell, self.clock(), user)
+        with self.hand_goals.asking(entry, self.clock()):
+            await self.commit()
+            if not self.facts.is_live:
+                return ""
+            refusal = await self._planner.set_goal(robot, cell)
+            if not refusal or not self.hand_goals.undo(entry, before, self.clock(), refusal):
+                return refusal
+        await self.commit()
+        return refusal
+
+    async def _note_confirmed(self) -> None:
+        """Keep in the journal what the planner confirmed: it is not sent again after a restart."""
+        if self._next is not None or self._current is not None:
+            return  # an older record must not follow one that is being written
+        records = [*self._sync.confirmed(), *self.hand_goals.confirmed()]
+        for record in records:
+            self.book.put_record(record)
+        if records:
+            try:
+                await self._in_thread(self._journal.put, records)
+            except JournalError as error:
+                self._log.warning(
+                    "%s; modes, zones, cells and goals may be sent again after a restart", error
+                )
+
+    async def _call(self, call: PlannerCall) -> str:
+        match call:
+            case SetMode(robot, mode, reason, user):
+                return await self._planner.set_mode(robot, mode, reason, user)
+            case SetZone(name, zone):
+                return await self._planner.set_zone(name, zone, self.clock())
+            case BlockCell(cell, blocked):
+                return await self._planner.block_cell(cell, blocked=blocked)
+            case _:
+                assert_never(call)
+
+    # Journal
+
+    async def commit(self) -> None:
+        """Write the book's new events; return when they are on the disk.
+
+        Raises:
+            JournalError: They could not be written. The book is then as it was before them.
+        """
+        events = self.book.take_events()
+        if events:
+            self._pending += events
+            if self._next is None:
+                self._next = asyncio.get_running_loop().create_future()
+            if self._writer is None or self._writer.done():
+                self._writer = asyncio.create_task(self._write())
+        waiting = self._next or self._current
+        if waiting is not None:
+            await asyncio.shield(waiting)
+
+    async def _write(self) -> None:
+        """Write what is pending, and what becomes pending meanwhile, batch by batch."""
+        while self._next is not None:
+            batch, self._pending = self._pending, []
+            waiting, self._next = self._next, None
+            self._current = waiting
+            try:
+                await self._in_thread(self._journal.append, batch, self._forget_old())
+            except JournalError as error:
+                self._roll_back(error)
+                return
+            self._current = None
+            self.written = batch[-1].number
+            waiting.set_result(None)
+            self._publish(event_fields(batch))
+            if batch[-1].number // _TRIM_EVERY != (batch[0].number - 1) // _TRIM_EVERY:
+                await self._in_thread(self._journal.forget_events, batch[-1].number - KEEP_EVENTS)
+
+    def _roll_back(self, error: JournalError) -> None:
+        """Go back to what the journal has: nothing was accepted that is not in it."""
+        self._log.error("%s; requests that change something are refused until it can be written", error)
+        self._failure = str(error)
+        for future in (self._current, self._next):
+            if future is not None and not future.done():
+                future.set_exception(error)
+                future.exception()  # those who wait get it; it is not lost if none of them does
+        self._current = self._next = None
+        self._pending.clear()
+        self._reload()
+
+    async def _try_journal(self) -> None:
+        """Look whether the journal can be written again."""
+        places = self.book.places
+        self.book.emit(places, "checked", self.clock(), text="the journal can be written again")
+        batch = self.book.take_events()
+        try:
+            await self._in_thread(self._journal.append, batch)
+        except JournalError:
+            self._reload()
+            await asyncio.sleep(1.0)
+            return
+        self._failure = ""
+        self.written = batch[-1].number
+        self._publish(event_fields(batch))
+        self._log.info("the journal can be written again")
+
+    @property
+    def failure(self) -> str:
+        """Why nothing can be accepted now; empty: it can."""
+        return self._failure
+
+    @property
+    def journal_id(self) -> str:
+        """Which journal numbers the events."""
+        return self._journal.id
+
+    async def events(self, query: EventQuery) -> list[dict[str, Any]]:
+        """Return events of the journal."""
+        found: list[dict[str, Any]] = await self._in_thread(self._journal.events, query)
+        return found
+
+    async def close(self) -> None:
+        """Write what is left and close the journal."""
+        if self._writer is not None:
+            await asyncio.wait([self._writer])
+        await self._in_thread(self._journal.close)
+        self._thread.shutdown()
+
+    def _forget_old(self) -> list[tuple[str, str]]:
+        """Forget the oldest tasks that have ended, if there are too many."""
+        if len(self.book.tasks) <= KEEP_ENDED + KEEP_ENDED // 10:
+            return []
+        ended = [task for task in self.book.tasks.values() if task.has_ended and task.recurs_at is None]
+        old = sorted(ended, key=lambda task: task.changed_at)[: max(0, len(ended) - KEEP_ENDED)]
+        for task in old:
+            self.book.forget(task.number)
+        return [("task", task.id) for task in old]
+
+    async def _in_thread(self, work: Callable[..., Any], *arguments: Any) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(self._thread, work, *arguments)

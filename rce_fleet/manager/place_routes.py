@@ -1,0 +1,189 @@
+"""The routes of chargers, parking places, return cells, zones and blocked cells."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, cast
+
+from rce_fleet.api.fleet import (
+    CellAnswer,
+    CellChange,
+    ChargersModel,
+    ChargersState,
+    ZoneList,
+    ZoneModel,
+    ZoneRequest,
+)
+from rce_fleet.exceptions import TaskRefusedError, UnknownTaskError
+from rce_fleet.manager.goals import NO_ANSWER
+from rce_fleet.manager.requests import Call, FleetAnswer, Route, problem, shown
+from rce_fleet.manager.zones import checked
+from rce_fleet.tasks.records import Places, Zone
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rce_fleet.api.fleet import ZoneKindName
+
+MOST_DIGITS = 18
+"""Digits of a cell's number."""
+
+
+async def chargers(call: Call) -> FleetAnswer:
+    """Return chargers, parking places and return cells, and who charges."""
+    places, queue = call.manager.book.places, call.manager.dispatcher.chargers
+    return shown(
+        ChargersState(
+            chargers=list(places.chargers),
+            parking=list(places.parking),
+            returns=list(places.returns),
+            charging=dict(queue.charging),
+            waiting=list(queue.waiting),
+            revision=places.revision,
+        ),
+        revision=places.revision,
+    )
+
+
+async def set_chargers(call: Call) -> FleetAnswer:
+    """Replace chargers, parking places and return cells."""
+    model = call.model(ChargersModel)
+    book = call.manager.book
+    call.check_revision("the chargers", book.places.revision)
+    check_cells(call, (*model.chargers, *model.parking, *model.returns))
+    places = Places(
+        tuple(dict.fromkeys(model.chargers)),
+        tuple(dict.fromkeys(model.parking)),
+        tuple(dict.fromkeys(model.returns)),
+        book.places.revision + 1,
+    )
+    text = f"{len(places.chargers)} chargers, {len(places.parking)} parking places"
+    book.emit(places, "places", call.now, user=call.request.user, text=text)
+    await call.manager.commit()
+    return await chargers(call)
+
+
+def check_cells(call: Call, cells: Iterable[int]) -> None:
+    """Check that robots can be in these cells.
+
+    Raises:
+        TaskRefusedError: One is a wall, or not on the map.
+    """
+    grid = call.manager.book.grid
+    for cell in cells:
+        if grid is not None and (cell not in grid or cell in grid.blocked):
+            what = "a wall" if cell in grid else f"not on the map of {len(grid)} cells"
+            raise TaskRefusedError(f"cell {cell} is {what}")
+
+
+async def zones(call: Call) -> FleetAnswer:
+    """Return all zones."""
+    call.only()
+    found = sorted(call.manager.book.zones.values(), key=lambda zone: zone.id)
+    return shown(ZoneList(zones=[_show_zone(zone) for zone in found]))
+
+
+async def zone(call: Call) -> FleetAnswer:
+    """Return a zone."""
+    found = _zone(call)
+    return shown(_show_zone(found), revision=found.revision)
+
+
+async def set_zone(call: Call) -> FleetAnswer:
+    """Make or replace a zone."""
+    model, name = call.model(ZoneRequest), call.names[0]
+    book = call.manager.book
+    known = book.zones.get(name)
+    call.check_revision(f"zone {name}", known.revision if known else 0)
+    asked = Zone(
+        name,
+        model.kind,
+        tuple(model.cells),
+        model.value,
+        tuple((edge[0], edge[1]) for edge in model.edges),
+        tuple(model.robots),
+        model.reason,
+        call.request.user,
+        model.until,
+        (known.revision if known else 0) + 1,
+        unsent=True,
+    )
+    made = checked(asked, book.grid, call.now)
+    book.emit(made, "zone", call.now, user=call.request.user, text=f"zone {name}: {model.kind}")
+    await call.manager.commit()
+    await call.manager.tell_planner()
+    return shown(_show_zone(made), 200 if known else 201, made.revision)
+
+
+async def remove_zone(call: Call) -> FleetAnswer:
+    """Remove a zone."""
+    found = _zone(call)
+    call.check_revision(f"zone {found.id}", found.revision)
+    gone = replace(found, is_removed=True, revision=found.revision + 1, unsent=True)
+    call.manager.book.emit(
+        gone, "zone removed", call.now, user=call.request.user, text=f"zone {found.id} is gone"
+    )
+    await call.manager.commit()
+    await call.manager.tell_planner()
+    return shown(_show_zone(found), revision=gone.revision)
+
+
+async def set_cell(call: Call) -> FleetAnswer:
+    """Block or free a cell; if the planner refuses, it stays as it was."""
+    name, blocked, manager = call.names[0], call.model(CellChange).blocked, call.manager
+    if not (name.isdecimal() and name.isascii() and len(name) <= MOST_DIGITS):
+        return problem(404, f"{name[:MOST_DIGITS]!r} is not the number of a cell")
+    cell, user = int(name), call.request.user
+    check_cells(call, (cell,))
+    was_blocked = cell in manager.book.blocked.cells
+    made = manager.book.blocked.changed({cell: blocked}, unsent=True)
+    what, text = ("blocked", f"cell {cell} is blocked") if blocked else ("freed", f"cell {cell} is free")
+    if was_blocked != blocked:
+        manager.book.emit(made, what, call.now, user=user, text=text)
+        await manager.commit()
+    refusal = await manager.block_cell(cell, blocked=blocked)
+    if refusal:
+        if was_blocked != blocked and (cell in manager.book.blocked.cells) == blocked:
+            back = manager.book.blocked.changed({cell: was_blocked}, unsent=False)
+            manager.book.emit(back, "refused", manager.clock(), text=f"cell {cell}: {refusal}")
+            await manager.commit()
+        if refusal.startswith(NO_ANSWER):
+            return problem(503, refusal)
+        raise TaskRefusedError(refusal)
+    inside = [robot.id for robot in manager.facts.robots.values() if robot.cell == cell and robot.is_there]
+    if blocked and inside:
+        text = f"cell {cell} will be blocked when {inside[0]} has left it"
+    return shown(CellAnswer(message=text))
+
+
+def _zone(call: Call) -> Zone:
+    found = call.manager.book.zones.get(call.names[0])
+    if found is None:
+        raise UnknownTaskError(f"there is no zone {call.names[0]!r}")
+    return found
+
+
+def _show_zone(zone: Zone) -> ZoneModel:
+    return ZoneModel(
+        id=zone.id,
+        kind=cast("ZoneKindName", zone.kind),
+        cells=list(zone.cells),
+        value=zone.value,
+        edges=[list(edge) for edge in zone.edges],
+        robots=list(zone.robots),
+        reason=zone.reason,
+        until=zone.until,
+        user=zone.user,
+        revision=zone.revision,
+    )
+
+
+ROUTES = [
+    Route("GET", "/chargers", chargers),
+    Route("PUT", "/chargers", set_chargers, changes=True),
+    Route("GET", "/zones", zones),
+    Route("GET", "/zones/{id}", zone),
+    Route("PUT", "/zones/{id}", set_zone, changes=True),
+    Route("DELETE", "/zones/{id}", remove_zone, changes=True),
+    Route("PUT", "/cells/{cell}", set_cell, changes=True),
+]

@@ -1,0 +1,273 @@
+"""Brings modes, zones and blocked cells of journal and planner together. Pure.
+
+People change them on both sides: by requests of the API, which the journal has first, and by the planner's
+services, which the operator's page and other programs call without the manager. After a restart the planner
+knows none of them, and gets the journal's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, TypeAlias
+
+from rce_fleet.manager.mirror import Mirror
+from rce_fleet.manager.zones import COST, rule
+from rce_fleet.tasks.records import AUTOMATIC, BlockedCells, FleetEntry, PlannerRun, RobotEntry, Zone
+
+if TYPE_CHECKING:
+    from rce_fleet.tasks.book import TaskBook
+    from rce_fleet.tasks.facts import FleetFacts
+
+CELLS_DELAY_S = 6.0
+"""Longest time after which the planner's list of blocked cells has an accepted one: a list counts only when
+the planner was heard again after it."""
+FLEET = ""
+"""Stands for the whole fleet where modes are by robot."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetMode:
+    """Set who drives a robot, or the fleet's mode (robot empty)."""
+
+    robot: str
+    mode: str
+    reason: str
+    user: str
+
+
+@dataclass(frozen=True, slots=True)
+class SetZone:
+    """Make or replace a zone, or remove it (zone None)."""
+
+    id: str
+    zone: Zone | None
+
+
+@dataclass(frozen=True, slots=True)
+class BlockCell:
+    """Block or free a cell."""
+
+    cell: int
+    blocked: bool
+
+
+PlannerCall: TypeAlias = SetMode | SetZone | BlockCell
+
+
+class PlannerSync:
+    """Compares the book with the planner's state.
+
+    Args:
+        book: What people decided.
+        facts: What the planner says.
+    """
+
+    def __init__(self, book: TaskBook, facts: FleetFacts) -> None:
+        self._book = book
+        self._facts = facts
+        self._modes: Mirror[str, str] = Mirror()
+        self._zones: Mirror[str, Zone] = Mirror()
+        self._cells: Mirror[int, bool] = Mirror(CELLS_DELAY_S)
+        self._run = PlannerRun()
+
+    def take_book(self, book: TaskBook) -> None:
+        """Continue with another book, made from the journal again."""
+        self._book = book
+
+    def begin(self, run: PlannerRun, now: float) -> str:
+        """Begin with a planner that was started, or is heard for the first time.
+
+        Args:
+            run: The planner.
+            now: Seconds since 1970.
+
+        Returns:
+            What people should know; empty: nothing.
+        """
+        book, known = self._book, self._book.planner
+        is_same = run.started == known.started
+        is_other_floor = known.floor not in ("", run.floor)
+        self._modes.restart({**self._modes_kept(), **self._unsent_modes()} if is_same else {})
+        keeps = is_same or is_other_floor
+        unsent = self._unsent_zones() if not is_other_floor else {}
+        self._zones.restart({**self._zones_kept(), **unsent} if keeps else {})
+        told = dict.fromkeys(book.blocked.cells, True)
+        # False: a stand-in that no cell equals, for those that the planner may not have, or still has.
+        waiting = dict.fromkeys(() if is_other_floor else book.blocked.unsent, False)
+        self._cells.restart({**told, **waiting} if keeps else {})
+        self._facts.requested = None if keeps else frozenset()  # a planner that begins has no requests
+        self._run = run
+        self._note_run(now)
+        lost = len(book.zones) + len(book.blocked.cells)
+        if is_other_floor and lost:
+            return f"the planner has another grid: its zones and blocked cells replace the {lost} known ones"
+        return ""
+
+    def adopt(self, now: float) -> None:
+        """Take over into the book what was changed at the planner, and end zones whose time has come.
+
+        Args:
+            now: Seconds since 1970.
+        """
+        book, facts = self._book, self._facts
+        for zone in list(book.zones.values()):
+            if zone.until is not None and zone.until <= now:
+                gone = replace(zone, is_removed=True, revision=zone.revision + 1, unsent=True)
+                book.emit(gone, "zone ended", now, text=f"zone {zone.id} has ended")
+        if not self._is_comparable():
+            return
+        self._note_run(now)  # again, if the journal could not be written
+        for name, mode in self._modes.compare(*self._modes_of_both(), now).to_adopt.items():
+            self._adopt_mode(name, mode or AUTOMATIC, now)
+        for key, zone_seen in self._zones.compare(*self._zones_of_both(), now).to_adopt.items():
+            self._adopt_zone(key, zone_seen, now)
+        if facts.requested is not None:
+            self._adopt_cells(self._cells.compare(*self._cells_of_both(), now).to_adopt, now)
+
+    def calls(self, now: float) -> list[PlannerCall]:
+        """Return what the planner has to be told now; modes first.
+
+        Args:
+            now: Seconds since 1970.
+        """
+        if not self._is_comparable():
+            return []
+        book, out = self._book, list[PlannerCall]()
+        for name, mode in self._modes.compare(*self._modes_of_both(), now).to_send.items():
+            entry = book.fleet if name == FLEET else book.entry(name)
+            out.append(SetMode(name, mode or AUTOMATIC, entry.reason, entry.user))
+        for key in self._zones.compare(*self._zones_of_both(), now).to_send:
+            out.append(SetZone(key, book.zones.get(key)))
+        if self._facts.requested is not None:
+            cells = self._cells.compare(*self._cells_of_both(), now).to_send
+            out += [BlockCell(cell, bool(blocked)) for cell, blocked in cells.items()]
+        return out
+
+    def took(self, call: PlannerCall, now: float, *, refused: bool) -> None:
+        """Note that the planner carried out or refused a call.
+
+        Args:
+            call: The call.
+            now: Seconds since 1970.
+            refused: Whether it refused.
+        """
+        if isinstance(call, SetMode):
+            self._modes.sent(call.robot, None if call.mode == AUTOMATIC else call.mode, now, refused=refused)
+        elif isinstance(call, SetZone):
+            self._zones.sent(call.id, None if call.zone is None else rule(call.zone), now, refused=refused)
+        else:
+            self._cells.sent(call.cell, True if call.blocked else None, now, refused=refused)
+
+    def confirmed(self) -> list[RobotEntry | Zone | BlockedCells]:
+        """Return records whose change by a request the planner has now, marked so."""
+        if not self._is_comparable():
+            return []
+        book, modes, zones = self._book, self._modes_kept(), self._zones_kept()
+        entries = [entry for entry in book.robots.values() if entry.unsent]
+        changed = [zone for zone in (*book.zones.values(), *book.removed_zones.values()) if zone.unsent]
+        return [
+            *self._confirmed_cells(),
+            *(
+                replace(each, unsent=False)
+                for each in entries
+                if self._modes.is_known(each.id, modes.get(each.id))
+            ),
+            *(
+                replace(each, unsent=False)
+                for each in changed
+                if self._zones.is_known(each.id, zones.get(each.id))
+            ),
+        ]
+
+    def _confirmed_cells(self) -> list[BlockedCells]:
+        blocked = self._book.blocked
+        kept = dict.fromkeys(blocked.cells, True)
+        waiting = tuple(cell for cell in blocked.unsent if not self._cells.is_known(cell, kept.get(cell)))
+        return [] if waiting == blocked.unsent else [replace(blocked, unsent=waiting)]
+
+    # What both have
+
+    def _is_comparable(self) -> bool:
+        return self._facts.is_live and self._facts.is_current and bool(self._run.started)
+
+    def _note_run(self, now: float) -> None:
+        known = self._book.planner
+        if self._run != known:
+            text = "the planner has another grid" if known.floor != self._run.floor else "the planner began"
+            self._book.emit(self._run, "planner", now, text=text)
+
+    def _modes_kept(self) -> dict[str, str]:
+        entries = {name: entry.mode for name, entry in self._book.robots.items()}
+        entries[FLEET] = self._book.fleet.mode
+        return {name: mode for name, mode in entries.items() if mode != AUTOMATIC}
+
+    def _modes_of_both(self) -> tuple[dict[str, str], dict[str, str]]:
+        """Return the modes of robots that the planner knows, and of the fleet."""
+        facts = self._facts
+        kept, seen = self._modes_kept(), {FLEET: facts.mode}
+        for name in self._book.robots:
+            if name not in facts.robots or not facts.robots[name].is_known:
+                kept.pop(name, None)
+                self._modes.forget(name)
+        for name, robot in facts.robots.items():
+            if not robot.is_known:
+                continue
+            wanted = kept.get(name)
+            is_covered = facts.mode != AUTOMATIC and robot.mode == facts.mode
+            # The fleet's mode hides the robot's own one.
+            hidden = is_covered and self._modes.is_known(name, wanted)
+            seen[name] = (wanted or AUTOMATIC) if hidden else robot.mode
+        return kept, {name: mode for name, mode in seen.items() if mode != AUTOMATIC}
+
+    def _unsent_modes(self) -> dict[str, str]:
+        """Return stand-ins that no mode equals, for robots whose mode the planner may not have."""
+        return {name: "" for name, entry in self._book.robots.items() if entry.unsent}
+
+    def _unsent_zones(self) -> dict[str, Zone]:
+        """Return stand-ins that no zone equals, for zones that the planner may not have, or still has."""
+        zones = {**self._book.zones, **self._book.removed_zones}
+        return {name: Zone(name, "", ()) for name, zone in zones.items() if zone.unsent}
+
+    def _zones_kept(self) -> dict[str, Zone]:
+        return {zone.id: rule(zone) for zone in self._book.zones.values() if zone.kind != COST}
+
+    def _zones_of_both(self) -> tuple[dict[str, Zone], dict[str, Zone]]:
+        return self._zones_kept(), {zone.id: rule(zone) for zone in self._facts.zones.values()}
+
+    def _cells_of_both(self) -> tuple[dict[int, bool], dict[int, bool]]:
+        kept = dict.fromkeys(self._book.blocked.cells, True)
+        seen = dict.fromkeys(self._facts.requested or (), True)
+        waiting = {cell: True for cell in kept if cell in self._facts.pending}
+        return kept, {**seen, **waiting}
+
+    # What the book takes over
+
+    def _adopt_mode(self, name: str, mode: str, now: float) -> None:
+        book = self._book
+        if name == FLEET:
+            fleet = FleetEntry(mode, revision=book.fleet.revision + 1)
+            book.emit(fleet, mode, now, text=f"the fleet is {_words(mode)}")
+            return
+        entry, reason = book.entry(name), "" if mode == AUTOMATIC else self._facts.robots[name].mode_reason
+        changed = replace(entry, mode=mode, reason=reason, user="", revision=entry.revision + 1, unsent=False)
+        book.emit(changed, mode, now, text=f"{name} is {_words(mode)}" + (f": {reason}" if reason else ""))
+
+    def _adopt_zone(self, key: str, seen: Zone | None, now: float) -> None:
+        book, known = self._book, self._book.zones.get(key)
+        if seen is None:
+            if known is not None:
+                gone = replace(known, is_removed=True, revision=known.revision + 1, unsent=False)
+                book.emit(gone, "zone removed", now, text=f"zone {key} is gone")
+            return
+        made = replace(self._facts.zones[key], revision=(known.revision if known else 0) + 1)
+        book.emit(made, "zone", now, user=made.user, text=f"zone {key}: {made.kind}")
+
+    def _adopt_cells(self, changes: dict[int, bool | None], now: float) -> None:
+        if not changes:
+            return
+        made = self._book.blocked.changed({cell: bool(one) for cell, one in changes.items()}, unsent=False)
+        self._book.emit(made, "blocked", now, text=f"{len(made.cells)} cells are blocked")
+
+
+def _words(mode: str) -> str:
+    return mode.replace("_", " ")

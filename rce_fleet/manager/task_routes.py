@@ -1,0 +1,165 @@
+"""The routes of tasks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce_fleet.api.tasks import HoldRequest, LoadRequest, TaskChange, TaskPage, TaskRequest
+from rce_fleet.manager.convert import changed_order, read_order, show_task
+from rce_fleet.manager.requests import BadRequestError, Call, FleetAnswer, Route, shown
+from rce_fleet.tasks.loads import settle_load
+from rce_fleet.tasks.task import TaskState
+
+if TYPE_CHECKING:
+    from rce_fleet.api.tasks import TaskModel
+    from rce_fleet.tasks.task import Task
+
+MOST_OPEN = 100_000
+"""Tasks that have not ended; more are refused until some have."""
+
+
+async def create(call: Call) -> FleetAnswer:
+    """Accept a task."""
+    model = call.model(TaskRequest)
+    key = call.request.key or model.key
+    if call.request.key and model.key not in ("", call.request.key):
+        raise BadRequestError("the header Idempotency-Key and the field key differ; give one of them")
+    book = call.manager.book
+    if sum(1 for _ in book.open_tasks()) >= MOST_OPEN:
+        return FleetAnswer(
+            429, f'{{"error": "there are {MOST_OPEN} open tasks; wait until some have ended"}}'
+        )
+    before = book.number
+    task = book.create(read_order(model), call.now, user=call.request.user, key=key)
+    is_new = book.number != before
+    await call.manager.commit()
+    return _answer(call, task, 201 if is_new else 200)
+
+
+async def listed(call: Call) -> FleetAnswer:
+    """Return a page of tasks."""
+    call.only("state", "robot", "limit", "cursor", "order", "requester")
+    states = {state for state in call.query.get("state", "").split(",") if state}
+    unknown = states - {state.value for state in TaskState} - {"open", "ended"}
+    if unknown:
+        possible = ", ".join([*(state.value for state in TaskState), "open", "ended"])
+        raise BadRequestError(f"unknown state {min(unknown)!r}; possible are {possible}")
+    limit = call.count("limit", 100, 1000) or 100
+    is_descending = call.query.get("order", "asc") == "desc"
+    cursor = call.query.get("cursor", "")
+    if cursor and not (cursor.isdecimal() and len(cursor) < 19):  # noqa: PLR2004 - digits of a 64-bit number
+        raise BadRequestError(f"cursor must be the field next of a page before, not {cursor!r}")
+    found: list[Task] = []
+    for number in sorted(call.manager.book.tasks, reverse=is_descending):
+        if cursor and (number >= int(cursor) if is_descending else number <= int(cursor)):
+            continue
+        task = call.manager.book.tasks[number]
+        if _fits(task, states, call.query):
+            found.append(task)
+            if len(found) > limit:
+                break
+    page = found[:limit]
+    following = str(page[-1].number) if len(found) > limit else None
+    return shown(TaskPage(tasks=[_show(call, task) for task in page], next=following))
+
+
+async def read(call: Call) -> FleetAnswer:
+    """Return a task."""
+    return _answer(call, call.manager.book.find(call.names[0]))
+
+
+async def change(call: Call) -> FleetAnswer:
+    """Change a task."""
+    model = call.model(TaskChange)
+    book = call.manager.book
+    order = changed_order(book.find(call.names[0]).order, model)
+    task = book.change(call.names[0], order, call.now, user=call.request.user, revision=call.revision())
+    await call.manager.commit()
+    return _answer(call, task)
+
+
+async def cancel(call: Call) -> FleetAnswer:
+    """Cancel a task."""
+    task = call.manager.book.cancel(call.names[0], call.now, user=call.request.user, revision=call.revision())
+    await call.manager.commit()
+    return _answer(call, task)
+
+
+async def hold(call: Call) -> FleetAnswer:
+    """Hold a task."""
+    reason = call.model(HoldRequest).reason
+    task = call.manager.book.hold(
+        call.names[0], call.now, user=call.request.user, reason=reason, revision=call.revision()
+    )
+    await call.manager.commit()
+    return _answer(call, task)
+
+
+async def resume(call: Call) -> FleetAnswer:
+    """End the hold of a task."""
+    task = call.manager.book.resume(call.names[0], call.now, user=call.request.user, revision=call.revision())
+    await call.manager.commit()
+    return _answer(call, task)
+
+
+async def reassign(call: Call) -> FleetAnswer:
+    """Give a task to another robot."""
+    robot = call.manager.book.find(call.names[0]).robot
+    task = call.manager.book.reassign(
+        call.names[0], call.now, user=call.request.user, revision=call.revision()
+    )
+    call.manager.dispatcher.avoid(task, robot, call.now)
+    await call.manager.commit()
+    return _answer(call, task)
+
+
+async def confirm(call: Call) -> FleetAnswer:
+    """Confirm the action that is under way."""
+    task = call.manager.book.confirm(
+        call.names[0], call.now, user=call.request.user, revision=call.revision()
+    )
+    await call.manager.commit()
+    return _answer(call, task)
+
+
+async def load(call: Call) -> FleetAnswer:
+    """Say where the load of a task is whose robot does not come back."""
+    cell = call.model(LoadRequest).cell
+    task = settle_load(
+        *(call.manager.book, call.names[0], cell, call.now),
+        user=call.request.user,
+        revision=call.revision(),
+    )
+    await call.manager.commit()
+    return _answer(call, task)
+
+
+ROUTES = [
+    Route("POST", "/tasks", create, changes=True),
+    Route("GET", "/tasks", listed),
+    Route("GET", "/tasks/{id}", read),
+    Route("PATCH", "/tasks/{id}", change, changes=True),
+    Route("DELETE", "/tasks/{id}", cancel, changes=True),
+    Route("POST", "/tasks/{id}/hold", hold, changes=True),
+    Route("POST", "/tasks/{id}/resume", resume, changes=True),
+    Route("POST", "/tasks/{id}/reassign", reassign, changes=True),
+    Route("POST", "/tasks/{id}/confirm", confirm, changes=True),
+    Route("POST", "/tasks/{id}/load", load, changes=True),
+]
+
+
+def _fits(task: Task, states: set[str], query: dict[str, str]) -> bool:
+    kinds = {task.state.value, "ended" if task.has_ended else "open"}
+    if states and not states & kinds:
+        return False
+    if "robot" in query and task.robot != query["robot"]:
+        return False
+    return "requester" not in query or task.requester == query["requester"]
+
+
+def _show(call: Call, task: Task) -> TaskModel:
+    return show_task(task, call.manager.dispatcher.expected_end(task, call.now))
+
+
+def _answer(call: Call, task: Task, status: int = 200) -> FleetAnswer:
+    return shown(_show(call, task), status, task.revision)

@@ -1,0 +1,158 @@
+"""Zones of the API as the planner's messages have them, and back. Pure.
+
+| kind | value |
+|---|---|
+| ``blocked`` | none |
+| ``slow`` | metres per second |
+| ``one_way`` | radians from the grid's columns: 0, pi/2, pi, -pi/2 |
+| ``limited`` | number of robots |
+| ``cost``: not sent, the manager counts ways in it | how much a metre counts |
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import isfinite, pi, tau
+from typing import TYPE_CHECKING, Any
+
+from rce_fleet.exceptions import TaskRefusedError
+from rce_fleet.tasks.records import Zone
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rce_fleet.planning.grid import GridMap
+
+COST = "cost"
+_DIRECTIONS = ("+x", "+y", "-x", "-y")
+_NEAR = 0.1
+"""Radians that a direction may differ from one of the grid's four."""
+
+
+def rule(zone: Zone) -> Zone:
+    """Return what two copies of a zone must have in common: not its reason, author, end and revision."""
+    return replace(
+        zone, reason="", user="", until=None, revision=0, unsent=False, cells=tuple(sorted(zone.cells))
+    )
+
+
+def checked(zone: Zone, grid: GridMap | None, now: float) -> Zone:
+    """Return a zone as it is kept.
+
+    Args:
+        zone: As it was asked for.
+        grid: The map; None: not known yet.
+        now: Seconds since 1970.
+
+    Raises:
+        TaskRefusedError: It cannot be on the map, or its rule is not clear.
+    """
+    for problem in _problems(zone, grid, now):
+        raise TaskRefusedError(f"zone {zone.id!r}: {problem}")
+    value = zone.value
+    if zone.kind == "one_way" and value is not None:
+        value = _quarters(value) * pi / 2
+    elif zone.kind == "blocked":
+        value = None
+    return replace(
+        zone,
+        value=value,
+        cells=tuple(sorted(set(zone.cells))),
+        edges=tuple(sorted(set(zone.edges))),
+        robots=tuple(sorted(set(zone.robots))),
+    )
+
+
+def zone_fields(zone: Zone, now: float) -> dict[str, Any]:
+    """Return the fields of a ``fleet/Zone``.
+
+    Args:
+        zone: The zone; of another kind than ``cost``.
+        now: Seconds since 1970.
+    """
+    value = zone.value or 0.0
+    return {
+        "id": zone.id,
+        "kind": zone.kind,
+        "cells": list(zone.cells),
+        "edges": [cell for edge in zone.edges for cell in edge],
+        "robots": list(zone.robots),
+        "speed": value if zone.kind == "slow" else 0.0,
+        "direction": _DIRECTIONS[_quarters(value) % 4] if zone.kind == "one_way" else "",
+        "capacity": int(value) if zone.kind == "limited" else 0,
+        "reason": zone.reason,
+        "by": zone.user,
+        "lifetime": 0.0 if zone.until is None else max(zone.until - now, 0.001),
+    }
+
+
+def read_zone(message: dict[str, Any], now: float) -> Zone:
+    """Return the zone of a ``fleet/Zone`` in its JSON form.
+
+    Args:
+        message: The message.
+        now: Seconds since 1970.
+    """
+    kind = message["kind"]
+    value = None
+    if kind == "slow":
+        value = float(message["speed"])
+    elif kind == "limited":
+        value = float(message["capacity"])
+    elif kind == "one_way":
+        value = _quarters(_DIRECTIONS.index(message["direction"]) * pi / 2) * pi / 2
+    edges = message["edges"]
+    return Zone(
+        id=message["id"],
+        kind=kind,
+        cells=tuple(sorted(message["cells"])),
+        value=value,
+        edges=tuple(sorted(zip(edges[::2], edges[1::2], strict=True))),
+        robots=tuple(sorted(message["robots"])),
+        reason=message["reason"],
+        user=message["by"],
+        until=now + message["lifetime"] if message["lifetime"] else None,
+    )
+
+
+def _problems(zone: Zone, grid: GridMap | None, now: float) -> Iterator[str]:
+    value = zone.value
+    if zone.until is not None and zone.until <= now:
+        yield f"it ends at {zone.until:.0f}, which is not after now ({now:.0f}), seconds since 1970"
+    if not zone.cells and not zone.edges:
+        yield "it has no cells"
+    if zone.edges and (zone.kind != "blocked" or zone.robots):
+        yield "edges are moves that a blocked zone does not allow any robot"
+    if zone.robots and zone.kind == "one_way":
+        yield "a one-way zone is for all robots; leave robots empty"
+    if value is None and zone.kind != "blocked":
+        yield f"the kind {zone.kind} needs a value"
+    if value is not None:
+        yield from _problems_of_value(zone.kind, value)
+    if grid is not None:
+        cells = {*zone.cells, *(cell for edge in zone.edges for cell in edge)}
+        outside = sorted(cell for cell in cells if cell not in grid)
+        if outside:
+            yield f"cell {outside[0]} is not on the map of {len(grid)} cells"
+        far = [edge for edge in zone.edges if not outside and not grid.adjacent(*edge)]
+        if far:
+            yield f"the cells of edge {list(far[0])} are not neighbours"
+
+
+def _problems_of_value(kind: str, value: float) -> Iterator[str]:
+    if not isfinite(value):
+        yield "its value must be a number"
+    elif kind == "slow" and value <= 0:
+        yield f"a slow zone needs a speed above 0 m/s, not {value:g}"
+    elif kind == "limited" and (value < 1 or value != int(value)):
+        yield f"limited is a whole number of robots from 1 on, not {value:g}"
+    elif kind == COST and value < 1:
+        yield f"in a cost zone a metre counts at least 1, not {value:g}"
+    elif kind == "one_way" and abs(value / (pi / 2) - round(value / (pi / 2))) > _NEAR / (pi / 2):
+        yield f"a direction is 0, pi/2, pi or -pi/2 radians from the grid's columns, not {value:g}"
+
+
+def _quarters(radians: float) -> int:
+    """Return a direction as quarters of a turn, -1 .. 2."""
+    turns = round((radians % tau) / (pi / 2)) % 4
+    return turns - 4 if turns == 3 else turns  # noqa: PLR2004 - three quarters are minus one

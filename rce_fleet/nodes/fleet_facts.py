@@ -1,0 +1,174 @@
+"""Builds what the fleet manager knows of the robots from the planner's messages. Pure."""
+
+from __future__ import annotations
+
+import re
+from math import inf, isfinite
+from typing import Any
+
+from rce_fleet.coordination.following import ChangeFollower
+from rce_fleet.manager.zones import read_zone
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.tasks.facts import NOT_DRIVEN, FleetFacts, RobotFacts
+from rce_fleet.tasks.records import PlannerRun
+
+_DETAILS = re.compile(r"[^(]*\((.*)\)")
+"""A mode as a reason, with what a person gave as reason: ``paused (visitors, by anna)``."""
+
+
+class FactKeeper:
+    """Keeps the facts up to date. Messages are in their JSON form.
+
+    Args:
+        facts: Updated in place.
+
+    Attributes:
+        started: When the planner began, as its messages have it; None: not heard yet.
+    """
+
+    def __init__(self, facts: FleetFacts) -> None:
+        self._facts = facts
+        self._follower = ChangeFollower()
+        self._blocked: set[int] = set()
+        self._pending: set[int] = set()
+        self._batteries: dict[str, tuple[float | None, bool | None]] = {}
+        self.started: Any = None
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether the complete state is needed."""
+        return self._follower.is_behind
+
+    def take_state(self, answer: dict[str, Any], now: float) -> bool:
+        """Take over a ``fleet/GetState`` response; return whether it is of another planner than before.
+
+        Args:
+            answer: The response.
+            now: Seconds since 1970.
+        """
+        kept = self._follower.take_snapshot(answer)
+        state = answer["state"]
+        is_other = bool(self.started != state["started"])
+        self.started = state["started"]
+        self._blocked, self._pending = set(state["blocked"]), set(state["pending"])
+        grid = GridMap(
+            rows=state["rows"],
+            columns=state["columns"],
+            cell_size=state["cell_size"],
+            origin=(state["origin_x"], state["origin_y"]),
+            blocked=frozenset(state["walls"]),
+        )
+        if self._facts.grid is None or grid != self._facts.grid:
+            self._facts.grid = grid
+        present = {robot["id"] for robot in state["robots"]}
+        for name in self._facts.robots.keys() - present:
+            self._facts.robots[name].state = "joining"
+            self._facts.robots[name].reason = "the planner does not know it"
+            self._facts.robots[name].is_known = False
+            self._facts.robots[name].goal = None  # a planner that was restarted has none yet
+            self._note_away(self._facts.robots[name], now)
+        for robot in state["robots"]:
+            self._take_robot(robot, now)
+        self._facts.zones = {zone["id"]: read_zone(zone, now) for zone in state["zones"]}
+        self._facts.mode = state["mode"]
+        self._note_map()
+        self._facts.is_live = True
+        for message in kept:
+            self._apply(message, now)
+        self._facts.is_current = not self._follower.is_behind
+        return is_other
+
+    @property
+    def run(self) -> PlannerRun:
+        """The planner whose state was taken over."""
+        grid, started = self._facts.grid, self.started
+        if grid is None or started is None:
+            return PlannerRun()
+        floor = (
+            f"{grid.rows} x {grid.columns} cells of {grid.cell_size:g} m at {grid.origin}, {grid.yaw:g} rad"
+        )
+        return PlannerRun(f"{started['secs']}.{started['nsecs']:09d}", floor)
+
+    def take_changes(self, message: dict[str, Any], now: float) -> None:
+        """Take over a ``fleet/FleetChanges``."""
+        if message["started"] == self.started:
+            self._facts.mode = message["mode"]
+        if self._follower.take_changes(message):
+            self._apply(message, now)
+        self._facts.is_current = not self._follower.is_behind
+
+    def take_battery(
+        self, robot: str, percentage: float, charge: float, capacity: float, status: int
+    ) -> None:
+        """Take over a ``sensor_msgs/BatteryState``.
+
+        Args:
+            robot: Whose battery.
+            percentage: Share, 0 .. 1; not a number if it is not measured.
+            charge: Ampere hours that are left.
+            capacity: Ampere hours of the full battery.
+            status: ``power_supply_status``: 1 charging, 4 full.
+        """
+        share = percentage
+        if not isfinite(share) and capacity > 0:
+            share = charge / capacity
+        level = min(1.0, max(0.0, share)) if isfinite(share) else None
+        charging = {0: None, 1: True, 4: True}.get(status, False)
+        self._batteries[robot] = level, charging
+        known = self._facts.robots.get(robot)
+        if known is not None:
+            known.battery, known.is_charging = level, charging
+
+    # Inner
+
+    def _apply(self, message: dict[str, Any], now: float) -> None:
+        for name in message["removed"]:
+            self._facts.robots.pop(name, None)
+        for robot in message["robots"]:
+            self._take_robot(robot, now)
+        for zone in message["removed_zones"]:
+            self._facts.zones.pop(zone, None)
+        for zone in message["zones"]:
+            self._facts.zones[zone["id"]] = read_zone(zone, now)
+        if message["blocked"] or message["pending"] or message["freed"]:
+            freed = set(message["freed"])
+            blocked, pending = set(message["blocked"]), set(message["pending"])
+            self._blocked = (self._blocked - freed - pending) | blocked
+            self._pending = (self._pending - freed - blocked) | pending
+            self._note_map()
+
+    def _note_map(self) -> None:
+        walls = self._facts.grid.blocked if self._facts.grid is not None else frozenset()
+        self._facts.pending = frozenset(self._pending)
+        shut = frozenset(walls | self._blocked | self._pending)
+        if shut != self._facts.shut:
+            self._facts.shut = shut
+            self._facts.map_revision += 1
+
+    def _take_robot(self, robot: dict[str, Any], now: float) -> None:
+        name = robot["id"]
+        known = self._facts.robots.get(name)
+        if known is None:
+            battery, charging = self._batteries.get(name, (None, None))
+            known = RobotFacts(name, battery=battery, is_charging=charging, moved_at=now)
+            self._facts.robots[name] = known
+        cell = robot["cell"] if robot["cell"] >= 0 else None
+        goal = robot["goal"] if robot["goal"] >= 0 else None
+        could_not_move = known.state in NOT_DRIVEN and robot["state"] not in NOT_DRIVEN
+        if (cell, goal) != (known.cell, known.goal) or could_not_move:
+            known.moved_at = now
+        known.cell, known.goal = cell, goal
+        known.state, known.reason = robot["state"], robot["reason"]
+        details = _DETAILS.fullmatch(known.reason)
+        if robot["mode"] != known.mode:
+            known.mode_reason = ""
+        if details is not None and robot["mode"] in NOT_DRIVEN:
+            known.mode_reason = details[1]
+        known.mode, known.is_known = robot["mode"], True
+        self._note_away(known, now)
+
+    def _note_away(self, robot: RobotFacts, now: float) -> None:
+        if robot.is_there:
+            robot.away_since = inf
+        elif robot.away_since == inf:
+            robot.away_since = now

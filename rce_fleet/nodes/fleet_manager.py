@@ -1,0 +1,271 @@
+"""The fleet manager as a node: tasks, goals, chargers and zones, kept in a journal, beside the planner.
+
+The work is done by :mod:`rce_fleet.manager` and :mod:`rce_fleet.tasks`; this node passes messages to them and
+from them. ``share/README.md`` lists topics, services and parameters.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from rce.ros.node import MasterError, Message, Node, Publisher, RosError, run
+from rce.ros.tools.plain import plain
+from rce_fleet.journal.journal import Journal
+from rce_fleet.manager.fleet_routes import ROUTES as FLEET_ROUTES
+from rce_fleet.manager.goals import NO_ANSWER
+from rce_fleet.manager.manager import FleetManager
+from rce_fleet.manager.requests import FleetRequest, Router
+from rce_fleet.manager.task_routes import ROUTES as TASK_ROUTES
+from rce_fleet.manager.zones import zone_fields
+from rce_fleet.nodes.fleet_facts import FactKeeper
+from rce_fleet.nodes.graph_look import GraphLook
+from rce_fleet.nodes.known_robots import VOLUME_VARIABLE
+from rce_fleet.nodes.manager_parameters import ManagerParameters, rules_of
+from rce_fleet.nodes.parameters import read_parameters
+from rce_fleet.nodes.throttled_log import ThrottledLog
+from rce_fleet.tasks.records import Places, Zone
+
+STEP_S = 0.2
+"""Seconds between two steps."""
+LOOK_AROUND_S = 2.0
+"""Seconds between two searches for batteries, in a small graph."""
+SILENT_S = 5.0
+"""The planner publishes a change, or the number of the last one, every second. After this time without one,
+its complete state is requested again."""
+CALL_TIMEOUT_S = 5.0
+BATTERY_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/battery_state")
+SAME_PLANNER_S = 1.5
+"""A list of requested cells counts once the same planner was heard so long after it: that of a planner that
+was restarted, which begins empty, can come before the manager knows of the restart."""
+MOST_LISTS = 1000
+"""Most lists of requested cells that wait until they count."""
+
+
+class PlannerServices:
+    """The planner's services.
+
+    Args:
+        node: A running node.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._set_goal = node.service_client("/fleet/set_goal", "fleet/SetGoal")
+        self._block_cell = node.service_client("/fleet/block_cell", "fleet/BlockCell")
+        self._set_mode = node.service_client("/fleet/set_mode", "fleet/SetMode")
+        self._set_zones = node.service_client("/fleet/set_zones", "fleet/SetZones")
+
+    async def set_goal(self, robot: str, cell: int | None) -> str:
+        """Send a robot to a cell, or remove its goal; return why the planner refused."""
+        return await self._call(self._set_goal, robot=robot, cell=-1 if cell is None else cell)
+
+    async def block_cell(self, cell: int, *, blocked: bool) -> str:
+        """Block or free a cell; return why the planner refused."""
+        return await self._call(self._block_cell, cell=cell, blocked=blocked)
+
+    async def set_mode(self, robot: str, mode: str, reason: str, user: str) -> str:
+        """Set who drives a robot, or the fleet's mode (robot empty); return why the planner refused."""
+        return await self._call(self._set_mode, robot=robot, mode=mode, reason=reason, by=user)
+
+    async def set_zone(self, name: str, zone: Zone | None, now: float) -> str:
+        """Make or replace a zone, or remove it (None); return why the planner refused.
+
+        Args:
+            name: Its name.
+            zone: The zone.
+            now: Seconds since 1970.
+        """
+        zones, remove = ([], [name]) if zone is None else ([zone_fields(zone, now)], [])
+        return await self._call(self._set_zones, zones=zones, remove=remove, revision=-1)
+
+    async def _call(self, client: Any, **request: Any) -> str:
+        try:
+            answer = await client(request, timeout=CALL_TIMEOUT_S)
+        except RosError as error:
+            return f"{NO_ANSWER}: {error}"
+        return "" if answer.ok else str(answer.message)
+
+
+class ManagerNode:
+    """The manager in a ROS graph.
+
+    Args:
+        node: Running node.
+        parameters: Its parameters.
+        journal: Where everything is kept.
+    """
+
+    def __init__(self, node: Node, parameters: ManagerParameters, journal: Journal) -> None:
+        self._node = node
+        self._parameters = parameters
+        self._journal = journal
+        self._events: Publisher
+        self._batteries: set[str] = set()
+        self._heard_at = 0.0
+        self._state_needed = asyncio.Event()
+        self._requested: deque[tuple[float, frozenset[int]]] = deque(maxlen=MOST_LISTS)
+        self._manager: FleetManager
+        self._facts: FactKeeper
+
+    async def run(self) -> None:
+        """Run until the node is stopped."""
+        node = self._node
+        self._events = await node.advertise("/fleet/events", "std_msgs/String")
+        self._manager = FleetManager(
+            self._journal,
+            PlannerServices(node),
+            rules_of(self._parameters),
+            node.log,
+            publish=self._publish,
+        )
+        self._facts = FactKeeper(self._manager.facts)
+        self._state_needed.set()
+        await self._set_places()
+        router = Router(self._manager, [*TASK_ROUTES, *FLEET_ROUTES])
+
+        async def answer(request: Message) -> dict[str, Any]:
+            said = await router.answer(
+                FleetRequest(
+                    *(request.method.upper(), request.path, request.body, request.user, request.role),
+                    *(request.key, request.revision),
+                )
+            )
+            return {"status": said.status, "body": said.body, "revision": said.revision}
+
+        await node.subscribe("/fleet/changes", "fleet/FleetChanges", self._take_changes)
+        await node.subscribe("/fleet/requestedCells", "std_msgs/Int32MultiArray", self._take_requested)
+        await node.advertise_service("/fleet/request", "fleet/Request", answer)
+        node.log.info("the fleet manager has %d open tasks", sum(1 for _ in self._manager.book.open_tasks()))
+        async with asyncio.TaskGroup() as tasks:
+            others = [tasks.create_task(self._follow_planner()), tasks.create_task(self._look_around())]
+            while await node.sleep(STEP_S):
+                await self._step()
+            for other in others:
+                other.cancel()
+        await self._manager.close()
+
+    async def _step(self) -> None:
+        if time.monotonic() - self._heard_at > SILENT_S:
+            self._manager.facts.is_live = False
+            self._state_needed.set()
+        while self._requested and self._heard_at - self._requested[0][0] > SAME_PLANNER_S:
+            self._manager.facts.requested = self._requested.popleft()[1]
+        await self._manager.step()
+
+    async def _set_places(self) -> None:
+        """Take chargers and parking places of the parameters over, unless people have set others."""
+        book, given = self._manager.book, self._parameters
+        places = Places(tuple(given.chargers), tuple(given.parking), tuple(given.return_cells))
+        if book.places.revision == 0 and places != Places():
+            book.emit(
+                places, "places", self._manager.clock(), text="chargers and parking places of the parameters"
+            )
+            await self._manager.commit()
+
+    def _publish(self, events: list[dict[str, Any]]) -> None:
+        for event in events:
+            self._events.publish(data=json.dumps({**event, "journal": self._journal.id}))
+
+    # The planner
+
+    def _take_changes(self, message: Message) -> None:
+        change = plain(message)
+        if change["started"] == self._facts.started:
+            self._heard_at = time.monotonic()
+        self._facts.take_changes(change, self._manager.clock())
+        if self._facts.is_behind:
+            self._state_needed.set()
+
+    def _take_requested(self, message: Message) -> None:
+        """Take over which cells people blocked at the planner."""
+        newest = time.monotonic(), frozenset(message.data)
+        if len(self._requested) == MOST_LISTS:
+            self._requested.pop()  # not the oldest: lists that come without a pause must count some time
+        self._requested.append(newest)
+
+    async def _follow_planner(self) -> None:
+        """Request the planner's complete state whenever it is needed."""
+        client = self._node.service_client("/fleet/get_state", "fleet/GetState")
+        throttled = ThrottledLog(self._node)
+        while True:
+            await self._state_needed.wait()
+            self._state_needed.clear()
+            try:
+                answer = await client({}, timeout=CALL_TIMEOUT_S)
+            except RosError as error:
+                throttled.warn("planner", f"the planner does not answer: {error}")
+                self._state_needed.set()
+                await asyncio.sleep(1.0)
+                continue
+            self._heard_at = time.monotonic()
+            if self._facts.take_state(plain(answer), self._manager.clock()):
+                self._begin()
+
+    def _begin(self) -> None:
+        """Begin with a planner that was started, or is heard for the first time."""
+        self._manager.planner_began(self._facts.run)
+        if self._manager.facts.requested is not None:
+            self._requested.clear()  # of the planner before
+
+    # Batteries
+
+    async def _look_around(self) -> None:
+        """Subscribe to the battery of every robot."""
+        async with GraphLook(self._node, LOOK_AROUND_S) as graph:
+            while True:
+                try:
+                    for topic in (await graph.look()).publishers:
+                        found = BATTERY_TOPIC.fullmatch(topic)
+                        if found is not None and found[1] not in self._batteries:
+                            self._batteries.add(found[1])
+                            await self._follow_battery(found[1], topic)
+                except MasterError as error:
+                    self._node.log.warning("cannot search for batteries: %s", error)
+                await asyncio.sleep(graph.pause)
+
+    async def _follow_battery(self, robot: str, topic: str) -> None:
+        def take(message: Message) -> None:
+            capacity = message.capacity if message.capacity > 0 else message.design_capacity
+            self._facts.take_battery(
+                robot, message.percentage, message.charge, capacity, message.power_supply_status
+            )
+
+        await self._node.subscribe(topic, "sensor_msgs/BatteryState", take)
+
+
+def open_journal(given: str) -> Journal:
+    """Open the journal in a file, or in a folder; without a name in the home of this machine's user.
+
+    Raises:
+        JournalError: It cannot be opened.
+        OSError: Its folder cannot be made.
+    """
+    path = Path(given).expanduser() if given else Path.home() / "fleet"
+    if path.is_dir() or not path.suffix:
+        path = path / "journal.sqlite"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return Journal(path)
+
+
+async def main() -> None:
+    """Run the manager until the node is stopped."""
+    async with Node("fleet_manager") as node:
+        parameters = await read_parameters(node, ManagerParameters)
+        place = parameters.journal or os.environ.get(VOLUME_VARIABLE, "")
+        if not place:
+            node.log.warning(
+                "tasks are kept in the home of this container: they survive the end of this node, and are"
+                " lost with the container; give the container a volume with the name fleet"
+            )
+        journal = await asyncio.to_thread(open_journal, place)
+        await ManagerNode(node, parameters, journal).run()
+
+
+if __name__ == "__main__":
+    run(main())

@@ -1,0 +1,109 @@
+"""Keeps the robots of a fleet, and the cells that each may be in, for the planner after this one.
+
+They are in a file on the container's volume ``fleet``, so a planner whose container was killed claims the
+cells of robots that it has not heard yet.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rce_fleet.coordination.fleet_state import FleetState
+    from rce_fleet.planning.grid import GridMap
+
+VOLUME_VARIABLE = "RCE_VOLUME_FLEET"
+"""Where the container has its volume with the name ``fleet``, if it has one."""
+FILE = "robots.json"
+KNOWN_FOR = 3600.0
+"""Seconds; robots of an older file may have been moved by hand, so it is ignored."""
+
+
+def file_of_robots(values: Mapping[str, Any]) -> Path | None:
+    """Return the file that the parameter ``known_robots`` names, or that is on the volume; None without."""
+    named = str(values.get("known_robots", ""))
+    if named:
+        return Path(named)
+    folder = os.environ.get(VOLUME_VARIABLE, "")
+    return Path(folder, FILE) if folder else None
+
+
+def cells_of_robots(state: FleetState, ahead: int) -> dict[str, tuple[int, ...]]:
+    """Return the cells that each robot may be in soon: those that it claims, and the next of its path.
+
+    Args:
+        state: The fleet.
+        ahead: Cells that are granted at most beyond a robot's own; so many more are returned, because the
+            file is written a little later than cells are granted.
+    """
+    return {
+        robot: tuple(sorted({*state.ledger.claims(robot), *state.ledger.route(robot)[: 2 * ahead + 1]}))
+        for robot in sorted(state.robots)
+    }
+
+
+class KnownRobots:
+    """The file.
+
+    Args:
+        path: Its path.
+        ahead: Cells that are granted at most beyond a robot's own.
+    """
+
+    def __init__(self, path: Path, ahead: int) -> None:
+        self._path = path
+        self._ahead = ahead
+        self._written: dict[str, Any] = {}
+
+    def read(self, grid: GridMap, now: float) -> dict[str, tuple[int, ...]]:
+        """Return the cells that each robot may be in; empty if the file is of another grid, or old.
+
+        Args:
+            grid: The fleet's grid.
+            now: Seconds since 1970.
+
+        Raises:
+            ValueError: The file does not hold robots; the text says what it holds.
+            OSError: The file cannot be read.
+        """
+        if not self._path.exists():
+            return {}
+        try:
+            found = json.loads(self._path.read_text(encoding="utf-8"))
+            if found["grid"] != _describe(grid) or not 0 <= now - float(found["written"]) <= KNOWN_FOR:
+                return {}
+            return {str(robot): tuple(map(int, cells)) for robot, cells in found["robots"].items()}
+        except (KeyError, TypeError, AttributeError, json.JSONDecodeError) as error:
+            raise ValueError(
+                f"{self._path} does not hold the robots of a fleet ({error!r}): it is written anew"
+            ) from error
+
+    def content(self, state: FleetState) -> dict[str, Any] | None:
+        """Return what to write; None if the file has it already."""
+        robots = {robot: list(cells) for robot, cells in cells_of_robots(state, self._ahead).items()}
+        content = {"grid": _describe(state.grid), "robots": robots}
+        return None if content == self._written else content
+
+    def write(self, content: dict[str, Any], now: float) -> None:
+        """Replace the file.
+
+        Args:
+            content: As :meth:`content` returned it.
+            now: Seconds since 1970.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        beside = self._path.with_suffix(".new")
+        beside.write_text(json.dumps({**content, "written": now}), encoding="utf-8")
+        beside.replace(self._path)
+        self._written = content
+
+
+def _describe(grid: GridMap) -> list[float]:
+    return [grid.rows, grid.columns, grid.cell_size, *grid.origin, grid.yaw]

@@ -1,0 +1,152 @@
+"""The topics of the planner's robots: what each robot and its move client publish and receive."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from rce_fleet.coordination.answers import is_answer, numbered_array, read_answer
+from rce_fleet.coordination.events import Event, ObstacleGone, ObstacleSeen, PoseSeen, ReportSeen, RobotHeard
+from rce_fleet.nodes.grid_messages import grid_name
+from rce_fleet.nodes.robot_messages import read_pose_seen, read_report, read_sign
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rce.ros.node import Node, Publisher
+    from rce.ros.types import Message
+    from rce_fleet.coordination.events import SendCells
+    from rce_fleet.coordination.move_client import ClientReport
+    from rce_fleet.coordination.robot_signs import RobotSign
+    from rce_fleet.nodes.pose_publisher import PosePublisher
+
+POSE = "geometry_msgs/PoseWithCovarianceStamped"
+OLD_CELLS_LAST = 3.0
+"""Seconds after a change of the grid in which robots may report cells of the one before."""
+
+
+class RobotTopics:
+    """Connects robots with the planner.
+
+    Args:
+        node: Running node.
+        take: Passes an event to the planner.
+        poses: Publishes the poses of all robots.
+        takes_answers: Move clients answer on ``goalNodesList`` instead of their own topics.
+
+    Attributes:
+        client_grids: The grid that each robot's move client has; empty: it has one from its parameters.
+    """
+
+    def __init__(
+        self, node: Node, take: Callable[[Event], object], poses: PosePublisher, *, takes_answers: bool
+    ) -> None:
+        self._node = node
+        self._take = take
+        self._poses = poses
+        self._takes_answers = takes_answers
+        self._cells: dict[str, Publisher] = {}
+        self._cancels: dict[str, Publisher] = {}
+        self._obstacles_from = 0.0
+        self.client_grids: dict[str, str] = {}
+
+    def __contains__(self, robot: str) -> bool:
+        """Return whether a robot is connected."""
+        return robot in self._cells
+
+    def send_cells(self, instruction: SendCells, grid: str) -> None:
+        """Send a robot its cells, which belong to a grid of this name.
+
+        A robot that an earlier planner knew may not be connected yet: its list is sent again.
+        """
+        publisher = self._cells.get(instruction.robot)
+        if publisher is not None:
+            named = "" if self._takes_answers else grid
+            fields = numbered_array(instruction.cells, instruction.revision, named, instruction.speed)
+            publisher.publish(fields)
+
+    def send_cancel(self, robot: str) -> None:
+        """Stop a robot."""
+        publisher = self._cancels.get(robot)
+        if publisher is not None:
+            publisher.publish(data=True)
+
+    def ignore_old_cells(self) -> None:
+        """Take no cells from robots for a while, because they may be of the grid before."""
+        self._obstacles_from = time.monotonic() + OLD_CELLS_LAST
+
+    async def join(self, robot: str) -> None:
+        """Connect a robot."""
+        node = self._node
+        self._cells[robot] = await node.advertise(f"/{robot}/goalNodesList", "std_msgs/Int32MultiArray")
+        self._cancels[robot] = await node.advertise(f"/{robot}/cancelGoal", "std_msgs/Bool")
+        if self._takes_answers:
+            await node.subscribe(
+                f"/{robot}/goalNodesList",
+                "std_msgs/Int32MultiArray",
+                lambda message: self._take_answer(robot, message),
+            )
+        else:
+            await self._hear_apart(robot)
+        # Clients of the planner's container do not receive what its other interfaces publish.
+        seen = await node.advertise(f"/fleet/poses/{robot}", POSE, latch=True)
+
+        def take(message: Message) -> None:
+            self._take(read_pose_seen(robot, message))
+            self._poses.take(robot, message)
+            seen.publish(message)
+
+        await node.subscribe(f"/{robot}/amcl_pose", POSE, take)
+        node.log.info("found robot %s", robot)
+
+    async def _hear_apart(self, robot: str) -> None:
+        """Subscribe to the topics of a move client and its robot."""
+        await self._node.subscribe(
+            f"/{robot}/moveClient/status",
+            "fleet/MoveStatus",
+            lambda message: self._take_status(robot, message),
+        )
+        await self._node.subscribe(
+            f"/{robot}/blockedCells",
+            "std_msgs/Int32MultiArray",
+            lambda message: self._take_obstacle(ObstacleSeen(robot, tuple(message.data))),
+        )
+        await self._node.subscribe(
+            f"/{robot}/freedCells",
+            "std_msgs/Int32MultiArray",
+            lambda message: self._take_obstacle(ObstacleGone(robot, tuple(message.data))),
+        )
+
+    def _take_answer(self, robot: str, message: Message) -> None:
+        """Handle a move client's answer; the planner's own lists arrive here too."""
+        dimensions = message.layout.dim
+        labels = [dimension.label for dimension in dimensions]
+        if not is_answer(labels):
+            return
+        try:
+            answer = read_answer(labels, [dimension.size for dimension in dimensions], message.data)
+        except ValueError as error:
+            self._node.log.warning("%s: %s", robot, error)
+            return
+        self._take_report(robot, answer.report, answer.sign)
+        if answer.blocked:
+            self._take(ObstacleSeen(robot, answer.blocked))
+        if answer.freed:
+            self._take(ObstacleGone(robot, answer.freed))
+
+    def _take_status(self, robot: str, message: Message) -> None:
+        self.client_grids[robot] = grid_name(message.grid)
+        self._take_report(robot, read_report(message), read_sign(message))
+
+    def _take_obstacle(self, event: ObstacleSeen | ObstacleGone) -> None:
+        """Handle cells that a robot reports, unless they may be of the grid before."""
+        if time.monotonic() >= self._obstacles_from:
+            self._take(event)
+
+    def _take_report(self, robot: str, report: ClientReport, sign: RobotSign) -> None:
+        """Handle a move client's report; what it heard of the robot comes first, because it is older."""
+        if sign.pose is not None:
+            self._take(PoseSeen(robot, *sign.pose))
+        if sign.age is not None:
+            self._take(RobotHeard(robot, sign.age))
+        self._take(ReportSeen(robot, report))

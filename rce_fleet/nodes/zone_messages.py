@@ -1,0 +1,108 @@
+"""Reads and writes ``fleet/Zone``, and reads the requests ``fleet/SetZones`` and ``fleet/SetMode``."""
+
+from __future__ import annotations
+
+from enum import Enum
+from math import inf, isfinite
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from rce_fleet.coordination.events import ModeSet, ZonesSet
+from rce_fleet.coordination.modes import read_mode
+from rce_fleet.coordination.zones import Direction, Zone, ZoneKind
+from rce_fleet.exceptions import ZoneError
+
+if TYPE_CHECKING:
+    from rce.ros.types import Message
+
+E = TypeVar("E", bound=Enum)
+
+
+def read_zone(message: Message, now: float) -> Zone:
+    """Return the zone of a ``fleet/Zone``.
+
+    Args:
+        message: The message.
+        now: The planner's time, seconds.
+
+    Raises:
+        ZoneError: A field has a value that no zone has.
+    """
+    where = f"zone {message.id!r}"
+    if len(message.edges) % 2:
+        raise ZoneError(
+            f"{where}: edges are pairs of cells, and {len(message.edges)} is an odd number of cells"
+        )
+    if not isfinite(message.lifetime) or message.lifetime < 0:
+        raise ZoneError(f"{where}: its lifetime must be at least 0 s, not {message.lifetime}")
+    edges = zip(message.edges[::2], message.edges[1::2], strict=True)
+    return Zone(
+        id=message.id,
+        kind=_member(ZoneKind, message.kind, f"{where}: kind"),
+        cells=tuple(sorted(set(message.cells))),
+        edges=tuple(sorted(set(edges))),
+        robots=tuple(sorted(set(message.robots))),
+        speed=message.speed,
+        direction=_member(Direction, message.direction, f"{where}: direction") if message.direction else None,
+        capacity=message.capacity,
+        reason=message.reason,
+        by=message.by,
+        expires=now + message.lifetime if message.lifetime else inf,
+    )
+
+
+def zone_fields(zone: Zone, now: float) -> dict[str, Any]:
+    """Return the fields of a ``fleet/Zone``.
+
+    Args:
+        zone: The zone.
+        now: The planner's time, seconds.
+    """
+    return {
+        "id": zone.id,
+        "kind": zone.kind.value,
+        "cells": list(zone.cells),
+        "edges": [cell for edge in zone.edges for cell in edge],
+        "robots": list(zone.robots),
+        "speed": zone.speed,
+        "direction": zone.direction.value if zone.direction else "",
+        "capacity": zone.capacity,
+        "reason": zone.reason,
+        "by": zone.by,
+        "lifetime": max(zone.expires - now, 0.001) if zone.expires < inf else 0.0,
+    }
+
+
+def read_zones_set(request: Message, now: float) -> ZonesSet:
+    """Return the event of a ``fleet/SetZones`` request.
+
+    Raises:
+        ZoneError: A zone cannot be read.
+    """
+    return ZonesSet(
+        zones=tuple(read_zone(zone, now) for zone in request.zones),
+        remove=tuple(request.remove),
+        replace=request.replace,
+        revision=None if request.revision < 0 else request.revision,
+    )
+
+
+def read_mode_set(request: Message) -> ModeSet:
+    """Return the event of a ``fleet/SetMode`` request.
+
+    Raises:
+        ValueError: There is no such mode.
+    """
+    return ModeSet(request.robot or None, read_mode(request.mode), request.reason, request.by)
+
+
+def _member(kind: type[E], text: str, where: str) -> E:
+    """Return the member of an enumeration with a value.
+
+    Raises:
+        ZoneError: There is none.
+    """
+    try:
+        return kind(text)
+    except ValueError:
+        known = ", ".join(str(member.value) for member in kind)
+        raise ZoneError(f"{where} must be one of {known}, not {text!r}") from None

@@ -1,0 +1,180 @@
+"""``rce plan MAP``: joint plans and lifelong runs on MovingAI maps, without an engine."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from rce_fleet.compiled import compile_kernels
+from rce_fleet.exceptions import FleetError, PlanningError
+from rce_fleet.planning.fields import UNREACHABLE, distance_fields
+from rce_fleet.planning.graph import PlanningGraph
+from rce_fleet.planning.lacam import LacamPlanner
+from rce_fleet.planning.lifelong import LIFELONG_KERNELS, LifelongPlanner, LifelongSettings
+from rce_fleet.planning.movingai import read_map, read_scenario
+from rce_fleet.planning.planner import DEFAULT_EFFORT, JointPlan, PlanningProblem, load_planner
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rce_fleet.planning.grid import GridMap
+
+_EFFORT_PER_ROBOT = 4000
+"""Configurations of a search for a first plan at most, if this is more than the default."""
+
+
+def plan(
+    map_: Annotated[Path, typer.Argument(metavar="MAP", help="MovingAI map.", show_default=False)],
+    output: Annotated[Path, typer.Option(help="JSON file for the plan.", show_default=False)],
+    robots: Annotated[int, typer.Option(min=1, help="Number of robots.")],
+    scen: Annotated[Path | None, typer.Option(help="MovingAI scenario: starts and goals.")] = None,
+    seconds: Annotated[float, typer.Option(min=0.0, help="Time to plan; 0 ends with the first plan.")] = 0.0,
+    planner: Annotated[str, typer.Option(help="Planner, by its name.")] = "lacam",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of random choices.")] = 0,
+    *,
+    lifelong: Annotated[
+        bool, typer.Option("--lifelong", help="Give each robot one goal after another.")
+    ] = False,
+    steps: Annotated[int, typer.Option(min=1, help="With --lifelong: number of steps.")] = 500,
+) -> None:
+    """Plan robots on a map without an engine.
+
+    A robot moves by one cell a step. A cell's number is row * width + column; row 0 is the file's first line.
+    """
+    with _errors():
+        if lifelong:
+            report = _lifelong(read_map(map_), robots, steps, seed)
+        elif scen is None:
+            raise PlanningError("a plan needs --scen FILE.scen with starts and goals, or --lifelong")
+        else:
+            report = _one_shot(map_, scen, robots, seconds, planner, seed)
+        output.write_text(json.dumps(report, separators=(",", ":")) + "\n", encoding="utf-8")
+    shown = {name: value for name, value in report.items() if not isinstance(value, list)}
+    typer.echo(f"{output}: " + ", ".join(f"{name} {value}" for name, value in shown.items()))
+
+
+def _one_shot(map_: Path, scen: Path, robots: int, seconds: float, name: str, seed: int) -> dict[str, Any]:
+    """Plan a scenario; return the report."""
+    found: list[float] = []
+    began = time.perf_counter()
+    planner = load_planner(name)
+    if name == "lacam":
+        planner = LacamPlanner(on_first=lambda _: found.append(time.perf_counter()))
+    compile_s = time.perf_counter() - began
+    grid = read_map(map_)
+    rows = read_scenario(scen, grid, limit=robots)
+    if len(rows) < robots:
+        raise PlanningError(f"{scen}: the scenario has {len(rows)} robots; --robots asks for {robots}")
+    starts, goals = [row.start for row in rows], [row.goal for row in rows]
+    began = time.perf_counter()
+    problem = PlanningProblem.of(
+        PlanningGraph.from_grid(grid),
+        starts,
+        goals,
+        seed=seed,
+        effort=max(DEFAULT_EFFORT, _EFFORT_PER_ROBOT * robots),
+        seconds=seconds,
+        rotations=True,
+    )
+    joint = planner.plan(problem)
+    found.append(time.perf_counter())
+    bound = _lower_bound(problem)  # also says which goal has no path
+    if not joint.complete:
+        raise PlanningError(f"no plan was found in {found[-1] - began:.1f} s; try another --seed")
+    return {
+        "robots": robots,
+        "compile_s": round(compile_s, 4),
+        "first_solution_s": round(found[0] - began, 4),
+        "cost": joint.cost,
+        "lower_bound": bound,
+        "makespan": joint.makespan,
+        "paths": _paths(joint),
+    }
+
+
+def _paths(joint: JointPlan) -> list[list[int]]:
+    columns = joint.cells.T.tolist()
+    return [column[: last + 1] for column, last in zip(columns, joint.arrivals.tolist(), strict=True)]
+
+
+def _lower_bound(problem: PlanningProblem) -> int:
+    """Return the sum of the shortest distances.
+
+    Raises:
+        PlanningError: A goal cannot be reached.
+    """
+    total = 0
+    for robot, (start, goal) in enumerate(zip(problem.starts.tolist(), problem.goals.tolist(), strict=True)):
+        distance = int(distance_fields(problem.graph, [goal])[0, start])
+        if distance >= UNREACHABLE:
+            raise PlanningError(f"robot {robot}: no path leads from cell {start} to its goal, cell {goal}")
+        total += distance
+    return total
+
+
+def _lifelong(grid: GridMap, robots: int, steps: int, seed: int) -> dict[str, Any]:
+    """Draw starts and goals and drive; return the report."""
+    began = time.perf_counter()
+    compile_kernels(LIFELONG_KERNELS)
+    compile_s = time.perf_counter() - began
+    cells = np.array(_largest_part(grid), np.int32)
+    if robots >= len(cells):
+        raise PlanningError(f"{robots} robots do not fit: the map has {len(cells)} connected free cells")
+    rng = np.random.default_rng(seed)
+    starts = rng.choice(cells, robots, replace=False)
+
+    def next_goal(_: int, before: int) -> int:
+        goal = before
+        while goal == before:
+            goal = int(rng.choice(cells))
+        return goal
+
+    began = time.perf_counter()
+    planner = LifelongPlanner(
+        PlanningGraph.from_grid(grid), starts, next_goal, seed=seed, settings=LifelongSettings()
+    )
+    rows = [planner.cells]
+    first_s = 0.0
+    for _ in range(steps):
+        planner.step()
+        rows.append(planner.cells)
+        first_s = first_s or time.perf_counter() - began
+    tasks = sum(map(len, planner.goals))
+    return {
+        "robots": robots,
+        "compile_s": round(compile_s, 4),
+        "first_solution_s": round(first_s, 4),
+        "seconds_per_step": round((time.perf_counter() - began) / steps, 4),
+        "tasks": tasks,
+        "tasks_per_step": tasks / steps,
+        "goals": planner.goals,
+        "paths": np.stack(rows, axis=1).tolist(),
+    }
+
+
+def _largest_part(grid: GridMap) -> list[int]:
+    """Return the cells of the largest connected part of the map."""
+    rest = set(grid.free)
+    largest: set[int] = set()
+    while len(rest) > len(largest):
+        part = grid.reachable(next(iter(rest)))
+        rest -= part
+        largest = max(largest, part, key=len)
+    return sorted(largest)
+
+
+@contextmanager
+def _errors() -> Iterator[None]:
+    """Print errors of the input as one line, and end with code 1."""
+    try:
+        yield
+    except (FleetError, OSError) as error:
+        typer.echo(f"rce plan: {error}", err=True)
+        sys.exit(1)

@@ -1,0 +1,1 @@
+"""What reaches robots without the planner: emergency stops, velocities by hand, initial poses."""

@@ -1,0 +1,87 @@
+"""Driving a robot by hand: what stops it when a key is released, or when frames are missing or late. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from math import isfinite
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+DEAD_S = 0.4
+"""Without a frame for this time the robot stops."""
+LATE_S = 0.35
+"""A frame that took this much longer than the fastest one stops the robot."""
+ROUND_TRIP_S = 0.6
+"""A round trip longer than this stops the robot."""
+WINDOW = 200
+"""Frames of which the fastest one is known."""
+MAX_SPEED = 0.5
+"""Metres per second."""
+MAX_TURN_RATE = 1.2
+"""Radians per second."""
+
+
+class DriveFrame(BaseModel):
+    """A frame of the page; it sends ten or more in a second while an operator drives."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    number: Annotated[int, Field(ge=0, le=1 << 53)]
+    sent: Annotated[float, Field(description="The page's clock, seconds.")]
+    held: Annotated[bool, Field(description="Whether the operator holds the dead-man's switch.")]
+    speed: Annotated[float, Field(description="Metres per second, forward.")] = 0.0
+    turn_rate: Annotated[float, Field(description="Radians per second, counter-clockwise.")] = 0.0
+    round_trip: Annotated[float, Field(ge=0, description="Of the last answered frame, seconds.")] = 0.0
+
+
+class DriveGuard:
+    """Decides what a robot that is driven by hand does.
+
+    Attributes:
+        reason: Why it stands; empty while it may drive.
+    """
+
+    def __init__(self) -> None:
+        self.reason = "waiting for the dead-man's switch"
+        self._delays: deque[float] = deque(maxlen=WINDOW)
+        self._number = -1
+        self._at = float("-inf")
+
+    def take(self, frame: DriveFrame, now: float) -> tuple[float, float]:
+        """Handle a frame; return the speed and the turn rate to send, metres and radians per second.
+
+        Args:
+            frame: The frame.
+            now: The station's clock, seconds.
+        """
+        if frame.number <= self._number:
+            return self._stand("a frame came out of order")
+        self._number, self._at = frame.number, now
+        delay = now - frame.sent
+        self._delays.append(delay)
+        if delay - min(self._delays) > LATE_S:
+            return self._stand("frames are late")
+        if frame.round_trip > ROUND_TRIP_S:
+            return self._stand(f"a round trip takes {frame.round_trip:.1f} s")
+        if not frame.held:
+            return self._stand("the dead-man's switch is released")
+        if not (isfinite(frame.speed) and isfinite(frame.turn_rate)):
+            return self._stand("the frame has no velocity")
+        self.reason = ""
+        return _clip(frame.speed, MAX_SPEED), _clip(frame.turn_rate, MAX_TURN_RATE)
+
+    def check(self, now: float) -> bool:
+        """Return whether the robot must stop because no frame came for :data:`DEAD_S`."""
+        if now - self._at < DEAD_S:
+            return False
+        self._stand("no frame came")
+        return True
+
+    def _stand(self, reason: str) -> tuple[float, float]:
+        self.reason = reason
+        return 0.0, 0.0
+
+
+def _clip(value: float, limit: float) -> float:
+    return max(-limit, min(limit, value))

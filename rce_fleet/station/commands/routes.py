@@ -1,0 +1,243 @@
+"""The routes of what reaches robots without the planner: emergency stop, initial pose, driving by hand."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Literal
+
+from aiohttp import WSMsgType, web
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from rce.aio.tasks import cancel_and_wait
+from rce.web.bodies import read_whole
+from rce.web.routes import Route, RouteTable
+from rce_fleet.station.access import USER, AccessControl, problem
+from rce_fleet.station.api import Answer
+from rce_fleet.station.commands.driving import DEAD_S, DriveFrame, DriveGuard
+from rce_fleet.station.commands.kinds import VELOCITY, velocity_message
+from rce_fleet.station.commands.sources import CommandError
+from rce_fleet.station.planner_client import PlannerError
+
+if TYPE_CHECKING:
+    from rce_fleet.station.commands.control import RobotControl
+    from rce_fleet.station.commands.sources import CommandSender
+    from rce_fleet.station.fleet_link import FleetLink
+
+MAX_FRAME = 1 << 12
+_ERRORS = (400, 401, 403, 404, 408, 409, 413, 421, 503)
+
+Method = Callable[["ControlRoutes", web.Request], Awaitable[web.StreamResponse]]
+ROUTES: RouteTable[Route[Method]] = RouteTable("fleet", Route)
+"""Routes that do not need the planner."""
+
+
+class StopRequest(BaseModel):
+    """An emergency stop."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    stopped: bool = Field(description="True: stand at once; false: release.")
+
+
+class ModeRequest(BaseModel):
+    """Whether the fleet drives."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    mode: Literal["automatic", "paused"] = Field(description="paused: robots get no new cells and stand.")
+    reason: str = Field(default="", max_length=500)
+
+
+class PoseRequest(BaseModel):
+    """Where a robot is, for its localization."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    x: float = Field(description="Metres, in the map frame.", ge=-1e6, le=1e6)
+    y: float = Field(description="Metres.", ge=-1e6, le=1e6)
+    yaw: float = Field(default=0.0, description="Radians, counter-clockwise from x.", ge=-10, le=10)
+
+
+class ControlRoutes:
+    """Handlers of these routes.
+
+    Args:
+        control: Reaches the robots; None: this station cannot.
+        fleet: Tells the planner which robot is driven by hand.
+        access: Checks what users may do.
+    """
+
+    def __init__(self, control: RobotControl | None, fleet: FleetLink, access: AccessControl) -> None:
+        self._control = control
+        self._fleet = fleet
+        self._access = access
+
+    @ROUTES.route(
+        "PUT",
+        "/emergency-stop",
+        "Stop all robots at once, or release them; works without the planner",
+        body=StopRequest,
+        reply=Answer,
+        errors=_ERRORS,
+    )
+    async def stop_all(self, request: web.Request) -> web.StreamResponse:
+        """Stop or release all robots."""
+        return await self._stop(request, None)
+
+    @ROUTES.route(
+        "PUT",
+        "/robots/{robot}/emergency-stop",
+        "Stop a robot at once, or release it; works without the planner",
+        body=StopRequest,
+        reply=Answer,
+        errors=_ERRORS,
+    )
+    async def stop_one(self, request: web.Request) -> web.StreamResponse:
+        """Stop or release a robot."""
+        return await self._stop(request, request.match_info["robot"])
+
+    async def _stop(self, request: web.Request, robot: str | None) -> web.StreamResponse:
+        subject = robot or "all robots"
+        refusal = self._access.control_refusal(request, "emergency_stop", subject)
+        if refusal is not None:
+            return refusal
+        asked = StopRequest.model_validate_json(await read_whole(request))
+        if self._control is None:
+            return problem(409, "this station cannot reach robots")
+        robots = None if robot is None else [robot]
+        result = await self._control.emergency_stop(robots, request[USER].name, stopped=asked.stopped)
+        done = bool(result.reached) and not result.missed
+        name = "emergency_stop" if asked.stopped else "release_emergency_stop"
+        self._access.audit(request, name, subject, result.text, done=done)
+        if not done and not (robot is None and result.reached):
+            return problem(409, result.text if result.missed else "no robot is known")
+        return _reply(Answer(message=f"{'stopped' if asked.stopped else 'released'}: {result.text}"))
+
+    @ROUTES.route(
+        "PUT",
+        "/robots/{robot}/pose",
+        "Tell a robot's localization where the robot is",
+        body=PoseRequest,
+        reply=Answer,
+        errors=_ERRORS,
+    )
+    async def put_pose(self, request: web.Request) -> web.StreamResponse:
+        """Set a robot's initial pose."""
+        robot = request.match_info["robot"]
+        refusal = self._access.control_refusal(request, "set_pose", robot)
+        if refusal is not None:
+            return refusal
+        asked = PoseRequest.model_validate_json(await read_whole(request))
+        if self._control is None:
+            return problem(409, "this station cannot reach robots")
+        try:
+            await self._control.set_pose(robot, asked.x, asked.y, asked.yaw)
+        except CommandError as error:
+            return problem(409, str(error))
+        self._access.audit(request, "set_pose", robot, f"x {asked.x:g}, y {asked.y:g}, yaw {asked.yaw:g}")
+        return _reply(Answer(message=f"{robot} is told that it is at ({asked.x:.2f}, {asked.y:.2f})"))
+
+    @ROUTES.route(
+        "PUT",
+        "/mode",
+        "Pause the fleet, or let it drive again",
+        body=ModeRequest,
+        reply=Answer,
+        errors=_ERRORS,
+    )
+    async def put_mode(self, request: web.Request) -> web.StreamResponse:
+        """Set the fleet's mode."""
+        refusal = self._access.control_refusal(request, "set_mode", "fleet")
+        if refusal is not None:
+            return refusal
+        asked = ModeRequest.model_validate_json(await read_whole(request))
+        message = await self._fleet.set_mode("", asked.mode, reason=asked.reason, user=request[USER].name)
+        self._access.audit(request, "set_mode", "fleet", asked.mode)
+        return _reply(Answer(message=message))
+
+    # Driving by hand
+
+    async def drive(self, request: web.Request) -> web.StreamResponse:
+        """Let a page drive a robot over a WebSocket, until it disconnects.
+
+        The page sends frames (:class:`DriveFrame`) and gets an answer to each: its number, what the robot was
+        told, and why it stands. The robot stops if no frame comes for 0.4 s.
+        """
+        robot = request.match_info["robot"]
+        refusal = self._access.control_refusal(request, "drive", robot)
+        if refusal is not None:
+            return refusal
+        control = self._control
+        if control is None:
+            return problem(409, "this station cannot reach robots")
+        socket = web.WebSocketResponse(heartbeat=5.0, compress=False, max_msg_size=MAX_FRAME)
+        await socket.prepare(request)
+        user = request[USER].name
+        if not control.begin_driving(robot, user):
+            await _refuse(socket, f"{robot} is driven by {control.driven[robot]}")
+            return socket
+        sender = None
+        try:
+            await self._set_manual(robot, user, manual=True)
+            sender = await control.open(robot, VELOCITY)
+            self._access.audit(request, "drive", robot, "begin")
+            await _drive(socket, sender)
+        except (CommandError, PlannerError) as error:
+            await _refuse(socket, str(error))
+        finally:
+            control.end_driving(robot)
+            if sender is not None:
+                sender.send(velocity_message(0.0, 0.0))
+                await sender.close()
+                self._access.audit(request, "drive", robot, "end")
+            with contextlib.suppress(PlannerError):
+                await self._set_manual(robot, user, manual=False)
+        return socket
+
+    async def _set_manual(self, robot: str, user: str, *, manual: bool) -> None:
+        mode = "manual" if manual else "automatic"
+        await self._fleet.set_mode(robot, mode, reason=f"driven by {user}" if manual else "", user=user)
+
+
+async def _drive(socket: web.WebSocketResponse, sender: CommandSender) -> None:
+    """Pass frames on until the page leaves."""
+    guard, loop = DriveGuard(), asyncio.get_running_loop()
+
+    async def watch() -> None:
+        while True:
+            await asyncio.sleep(DEAD_S / 4)
+            if guard.check(loop.time()):
+                sender.send(velocity_message(0.0, 0.0))
+
+    watcher = asyncio.create_task(watch())
+    try:
+        async for message in socket:
+            if message.type is not WSMsgType.TEXT:
+                break
+            try:
+                frame = DriveFrame.model_validate_json(message.data)
+            except ValidationError as error:
+                sender.send(velocity_message(0.0, 0.0))
+                await _refuse(socket, f"not a frame: {error.errors()[0]['msg']}")
+                break
+            speed, turn_rate = guard.take(frame, loop.time())
+            sender.send(velocity_message(speed, turn_rate))
+            answer = {"number": frame.number, "speed": speed, "turn_rate": turn_rate, "reason": guard.reason}
+            await socket.send_str(json.dumps(answer))
+    except ConnectionError:
+        pass  # the page left while it was answered
+    finally:
+        await cancel_and_wait(watcher)
+
+
+async def _refuse(socket: web.WebSocketResponse, text: str) -> None:
+    with contextlib.suppress(ConnectionError):
+        await socket.send_str(json.dumps({"error": text}))
+        await socket.close()
+
+
+def _reply(model: BaseModel) -> web.Response:
+    return web.Response(text=model.model_dump_json(), content_type="application/json")

@@ -1,0 +1,214 @@
+"""Ways to publish on robots' topics: through the engine, or in ROS graphs."""
+
+from __future__ import annotations
+
+import asyncio
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable
+from contextlib import AsyncExitStack, suppress
+from typing import TYPE_CHECKING, Any
+
+from rce_client.exceptions import ClientError
+
+if TYPE_CHECKING:
+    from rce.ros.node import Publisher as RosPublisher
+    from rce_client.connection import Connection
+    from rce_client.topics import Publisher
+    from rce_fleet.station.commands.kinds import RobotCommand
+    from rce_fleet.station.layers.ros_source import RosLayerSource
+
+CONNECT_S = 3.0
+"""How long a robot's topic is awaited."""
+POLL_S = 0.05
+KEEP_S = 1.0
+"""How long the master's answer is kept."""
+
+ReadItems = Callable[[str], Awaitable[list[dict[str, Any]]]]
+
+
+class CommandError(Exception):
+    """A robot cannot be reached; the text says what is missing."""
+
+
+class CommandSender(ABC):
+    """Publishes on one topic of one robot."""
+
+    @abstractmethod
+    def send(self, message: dict[str, Any]) -> None:
+        """Publish a message in its JSON form; it never waits."""
+
+    @property
+    @abstractmethod
+    def is_connected(self) -> bool:
+        """Whether the robot gets messages now."""
+
+    @abstractmethod
+    async def repair(self) -> None:
+        """Connect again if the robot was away: one that restarts removes its interfaces.
+
+        Raises:
+            CommandError: The robot does not offer the topic now.
+        """
+
+    @abstractmethod
+    async def close(self) -> None:
+        """Stop publishing."""
+
+    async def wait_connected(self, timeout: float = CONNECT_S) -> bool:
+        """Wait until the robot gets messages; return whether it does.
+
+        Args:
+            timeout: Seconds.
+        """
+        for _ in range(round(timeout / POLL_S)):
+            if self.is_connected:
+                break
+            await asyncio.sleep(POLL_S)
+        return self.is_connected
+
+
+class CommandSource(ABC):
+    """Gives senders for robots' topics."""
+
+    @abstractmethod
+    async def open(self, robot: str, command: RobotCommand) -> CommandSender:
+        """Begin to publish on a topic of a robot.
+
+        Raises:
+            CommandError: The robot does not offer the topic, or engine or graph cannot be reached.
+        """
+
+
+class EngineCommandSource(CommandSource):
+    """Connects interfaces named ``command_ROBOT_KEY`` of robots.
+
+    Args:
+        connection: Returns the station's connection; None while there is none.
+        read_items: Reads the user's items of a kind from the master.
+    """
+
+    def __init__(self, connection: Callable[[], Connection | None], read_items: ReadItems) -> None:
+        self._connection = connection
+        self._read_items = read_items
+        self._offers: dict[str, set[str]] = {}
+        """Endpoints with an interface, by its tag."""
+        self._read_at = float("-inf")
+
+    async def open(self, robot: str, command: RobotCommand) -> CommandSender:
+        """Connect the station's interface to the robot's."""
+        connection = self._connection()
+        if connection is None:
+            raise CommandError("the engine is not connected")
+        tag = command.interface_tag(robot)
+        endpoints = await self.find(tag, f"{robot} does not offer {command.topic}")
+        try:
+            publisher: Publisher[dict[str, Any]] = await connection.publisher(tag, command.type_name)
+        except ClientError as error:
+            raise CommandError(f"the engine cannot be reached: {error}") from error
+        sender = _EngineSender(self, connection, publisher, latch="1" if command.is_latched else "")
+        await sender.connect(endpoints)
+        return sender
+
+    async def find(self, tag: str, otherwise: str) -> set[str]:
+        """Return the robots that have an interface. What the master says is kept for a second.
+
+        Raises:
+            CommandError: There is none; the text begins with ``otherwise``.
+        """
+        connection, now = self._connection(), asyncio.get_running_loop().time()
+        if now - self._read_at > KEEP_S:
+            try:
+                items = await self._read_items("interfaces")
+            except Exception as error:
+                raise CommandError(f"the engine does not say what robots offer: {error}") from error
+            self._read_at = now
+            self._offers = {}
+            for item in items:
+                self._offers.setdefault(item["tag"], set()).add(str(item["endpoint"]))
+        own = "" if connection is None else connection.robot_id
+        found = self._offers.get(tag, set()) - {own}
+        if not found:
+            raise CommandError(f"{otherwise}: no interface {tag} exists")
+        return found
+
+
+class _EngineSender(CommandSender):
+    def __init__(
+        self,
+        source: EngineCommandSource,
+        connection: Connection,
+        publisher: Publisher[dict[str, Any]],
+        *,
+        latch: str,
+    ) -> None:
+        self._source = source
+        self._connection = connection
+        self._publisher = publisher
+        self._latch = latch
+
+    async def connect(self, endpoints: set[str]) -> None:
+        tag = self._publisher.tag
+        try:
+            for endpoint in endpoints:
+                await self._connection.connect(f"{self._connection.robot_id}/{tag}", f"{endpoint}/{tag}")
+        except ClientError as error:
+            raise CommandError(f"the engine cannot be reached: {error}") from error
+
+    async def repair(self) -> None:
+        if not self.is_connected:
+            await self.connect(await self._source.find(self._publisher.tag, "the robot is away"))
+
+    def send(self, message: dict[str, Any]) -> None:
+        self._publisher.publish(message, latch=self._latch)
+
+    @property
+    def is_connected(self) -> bool:
+        return self._connection.is_active(self._publisher.tag)
+
+    async def close(self) -> None:
+        with suppress(ClientError):
+            await self._publisher.close()
+
+
+class RosCommandSource(CommandSource):
+    """Publishes in the planner's graph, or in the robot's own if discovery knows one.
+
+    Args:
+        graphs: Joins robots' graphs.
+    """
+
+    def __init__(self, graphs: RosLayerSource) -> None:
+        self._graphs = graphs
+
+    async def open(self, robot: str, command: RobotCommand) -> CommandSender:
+        """Advertise the topic in the robot's graph."""
+        stack = AsyncExitStack()
+        try:
+            node, namespace = await stack.enter_async_context(self._graphs.graph_of(robot))
+            publisher = await node.advertise(
+                f"{namespace}{command.topic}", command.type_name, latch=command.is_latched, queue_size=1
+            )
+        except Exception as error:
+            await stack.aclose()
+            raise CommandError(f"the ROS graph of {robot} cannot be reached: {error}") from error
+        stack.push_async_callback(publisher.close)
+        return _RosSender(publisher, stack)
+
+
+class _RosSender(CommandSender):
+    def __init__(self, publisher: RosPublisher, stack: AsyncExitStack) -> None:
+        self._publisher = publisher
+        self._stack = stack
+
+    def send(self, message: dict[str, Any]) -> None:
+        self._publisher.publish(message)
+
+    @property
+    def is_connected(self) -> bool:
+        return self._publisher.connections > 0
+
+    async def repair(self) -> None:
+        """Leave it to the ROS graph: subscribers find the topic by themselves."""
+
+    async def close(self) -> None:
+        await self._stack.aclose()

@@ -1,0 +1,163 @@
+"""Events over HTTP: pages of JSON, server-sent events, and the history as CSV."""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import io
+import json
+import re
+from collections.abc import Awaitable, Callable
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from aiohttp import hdrs, web
+
+from rce_fleet.exceptions import EventsRestartedError
+from rce_fleet.station.access import USER, problem
+from rce_fleet.station.events import EventCursor, EventFeed
+from rce_fleet.station.planner_client import PlannerUnavailableError
+
+if TYPE_CHECKING:
+    from rce_fleet.station.access import AccessControl
+    from rce_fleet.station.fleet_requests import FleetRequests
+
+EVENT_STREAM, CSV = "text/event-stream", "text/csv"
+MAX_STREAMS = 100
+"""Open streams of events at one station."""
+AWAY_S = 2.0
+MAX_ROWS = 1_000_000
+_PAGE = 1000
+_DIGITS = 18
+_ID = re.compile(r"(?:([0-9a-f]{1,32}):)?([0-9]{1,18})")
+"""The id of a server-sent event: the journal and the number; a number alone is of any journal."""
+COLUMNS = ("number", "time", "kind", "id", "name", "state", "robot", "user", "text", "revision")
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""Beginnings of a text that spreadsheets take for a formula."""
+
+Work = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class EventStreams:
+    """Handlers of ``/events`` and ``/history``.
+
+    Args:
+        requests: Asks the manager.
+        feed: The newest events.
+        access: Ends streams of users whose login has ended.
+    """
+
+    def __init__(self, requests: FleetRequests, feed: EventFeed, access: AccessControl) -> None:
+        self._requests = requests
+        self._feed = feed
+        self._access = access
+        self._open = 0
+
+    async def events(self, request: web.Request) -> web.StreamResponse:
+        """Return events after a number; with ``Accept: text/event-stream``, follow them."""
+        if EVENT_STREAM not in request.headers.get(hdrs.ACCEPT, ""):
+            return await self._requests.handle(request, "")
+        last = request.headers.get("Last-Event-ID") or request.query.get("after", "")
+        found = _ID.fullmatch(last)
+        if last and found is None:
+            return problem(422, f"Last-Event-ID must be the id or number of an event, not {last[:40]!r}")
+        journal, number = (found[1] or "", int(found[2])) if found else ("", None)
+        if self._open >= MAX_STREAMS:
+            return problem(
+                429, f"{MAX_STREAMS} streams of events are open; close some", {"Retry-After": "10"}
+            )
+        self._open += 1
+        try:
+            return await self._follow(request, EventCursor(self._feed, number, journal))
+        finally:
+            self._open -= 1
+
+    async def _follow(self, request: web.Request, cursor: EventCursor) -> web.StreamResponse:
+        headers = {hdrs.CONTENT_TYPE: EVENT_STREAM, hdrs.CACHE_CONTROL: "no-store", "X-Accel-Buffering": "no"}
+        response = web.StreamResponse(headers=headers)
+        await response.prepare(request)
+        try:
+            await response.write(b"retry: 2000\n\n")
+            while True:
+                frames = await _next_frames(cursor)
+                if not await self._access.is_still_allowed(request):
+                    await response.write(b": your login has ended; log in again\n\n")
+                    return response
+                await response.write("".join(frames or [": no event\n\n"]).encode())
+        except ConnectionError:
+            return response
+
+    async def history(self, request: web.Request) -> web.StreamResponse:
+        """Return events of a time as JSON, or all of them as CSV."""
+        wanted = request.query.get("format", "csv" if CSV in request.headers.get(hdrs.ACCEPT, "") else "json")
+        if wanted == "json":
+            return await self._requests.handle(request, "")
+        if wanted != "csv":
+            return problem(422, f"format must be json or csv, not {wanted[:40]!r}")
+        url = request.rel_url.without_query_params("token", "format", "limit")
+        first = url.query.get("after", "0")
+        if not (first.isdecimal() and len(first) <= _DIGITS):
+            return problem(422, f"after must be the number of an event, not {first[:40]!r}")
+        after = int(first)
+        response: web.StreamResponse | None = None
+        for _ in range(MAX_ROWS // _PAGE):
+            asked = url.update_query({"after": str(after), "limit": str(_PAGE)})
+            path = f"/history?{asked.raw_query_string}"
+            answer = await self._requests.ask("GET", path, user=request[USER])
+            if answer["status"] != 200:  # noqa: PLR2004
+                if response is not None:
+                    raise ConnectionError("the manager stopped in the middle of the history")
+                return web.Response(
+                    status=int(answer["status"]), text=answer["body"], content_type="application/json"
+                )
+            page = json.loads(answer["body"])
+            if response is None:
+                response = await _begin(request)
+            await response.write(csv_rows(page["events"]).encode())
+            after = page["next"]
+            if len(page["events"]) < _PAGE:
+                break
+        assert response is not None
+        await response.write_eof()
+        return response
+
+
+async def _next_frames(cursor: EventCursor) -> list[str]:
+    """Wait for events; return them as server-sent events, and the event ``gap`` where numbers begin anew."""
+    try:
+        found = await cursor.next()
+    except PlannerUnavailableError:
+        await asyncio.sleep(AWAY_S)
+        return []
+    except EventsRestartedError as error:
+        told = json.dumps({"journal": error.journal, "text": str(error)})
+        return [f"event: gap\nid: {error.journal}:0\ndata: {told}\n\n"]
+    return [f"id: {cursor.journal}:{one['number']}\ndata: {json.dumps(one)}\n\n" for one in found]
+
+
+async def _begin(request: web.Request) -> web.StreamResponse:
+    headers = {
+        hdrs.CONTENT_TYPE: f"{CSV}; charset=utf-8",
+        hdrs.CONTENT_DISPOSITION: 'attachment; filename="history.csv"',
+        hdrs.CACHE_CONTROL: "no-store",
+    }
+    response = web.StreamResponse(headers=headers)
+    await response.prepare(request)
+    await response.write((",".join(COLUMNS) + "\r\n").encode())
+    return response
+
+
+def csv_rows(events: list[dict[str, Any]]) -> str:
+    """Write events as lines of CSV; times as ISO 8601 in UTC, and no text that begins a formula."""
+    lines = io.StringIO()
+    writer = csv.writer(lines)
+    for event in events:
+        writer.writerow([_cell(column, event.get(column, "")) for column in COLUMNS])
+    return lines.getvalue()
+
+
+def _cell(column: str, value: Any) -> str:
+    if column == "time":
+        return datetime.fromtimestamp(float(value), UTC).isoformat(timespec="milliseconds")
+    text = str(value)
+    return f"'{text}" if isinstance(value, str) and text.startswith(_FORMULA) else text

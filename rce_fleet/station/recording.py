@@ -1,0 +1,205 @@
+"""Records what the fleet did, compactly and within a bound, so that the page can replay the last hours.
+
+A record is written for each second in which something changed: poses and states of robots that changed, and
+blocked cells if they did. Every half minute a record is whole. Records are JSON, compressed, in SQLite: in a
+file, which outlives the station, or in memory. The oldest ones are removed to stay within the bound.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import sqlite3
+import threading
+import time
+import zlib
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rce_fleet.station.view import FleetView
+
+_log = logging.getLogger(__name__)
+
+RECORD_EVERY_S = 1.0
+WHOLE_EVERY_S = 30.0
+MAX_BYTES = 256 << 20
+"""Bound of all records, bytes."""
+IN_MEMORY_BYTES = 32 << 20
+"""Bound of records that are in memory only, bytes."""
+FIGURES_LAST_S = 86400.0
+"""Figures that are older are removed, seconds."""
+MOST_FRAMES = 120
+"""Most records in one answer."""
+
+Frame = dict[str, Any]
+
+
+class Records:
+    """The records of a fleet, oldest first.
+
+    Args:
+        file: Where they are kept; None: in memory.
+        limit: Most bytes of all records; None: :data:`MAX_BYTES`, or :data:`IN_MEMORY_BYTES` in memory.
+    """
+
+    def __init__(self, file: Path | None = None, limit: int | None = None) -> None:
+        self._limit = limit or (IN_MEMORY_BYTES if file is None else MAX_BYTES)
+        self._lock = threading.Lock()
+        self._database = sqlite3.connect(str(file or ":memory:"), check_same_thread=False)
+        self._database.execute(
+            "CREATE TABLE IF NOT EXISTS records (time REAL PRIMARY KEY, whole INTEGER, data BLOB)"
+        )
+        self._database.execute("CREATE TABLE IF NOT EXISTS figures (time REAL PRIMARY KEY, data TEXT)")
+        if file is not None:
+            self._database.execute("PRAGMA journal_mode=WAL")
+            self._database.execute("PRAGMA synchronous=NORMAL")
+        ((self._bytes,),) = self._database.execute("SELECT TOTAL(LENGTH(data)) FROM records")
+
+    def add(self, now: float, frame: Frame, *, whole: bool) -> None:
+        """Write a record, and remove the oldest ones that do not fit.
+
+        Args:
+            now: Seconds since 1970.
+            frame: What changed.
+            whole: Whether it is the complete state.
+        """
+        data = zlib.compress(json.dumps(frame, separators=(",", ":")).encode(), 6)
+        with self._lock, self._database:
+            self._database.execute("INSERT OR REPLACE INTO records VALUES (?, ?, ?)", (now, whole, data))
+            self._bytes += len(data)
+            while self._bytes > self._limit:
+                removed = self._database.execute(
+                    "DELETE FROM records WHERE time IN (SELECT time FROM records ORDER BY time LIMIT 50)"
+                    " RETURNING LENGTH(data)"
+                ).fetchall()
+                self._bytes -= sum(length for (length,) in removed)
+
+    def add_figures(self, now: float, figures: dict[str, float]) -> None:
+        """Write figures of the fleet, seconds since 1970; remove those of yesterday."""
+        with self._lock, self._database:
+            self._database.execute("INSERT OR REPLACE INTO figures VALUES (?, ?)", (now, json.dumps(figures)))
+            self._database.execute("DELETE FROM figures WHERE time < ?", (now - FIGURES_LAST_S,))
+
+    def figures(self, since: float) -> list[tuple[float, dict[str, float]]]:
+        """Return the figures from a time on, seconds since 1970, the oldest first."""
+        query = "SELECT time, data FROM figures WHERE time >= ? ORDER BY time"
+        with self._lock:
+            rows = self._database.execute(query, (since,)).fetchall()
+        return [(moment, json.loads(data)) for moment, data in rows]
+
+    def range(self) -> tuple[float, float] | None:
+        """Return the times of the first and the last record, seconds since 1970; None if there is none."""
+        with self._lock:
+            ((first, last),) = self._database.execute("SELECT MIN(time), MAX(time) FROM records")
+        return None if first is None else (first, last)
+
+    def read(self, at: float, seconds: float) -> list[Frame]:
+        """Return the state at a time, and what changed after it.
+
+        Args:
+            at: Seconds since 1970; before the first record, that is the first state.
+            seconds: How much time to return.
+
+        Returns:
+            Frames with ``time``; the first one is whole. Empty if nothing is recorded.
+        """
+        ((start,),) = self._database.execute("SELECT MAX(time) FROM records WHERE whole AND time <= ?", (at,))
+        if start is None:
+            ((start,),) = self._database.execute("SELECT MIN(time) FROM records WHERE whole")
+        if start is None:
+            return []
+        at = max(at, start)
+        whole: Frame = {"time": at, "robots": {}, "blocked": [], "pending": []}
+        later: list[Frame] = []
+        for moment, frame in self._between(start, at + seconds):
+            if moment <= at:
+                _merge(whole, frame)
+            elif len(later) < MOST_FRAMES:
+                later.append({"time": moment, **frame})
+        return [whole, *later]
+
+    def _between(self, first: float, last: float) -> Iterator[tuple[float, Frame]]:
+        query = "SELECT time, data FROM records WHERE time BETWEEN ? AND ? ORDER BY time"
+        with closing(self._database.execute(query, (first, last))) as rows:
+            for moment, data in rows:
+                yield moment, json.loads(zlib.decompress(data))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._database.close()
+
+
+def _merge(state: Frame, frame: Frame) -> None:
+    """Apply a record to a complete state."""
+    if frame.get("whole"):
+        state["robots"] = {}
+    state["robots"].update(frame["robots"])
+    for robot in frame.get("removed", ()):
+        state["robots"].pop(robot, None)
+    state |= {key: frame[key] for key in ("blocked", "pending") if key in frame}
+
+
+class Recorder:
+    """Records a fleet's view.
+
+    Args:
+        view: What is recorded.
+        records: Where.
+    """
+
+    def __init__(self, view: FleetView, records: Records) -> None:
+        self.records = records
+        self._view = view
+        self._last: dict[str, list[Any]] = {}
+        self._cells: dict[str, list[int]] = {}
+        self._whole_at = float("-inf")
+
+    async def run(self) -> None:
+        """Write records until cancelled. A full disk ends the recording, not the station."""
+        while True:
+            await asyncio.sleep(RECORD_EVERY_S)
+            made = self.take(time.time())
+            if made is None:
+                continue
+            now, frame, whole = made
+            try:
+                await asyncio.to_thread(self.records.add, now, frame, whole=whole)
+            except sqlite3.Error as error:
+                _log.warning("the recording for replays has ended: %s", error)
+                return
+
+    def take(self, now: float) -> tuple[float, Frame, bool] | None:
+        """Return the record of this moment, and whether it is whole; None if nothing changed.
+
+        Args:
+            now: Seconds since 1970.
+        """
+        if self._view.map() is None:
+            return None
+        whole = now - self._whole_at >= WHOLE_EVERY_S
+        robots = {robot["id"]: self._row(robot) for robot in self._view.robots()}
+        cells = {"blocked": self._view.blocked(), "pending": self._view.pending()}
+        frame: Frame = {
+            "robots": robots
+            if whole
+            else {robot: row for robot, row in robots.items() if self._last.get(robot) != row}
+        }
+        if gone := sorted(self._last.keys() - robots.keys()):
+            frame["removed"] = gone
+        if whole or cells != self._cells:
+            frame |= cells
+        if whole:
+            frame["whole"] = True
+            self._whole_at = now
+        self._last, self._cells = robots, cells
+        return (now, frame, whole) if whole or len(frame) > 1 or frame["robots"] else None
+
+    def _row(self, robot: dict[str, Any]) -> list[Any]:
+        """Return x, y (metres), yaw (radians), state, cell, goal and the last granted cell."""
+        pose = robot["pose"]
+        place = [None] * 3 if pose is None else [round(pose[key], 2) for key in ("x", "y", "theta")]
+        return [*place, robot["state"], robot["cell"], robot["goal"], robot["granted"][-1:]]

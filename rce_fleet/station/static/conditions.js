@@ -1,0 +1,69 @@
+// What needs the operator: which robots are in trouble, and how badly. Independent of the screen.
+
+import { t } from "./texts.js";
+
+export const LOW_BATTERY = 0.2;
+export const OFFLINE_S = 5;
+const STUCK_S = 60;
+
+// Marks on the map; each has a shape of its own.
+export const MARK = { none: 0, trouble: 1, offline: 2, manual: 3, stopped: 4, lost: 5 };
+
+export const TROUBLE = new Set(["unreachable", "silent", "lost", "dead"]);
+
+// Answers that the fleet manager gives; without one they are not offered.
+const NEEDS_MANAGER = new Set(["pause", "resume", "takeOut", "putIn", "charge", "reassign", "raise"]);
+
+export function isPossible(answer, fleet) {
+  return fleet.manager || !NEEDS_MANAGER.has(answer);
+}
+
+// The planner hears these: one that gives it no sign of life for a few seconds is "silent".
+const HEARD = new Set(["driving", "waiting", "arrived", "idle", "unreachable", "lost"]);
+
+// Seconds since the last sign of life; null if there was none. The planner tells it with the poses, every two seconds
+// at least. Of one that does not, only the time of the last pose is known, which a robot that stands does not send.
+export function heartbeatAge(robot, now = performance.now()) {
+  if (robot.heard !== null && robot.heard !== undefined) return Math.max(0, (now - robot.heard) / 1000);
+  if (HEARD.has(robot.state)) return 0;
+  return robot.seen === null || robot.seen === undefined ? null : (now - robot.seen) / 1000;
+}
+
+export function markOf(robot) {
+  if (robot.emergency) return MARK.stopped;
+  if (robot.state === "silent" || robot.state === "offline") return MARK.offline;
+  if (robot.mode === "manual" || robot.driver) return MARK.manual;
+  if (robot.state === "lost") return MARK.lost;
+  return TROUBLE.has(robot.state) ? MARK.trouble : MARK.none;
+}
+
+// All that is wrong with a robot, worst first: {kind, severity (3 is worst), text}.
+export function conditionsOf(robot, now = performance.now()) {
+  const found = [];
+  const add = (kind, severity, text) => found.push({ kind, severity, text });
+  const age = heartbeatAge(robot, now);
+  if (robot.emergency) add("emergency", 3, t("condition.emergency", { user: robot.emergency }));
+  if (robot.state === "silent") add("offline", 3, [robot.reason || t("condition.silent"), age !== null && t("condition.offline", { seconds: Math.round(age) })].filter(Boolean).join("; "));
+  else if (age !== null && age > OFFLINE_S && robot.state !== "joining" && !HEARD.has(robot.state)) add("offline", 2, t("condition.offline", { seconds: Math.round(age) }));
+  if (robot.state === "unreachable") add("stuck", 3, robot.reason || t("condition.unreachable", { cell: robot.goal ?? "?" }));
+  if (robot.waitingSince !== null && robot.waitingSince !== undefined) {
+    const waited = (now - robot.waitingSince) / 1000;
+    if (waited > STUCK_S) add("stuck", 2, t("condition.waiting", { seconds: Math.round(waited) }));
+  }
+  if (robot.state === "lost") add("lost", 3, robot.reason || t("condition.lost"));
+  if (Number.isFinite(robot.battery) && robot.battery < LOW_BATTERY) {
+    add("battery", robot.battery < LOW_BATTERY / 2 ? 3 : 2, t("condition.battery", { percent: Math.round(100 * robot.battery) }));
+  }
+  if (robot.deadlineAtRisk) add("deadline", 2, t("condition.deadline", { task: robot.deadlineAtRisk }));
+  return found.sort((a, b) => b.severity - a.severity);
+}
+
+// The fleet's exceptions: {robot, conditions}, worst first.
+export function exceptionsOf(robots, now = performance.now()) {
+  const found = [];
+  for (const robot of robots) {
+    const conditions = conditionsOf(robot, now);
+    if (conditions.length) found.push({ robot, conditions });
+  }
+  return found.sort((a, b) => b.conditions[0].severity - a.conditions[0].severity || a.robot.id.localeCompare(b.robot.id, "en", { numeric: true }));
+}

@@ -1,0 +1,57 @@
+// The WebSocket to the station: it comes back after a loss, and tells what it brought.
+
+import { Fleet } from "./model.js";
+
+const LOGIN_ENDED = 1008;
+const LONGEST_MS = 8000;
+
+export class Connection {
+  traffic = { messages: 0, bytes: 0, spent_ms: 0 }; // for measurements
+  #socket = null;
+
+  // onLink: (whether it is live) => shows it
+  constructor(fleet, layers, onLink) {
+    this.fleet = fleet;
+    this.layers = layers;
+    this.onLink = onLink;
+  }
+
+  send(message) {
+    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(message));
+  }
+
+  open(delay = 500) {
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    const socket = new WebSocket(`${scheme}://${location.host}/api/v1/live?changes=1&frames=1`);
+    socket.binaryType = "arraybuffer";
+    this.#socket = socket;
+    let opened = false;
+    socket.addEventListener("open", () => {
+      opened = true;
+      this.onLink(true);
+      this.layers.request();
+    });
+    socket.addEventListener("message", ({ data }) => {
+      const started = performance.now();
+      this.#take(data, socket);
+      this.traffic.messages++;
+      this.traffic.bytes += data.byteLength ?? data.length;
+      this.traffic.spent_ms += performance.now() - started;
+    });
+    socket.addEventListener("close", ({ code }) => {
+      if (code === LOGIN_ENDED) return location.replace("/login");
+      this.onLink(false);
+      setTimeout(() => this.open(opened ? 500 : Math.min(2 * delay, LONGEST_MS)), delay * (0.5 + Math.random()));
+    });
+  }
+
+  #take(data, socket) {
+    const { fleet, layers } = this;
+    if (data instanceof ArrayBuffer) return Fleet.isFrame(data) ? fleet.applyFrame(data) : layers.takeFrame(data);
+    const received = JSON.parse(data);
+    if (received.type === "layer") return layers.take(received);
+    fleet.apply(received);
+    // A change is missing; the next connection begins with the complete state.
+    if (received.type === "changes" && fleet.isBehind) socket.close();
+  }
+}

@@ -1,0 +1,46 @@
+// The selected robot: its state, and what can be done with it.
+
+import { element } from "./engine.js";
+import { heartbeatAge, isPossible } from "./conditions.js";
+import { t } from "./texts.js";
+
+const ANSWERS = ["drive", "localize", "charge", "reassign", "cancel"];
+
+export class RobotCard {
+  steers = true;
+
+  constructor(fleet, answer) {
+    this.fleet = fleet;
+    this.answer = answer;
+    this.box = document.querySelector("#robot-card");
+    for (const type of ["selected", "state", "changes", "control", "manager"]) fleet.addEventListener(type, () => this.draw());
+    setInterval(() => this.draw(), 1000);
+  }
+
+  draw() {
+    const robot = this.fleet.robots.get(this.fleet.selected);
+    this.box.hidden = !robot || !this.steers;
+    if (this.box.hidden) return;
+    const paused = robot.activity === "paused" || robot.mode === "paused";
+    const out = robot.activity === "out" || robot.mode === "out_of_service";
+    const names = [robot.emergency ? "release" : "stop", paused ? "resume" : "pause", out ? "putIn" : "takeOut", ...ANSWERS].filter((name) => isPossible(name, this.fleet));
+    const key = [robot.id, ...names].join();
+    if (key !== this.key) {
+      this.key = key;
+      this.title = element("h3", robot.id);
+      this.text = element("p", "", "quiet");
+      const row = element("div", "", "answers");
+      for (const name of names) {
+        const button = element("button", t(`action.${name}`), name === "stop" ? "stop" : "");
+        button.type = "button";
+        button.addEventListener("click", () => this.answer(name, robot.id));
+        row.append(button);
+      }
+      this.box.replaceChildren(this.title, this.text, row);
+    }
+    const age = heartbeatAge(robot);
+    const parts = [robot.activity ?? robot.state, robot.reason, robot.task && `${robot.task}`, robot.loads && t("robot.loads", { count: robot.loads }), Number.isFinite(robot.battery) && `${Math.round(100 * robot.battery)} %`];
+    parts.push(age === null ? t("age.never") : t("age.seconds", { seconds: age.toFixed(1) }));
+    this.text.textContent = parts.filter(Boolean).join(" \u00b7 ");
+  }
+}

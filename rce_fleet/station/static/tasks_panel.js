@@ -1,0 +1,76 @@
+// The list of tasks with their expected ends, and the form for a new one.
+
+import { element } from "./engine.js";
+import { t } from "./texts.js";
+
+const TONE = { running: "good", queued: "quiet", assigned: "quiet", held: "warn", suspended: "warn", cancelling: "warn", failed: "bad", cancelled: "quiet", done: "good" };
+
+// Whether the action that is under way ends only when a person or a program confirms it.
+function awaitsConfirmation({ visits, stops }) {
+  const last = visits.at(-1);
+  return last?.ended_at === null && last.stop >= 0 && stops[last.stop % stops.length].confirm;
+}
+
+export class TasksPanel {
+  steers = true;
+
+  constructor(work, actions, fleet) {
+    this.work = work;
+    this.actions = actions;
+    this.fleet = fleet;
+    this.body = document.querySelector("#tasks tbody");
+    this.note = document.querySelector("#tasks-note");
+    work.addEventListener("change", () => this.draw());
+  }
+
+  draw() {
+    const { work } = this;
+    const tasks = [...work.tasks.values(), ...work.recent.slice(0, 5)];
+    this.note.textContent = work.trouble === "none" ? t("tasks.noManager") : work.trouble ?? (tasks.length ? "" : t("tasks.none"));
+    const focused = document.activeElement?.id;
+    this.body.replaceChildren(...tasks.slice(0, 100).flatMap((task) => [this.#row(task), this.#buttons(task)]));
+    if (focused?.startsWith("task-")) document.getElementById(focused)?.focus();
+  }
+
+  #row(task) {
+    const row = element("tr");
+    row.dataset.task = task.id;
+    row.title = task.reason;
+    const stops = task.stops.map(({ action, cell, cells }) => `${t(`stop.${action}`)} ${cell ?? cells?.join("/") ?? ""}`.trim()).join(", ");
+    const state = element("td", t(`task.${task.state}`), TONE[task.state]);
+    row.append(element("td", task.id), element("td", task.name || stops), state, element("td", task.robot_assigned || ""), this.#end(task));
+    return row;
+  }
+
+  // When it ends, or ended; a deadline that is at risk has a sign and a colour.
+  #end(task) {
+    const ended = ["done", "failed", "cancelled"].includes(task.state);
+    const at = ended ? task.changed_at : task.expected_end;
+    const risk = !ended && task.deadline && (task.late || (at ?? 0) > task.deadline);
+    const text = at ? new Date(1000 * at).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", hour12: false }) : "";
+    return element("td", risk ? `\u26a0 ${text}` : text, risk ? "bad" : "quiet");
+  }
+
+  // A row below the task's.
+  #buttons(task) {
+    const row = element("tr");
+    const cell = element("td", "", "answers");
+    cell.colSpan = 5;
+    row.append(cell);
+    if (!this.steers || ["done", "failed", "cancelled", "cancelling"].includes(task.state)) return row;
+    const add = (name, run) => {
+      const button = element("button", t(`action.${name}`));
+      button.type = "button";
+      button.id = `task-${task.id}-${name}`;
+      button.setAttribute("aria-label", `${t(`action.${name}`)}: ${task.id}`);
+      button.addEventListener("click", async () => { await run(); this.work.refresh(); });
+      cell.append(button);
+    };
+    if (awaitsConfirmation(task)) add("confirm", () => this.actions.confirmTask(task.id));
+    if (task.state === "held") add("resume", () => this.actions.resumeTask(task.id));
+    else add("hold", () => this.actions.holdTask(task.id));
+    add("raise", () => this.actions.raise(task.id, Math.min(100, (task.priority ?? 0) + 10)));
+    add("cancel", () => this.actions.cancelTask(task.id));
+    return row;
+  }
+}

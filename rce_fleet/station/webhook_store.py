@@ -1,0 +1,161 @@
+"""The webhooks of a station: who gets which events, and how far each receiver is. Kept in a file."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import os
+import secrets
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import msgspec
+from msgspec import Struct
+
+from rce_fleet.api.webhooks import WebhookRequest
+from rce_fleet.exceptions import RequestRefusedError
+
+MAX_WEBHOOKS = 20
+
+
+class Webhook(Struct, kw_only=True):
+    """A receiver of events.
+
+    Attributes:
+        position: Number of the last event that is done.
+        journal: Which journal numbered it; empty: not known.
+        failures: Failed deliveries in a row.
+        error: Why the last delivery failed.
+        next_attempt: Seconds since 1970; None: at the next event.
+    """
+
+    id: str
+    url: str
+    secret: str
+    kinds: tuple[str, ...] = ()
+    allow_private: bool = False
+    created_by: str = ""
+    position: int
+    journal: str = ""
+    failures: int = 0
+    error: str = ""
+    next_attempt: float | None = None
+
+    def __repr__(self) -> str:
+        return f"Webhook(id={self.id!r}, url={self.url!r})"
+
+
+class WebhookStore:
+    """All webhooks, in memory and in a file that only its owner reads.
+
+    Args:
+        file: The file; None keeps them in memory only.
+    """
+
+    def __init__(self, file: Path | None) -> None:
+        self._file = file
+        self._saving = threading.Lock()
+        """A save goes on in its thread when the task that waits for it is cancelled."""
+        self._webhooks: dict[str, Webhook] = {}
+
+    def load(self) -> None:
+        """Read the file; a missing one holds none. Blocks.
+
+        Raises:
+            OSError: It cannot be read.
+            msgspec.DecodeError: It is damaged.
+        """
+        if self._file is None or not self._file.exists():
+            return
+        found = msgspec.json.decode(self._file.read_bytes(), type=list[Webhook])
+        self._webhooks = {webhook.id: webhook for webhook in found}
+
+    def __iter__(self) -> Iterator[Webhook]:
+        return iter(list(self._webhooks.values()))
+
+    def get(self, id_: str) -> Webhook | None:
+        """Find a webhook."""
+        return self._webhooks.get(id_)
+
+    def add(self, request: WebhookRequest, user: str, position: int, journal: str = "") -> Webhook:
+        """Add a webhook that gets events of a journal after a number; :meth:`save` keeps it.
+
+        Raises:
+            RequestRefusedError: The URL cannot be one, or there are too many.
+        """
+        check_url(request.url, allow_private=request.allow_private)
+        if len(self._webhooks) >= MAX_WEBHOOKS:
+            raise RequestRefusedError(f"there are {MAX_WEBHOOKS} webhooks already; remove one first")
+        made = Webhook(
+            id=secrets.token_hex(6),
+            url=request.url,
+            secret=request.secret or secrets.token_urlsafe(32),
+            kinds=tuple(request.kinds),
+            allow_private=request.allow_private,
+            created_by=user,
+            position=position,
+            journal=journal,
+        )
+        self._webhooks[made.id] = made
+        return made
+
+    def remove(self, id_: str) -> bool:
+        """Remove a webhook; return whether it was there."""
+        return self._webhooks.pop(id_, None) is not None
+
+    def save(self) -> None:
+        """Write the file, whole or not at all. Blocks.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        if self._file is None:
+            return
+        with self._saving:
+            self._write(self._file)
+
+    def _write(self, file: Path) -> None:
+        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        aside = file.with_name(f".{file.name}.{os.getpid()}")
+        body = msgspec.json.encode(list(self._webhooks.values()))
+        try:
+            descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+            with os.fdopen(descriptor, "wb") as output:
+                output.write(body)
+                output.flush()
+                os.fsync(output.fileno())
+            aside.replace(file)
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                aside.unlink()
+
+
+def check_url(url: str, *, allow_private: bool) -> None:
+    """Check where events may be sent; names are looked up, and checked again, at each delivery.
+
+    Raises:
+        RequestRefusedError: It is not http or https, holds a password, or names a private address.
+    """
+    try:
+        parts = urlsplit(url)
+        host, _ = parts.hostname or "", parts.port
+    except ValueError as error:
+        raise RequestRefusedError(f"url {url!r:.80}: {error}") from error
+    if parts.scheme not in ("http", "https") or not host:
+        raise RequestRefusedError(f"url must be http://... or https://..., not {url!r:.80}")
+    if parts.username is not None or parts.password is not None:
+        raise RequestRefusedError("url must not hold a name or password; deliveries are signed instead")
+    if not allow_private and (host == "localhost" or is_private(host)):
+        raise RequestRefusedError(
+            f"{host} is on this machine or in a private network; if events shall go there, set allow_private"
+        )
+
+
+def is_private(address: str) -> bool:
+    """Whether an IP address is not one of the public Internet; False for names."""
+    try:
+        return not ipaddress.ip_address(address).is_global
+    except ValueError:
+        return False

@@ -1,0 +1,247 @@
+"""Chooses tasks for idle robots: all at once, by the cheapest sum of ways."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf, nan
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from rce_fleet.tasks.energy import BatteryLevels, Effort, charges, effort_of, share_needed
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from numpy.typing import NDArray
+
+    from rce_fleet.tasks.records import RobotProfile
+    from rce_fleet.tasks.task import Task
+    from rce_fleet.tasks.travel import TravelCosts
+
+_IMPOSSIBLE = 1e9
+_SPARE_TASKS = 50
+"""So many tasks more than robots, and twice as many as robots, are looked at, the most urgent ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class AssignmentRules:
+    """What counts when tasks are chosen. All in seconds of a robot's way.
+
+    Attributes:
+        priority: What one step of priority is worth.
+        age: What a second of waiting is worth: no task waits without end.
+        deadline: What a second less than ``deadline_window`` is worth ...
+        deadline_window: ... that is left of the time before the last moment to begin.
+        keep: What it is worth to leave a task in the queue of its robot.
+    """
+
+    priority: float = 300.0
+    age: float = 0.5
+    deadline: float = 2.0
+    deadline_window: float = 300.0
+    keep: float = 10.0
+
+
+class FreeRobot(NamedTuple):
+    """A robot that can begin with a task: its name, cell, profile and share of a full battery."""
+
+    id: str
+    cell: int
+    profile: RobotProfile
+    battery: float | None
+
+
+class Choice(NamedTuple):
+    """A robot that shall begin with a task."""
+
+    task: Task
+    robot: str
+    seconds: float
+
+
+class Assigner:
+    """Chooses tasks for robots.
+
+    Args:
+        travel: Distances.
+        rules: What counts.
+        levels: Thresholds of batteries.
+    """
+
+    def __init__(self, travel: TravelCosts, rules: AssignmentRules, levels: BatteryLevels) -> None:
+        self._travel = travel
+        self._rules = rules
+        self._levels = levels
+
+    def urgency(self, task: Task, now: float, seconds: float = 0.0) -> float:
+        """Return what it is worth to begin with a task now, in seconds of way.
+
+        Args:
+            task: The task.
+            now: Seconds since 1970.
+            seconds: About how long it takes.
+        """
+        rules = self._rules
+        since = max(task.created_at, task.order.earliest_start or 0.0)
+        worth = task.order.priority * rules.priority + max(0.0, now - since) * rules.age
+        if task.order.deadline is not None:
+            left = task.order.deadline - now - seconds
+            worth += max(0.0, rules.deadline_window - left) * rules.deadline
+        return worth
+
+    def refuse(self, task: Task, robot: FreeRobot, effort: Effort, chargers: Sequence[int]) -> str:
+        """Return why a robot cannot do a task; empty if it can."""
+        if reason := misfit(task, robot.id, robot.profile):
+            return reason
+        if effort.first == inf:
+            return "no path leads it to all stops"
+        return self.lack_of_energy(task, robot, effort, chargers)
+
+    def lack_of_energy(self, task: Task, robot: FreeRobot, effort: Effort, chargers: Sequence[int]) -> str:
+        """Return why a robot's battery is not enough for the rest of a task; empty if it is."""
+        if robot.battery is not None and not charges(task):
+            needed = self.battery_needed(robot.profile, effort, chargers)
+            if robot.battery < needed:
+                return f"its battery has {robot.battery:.0%}; task and way to a charger need {needed:.0%}"
+        return ""
+
+    def battery_needed(self, profile: RobotProfile, effort: Effort, chargers: Sequence[int]) -> float:
+        """Return the share of a full battery that a robot must have to begin with a task."""
+        ways = [self._travel.metres(effort.end, cell) for cell in chargers if effort.end is not None]
+        to_charger = min(ways, default=0.0)
+        return share_needed(effort, profile, to_charger) + self._levels.critical
+
+    def choose(
+        self,
+        tasks: Sequence[Task],
+        robots: Sequence[FreeRobot],
+        now: float,
+        chargers: Sequence[int] = (),
+        avoided: Collection[tuple[int, str]] = (),
+    ) -> list[Choice]:
+        """Return which robots begin with which tasks, with the smallest sum of costs.
+
+        Args:
+            tasks: Tasks that can begin now.
+            robots: Robots that can.
+            now: Seconds since 1970.
+            chargers: Cells with chargers.
+            avoided: Numbers of tasks with robots that gave them up a short time ago.
+        """
+        if not tasks or not robots:
+            return []
+        most = max(2 * len(robots), len(robots) + _SPARE_TASKS)
+        urgent = sorted(tasks, key=lambda task: (-self.urgency(task, now), task.number))[:most]
+        costs = np.full((len(robots), len(urgent)), _IMPOSSIBLE)
+        seconds = np.full_like(costs, inf)
+        for rows in _rows_by_profile(robots):
+            group = _Group(rows, [robots[row] for row in rows])
+            for column, task in enumerate(urgent):
+                self._price(task, group, now, chargers, costs[:, column], seconds[:, column])
+        names = {robot.id: row for row, robot in enumerate(robots)}
+        columns = {task.number: column for column, task in enumerate(urgent)}
+        costs[
+            [names[name] for number, name in avoided if number in columns and name in names],
+            [columns[number] for number, name in avoided if number in columns and name in names],
+        ] = _IMPOSSIBLE
+        queued = [(names[task.robot], columns[task.number]) for task in urgent if task.robot in names]
+        for place in queued:
+            costs[place] -= self._rules.keep
+        return self._pairs(costs, urgent, robots, chargers)
+
+    def _pairs(
+        self,
+        costs: NDArray[np.float64],
+        urgent: Sequence[Task],
+        robots: Sequence[FreeRobot],
+        chargers: Sequence[int],
+    ) -> list[Choice]:
+        """Return the cheapest pairs; their batteries are checked again, with the cells of all stops."""
+        chosen = []
+        for row, column in zip(*linear_sum_assignment(costs), strict=True):
+            robot, task = robots[row], urgent[column]
+            if costs[row, column] < _IMPOSSIBLE / 2:
+                effort = effort_of(task, robot.cell, self._travel, robot.profile)
+                if not self.refuse(task, robot, effort, chargers):
+                    chosen.append(Choice(task, robot.id, effort.seconds(robot.profile)))
+        return chosen
+
+    def _price(
+        self,
+        task: Task,
+        group: _Group,
+        now: float,
+        chargers: Sequence[int],
+        costs: NDArray[np.float64],
+        seconds: NDArray[np.float64],
+    ) -> None:
+        """Write what a task costs the robots of one profile."""
+        profile, order = group.profile, task.order
+        if misfit(task, order.robot or group.names[0], profile):
+            return
+        stop = task.next_stop
+        first_cells = stop.cells if stop is not None else ()
+        start = first_cells[0] if first_cells else int(group.cells[0])
+        tail = effort_of(task, start, self._travel, profile)
+        if tail.first == inf:
+            return
+        ways = np.zeros(len(group.cells))
+        if first_cells:
+            fields = [self._travel.field(cell, profile.zone_cost)[group.cells] for cell in first_cells]
+            ways = np.min(fields, axis=0).astype(np.float64)
+        fits = np.isfinite(ways)
+        if order.robot:
+            fits &= np.array([name == order.robot for name in group.names])
+        if not charges(task):
+            none = Effort(0.0, tail.metres, tail.acting, tail.end)
+            each = share_needed(Effort(1.0, 0.0, 0.0, None), profile)
+            needed = self.battery_needed(profile, none, chargers) + np.where(fits, ways, 0.0) * each
+            fits &= np.isnan(group.batteries) | (group.batteries >= needed)
+        rows = group.rows[fits]
+        takes = (ways[fits] + tail.metres) / profile.speed + tail.acting
+        worth = self.urgency(task, now, float(takes.min(initial=inf)) if len(takes) else 0.0)
+        costs[rows] = ways[fits] / profile.speed - worth
+        seconds[rows] = takes
+
+
+class _Group:
+    """Robots of one profile, as arrays."""
+
+    def __init__(self, rows: list[int], robots: list[FreeRobot]) -> None:
+        self.rows = np.array(rows)
+        self.profile = robots[0].profile
+        self.names = [robot.id for robot in robots]
+        self.cells = np.array([robot.cell for robot in robots])
+        self.batteries = np.array(
+            [nan if robot.battery is None else robot.battery for robot in robots], np.float64
+        )
+
+
+def _rows_by_profile(robots: Sequence[FreeRobot]) -> list[list[int]]:
+    groups: list[tuple[RobotProfile, list[int]]] = []
+    places: dict[int, list[int]] = {}
+    for row, robot in enumerate(robots):
+        rows = places.get(id(robot.profile))
+        if rows is None:
+            rows = next((known for profile, known in groups if profile == robot.profile), None)
+            if rows is None:
+                rows = []
+                groups.append((robot.profile, rows))
+            places[id(robot.profile)] = rows
+        rows.append(row)
+    return [rows for _, rows in groups]
+
+
+def misfit(task: Task, robot: str, profile: RobotProfile) -> str:
+    """Return why a robot can never do a task, whatever its place and battery; empty if it can."""
+    order = task.order
+    if order.robot and order.robot != robot:
+        return f"only {order.robot} may do it"
+    missing = sorted(set(order.capabilities) - set(profile.capabilities))
+    if missing:
+        return f"it lacks {', '.join(missing)}"
+    if order.payload > profile.payload:
+        return f"it carries {profile.payload:g} kg, not {order.payload:g} kg"
+    return ""

@@ -1,0 +1,89 @@
+"""Conditions of tasks that no robot has begun: start, deadline, tasks before, recurrence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from rce_fleet.exceptions import UnknownTaskError
+from rce_fleet.tasks.order import WhenLate
+from rce_fleet.tasks.task import Task, TaskCause, TaskState
+
+if TYPE_CHECKING:
+    from rce_fleet.tasks.book import TaskBook
+
+NOT_BEGUN = frozenset({TaskState.QUEUED, TaskState.ASSIGNED})
+
+
+class Conditions:
+    """Decides which tasks can begin.
+
+    Args:
+        book: The tasks.
+
+    Attributes:
+        ready: Tasks that a robot could begin with at the last update.
+    """
+
+    def __init__(self, book: TaskBook) -> None:
+        self._book = book
+        self.ready: list[Task] = []
+
+    def update(self, now: float) -> list[Task]:
+        """Let time pass; return the tasks that a robot can begin with.
+
+        Args:
+            now: Seconds since 1970.
+        """
+        self._recur(now)
+        self.ready = []
+        for task in list(self._book.open_tasks()):
+            task = self._check_deadline(task, now)  # noqa: PLW2901 - the same task, changed
+            if task.state in NOT_BEGUN and self._can_begin(task, now):
+                self.ready.append(self._book.tasks[task.number])
+        return self.ready
+
+    def note(self, task: Task, reason: str, now: float) -> None:
+        """Note why a task waits; an event tells it if it is new."""
+        if task.reason != reason:
+            noted = replace(task, reason=reason, revision=task.revision + 1)
+            self._book.emit(noted, "waits", now, text=f"{task.id}: {reason or 'waits for a free robot'}")
+
+    def _recur(self, now: float) -> None:
+        """Create occurrences that are due. One begins only after the one before has ended."""
+        due = [
+            task
+            for task in self._book.tasks.values()
+            if task.recurs_at is not None and task.has_ended and task.recurs_at <= now
+        ]
+        for task in due:
+            self._book.recur(task, now)
+
+    def _check_deadline(self, task: Task, now: float) -> Task:
+        deadline = task.order.deadline
+        if deadline is None or task.late or now < deadline:
+            return task
+        if task.order.when_late is WhenLate.FAIL and task.state in NOT_BEGUN and not task.visits:
+            reason = "its deadline passed before a robot began with it"
+            return self._book.advance(task, TaskCause.FAIL, now, reason, robot="", late=True)
+        late = replace(task, late=True, revision=task.revision + 1)
+        self._book.emit(late, "late", now, text=f"the deadline of {task.id} has passed")
+        return late
+
+    def _can_begin(self, task: Task, now: float) -> bool:
+        for name in task.order.after:
+            try:
+                before = self._book.find(name)
+            except UnknownTaskError:
+                continue  # It ended so long ago that it was forgotten.
+            if before.state in (TaskState.FAILED, TaskState.CANCELLED):
+                reason = f"{name}, which must be done before, is {before.state.value}"
+                self._book.advance(task, TaskCause.FAIL, now, reason, robot="")
+                return False
+            if before.state is not TaskState.DONE:
+                self.note(task, f"waits for {name}", now)
+                return False
+        if task.order.earliest_start is not None and now < task.order.earliest_start:
+            self.note(task, "waits for its earliest start", now)
+            return False
+        return True

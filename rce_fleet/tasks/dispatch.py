@@ -1,0 +1,296 @@
+"""One step of the fleet manager: robots' progress, conditions of tasks, charging, assignment, parking."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from math import inf
+from typing import TYPE_CHECKING
+
+from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot
+from rce_fleet.tasks.charging import ChargerQueue, place_to_wait
+from rce_fleet.tasks.conditions import Conditions
+from rce_fleet.tasks.energy import BatteryLevels, effort_of
+from rce_fleet.tasks.explaining import why_none
+from rce_fleet.tasks.progress import ProgressRules, TaskProgress
+from rce_fleet.tasks.queueing import Queues, RobotQueue
+from rce_fleet.tasks.records import AUTOMATIC, RobotProfile
+from rce_fleet.tasks.task import Task, TaskCause, TaskState
+from rce_fleet.tasks.travel import TravelCosts
+from rce_fleet.tasks.zone_costs import zone_profiles
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rce_fleet.planning.grid import GridMap
+    from rce_fleet.tasks.book import TaskBook
+    from rce_fleet.tasks.facts import FleetFacts, RobotFacts
+
+QUEUES_EVERY = 2.0
+"""Seconds between two looks at the queues of busy robots and at tasks that no robot can do."""
+MOST_EXPLAINED = 50
+"""Waiting tasks that are looked at each time, to say why no robot can do them; the others come later."""
+
+
+@dataclass(frozen=True, slots=True)
+class TaskRules:
+    """The rules of a fleet manager.
+
+    Attributes:
+        progress: When a robot loses its task.
+        assignment: What counts when a task is chosen.
+        battery: Thresholds of batteries.
+        profile: What robots can do that have no profile of their own.
+        queue_length: Most tasks in the queue of a busy robot.
+        park_after: An idle robot goes out of the way after this time, seconds.
+    """
+
+    progress: ProgressRules = field(default_factory=ProgressRules)
+    assignment: AssignmentRules = field(default_factory=AssignmentRules)
+    battery: BatteryLevels = field(default_factory=BatteryLevels)
+    profile: RobotProfile = field(default_factory=RobotProfile)
+    queue_length: int = 3
+    park_after: float = 5.0
+
+
+class Dispatcher:
+    """Decides what the robots do.
+
+    Args:
+        book: The tasks.
+        rules: The rules.
+
+    Attributes:
+        chargers: Who charges, and who waits.
+    """
+
+    def __init__(self, book: TaskBook, rules: TaskRules | None = None) -> None:
+        self.rules = rules or TaskRules()
+        self._book = book
+        self._travel = TravelCosts()
+        self._progress = TaskProgress(book, self.rules.progress, charged=self.rules.battery.full)
+        self._conditions = Conditions(book)
+        self._assigner = Assigner(self._travel, self.rules.assignment, self.rules.battery)
+        self._queues = Queues(self._travel, self.rules.queue_length)
+        self.chargers = ChargerQueue(self.rules.battery, self._travel)
+        self._profiles: dict[str, RobotProfile] = {}
+        """Of robots for which zones count."""
+        self._parking: dict[str, int] = {}
+        self._idle_since: dict[str, float] = {}
+        self._queues_due = -inf
+        self._explained = 0
+        self._facts: FleetFacts | None = None
+
+    def profile(self, robot: str) -> RobotProfile:
+        """Return what a robot can do."""
+        return self._profiles.get(robot) or self._book.entry(robot).profile or self.rules.profile
+
+    def update(self, now: float, facts: FleetFacts) -> None:
+        """Take one step.
+
+        Args:
+            now: Seconds since 1970.
+            facts: What is known of the robots.
+        """
+        self._facts = facts
+        book = self._book
+        self._travel.begin_step()
+        self._profiles = zone_profiles(book, facts, self.rules.profile)
+        if facts.grid is not None:
+            self._travel.set_map(facts.grid, facts.shut, book.zones, facts.map_revision)
+        self._progress.update(now, facts, self._nearest, self._short_of_energy)
+        ready = self._conditions.update(now)
+        if facts.grid is None or not facts.is_live:
+            return
+        idle = {robot.id: robot for robot in facts.robots.values() if self._is_idle(robot)}
+        taken = self._progress.targets()
+        self.chargers.adopt(idle, book.places.chargers, taken)
+        free = [self._free(robot) for robot in idle.values() if self.chargers.can_work(robot)]
+        chosen = self._assigner.choose(ready, free, now, book.places.chargers, self._progress.avoid.keys())
+        for choice in chosen:
+            self._start(choice.task, choice.robot, now)
+            idle.pop(choice.robot, None)
+        self.chargers.update(idle, book.places.chargers, taken)
+        if now >= self._queues_due or now < self._queues_due - 2 * QUEUES_EVERY:
+            self._queues_due = now + QUEUES_EVERY
+            self._fill_queues(now, facts)
+            self._explain(facts, now)
+        self._park(idle, now, facts)
+
+    def goals(self) -> dict[str, int | None]:
+        """Return where robots shall go; None: the robot shall stand still. Others have no goal."""
+        goals: dict[str, int | None] = dict(self._parking)
+        goals.update(self.chargers.charging)
+        for task in self._book.active_tasks():
+            stands = task.state in (TaskState.HELD, TaskState.SUSPENDED)
+            goals[task.robot] = None if stands and task.action is None else task.target
+        for robot, entry in self._book.robots.items():
+            if entry.is_out:
+                goals[robot] = None
+        return goals
+
+    def avoid(self, task: Task, robot: str, now: float) -> None:
+        """Do not give a task to a robot again for a while."""
+        self._progress.avoid[task.number, robot] = now + self.rules.progress.avoid_for
+
+    def activity(self, robot: str) -> str:
+        """Return what a robot does for the manager, in one word."""
+        entry, task = self._book.entry(robot), self._book.task_of(robot)
+        facts = self._facts.robots.get(robot) if self._facts is not None else None
+        modes = {entry.mode, facts.mode if facts is not None else AUTOMATIC}
+        doings = (
+            (entry.is_out, "out"),
+            ("manual" in modes, "by hand"),
+            (bool(modes - {AUTOMATIC}), "paused"),
+            (task is not None, "task"),
+            (robot in self.chargers.charging, "charging"),
+            (robot in self.chargers.waiting, "waiting for a charger"),
+            (robot in self._parking, "parking"),
+        )
+        return next((word for does, word in doings if does), "idle")
+
+    def expected_end(self, task: Task, now: float) -> float | None:
+        """Return when a robot will have done a task, seconds since 1970; None: not known."""
+        facts = self._facts.robots.get(task.robot) if self._facts is not None else None
+        if task.state not in (TaskState.RUNNING, TaskState.ASSIGNED) or facts is None or facts.cell is None:
+            return None
+        profile = self.profile(task.robot)
+        if task.state is TaskState.RUNNING:
+            left = self._left(task, facts.cell, profile, now)[0]
+            return None if left == inf else now + left
+        queue = self._queue_of(task.robot, now, facts)
+        queue.tasks = [each for each in self._book.queue_of(task.robot) if each.number <= task.number]
+        left = self._queues.finish(queue)
+        return None if left == inf else now + left
+
+    # Parts of a step
+
+    def _nearest(self, robot: RobotFacts, cells: Iterable[int]) -> int | None:
+        if robot.cell is None:
+            return None
+        return self._travel.nearest(robot.cell, cells, self.profile(robot.id).zone_cost)
+
+    def _short_of_energy(self, task: Task, robot: RobotFacts) -> str:
+        if robot.cell is None or robot.battery is None or not self._travel.has_map:
+            return ""
+        free = self._free(robot)
+        effort = effort_of(task, free.cell, self._travel, free.profile)
+        lack = self._assigner.lack_of_energy(task, free, effort, self._book.places.chargers)
+        return "" if effort.first == inf else lack
+
+    def _is_idle(self, robot: RobotFacts) -> bool:
+        entry = self._book.entry(robot.id)
+        busy = entry.mode != AUTOMATIC or robot.by_hand
+        return robot.is_driven and not busy and self._book.task_of(robot.id) is None
+
+    def _free(self, robot: RobotFacts) -> FreeRobot:
+        assert robot.cell is not None
+        return FreeRobot(robot.id, robot.cell, self.profile(robot.id), robot.battery)
+
+    def _start(self, task: Task, robot: str, now: float) -> None:
+        self._parking.pop(robot, None)
+        self.chargers.charging.pop(robot, None)
+        started = now if task.started_at is None else task.started_at
+        self._book.advance(
+            task, TaskCause.START, now, f"{robot} begins", robot=robot, target=None, started_at=started
+        )
+
+    def _queue_of(self, robot: str, now: float, facts: RobotFacts) -> RobotQueue:
+        """Return a robot's queue without tasks, ready when its present task ends."""
+        profile, task = self.profile(robot), self._book.task_of(robot)
+        cell = facts.cell if facts.cell is not None else 0
+        if task is None:
+            return RobotQueue(robot, profile, cell, 0.0)
+        left, end = self._left(task, cell, profile, now)
+        return RobotQueue(robot, profile, cell if end is None else end, left)
+
+    def _left(self, task: Task, cell: int, profile: RobotProfile, now: float) -> tuple[float, int | None]:
+        effort = effort_of(task, cell, self._travel, profile)
+        acted = now - task.action.started_at if task.action is not None else 0.0
+        return max(0.0, effort.seconds(profile) - acted), effort.end
+
+    def _fill_queues(self, now: float, facts: FleetFacts) -> None:
+        """Give tasks to the queues of busy robots, and take them from robots that are not there any more."""
+        assigned = self._book.queues()
+        for name, tasks in assigned.items():
+            known = facts.robots.get(name)
+            if known is None or not known.is_there or self._book.entry(name).is_out:
+                for task in tasks:
+                    self._book.advance(task, TaskCause.RELEASE, now, f"{name} is not there", robot="")
+        queues = []
+        for robot in facts.robots.values():
+            present = self._book.task_of(robot.id)
+            if robot.is_there and present is not None and present.state is TaskState.RUNNING:
+                queue = self._queue_of(robot.id, now, robot)
+                mine = [self._book.tasks[task.number] for task in assigned.get(robot.id, [])]
+                queue.tasks = [task for task in mine if task.state is TaskState.ASSIGNED]
+                if queue.ready < inf:
+                    queues.append(queue)
+        if not queues:
+            return
+        waiting = [self._book.tasks[task.number] for task in self._conditions.ready]
+        waiting = [task for task in waiting if task.state is TaskState.QUEUED]
+        waiting.sort(key=lambda task: (-self._assigner.urgency(task, now), task.number))
+        for task, name in self._queues.insert(waiting, queues, self._progress.avoid.keys()):
+            text = f"{task.id} is in the queue of {name}"
+            self._book.advance(task, TaskCause.ASSIGN, now, text, robot=name)
+
+    def _explain(self, facts: FleetFacts, now: float) -> None:
+        """Say of tasks that wait why no robot can do them."""
+        robots = [
+            self._free(robot)
+            for robot in facts.robots.values()
+            if robot.cell is not None and not self._book.entry(robot.id).is_out
+        ]
+        known: dict[object, str] = {}
+        waiting = [self._book.tasks[ready.number] for ready in self._conditions.ready]
+        waiting = [task for task in waiting if task.state is TaskState.QUEUED]
+        begin = self._explained % len(waiting) if waiting else 0
+        self._explained = begin + MOST_EXPLAINED
+        for task in (waiting[begin:] + waiting[:begin])[:MOST_EXPLAINED]:
+            like = (
+                task.position,
+                replace(task.order, name="", priority=0, deadline=None, earliest_start=None),
+            )
+            if like not in known:
+                known[like] = why_none(task, robots, self._travel, self._assigner, self._book.places.chargers)
+            self._conditions.note(task, known[like], now)
+
+    def _park(self, idle: dict[str, RobotFacts], now: float, facts: FleetFacts) -> None:
+        """Send idle robots out of the way, some time after they have become idle."""
+        charging = self.chargers.charging
+        self._parking = {
+            name: cell for name, cell in self._parking.items() if name in idle and name not in charging
+        }
+        self._idle_since = {name: self._idle_since.get(name, now) for name in idle}
+        moves = [
+            robot
+            for robot in idle.values()
+            if robot.id not in charging
+            and robot.id not in self._parking
+            and now - self._idle_since[robot.id] >= self.rules.park_after
+        ]
+        if not moves or facts.grid is None:
+            return
+        used = set(self._book.places.chargers)
+        for task in self._book.open_tasks():
+            used.update(task.order.cells())
+        for robot in moves:
+            place = self._place(robot, facts.grid, facts, used)
+            if place is not None:
+                self._parking[robot.id] = place
+
+    def _place(self, robot: RobotFacts, grid: GridMap, facts: FleetFacts, used: set[int]) -> int | None:
+        """Return where an idle robot shall wait; None: where it is."""
+        if robot.cell is None:
+            return None
+        others = set(self._parking.values())
+        others.update(
+            each.cell for each in facts.robots.values() if each is not robot and each.cell is not None
+        )
+        parking = self._book.places.parking
+        if parking:
+            free = [cell for cell in parking if cell not in others]
+            return None if robot.cell in parking else self._nearest(robot, free)
+        if robot.cell not in used:
+            return None
+        return place_to_wait(grid, facts.shut, robot.cell, used | others)

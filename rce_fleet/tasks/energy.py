@@ -1,0 +1,110 @@
+"""What a task takes out of a battery, and whether a battery is enough for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+from typing import TYPE_CHECKING
+
+from rce_fleet.tasks.order import Action
+
+if TYPE_CHECKING:
+    from rce_fleet.tasks.records import RobotProfile
+    from rce_fleet.tasks.task import Task
+    from rce_fleet.tasks.travel import TravelCosts
+
+_SECONDS_PER_HOUR = 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class BatteryLevels:
+    """Four thresholds, shares of the full battery 0 .. 1, as openTCS has them.
+
+    Attributes:
+        critical: Below it a robot gets no task, and goes to charge; no task may bring it below.
+        good: An idle robot below it charges.
+        sufficient: A robot that charges may be given a task from here on.
+        full: It leaves the charger.
+    """
+
+    critical: float = 0.15
+    good: float = 0.5
+    sufficient: float = 0.4
+    full: float = 0.95
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.critical < self.sufficient <= self.full <= 1:
+            raise ValueError(
+                "battery levels must be 0 <= critical < sufficient <= full <= 1, not"
+                f" {self.critical}, {self.sufficient}, {self.full}"
+            )
+        if not self.critical <= self.good <= self.full:
+            raise ValueError(f"the level good must be within {self.critical} .. {self.full}, not {self.good}")
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """What the rest of a task costs a robot.
+
+    Attributes:
+        first: Metres to the first stop; ``inf``: no way leads there.
+        metres: Metres of the ways after that.
+        acting: Seconds of actions.
+        end: Cell of the last stop.
+    """
+
+    first: float
+    metres: float
+    acting: float
+    end: int | None
+
+    def seconds(self, profile: RobotProfile) -> float:
+        """Return how long it takes, seconds."""
+        return (self.first + self.metres) / profile.speed + self.acting
+
+
+def effort_of(task: Task, start: int, travel: TravelCosts, profile: RobotProfile) -> Effort:
+    """Return what the rest of a task costs a robot that stands in a cell.
+
+    Each stop is made in the one of its cells that is nearest to the stop before. Stops without cells, at any
+    charger or parking place, count nothing.
+    """
+    here, first, metres, acting = start, 0.0, 0.0, 0.0
+    zones = profile.zone_cost
+    is_first = True
+    for number in range(task.position, task.order.length):
+        stop = task.order.stop(number)
+        acting += stop.duration
+        if not stop.cells:
+            continue
+        cell = stop.cells[0] if len(stop.cells) == 1 else travel.nearest(here, stop.cells, zones)
+        way = inf if cell is None else travel.metres(here, cell, zones)
+        if way == inf or cell is None:
+            return Effort(inf, inf, acting, None)
+        if is_first:
+            first, is_first = way, False
+        else:
+            metres += way
+        here = cell
+    return Effort(first, metres, acting, here)
+
+
+def share_needed(effort: Effort, profile: RobotProfile, to_charger: float = 0.0) -> float:
+    """Return the share of a full battery that a task takes, with the way to a charger after it.
+
+    Args:
+        effort: The task's.
+        profile: The robot's.
+        to_charger: Metres from the last stop to the nearest charger.
+    """
+    metres = effort.first + effort.metres + to_charger
+    seconds = metres / profile.speed + effort.acting
+    drawn = metres * profile.drive
+    drawn += (seconds * profile.idle + effort.acting * profile.acting) / _SECONDS_PER_HOUR
+    return drawn / profile.capacity
+
+
+def charges(task: Task) -> bool:
+    """Return whether the next stop of a task charges: the battery need not be enough for the rest."""
+    stop = task.next_stop
+    return stop is not None and stop.action is Action.CHARGE

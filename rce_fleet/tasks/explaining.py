@@ -1,0 +1,81 @@
+"""Says why no robot can do a task, in words for people."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import TYPE_CHECKING
+
+from rce_fleet.tasks.assignment import misfit
+from rce_fleet.tasks.energy import charges, effort_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rce_fleet.tasks.assignment import Assigner, FreeRobot
+    from rce_fleet.tasks.task import Task
+    from rce_fleet.tasks.travel import TravelCosts
+
+MOST_ROBOTS = 20
+"""So many robots that fit are looked at for ways and batteries."""
+
+
+def why_none(
+    task: Task, robots: Sequence[FreeRobot], travel: TravelCosts, assigner: Assigner, chargers: Sequence[int]
+) -> str:
+    """Return why no robot of the fleet can do a task, even if it had nothing else to do; empty if one can.
+
+    Args:
+        task: The task.
+        robots: All robots in service.
+        travel: Distances.
+        assigner: Decides about batteries.
+        chargers: Cells with chargers.
+    """
+    if not robots:
+        return "no robot is in service"
+    fitting = [robot for robot in robots if not misfit(task, robot.id, robot.profile)]
+    if not fitting:
+        return _why_no_fit(task, robots)
+    lacks = set()
+    for robot in fitting[:MOST_ROBOTS]:
+        lack = _lack(task, robot, travel, assigner, chargers)
+        if not lack:
+            return ""
+        lacks.add(lack)
+    cells = ", ".join(str(cell) for cell in dict.fromkeys(task.order.cells()))
+    worst = next(lack for lack in ("energy", "capacity", "path") if lack in lacks)
+    return {
+        "path": f"no path leads any robot to all of its stops (cells {cells})",
+        "capacity": "no robot's battery is large enough for it, even when it is full; split the task",
+        "energy": "no robot's battery has enough energy for it now; it waits until one has charged",
+    }[worst]
+
+
+def _lack(
+    task: Task, robot: FreeRobot, travel: TravelCosts, assigner: Assigner, chargers: Sequence[int]
+) -> str:
+    """Return what a robot lacks for a task: a path, capacity or energy; empty: nothing."""
+    effort = effort_of(task, robot.cell, travel, robot.profile)
+    if effort.first == inf:
+        return "path"
+    if robot.battery is None or charges(task):
+        return ""
+    needed = assigner.battery_needed(robot.profile, effort, chargers)
+    return "capacity" if needed > 1 else "energy" if robot.battery < needed else ""
+
+
+def _why_no_fit(task: Task, robots: Sequence[FreeRobot]) -> str:
+    order = task.order
+    if order.robot and order.robot not in {robot.id for robot in robots}:
+        return f"only {order.robot} may do it, which is not in service"
+    asked = [robot for robot in robots if order.robot in ("", robot.id)]
+    able = [robot for robot in asked if set(order.capabilities) <= set(robot.profile.capabilities)]
+    whom = order.robot or "no robot"
+    if not able:
+        lacks = "lacks" if order.robot else "has all of"
+        return f"{whom} {lacks} the capabilities {', '.join(order.capabilities)}"
+    best = max(able, key=lambda robot: robot.profile.payload)
+    return (
+        f"no robot that may do it carries {order.payload:g} kg: the strongest, {best.id},"
+        f" carries {best.profile.payload:g} kg"
+    )

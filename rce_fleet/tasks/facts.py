@@ -1,0 +1,98 @@
+"""What the manager knows of the robots now: facts that are read anew after a restart, and are not kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import inf
+from typing import TYPE_CHECKING
+
+from rce_fleet.tasks.records import AUTOMATIC
+
+if TYPE_CHECKING:
+    from rce_fleet.planning.grid import GridMap
+    from rce_fleet.tasks.records import Zone
+
+AT_REST = frozenset({"idle", "arrived"})
+"""States of the planner in which a robot has nothing to do."""
+AWAY = frozenset({"silent", "joining"})
+"""States in which the planner cannot send a robot anywhere."""
+NOT_DRIVEN = frozenset({"paused", "stopped", "manual", "out_of_service", "dead", "lost"})
+"""States in which the planner does not drive a robot: a person decided so, or the robot is lost."""
+
+
+@dataclass(slots=True)
+class RobotFacts:
+    """One robot, as planner and battery tell.
+
+    Attributes:
+        id: Its name.
+        state: Its state in the planner.
+        reason: Why, for people.
+        cell: Its cell; None: not known.
+        goal: Its goal in the planner; None: none.
+        battery: Share of the full battery, 0 .. 1; None: not known.
+        is_charging: Whether it takes energy in; None: not known.
+        moved_at: When its cell changed last, or it got its goal: seconds since 1970.
+        away_since: Since when it has been silent, joining or not in the planner; ``inf``: it is there.
+        by_hand: Whether it drives to a goal that a person or another program gave it.
+        mode: Who drives it, by its own mode and the fleet's.
+        mode_reason: Why it has its mode, for people.
+        is_known: Whether the planner knows it now.
+    """
+
+    id: str
+    state: str = "joining"
+    reason: str = ""
+    cell: int | None = None
+    goal: int | None = None
+    battery: float | None = None
+    is_charging: bool | None = None
+    moved_at: float = -inf
+    away_since: float = inf
+    by_hand: bool = False
+    mode: str = AUTOMATIC
+    mode_reason: str = ""
+    is_known: bool = True
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the planner knows where it is, and hears it."""
+        return self.state not in AWAY and self.cell is not None
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether the planner drives it: it was not paused, and no person drives it."""
+        return self.is_there and self.state not in NOT_DRIVEN and self.mode == AUTOMATIC
+
+    def is_at(self, cell: int) -> bool:
+        """Return whether it has arrived in a cell."""
+        return self.cell == cell and self.state in AT_REST
+
+
+@dataclass(slots=True)
+class FleetFacts:
+    """The fleet, as the planner tells.
+
+    Attributes:
+        robots: By name.
+        shut: Cells that no robot may enter: walls, and cells that are blocked or will be.
+        map_revision: Changes whenever ``shut`` or the grid does.
+        is_live: Whether the planner is heard.
+        is_current: Whether no change of its state was missed.
+        grid: The grid, its walls blocked; None before the first state.
+        mode: The fleet's: ``automatic``, ``paused`` or ``stopped``.
+        zones: The planner's zones, by name.
+        pending: Cells that will be blocked once a robot has left them.
+        requested: Cells that people blocked, as the planner says; None: it has not said so since it began.
+    """
+
+    robots: dict[str, RobotFacts] = field(default_factory=dict)
+    shut: frozenset[int] = frozenset()
+    map_revision: int = 0
+    is_live: bool = False
+    is_current: bool = False
+    grid: GridMap | None = None
+    mode: str = AUTOMATIC
+    zones: dict[str, Zone] = field(default_factory=dict)
+    pending: frozenset[int] = frozenset()
+    requested: frozenset[int] | None = None

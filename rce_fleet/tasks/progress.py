@@ -1,0 +1,274 @@
+"""Carries tasks out: robots go from stop to stop, act there, and lose or end their tasks by rule."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from rce_fleet.tasks.order import Action, Stop
+from rce_fleet.tasks.task import RETURN, StopVisit, Task, TaskCause, TaskState
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from rce_fleet.tasks.book import TaskBook
+    from rce_fleet.tasks.facts import FleetFacts, RobotFacts
+
+
+@dataclass(frozen=True, slots=True)
+class ProgressRules:
+    """When a robot loses its task. Seconds.
+
+    Attributes:
+        lost_after: A robot that is silent this long gives its task up.
+        stuck_after: So does one that has a goal and has not changed its cell for this long ...
+        unreachable_after: ... or to whose goal no path has led for this long.
+        load_lost_after: A task whose load is on a robot that cannot continue fails after this time.
+        avoid_for: A robot that gave a task up does not get it again for this time.
+    """
+
+    lost_after: float = 15.0
+    stuck_after: float = 120.0
+    unreachable_after: float = 20.0
+    load_lost_after: float = 3600.0
+    avoid_for: float = 120.0
+
+
+class TaskProgress:
+    """Follows the robots that carry out tasks.
+
+    Args:
+        book: The tasks.
+        rules: When a robot loses its task.
+        charged: A stop that charges without a duration ends with this share of the full battery.
+
+    Attributes:
+        avoid: Until when a robot does not get a task again, by task's number and robot.
+    """
+
+    def __init__(self, book: TaskBook, rules: ProgressRules, charged: float = 0.95) -> None:
+        self._book = book
+        self._charged = charged
+        self._rules = rules
+        self.avoid: dict[tuple[int, str], float] = {}
+        self._taken: dict[int, str] = {}
+        self._warned: dict[int, int] = {}
+        """The stop before which people were told of a low battery, by task."""
+
+    def update(
+        self,
+        now: float,
+        facts: FleetFacts,
+        nearest: Callable[[RobotFacts, Iterable[int]], int | None],
+        short_of_energy: Callable[[Task, RobotFacts], str] = lambda _task, _robot: "",
+    ) -> None:
+        """Take over what the robots did.
+
+        Args:
+            now: Seconds since 1970.
+            facts: The robots.
+            nearest: Returns which of some cells a robot reaches first; None: it reaches none of them.
+            short_of_energy: Returns why a robot's battery is not enough for the rest of a task; empty: it is.
+        """
+        self._nearest, self._short_of_energy = nearest, short_of_energy
+        self.avoid = {pair: until for pair, until in self.avoid.items() if until > now}
+        self._taken = self.targets()
+        self._warned = {number: stop for number, stop in self._warned.items() if number in self._book.tasks}
+        for task in self._book.active_tasks():
+            robot = facts.robots.get(task.robot)
+            if task.state is TaskState.HELD:
+                self._end_action(task, now)
+            elif robot is None or not robot.is_there:
+                self._miss(self._end_action(task, now), robot, now, facts)
+            else:
+                self._follow(task, robot, now, facts)
+
+    def targets(self) -> dict[int, str]:
+        """Return the cells that robots go to or act in for tasks, and for whom they are taken."""
+        return {task.target: task.robot for task in self._book.active_tasks() if task.target is not None}
+
+    # Robots that are there
+
+    def _follow(self, task: Task, robot: RobotFacts, now: float, facts: FleetFacts) -> None:
+        entry = self._book.entry(robot.id)
+        if entry.is_out:
+            self._give_up(task, now, f"{robot.id} was taken out of service")
+            return
+        if task.state is TaskState.SUSPENDED:
+            task = self._book.advance(task, TaskCause.CONTINUE, now, f"{robot.id} can continue")
+        task = self._end_action(task, now, robot)
+        while not task.has_ended and task.action is None:
+            if not self._go(task, robot, now, facts):
+                return
+            task = self._end_action(self._book.tasks[task.number], now, robot)
+
+    def _go(self, task: Task, robot: RobotFacts, now: float, facts: FleetFacts) -> bool:
+        """Send the robot to the next stop; return whether it is there and its action began."""
+        stop, number = self._stop_of(task)
+        if stop is None:
+            self._finish(task, now)
+            return False
+        target = task.target
+        is_between_stops = target is None and bool(task.visits) and task.state is TaskState.RUNNING
+        if is_between_stops and (lack := self._short_of_energy(task, robot)):
+            if not task.is_loaded:
+                self._give_up(task, now, lack)
+                return False
+            self._warn_of_energy(task, lack, now)
+        if target is None or (target in facts.shut and len(stop.cells) != 1):
+            task = self._choose(task, stop, robot, now)
+            target = task.target
+        if target is None:
+            return False
+        if not robot.is_at(target):
+            if robot.is_driven:
+                self._check_trouble(task, robot, now, facts)
+            return False
+        visits = (*task.visits, StopVisit(number, robot.id, target, now))
+        begun = replace(task, visits=visits, revision=task.revision + 1, reason="", confirmed=False)
+        what = "brings the load of the cancelled task" if number == RETURN else stop.action.value
+        self._book.emit(begun, "arrived", now, text=f"{robot.id} is in cell {target}: {what}")
+        return True
+
+    def _warn_of_energy(self, task: Task, lack: str, now: float) -> None:
+        """Tell people, once for each stop, that a robot with a load may not get to its end."""
+        if self._warned.get(task.number) != task.position:
+            self._warned[task.number] = task.position
+            self._book.emit(
+                replace(task, revision=task.revision + 1), "low battery", now, text=f"{task.robot}: {lack}"
+            )
+
+    def _stop_of(self, task: Task) -> tuple[Stop | None, int]:
+        if task.state is not TaskState.CANCELLING:
+            return task.next_stop, task.position
+        if not task.is_loaded:
+            return None, RETURN
+        cells = task.order.return_cells or self._book.places.returns
+        if not cells:
+            source = task.load_from
+            cells = () if source is None else (source,)
+        duration = max((s.duration for s in task.order.stops if s.action is Action.DELIVER), default=0.0)
+        return Stop(Action.DELIVER, cells, duration), RETURN
+
+    def _choose(self, task: Task, stop: Stop, robot: RobotFacts, now: float) -> Task:
+        """Choose the cell of a stop; without one that is free, the task says what it waits for."""
+        cells = stop.cells
+        if stop.action is Action.CHARGE:
+            cells = cells or self._book.places.chargers
+        elif stop.action is Action.PARK:
+            cells = cells or self._book.places.parking or ((robot.cell,) if robot.cell is not None else ())
+        taken = {cell: self._taken[cell] for cell in cells if self._taken.get(cell, robot.id) != robot.id}
+        chosen = self._nearest(robot, [cell for cell in cells if cell not in taken])
+        if chosen is not None:
+            self._taken[chosen] = robot.id
+            sent = replace(task, target=chosen, revision=task.revision + 1, reason="")
+            self._book.emit(sent, "sent", now, text=f"{robot.id} goes to cell {chosen}")
+            return sent
+        waits = [cell for cell in cells if cell in taken]
+        if waits:
+            reason = f"waits for cell {waits[0]}, which {taken[waits[0]]} uses"
+        elif cells:
+            reason = f"no path leads {robot.id} to cell {', '.join(map(str, cells[:5]))}"
+        else:
+            reason = f"no cell is known for the stop {stop.action.value!r}: set chargers or parking places"
+        if task.reason != reason:
+            task = replace(task, reason=reason, revision=task.revision + 1)
+            self._book.emit(task, "waits", now, text=f"{task.id} {reason}")
+        if (
+            not waits
+            and not task.is_loaded
+            and now - max(robot.moved_at, task.changed_at) > self._rules.unreachable_after
+        ):
+            self._give_up(task, now, reason)
+            return self._book.tasks[task.number]
+        return task
+
+    def _end_action(self, task: Task, now: float, robot: RobotFacts | None = None) -> Task:
+        """End the action that is under way, if its time has come. An action is never begun twice."""
+        visit = task.action
+        if visit is None:
+            return task
+        stop = Stop(Action.DELIVER) if visit.stop == RETURN else task.order.stop(visit.stop)
+        if not self._is_over(task, stop, visit, now, robot):
+            return task
+        loads = task.loads + (stop.action is Action.PICK) - (stop.action is Action.DELIVER)
+        if visit.stop == RETURN:
+            loads = 0
+        ended = replace(
+            task,
+            visits=(*task.visits[:-1], replace(visit, ended_at=now)),
+            position=task.position + (visit.stop != RETURN),
+            loads=max(0, loads),
+            target=None,
+            revision=task.revision + 1,
+        )
+        if self._taken.get(visit.cell) == visit.robot:
+            del self._taken[visit.cell]
+        self._book.emit(
+            ended, "acted", now, text=f"{visit.robot} ended {stop.action.value} in cell {visit.cell}"
+        )
+        if ended.state is TaskState.HELD and not ended.is_loaded:
+            ended = replace(ended, robot="", revision=ended.revision + 1)
+            self._book.emit(ended, "left", now, text=f"{visit.robot} is free; {task.id} stays held")
+        return ended
+
+    def _is_over(
+        self, task: Task, stop: Stop, visit: StopVisit, now: float, robot: RobotFacts | None
+    ) -> bool:
+        if stop.confirm and not task.confirmed:
+            return False
+        if stop.action is Action.CHARGE and not stop.duration:
+            return robot is None or robot.battery is None or robot.battery >= self._charged
+        duration = stop.duration
+        if visit.stop == RETURN:
+            duration = max((s.duration for s in task.order.stops if s.action is Action.DELIVER), default=0.0)
+        return now >= visit.started_at + duration
+
+    def _finish(self, task: Task, now: float) -> None:
+        if task.state is TaskState.CANCELLING:
+            self._book.advance(task, TaskCause.CANCEL, now, f"{task.robot} has brought its load away")
+        elif task.state is TaskState.RUNNING:
+            took = now - (task.started_at if task.started_at is not None else now)
+            self._book.advance(task, TaskCause.FINISH, now, f"{task.robot} made all stops in {took:.0f} s")
+
+    # Robots that cannot go on
+
+    def _check_trouble(self, task: Task, robot: RobotFacts, now: float, facts: FleetFacts) -> None:
+        waited = now - max(robot.moved_at, task.changed_at)
+        if task.target in facts.shut and waited > self._rules.unreachable_after:
+            self._give_up(task, now, f"cell {task.target} is blocked")
+        elif robot.state == "unreachable" and waited > self._rules.unreachable_after:
+            self._give_up(task, now, f"no path leads {robot.id} to cell {task.target}")
+        elif waited > self._rules.stuck_after:
+            self._give_up(task, now, f"{robot.id} has not left cell {robot.cell} for {waited:.0f} s")
+
+    def _miss(self, task: Task, robot: RobotFacts | None, now: float, facts: FleetFacts) -> None:
+        """Decide about a task whose robot does not answer."""
+        if not facts.is_live or task.has_ended:
+            return
+        since = robot.away_since if robot is not None else task.changed_at
+        if robot is None:
+            reason = f"{task.robot} is not known to the planner"
+        else:
+            reason = f"{task.robot} is {robot.state}: {robot.reason or 'it has no pose'}"
+        if now - since > self._rules.lost_after or self._book.entry(task.robot).is_out:
+            self._give_up(task, now, reason)
+
+    def _give_up(self, task: Task, now: float, reason: str) -> None:
+        """Give a task to others; with its load on the robot it waits, and then fails."""
+        self.avoid[task.number, task.robot] = now + self._rules.avoid_for
+        if not task.is_bound:
+            if task.state is TaskState.CANCELLING:
+                self._book.advance(task, TaskCause.CANCEL, now, reason)
+            elif task.state is TaskState.RUNNING:
+                self._book.advance(task, TaskCause.RELEASE, now, reason, robot="", target=None)
+        elif task.state is TaskState.RUNNING:
+            suspended = self._book.advance(
+                task, TaskCause.SUSPEND, now, f"its load is on {task.robot}: {reason}"
+            )
+            if suspended.question:
+                self._book.emit(suspended, "question", now, text=suspended.question)
+        elif now - task.changed_at > self._rules.load_lost_after:
+            self._book.advance(
+                task, TaskCause.FAIL, now, f"its load is on {task.robot}, which did not come back: {reason}"
+            )

@@ -1,0 +1,139 @@
+"""Queues of busy robots: each waiting task is inserted where it costs least, the most regretted first.
+
+Regret insertion: J.-Y. Potvin, J.-M. Rousseau, "A parallel route building algorithm for the vehicle routing
+and scheduling problem with time windows" (1993).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import inf
+from typing import TYPE_CHECKING
+
+from rce_fleet.tasks.assignment import misfit
+from rce_fleet.tasks.energy import Effort, effort_of
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from rce_fleet.tasks.records import RobotProfile
+    from rce_fleet.tasks.task import Task
+    from rce_fleet.tasks.travel import TravelCosts
+
+NEAREST = 8
+"""So many robots are looked at for each task, those that could be there first."""
+MOST_QUEUES, MOST_TASKS = 32, 32
+"""So many queues, the shortest ones, and the most urgent tasks are looked at each time."""
+
+
+@dataclass(slots=True)
+class RobotQueue:
+    """The tasks that a robot does after its present one.
+
+    Attributes:
+        robot: Its name.
+        profile: What it can do.
+        cell: Where its present task ends.
+        ready: Seconds from now until then.
+        tasks: In order.
+    """
+
+    robot: str
+    profile: RobotProfile
+    cell: int
+    ready: float
+    tasks: list[Task] = field(default_factory=list)
+
+
+class Queues:
+    """Inserts tasks into queues.
+
+    Args:
+        travel: Distances.
+        length: Most tasks in a queue.
+    """
+
+    def __init__(self, travel: TravelCosts, length: int = 3) -> None:
+        self._travel = travel
+        self._length = length
+        self._efforts: dict[tuple[int, int, int], Effort] = {}
+
+    def insert(
+        self, tasks: Sequence[Task], queues: Sequence[RobotQueue], avoided: Collection[tuple[int, str]] = ()
+    ) -> list[tuple[Task, str]]:
+        """Insert tasks into queues, in place; return which task went to which robot.
+
+        Args:
+            tasks: Tasks without a robot, the most urgent first.
+            queues: Of busy robots.
+            avoided: Numbers of tasks with robots that gave them up a short time ago.
+        """
+        self._efforts.clear()
+        queues = [queue for queue in queues if len(queue.tasks) < self._length]
+        queues = sorted(queues, key=lambda queue: (len(queue.tasks), queue.ready))[:MOST_QUEUES]
+        room = sum(self._length - len(queue.tasks) for queue in queues)
+        waiting = list(tasks[: min(room, MOST_TASKS)])
+        options = {task.number: self._options(task, queues, avoided) for task in waiting}
+        inserted = []
+        while waiting:
+            task = max(waiting, key=lambda each: _regret(options[each.number]))
+            waiting.remove(task)
+            if not options[task.number]:
+                continue
+            _, place, queue = min(options[task.number], key=lambda option: option[0])
+            queue.tasks.insert(place, task)
+            inserted.append((task, queue.robot))
+            for other in waiting:
+                if any(option[2] is queue for option in options[other.number]):
+                    options[other.number] = self._options(other, queues, avoided)
+        return inserted
+
+    def finish(self, queue: RobotQueue) -> float:
+        """Return the seconds until a robot has done its queue; ``inf`` if it cannot."""
+        seconds, cell = queue.ready, queue.cell
+        for task in queue.tasks:
+            took, cell = self._leg(task, cell, queue.profile)
+            seconds += took
+        return seconds
+
+    def _options(
+        self, task: Task, queues: Sequence[RobotQueue], avoided: Collection[tuple[int, str]]
+    ) -> list[tuple[float, int, RobotQueue]]:
+        """Return the best place in each of the nearest queues: when all is done there, place and queue."""
+        fitting = [
+            queue
+            for queue in queues
+            if len(queue.tasks) < self._length
+            and not misfit(task, queue.robot, queue.profile)
+            and (task.number, queue.robot) not in avoided
+        ]
+        ends = []
+        for queue in fitting:
+            took, _ = self._leg(task, queue.cell, queue.profile)
+            if took < inf:
+                ends.append((queue.ready + took, queue.robot, queue))
+        ends.sort(key=lambda end: end[:2])
+        options = []
+        for _, _, queue in ends[:NEAREST]:
+            best = (inf, 0)
+            for place in range(len(queue.tasks) + 1):
+                trial = RobotQueue(queue.robot, queue.profile, queue.cell, queue.ready, [*queue.tasks])
+                trial.tasks.insert(place, task)
+                best = min(best, (self.finish(trial), place))
+            if best[0] < inf:
+                options.append((best[0], best[1], queue))
+        return options
+
+    def _leg(self, task: Task, cell: int, profile: RobotProfile) -> tuple[float, int]:
+        """Return how long a task takes a robot in a cell, and where it is then."""
+        key = (task.number, cell, id(profile))
+        effort = self._efforts.get(key)
+        if effort is None:
+            effort = self._efforts[key] = effort_of(task, cell, self._travel, profile)
+        return effort.seconds(profile), cell if effort.end is None else effort.end
+
+
+def _regret(options: list[tuple[float, int, RobotQueue]]) -> float:
+    """Return how much worse the second best robot is; a task with one robot goes first."""
+    costs = sorted(option[0] for option in options)
+    return inf if len(costs) == 1 else -inf if not costs else costs[1] - costs[0]

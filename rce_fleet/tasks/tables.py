@@ -1,0 +1,211 @@
+"""The tables of the fleet manager: all its records, and the events that changed them.
+
+Each event has the whole new record of what it changed. :meth:`FleetTables.put` applies events that a journal
+kept, so that the tables of a restarted manager are the ones before. The tables have no clock and do no I/O.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce_fleet.exceptions import RevisionError, UnknownTaskError
+from rce_fleet.tasks.records import (
+    BlockedCells,
+    FleetEntry,
+    FleetEvent,
+    GoalEntry,
+    Places,
+    PlannerRun,
+    Record,
+    RobotEntry,
+    Zone,
+    key_of,
+)
+from rce_fleet.tasks.task import Task, TaskState
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+WITH_ROBOT = frozenset({TaskState.RUNNING, TaskState.SUSPENDED, TaskState.CANCELLING})
+"""States in which a task occupies its robot; a held task does while its load is on the robot."""
+
+
+class FleetTables:
+    """All tasks that have not been forgotten, and what people decided about robots and places.
+
+    Attributes:
+        tasks: By number.
+        robots: What people decided about robots, by name.
+        goals: Where they sent robots, by the robot's name.
+        fleet: What they decided about the whole fleet.
+        planner: The planner that all this was last compared with.
+        places: Chargers, parking places, return cells.
+        zones: By name.
+        removed_zones: Zones that were removed, and that the planner may still have, by name.
+        blocked: Cells that people blocked.
+        number: Of the last event.
+    """
+
+    def __init__(self) -> None:
+        self.tasks: dict[int, Task] = {}
+        self.robots: dict[str, RobotEntry] = {}
+        self.goals: dict[str, GoalEntry] = {}
+        self.fleet = FleetEntry()
+        self.planner = PlannerRun()
+        self.places = Places()
+        self.zones: dict[str, Zone] = {}
+        self.removed_zones: dict[str, Zone] = {}
+        self.blocked = BlockedCells()
+        self.number = 0
+        self._open: dict[int, None] = {}
+        self._by_robot: dict[str, int] = {}
+        self._queues: dict[str, dict[int, None]] = {}
+        self._by_key: dict[tuple[str, str], int] = {}
+        self._last_task = 0
+        self._out: list[FleetEvent] = []
+
+    # Records and events
+
+    def put(self, event: FleetEvent) -> None:
+        """Apply an event that a journal kept."""
+        self.number = max(self.number, event.number)
+        self.put_record(event.record)
+
+    def put_record(self, record: Record) -> None:
+        """Apply a record that a journal kept."""
+        match record:
+            case Task():
+                self._put_task(record)
+            case RobotEntry():
+                self.robots[record.id] = record
+            case GoalEntry():
+                self._put_goal(record)
+            case FleetEntry():
+                self.fleet = record
+            case PlannerRun():
+                self.planner = record
+            case Places():
+                self.places = record
+            case Zone():
+                self._put_zone(record)
+            case BlockedCells():
+                self.blocked = record
+            case _:
+                raise AssertionError(record)
+
+    def emit(self, record: Record, name: str, now: float, *, user: str = "", text: str = "") -> None:
+        """Replace a record, and note the event."""
+        self.number += 1
+        kind, key = key_of(record)
+        self._out.append(FleetEvent(self.number, now, kind, key, name, user, text, record))
+        self.put_record(record)
+
+    def take_events(self) -> list[FleetEvent]:
+        """Return the events since the last call, in order."""
+        out, self._out = self._out, []
+        return out
+
+    def forget(self, number: int) -> None:
+        """Forget a task that has ended, and its key."""
+        task = self.tasks.pop(number)
+        self._open.pop(number, None)
+        if self._by_key.get((task.requester, task.key)) == number:
+            del self._by_key[task.requester, task.key]
+
+    # Questions
+
+    def find(self, task_id: str) -> Task:
+        """Return a task.
+
+        Raises:
+            UnknownTaskError: There is none of this id.
+        """
+        number = task_id.removeprefix("T")
+        task = self.tasks.get(int(number)) if number.isdecimal() and number.isascii() else None
+        if task is None or task.id != task_id:
+            raise UnknownTaskError(f"there is no task {task_id!r}")
+        return task
+
+    def open_tasks(self) -> Iterator[Task]:
+        """Return the tasks that have not ended, oldest first."""
+        for number in list(self._open):
+            task = self.tasks.get(number)
+            if task is not None and not task.has_ended:
+                yield task
+
+    def active_tasks(self) -> list[Task]:
+        """Return the tasks that occupy robots, oldest first."""
+        return [self.tasks[number] for number in sorted(self._by_robot.values())]
+
+    def queue_of(self, robot: str) -> list[Task]:
+        """Return the tasks in a robot's queue, in order."""
+        return [self.tasks[number] for number in self._queues.get(robot, ())]
+
+    def queues(self) -> dict[str, list[Task]]:
+        """Return the tasks in the queues of all robots that have some, by robot."""
+        return {robot: self.queue_of(robot) for robot in self._queues}
+
+    def task_of(self, robot: str) -> Task | None:
+        """Return the task that occupies a robot."""
+        number = self._by_robot.get(robot)
+        return None if number is None else self.tasks[number]
+
+    def entry(self, robot: str) -> RobotEntry:
+        """Return what people decided about a robot."""
+        return self.robots.get(robot) or RobotEntry(robot, revision=0)
+
+    def at(self, task_id: str, revision: int | None) -> Task:
+        """Return a task at a revision; None: any.
+
+        Raises:
+            RevisionError: It is at another one.
+            UnknownTaskError: There is no such task.
+        """
+        task = self.find(task_id)
+        if revision is not None and revision != task.revision:
+            raise RevisionError(
+                f"{task.id} is at revision {task.revision}, not {revision}: read it again, then change it"
+            )
+        return task
+
+    # Indexes
+
+    def _put_goal(self, entry: GoalEntry) -> None:
+        self.goals.pop(entry.id, None)
+        if entry.cell is not None or entry.unsent:
+            self.goals[entry.id] = entry
+
+    def _put_zone(self, zone: Zone) -> None:
+        self.zones.pop(zone.id, None)
+        self.removed_zones.pop(zone.id, None)
+        if not zone.is_removed:
+            self.zones[zone.id] = zone
+        elif zone.unsent:
+            self.removed_zones[zone.id] = zone
+
+    def _put_task(self, task: Task) -> None:
+        before = self.tasks.get(task.number)
+        self.tasks[task.number] = task
+        self._last_task = max(self._last_task, task.number)
+        if task.key:
+            self._by_key.setdefault((task.requester, task.key), task.number)
+        if task.has_ended:
+            self._open.pop(task.number, None)
+        else:
+            self._open[task.number] = None
+        if before is not None:
+            self._leave_robot(before)
+        if task.robot and (task.state in WITH_ROBOT or task.state is TaskState.HELD):
+            self._by_robot[task.robot] = task.number
+        elif task.state is TaskState.ASSIGNED:
+            self._queues.setdefault(task.robot, {})[task.number] = None
+
+    def _leave_robot(self, before: Task) -> None:
+        """Remove a task's former record from the indexes by robot."""
+        if self._by_robot.get(before.robot) == before.number:
+            del self._by_robot[before.robot]
+        queue = self._queues.get(before.robot)
+        if queue is not None and before.state is TaskState.ASSIGNED:
+            queue.pop(before.number, None)
+            if not queue:
+                del self._queues[before.robot]

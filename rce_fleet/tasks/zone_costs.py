@@ -1,0 +1,47 @@
+"""What zones make of robots' ways: detours around cells that one robot may not enter, and dearer metres."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rce_fleet.tasks.book import TaskBook
+    from rce_fleet.tasks.facts import FleetFacts
+    from rce_fleet.tasks.records import RobotProfile
+
+
+def zone_profiles(book: TaskBook, facts: FleetFacts, default: RobotProfile) -> dict[str, RobotProfile]:
+    """Return the profiles of robots for which zones count, with what a metre in each zone counts.
+
+    A zone that is blocked for some robots counts without end for them. What a robot's own profile says about
+    a cost zone comes before the zone's value. Robots with the same costs and the same profile share one
+    object, so that they are looked at together.
+
+    Args:
+        book: Zones and profiles.
+        facts: The robots.
+        default: Profile of robots that have none of their own.
+    """
+    zones = [
+        zone
+        for zone in book.zones.values()
+        if zone.kind == "cost" or (zone.kind == "blocked" and zone.robots)
+    ]
+    if not zones:
+        return {}
+    made: dict[tuple[int, tuple[str, ...]], RobotProfile] = {}
+    found = {}
+    for robot in facts.robots:
+        applied = [zone for zone in zones if zone.applies_to(robot)]
+        base = book.entry(robot).profile or default
+        if not applied:
+            continue
+        key = id(base), tuple(zone.id for zone in applied)
+        if key not in made:
+            costs = {zone.id: zone.value or 1.0 for zone in applied if zone.kind == "cost"}
+            shut = {zone.id: inf for zone in applied if zone.kind == "blocked"}
+            made[key] = replace(base, zone_cost={**costs, **base.zone_cost, **shut})
+        found[robot] = made[key]
+    return found

@@ -1,0 +1,64 @@
+"""``rce volume``: the folders of users that outlive containers."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from rce.model import about
+from rce_master.cli import credentials
+from rce_master.cli.client import ApiClient, run
+
+app = typer.Typer(no_args_is_help=True, help="List and remove volumes of containers.")
+
+OfUser = Annotated[str, typer.Option("--user", help="Whose; administrators only (default: yourself).")]
+
+
+@app.command("list")
+def list_(user: OfUser = "") -> None:
+    """List volumes with their use and their machine."""
+    run(_list(user))
+
+
+async def _list(user: str) -> None:
+    async with ApiClient.of(credentials.load()) as client:
+        found = (await client.call("GET", "/volumes", query=_of(user)))["volumes"]
+    several = len({one["user"] for one in found}) > 1
+    table = Table("volume", "used", "size", "machine", "container", "path", box=None)
+    for one in found:
+        name = f"{one['user']}/{one['name']}" if several else one["name"]
+        used = "-" if one["used"] is None else about(one["used"])
+        table.add_row(name, used, about(one["size"]), *(_or_dash(one, *_PLACE)))
+    Console().print(table)
+
+
+_PLACE = ("machine", "container", "path")
+
+
+def _or_dash(one: dict[str, Any], *keys: str) -> list[str]:
+    return [one[key] or "-" for key in keys]
+
+
+@app.command("remove")
+def remove(
+    name: Annotated[str, typer.Argument(help="Name of the volume.")],
+    user: OfUser = "",
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Remove a volume and all its files."""
+    if not yes:
+        typer.confirm(f"Remove volume {name} and all its files?", abort=True)
+    run(_remove(name, user))
+
+
+async def _remove(name: str, user: str) -> None:
+    async with ApiClient.of(credentials.load()) as client:
+        await client.call("DELETE", f"/volumes/{name}", query=_of(user))
+    typer.echo(f"removed {name}")
+
+
+def _of(user: str) -> dict[str, str | int]:
+    return {"user": user} if user else {}

@@ -1,0 +1,58 @@
+"""REST: volumes, the folders of users that outlive containers."""
+
+from __future__ import annotations
+
+from rce_master.http.model import Model
+from rce_master.http.routes import OF_USER, Call, route_table
+from rce_master.http.views import Views
+from rce_master.state import commands
+
+routes = route_table("volumes")
+
+_QUERY = (OF_USER,)
+
+
+class VolumeOut(Model):
+    """A volume."""
+
+    user: str
+    name: str
+    size: int
+    """Bytes that it may hold."""
+    used: int | None
+    """Bytes that it holds, as last measured; null if its machine has not reported it."""
+    machine: str
+    """The machine where it is; empty until its first container has a machine."""
+    task_set: str
+    """The container task set there."""
+    limit: str
+    """How its size is enforced there: ``image`` (writes fail) or ``watched`` (its container is ended)."""
+    container: str
+    """Tag of the container that has it; empty if none."""
+    path: str
+    """Where that container sees it."""
+
+
+class VolumesOut(Model):
+    """Volumes."""
+
+    volumes: list[VolumeOut]
+
+
+@routes.route("GET", "/volumes", "List volumes", reply=VolumesOut, query=_QUERY)
+async def list_volumes(call: Call) -> VolumesOut:
+    """List volumes."""
+    tables = call.services.state_service.tables
+    views = Views(tables, call.services.reconciler.usage)
+    scope = call.scope
+    found = tables.volumes if scope is None else tables.volumes.by("user", scope)
+    return VolumesOut(
+        volumes=[VolumeOut(**views.volume(known)) for known in sorted(found, key=lambda known: known.id)]
+    )
+
+
+@routes.route("DELETE", "/volumes/{name}", "Remove a volume with its files", status=204, query=_QUERY)
+async def remove_volume(call: Call) -> None:
+    """Remove a volume that no container has."""
+    command = commands.RemoveVolume(user=call.owner, name=call.path("name"))
+    await call.services.state_service.submit(command)

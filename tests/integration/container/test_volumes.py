@@ -1,0 +1,211 @@
+"""Volumes in real containers: folders in every runtime, file systems of their size where they work."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support.containers import Machine, until
+
+from rce.control.messages import RemoveVolume, VolumeLimit, VolumeRemoved
+from rce.control.model import EndpointState
+from rce.model import MEGABYTE, NodeSpec, Resources, Volume
+from rce_container.exceptions import VolumeError
+from rce_container.volumes import images
+from rce_container.volumes.store import VolumeStore
+
+BOX, OTHER = "user/box", "user/other"
+SIZE = 16 * MEGABYTE
+IMAGES = pytest.mark.skipif(bool(why := images.unavailable()), reason=f"volumes cannot be images: {why}")
+
+
+def resources(path: str = "/data/journal", size: int = SIZE) -> Resources:
+    return Resources(volumes=(Volume(name="journal", path=path, size=size),))
+
+
+def own(exe: str, args: str = "") -> NodeSpec:
+    return NodeSpec(tag="node", pkg="own", exe=exe, args=args)
+
+
+@pytest.fixture(
+    params=[
+        ("process", VolumeLimit.WATCHED),
+        pytest.param(("namespace", VolumeLimit.WATCHED), marks=pytest.mark.needs("bwrap")),
+        pytest.param(("namespace", VolumeLimit.IMAGE), marks=[pytest.mark.needs("bwrap"), IMAGES]),
+        pytest.param(("podman", VolumeLimit.IMAGE), marks=[pytest.mark.needs("podman"), IMAGES]),
+    ],
+    ids=lambda param: f"{param[0]}-{param[1].value}",
+)
+def keeper(request: pytest.FixtureRequest, folder: Path) -> Iterator[Machine]:
+    runtime, limit = request.param
+    machine = Machine(folder, runtime)
+    machine.volume_limit = limit
+    yield machine
+    machine.tidy()
+
+
+@pytest.fixture
+def sandbox(folder: Path) -> Iterator[Machine]:
+    """A machine whose containers are isolated."""
+    machine = Machine(folder, "namespace")
+    yield machine
+    machine.tidy()
+
+
+def volume_of(machine: Machine, user: str = "user") -> list[Path]:
+    place = machine.folder / "state" / "volumes" / user
+    return sorted(place.iterdir()) if place.is_dir() else []
+
+
+async def put(machine: Machine, exe: str, revision: int = 1, id_: str = BOX, size: int = SIZE) -> None:
+    await machine.put(id_, revision, nodes=(own(exe),), resources=resources(size=size))
+
+
+async def kill_environment(machine: Machine) -> None:
+    """Kill the environment; the node ends with it, and the container is made again."""
+    pid = await machine.node_pid(BOX, "node")
+    environment = next(
+        int(line.split()[1])
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+        if line.startswith("PPid:")
+    )
+    before = machine.reported(BOX).incarnation
+    os.kill(environment, signal.SIGKILL)
+    with contextlib.suppress(ProcessLookupError):  # in a sandbox it has ended with the environment
+        os.kill(pid, signal.SIGKILL)
+    await until(lambda: machine.reported(BOX).incarnation not in ("", before), what="another incarnation")
+
+
+async def test_files_outlive_the_container(keeper: Machine) -> None:
+    async with keeper.engine():
+        await put(keeper, "keep.py")
+        first = await keeper.log_holds(BOX, "node", "1 runs")
+        if keeper.runtime.isolated:
+            assert first.startswith("/data/journal ")
+        await keeper.drop(BOX)
+        await put(keeper, "keep.py", 200)
+        await keeper.log_holds(BOX, "node", "2 runs")
+    async with keeper.engine():  # another manager: all containers of the former one have ended
+        await put(keeper, "keep.py", 300)
+        await keeper.log_holds(BOX, "node", "3 runs")
+    assert len(volume_of(keeper)) == 1
+
+
+async def test_files_outlive_a_kill(keeper: Machine) -> None:
+    async with keeper.engine():
+        await put(keeper, "keep.py")
+        await keeper.log_holds(BOX, "node", "1 runs")
+        for number in (2, 3):
+            await kill_environment(keeper)
+            await keeper.log_holds(BOX, "node", f"{number} runs")
+
+
+async def test_an_adopted_container_keeps_its_volume(keeper: Machine) -> None:
+    async with keeper.managed():
+        await put(keeper, "keep.py")
+        await keeper.log_holds(BOX, "node", "1 runs")
+    async with keeper.engine():
+        await put(keeper, "keep.py")
+        await put(keeper, "keep.py", id_=OTHER)
+        await until(lambda: any("has not ended yet" in text for text in keeper.faults), what="a refusal")
+        await keeper.drop(BOX)
+        await keeper.log_holds(OTHER, "node", "2 runs")
+
+
+@pytest.mark.needs("bwrap")
+@IMAGES
+async def test_an_image_takes_no_more_than_its_size(sandbox: Machine) -> None:
+    machine = sandbox
+    machine.volume_limit = VolumeLimit.IMAGE
+    async with machine.engine():
+        await put(machine, "fill.py")
+        text = await machine.log_holds(BOX, "node", "wrote")
+        assert f"stopped {errno.ENOSPC}" in text
+        assert int(text.split()[-1]) < SIZE
+        await until(lambda: machine.usage and machine.usage[-1].volumes.get("user/journal", 0) > SIZE // 2)
+        assert machine.usage[-1].volumes["user/journal"] <= SIZE
+        await machine.drop(BOX)
+        await put(machine, "fill.py", 200, size=3 * SIZE)  # it grows
+        await until(lambda: "wrote" in "".join(machine.faults) or machine.node(BOX, "node"), what="a start")
+        text = await machine.log_holds(BOX, "node", "wrote")
+        assert 2 * SIZE < int(text.split()[-1]) < 3 * SIZE
+    (image,) = volume_of(machine)
+    assert 3 * SIZE - MEGABYTE < image.stat().st_blocks * 512 <= 3 * SIZE + MEGABYTE
+    assert not images.is_attached(image)
+
+
+async def test_a_container_with_a_full_folder_is_ended(machine: Machine) -> None:
+    async with machine.engine():
+        await put(machine, "fill.py")
+        await until(lambda: any("may hold 16 MiB" in text for text in machine.faults), what="a fault")
+        await until(lambda: any("cannot be started" in text for text in machine.faults), what="a refusal")
+        assert machine.reported(BOX).state is not EndpointState.RUNNING
+        await machine.drop(BOX)
+        await put(machine, "fill.py", 200, size=8 * SIZE)
+        await machine.log_holds(BOX, "node", "wrote")
+
+
+async def test_a_volume_is_removed_when_its_container_ended(keeper: Machine) -> None:
+    async with keeper.engine() as manager:
+        await put(keeper, "keep.py")
+        await keeper.log_holds(BOX, "node", "1 runs")
+        await manager.handle(RemoveVolume(volume="user/journal"))
+        assert len(volume_of(keeper)) == 1
+        await keeper.drop(BOX)
+        await until(lambda: keeper.of(VolumeRemoved), what="it is removed")
+        assert keeper.of(VolumeRemoved) == [VolumeRemoved(volume="user/journal")]
+        assert volume_of(keeper) == []
+        await put(keeper, "keep.py", 200)
+        await keeper.log_holds(BOX, "node", "1 runs")
+        await keeper.drop(BOX, 300)
+        await manager.handle(RemoveVolume(volume="user/journal"))
+        await until(lambda: len(keeper.of(VolumeRemoved)) == 2, what="it is removed again")
+        assert volume_of(keeper) == []
+
+
+@pytest.mark.needs("bwrap")
+async def test_users_do_not_see_volumes_of_others(sandbox: Machine) -> None:
+    machine = sandbox
+    async with machine.engine():
+        await put(machine, "keep.py")
+        await machine.log_holds(BOX, "node", "1 runs")
+        await put(machine, "keep.py", id_="mallory/box")
+        await machine.log_holds("mallory/box", "node", "1 runs")
+        pid = await machine.node_pid("mallory/box", "node")
+        inside = Path(f"/proc/{pid}/root")
+        assert not (inside / str(machine.folder / "state").lstrip("/")).exists()
+        assert [path.name for path in (inside / "data").iterdir()] == ["journal"]
+        (theirs,), (ours,) = volume_of(machine, "mallory"), volume_of(machine)
+        assert theirs != ours
+        assert machine.folder.joinpath("state/volumes").stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.needs("bwrap")
+async def test_a_volume_may_not_hide_the_engine(sandbox: Machine) -> None:
+    machine = sandbox
+    async with machine.engine():
+        hidden = str(machine.packages)
+        await machine.put(BOX, nodes=(own("keep.py"),), resources=resources(path=hidden))
+        await until(lambda: any(f"would hide {hidden}" in text for text in machine.faults), what="a refusal")
+
+
+@IMAGES
+async def test_an_image_is_not_mounted_twice(tmp_path: Path) -> None:
+    store = VolumeStore(tmp_path / "volumes", images=True)
+    (volume,) = resources().volumes
+    store.claim("user", "1" * 12, [volume])
+    await asyncio.to_thread(store.prepare, "1" * 12)
+    with pytest.raises(VolumeError, match="belongs to a container that has not ended"):
+        store.claim("user", "2" * 12, [volume])
+    with pytest.raises(VolumeError, match="is not the name of a volume"):
+        store.doom("user/../../etc")
+    store.release("1" * 12)
+    assert store.doom("user/journal")
+    store.delete_removed()
+    assert [path.name for path in (tmp_path / "volumes" / "user").iterdir()] == []

@@ -1,0 +1,87 @@
+"""Modes, zones and goals of the fleet manager at a real planner, whose process is killed in between."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+from support.managed_fleet import ManagedFleet, managed_fleet
+
+LONGEST_S = 90.0
+
+
+async def until(found: Callable[[], Awaitable[bool]]) -> None:
+    """Wait until something is so."""
+    async with asyncio.timeout(LONGEST_S):
+        while not await found():
+            await asyncio.sleep(0.1)
+
+
+async def state_of(fleet: ManagedFleet) -> dict[str, Any]:
+    """Return robots' states and modes, zones and blocked cells, as the planner has them."""
+    answer = await fleet.call("/fleet/get_state", "fleet/GetState")
+    if answer is None:
+        return {"robots": {}, "goals": {}, "zones": set(), "blocked": set()}
+    state = answer.state
+    return {
+        "robots": {robot.id: robot.mode for robot in state.robots},
+        "goals": {robot.id: robot.goal for robot in state.robots},
+        "zones": {zone.id for zone in state.zones},
+        "blocked": set(state.blocked),
+    }
+
+
+async def test_modes_and_zones_survive_the_planner(tmp_path: Path) -> None:
+    async with managed_fleet(tmp_path / "journal.sqlite", [0, 7]) as fleet:
+        spill = {"kind": "blocked", "cells": [26, 27], "reason": "oil", "robots": []}
+        ice = {"kind": "slow", "cells": [30], "value": 0.2}
+        async with asyncio.timeout(LONGEST_S):
+            while (await fleet.ask("POST", "/robots/Robot1/pause", {"reason": "tea"})).status != 200:
+                await asyncio.sleep(0.2)  # it has not joined yet
+        assert (await fleet.ask("PUT", "/zones/spill", spill)).status == 201
+        assert (await fleet.ask("PUT", "/zones/ice", ice)).status == 201
+        async with asyncio.timeout(LONGEST_S):
+            while (await fleet.ask("PUT", "/robots/Robot2/goal", {"cell": 47})).status != 200:
+                await asyncio.sleep(0.2)
+        blocked = await fleet.call("/fleet/block_cell", "fleet/BlockCell", cell=40, blocked=True)
+        assert blocked is not None
+        assert blocked.ok
+
+        async def is_told() -> bool:
+            state = await state_of(fleet)
+            return (
+                bool(state["robots"].get("Robot1") == "paused")
+                and bool(state["zones"] == {"spill", "ice"})
+                and {26, 27, 40} <= state["blocked"]
+                and bool(state["goals"].get("Robot2") == 47)
+            )
+
+        await until(is_told)
+
+        async def is_kept() -> bool:
+            page = (await fleet.ask("GET", "/events?after=0&limit=5000")).body
+            return "blocked" in {event["name"] for event in page["events"]}
+
+        await until(is_kept)
+        await fleet.kill("fleet_planner.py")
+        await fleet.start("fleet_planner.py")
+        await until(is_told)
+        shown = (await fleet.ask("GET", "/robots/Robot1")).body
+        assert (shown["mode"], shown["activity"], shown["reason"]) == ("paused", "paused", "tea")
+
+        task = (await fleet.ask("POST", "/tasks", {"stops": [{"cell": 5}], "robot": "Robot1"})).body["id"]
+        assert (await fleet.ask("POST", "/robots/Robot1/resume")).body["mode"] == "automatic"
+        await fleet.until_state(task, "done")
+        out = await fleet.call(
+            "/fleet/set_mode", "fleet/SetMode", robot="Robot2", mode="out_of_service", reason="flat", by="eve"
+        )
+        assert out is not None
+        assert out.ok
+
+        async def is_out() -> bool:
+            return bool((await fleet.ask("GET", "/robots/Robot2")).body["activity"] == "out")
+
+        await until(is_out)
+        assert (await fleet.ask("GET", "/robots/Robot2")).body["reason"] == "flat, by eve"

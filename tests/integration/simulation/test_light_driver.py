@@ -1,0 +1,49 @@
+"""Light robots as a ROS node: what reaches them without the planner."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+import numpy as np
+
+from rce.ros.core import Core
+from rce.ros.node import Node
+from rce.ros.packages import PackageIndex
+from rce.ros.types import TypeRegistry
+from rce_fleet.drivers.light_driver import LightDriver
+from rce_fleet.geometry.poses import Pose
+from rce_fleet.simulation.light.robots import LightRobots
+
+TYPES = TypeRegistry(PackageIndex([]))
+LIMIT_S = 60
+
+
+async def until(holds: Callable[[], object]) -> None:
+    async with asyncio.timeout(LIMIT_S):
+        while not holds():
+            await asyncio.sleep(0.02)
+
+
+async def test_light_robots_obey_stops_and_hands() -> None:
+    robots = LightRobots({"Robot1": Pose(0, 0, 0), "Robot2": Pose(0, 5, 0)}, np.empty((0, 4)))
+    async with (
+        Core(port=0) as core,
+        Node("world", argv=[], master_uri=core.uri, types=TYPES) as node,
+        Node("station", argv=[], master_uri=core.uri, types=TYPES) as station,
+    ):
+        await LightDriver(node, robots, range(2)).start()
+        stop = await station.advertise("/Robot2/emergency_stop", "std_msgs/Bool", latch=True)
+        stop.publish(data=True)
+        await until(lambda: robots.stopped.tolist() == [False, True])
+        drive = await station.advertise("/Robot1/raw_cmd_vel", "geometry_msgs/Twist")
+        await until(lambda: drive.connections)
+        drive.publish(linear={"x": 0.4}, angular={"z": 0.1})
+
+        def has_moved() -> bool:
+            robots.advance(0.04)
+            return bool(robots.bodies.poses[0, 0] > 0)
+
+        await until(has_moved)
+        stop.publish(data=False)
+        await until(lambda: not robots.stopped.any())

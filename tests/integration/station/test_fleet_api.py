@@ -1,0 +1,279 @@
+"""The station's API for an ERP, with a real manager, planner and robots: requests, events, webhooks."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+from aiohttp import web
+from aiohttp.test_utils import TestServer
+from support.fleet_station import RoleAuthenticator, fleet_station
+from support.managed_fleet import ManagedFleet, managed_fleet
+
+from rce_fleet.api.tasks import StopModel, TaskChange, TaskRequest
+from rce_fleet.api.webhooks import SIGNATURE, TIMESTAMP, WebhookRequest, verify
+from rce_fleet.client import ApiError, EventsRestartedError, FleetClient, NotFoundError, OutdatedError
+
+GO = {"stops": [{"cell": 9}]}
+
+
+class Receiver:
+    """An ERP that takes deliveries, or refuses them."""
+
+    def __init__(self) -> None:
+        self.refuses = False
+        self.secret = ""
+        self.refused = 0
+        self.numbers: list[int] = []
+        self.gaps: list[str] = []
+        self.forged = 0
+
+    async def take(self, request: web.Request) -> web.Response:
+        body = await request.read()
+        if self.refuses:
+            self.refused += 1
+            return web.Response(status=500)
+        headers = request.headers
+        if not verify(self.secret, headers[TIMESTAMP], body, headers[SIGNATURE], now=time.time()):
+            self.forged += 1
+        said = json.loads(body)
+        self.numbers += [event["number"] for event in said["events"]]
+        if said.get("gap"):
+            self.gaps.append(said["journal"])
+        return web.Response()
+
+    @asynccontextmanager
+    async def running(self) -> AsyncIterator[str]:
+        app = web.Application()
+        app.router.add_post("/fleet", self.take)
+        async with TestServer(app) as server:
+            yield str(server.make_url("/fleet"))
+
+
+async def until(condition: Any, what: str) -> None:
+    async with asyncio.timeout(150):
+        while not condition():
+            await asyncio.sleep(0.05)
+    assert condition(), what
+
+
+async def until_all_are_there(fleet: ManagedFleet) -> None:
+    """Wait until the manager knows the map and all robots."""
+    async with asyncio.timeout(150):
+        while (await fleet.ask("GET", "/map")).status != 200:
+            await asyncio.sleep(0.1)
+        while True:
+            robots = (await fleet.ask("GET", "/robots")).body["robots"]
+            if [robot["state"] for robot in robots] == ["idle", "idle"]:
+                return
+            await asyncio.sleep(0.1)
+
+
+async def ask(
+    session: aiohttp.ClientSession, method: str, path: str, body: Any = None, **headers: str
+) -> tuple[int, Any, str]:
+    """Send a request; return status, body and ETag."""
+    given = {name.replace("_", "-"): text for name, text in headers.items()}
+    async with session.request(method, f"/api/v1{path}", json=body, headers=given) as reply:
+        text = await reply.text()
+        return reply.status, json.loads(text) if text else None, reply.headers.get("ETag", "")
+
+
+def session_of(url: str, token: str = "operator") -> aiohttp.ClientSession:
+    return aiohttp.ClientSession(url, headers={"Authorization": f"Bearer {token}"})
+
+
+async def check_that_the_manager_keeps_requests(erp: aiohttp.ClientSession) -> None:
+    """Block a cell, free it, and send a robot; each becomes an event of the manager with the user.
+
+    They are the first requests to this station, which does not know yet whether there is a manager.
+    """
+    for blocked in (True, False):
+        status, said, _ = await ask(erp, "PUT", "/cells/30", {"blocked": blocked})
+        assert (status, "cell 30" in said["message"]) == (200, True)
+    assert (await ask(erp, "PUT", "/robots/Robot1/goal", {"cell": 8}))[0] == 200
+    status, said, _ = await ask(erp, "PUT", "/robots/Robot9/goal", {"cell": 8})
+    assert (status, "Robot9" in said["error"]) == (409, True)
+    events = (await ask(erp, "GET", "/events?limit=5000"))[1]["events"]
+    told = [(one["name"], one["user"]) for one in events if one["kind"] in ("cells", "goal") and one["user"]]
+    assert told == [(name, "the_operator") for name in ("blocked", "freed", "goal")]
+    assert (await ask(erp, "PUT", "/robots/Robot1/goal", {"cell": None}))[0] == 200
+
+
+async def check_requests(fleet: ManagedFleet) -> None:
+    users = RoleAuthenticator()
+    async with fleet_station(fleet.core.uri, authenticator=users) as url, session_of(url) as erp:
+        await check_that_the_manager_keeps_requests(erp)
+        users.actions.clear()
+        status, task, tag = await ask(erp, "POST", "/tasks", GO, Idempotency_Key="a-1")
+        assert (status, task["requester"], tag) == (201, "the_operator", f'"{task["revision"]}"')
+        assert (await ask(erp, "POST", "/tasks", GO, Idempotency_Key="a-1"))[1]["id"] == task["id"]
+        path = f"/tasks/{task['id']}"
+        assert (await ask(erp, "PATCH", path, {"priority": 3}, If_Match='"999"'))[0] == 412
+        status, said, _ = await ask(erp, "POST", "/tasks", {"stops": [{"cell": -1}]})
+        assert (status, "stops.0.cell" in said["error"]) == (422, True)
+        status, said, _ = await ask(erp, "GET", "/tasks?colour=red")
+        assert (status, "colour" in said["error"]) == (422, True)
+        assert (await ask(erp, "GET", "/tasks/T9999"))[0] == 404
+        assert (await ask(erp, "POST", "/tasks", GO, Idempotency_Key="x" * 201))[0] == 400
+        assert (await ask(erp, "PATCH", path, {"priority": 4}, If_Match="x" * 201))[0] == 400
+        async with erp.post("/api/v1/tasks", data=b"\xff\xfe") as reply:
+            assert reply.status == 400
+        async with erp.post("/api/v1/tasks", data=io.BytesIO(b"[" * (1 << 21))) as reply:
+            assert reply.status == 413
+        page = (await ask(erp, "GET", "/tasks?state=open,ended&limit=1"))[1]
+        assert len(page["tasks"]) == 1
+        robots = (await ask(erp, "GET", "/robots"))[1]["robots"]
+        assert [robot["id"] for robot in robots] == ["Robot1", "Robot2"]
+        _, _, tag = await ask(erp, "GET", "/chargers")
+        assert (await ask(erp, "GET", "/chargers", If_None_Match=tag))[0] == 304
+        assert (await ask(erp, "GET", "/map"))[1]["rows"] == 8
+        assert [(one.name, one.done) for one in users.actions][:1] == [("create_task", True)]
+        async with session_of(url, "viewer") as viewer:
+            assert (await ask(viewer, "GET", "/tasks"))[0] == 200
+            status, said, _ = await ask(viewer, "POST", "/tasks", GO)
+            assert (status, "may only see" in said["error"]) == (403, True)
+            assert (await ask(viewer, "GET", "/webhooks"))[0] == 403
+        async with session_of(url, "stranger") as stranger:
+            assert (await ask(stranger, "GET", "/tasks"))[0] == 401
+        assert (await ask(erp, "GET", "/webhooks"))[0] == 403
+
+
+async def check_events(fleet: ManagedFleet) -> None:
+    async with fleet_station(fleet.core.uri) as url, FleetClient(url) as client:
+        task = await client.create_task(TaskRequest(stops=[StopModel(cell=20)]))
+        first = [event async for event in client.history(subject=task.id)]
+        assert first[0].name == "created"
+        seen: list[int] = []
+        async with asyncio.timeout(150):
+            async for event in client.events(first[0].number - 1):
+                seen.append(event.number)
+                if (event.id, event.state) == (task.id, "done"):
+                    break
+        assert seen == list(range(first[0].number, seen[-1] + 1))
+        again: list[int] = []
+        async with asyncio.timeout(150):
+            async for event in client.events(seen[1]):
+                again.append(event.number)
+                if event.number == seen[-1]:
+                    break
+        assert again == seen[2:]
+        lines = [line async for line in client.history_csv()]
+        assert lines[0].startswith("number,time,kind,id,name,state,robot,user,text")
+        assert len(lines) - 1 >= len(seen)
+
+
+async def check_client(fleet: ManagedFleet) -> None:
+    async with fleet_station(fleet.core.uri) as url, FleetClient(url) as client:
+        later = TaskRequest(stops=[StopModel(cell=30)], earliest_start=time.time() + 3600)
+        task = await client.create_task(later, key="later")
+        assert (await client.create_task(later, key="later")).id == task.id
+        async with asyncio.timeout(150):
+            while not task.reason:  # why it waits is a change, too
+                await asyncio.sleep(0.05)
+                task = await client.task(task.id)
+        changed = await client.change_task(task.id, TaskChange(priority=7), revision=task.revision)
+        assert changed.priority == 7
+        with pytest.raises(OutdatedError, match="revision"):
+            await client.change_task(task.id, TaskChange(priority=8), revision=task.revision)
+        with pytest.raises(ApiError, match="queued: it cannot be released"):
+            await client.reassign_task(task.id)
+        assert (await client.hold_task(task.id, "wait for the truck")).state == "held"
+        assert (await client.resume_task(task.id)).state == "queued"
+        assert (await client.cancel_task(task.id)).state == "cancelled"
+        with pytest.raises(NotFoundError, match="T77777"):
+            await client.task("T77777")
+        with pytest.raises(ApiError, match="cell"):
+            await client.create_task(TaskRequest(stops=[StopModel(cell=10_000)]))
+        await client.set_blocked(62, blocked=True)
+        await client.set_blocked(62, blocked=False)
+        assert {robot.id for robot in (await client.fleet()).robots} == {"Robot1", "Robot2"}
+        assert (await client.statistics()).robots == 2
+
+
+async def check_webhooks(fleet: ManagedFleet, tmp_path: Path) -> None:
+    receiver, file = Receiver(), tmp_path / "station" / "webhooks.json"
+    async with receiver.running() as target:
+        async with fleet_station(fleet.core.uri, file) as url, FleetClient(url) as client:
+            with pytest.raises(ApiError, match="private network"):
+                await client.add_webhook(WebhookRequest(url=target))
+            hook = await client.add_webhook(WebhookRequest(url=target, kinds=["task"], allow_private=True))
+            receiver.secret = hook.secret
+            first = await client.create_task(TaskRequest(stops=[StopModel(cell=3)]))
+            await until(lambda: receiver.numbers, "a delivery")
+            await fleet.until_state(first.id, "done")
+            receiver.refuses = True
+            await client.create_task(TaskRequest(stops=[StopModel(cell=12)]))
+            await until(lambda: receiver.refused, "a refusal")
+            async with asyncio.timeout(150):
+                while not (await client.webhooks())[0].failures:
+                    await asyncio.sleep(0.05)
+            assert "answered 500" in (await client.webhooks())[0].error
+        receiver.refuses = False
+        known = len(receiver.numbers)
+        async with fleet_station(fleet.core.uri, file) as url, FleetClient(url) as client:
+            await until(lambda: len(receiver.numbers) > known, "the delivery after a restart")
+            await client.remove_webhook(hook.id)
+            assert await client.webhooks() == []
+    assert receiver.forged == 0
+    assert receiver.numbers == sorted(set(receiver.numbers))
+
+
+async def follow(client: FleetClient, after: int) -> None:
+    """Follow the events for a while."""
+    async with asyncio.timeout(150):
+        async for event in client.events(after):
+            assert event.number > after
+
+
+async def check_lost_journal(fleet: ManagedFleet, tmp_path: Path) -> None:
+    """Who follows the events is told that their numbers begin anew, also who was away meanwhile."""
+    receiver, file = Receiver(), tmp_path / "station" / "webhooks.json"
+    async with receiver.running() as target:
+        async with fleet_station(fleet.core.uri, file) as url, FleetClient(url) as client:
+            hook = await client.add_webhook(WebhookRequest(url=target, allow_private=True))
+            receiver.secret = hook.secret
+            task = await client.create_task(TaskRequest(stops=[StopModel(cell=3)]))
+            await until(lambda: receiver.numbers, "a delivery")
+            await fleet.lose_journal()
+            with pytest.raises(EventsRestartedError, match="lost its journal"):
+                await follow(client, receiver.numbers[-1])
+            await until(lambda: receiver.gaps, "a delivery that tells of the gap")
+            with pytest.raises(NotFoundError):
+                await client.task(task.id)
+        await fleet.lose_journal()
+        async with fleet_station(fleet.core.uri, file):
+            await until(lambda: len(receiver.gaps) == 2, "the same after the station was away")
+    assert len(set(receiver.gaps)) == 2
+    assert receiver.forged == 0
+
+
+async def test_requests_reach_the_manager(tmp_path: Path) -> None:
+    """Status, revision and key pass through; roles are checked; the client says what went wrong."""
+    async with managed_fleet(tmp_path / "journal.sqlite", [0, 7]) as fleet:
+        await until_all_are_there(fleet)
+        await check_requests(fleet)
+        await check_client(fleet)
+
+
+async def test_events_reach_streams_and_webhooks(tmp_path: Path) -> None:
+    """A stream is resumed where it broke; deliveries are signed, retried, and kept over a restart."""
+    async with managed_fleet(tmp_path / "journal.sqlite", [0, 7]) as fleet:
+        await until_all_are_there(fleet)
+        await check_events(fleet)
+        await check_webhooks(fleet, tmp_path)
+
+
+async def test_a_lost_journal_is_told(tmp_path: Path) -> None:
+    (tmp_path / "manager").mkdir()
+    async with managed_fleet(tmp_path / "manager" / "journal.sqlite", [0, 7]) as fleet:
+        await until_all_are_there(fleet)
+        await check_lost_journal(fleet, tmp_path)

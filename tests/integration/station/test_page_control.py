@@ -1,0 +1,108 @@
+"""What reaches a robot without the planner, done on the page: stops, initial poses, driving by hand."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
+
+import pytest
+from integration.station.test_page_operator import drag
+from integration.station.test_robot_control import Site, site
+
+if TYPE_CHECKING:
+    from playwright.async_api import Page
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+BROWSER = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
+WAIT_MS = 60_000
+
+pytestmark = pytest.mark.needs("chromium")
+
+
+@asynccontextmanager
+async def opened(made: Site) -> AsyncIterator[Page]:
+    """The page with Robot1 selected."""
+    from playwright.async_api import async_playwright
+
+    problems: list[str] = []
+    async with async_playwright() as playwright:
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=BROWSER)
+        try:
+            page = await browser.new_page(viewport={"width": 1280, "height": 1000})
+            page.on("pageerror", lambda error: problems.append(str(error)))
+            page.set_default_timeout(WAIT_MS)
+            await page.goto(str(made.client.make_url("/")))
+            await page.locator("tr[data-robot=Robot1]").click()
+            yield page
+        finally:
+            await browser.close()
+    assert problems == []
+
+
+async def check_stops(made: Site, page: Page) -> None:
+    """One robot by its card, all by the header; a stopped robot needs attention.
+
+    The topic is latched: a message may come twice.
+    """
+    await page.locator("#robot-card button", has_text="Stop").click()
+    await made.until(lambda: made.stops and made.stops[-1])
+    await page.locator("#attention-list button", has_text="Release").click()
+    await made.until(lambda: not made.stops[-1])
+    await page.locator("#stop-all").click()
+    await made.until(lambda: made.stops[-1])
+    await page.locator("#release-all").wait_for()
+    page.once("dialog", lambda dialog: dialog.accept())
+    await page.locator("#release-all").click()
+    await made.until(lambda: not made.stops[-1])
+    await page.locator("#release-all").wait_for(state="hidden")
+
+
+async def check_pose(made: Site, page: Page) -> None:
+    """A drag says where the robot is and in which direction it looks; two cells do without a pointer."""
+    await page.locator("#robot-card button", has_text="Localize").click()
+    await drag(page, 18, 34)
+    await made.until(lambda: made.poses)
+    pose = made.poses[0].pose.pose
+    assert (pose.position.x, pose.position.y) == pytest.approx((2.5, 2.5), abs=0.05)
+    assert pose.orientation.z == pytest.approx(0.7071, abs=0.02), "up: a quarter turn"
+    await page.locator("#map").focus()
+    await page.evaluate("rceFleet.view.cursorCell = 10")
+    for key in ("Enter", "ArrowLeft", "Enter"):
+        await page.keyboard.press(key)
+    await made.until(lambda: len(made.poses) > 1)
+    pose = made.poses[1].pose.pose
+    assert (pose.position.x, pose.position.y) == pytest.approx((2.5, 1.5))
+    assert abs(pose.orientation.z) == pytest.approx(1.0, abs=0.02), "left: half a turn"
+
+
+async def check_drive(made: Site, page: Page) -> None:
+    """Keys drive while the switch is held, the stick by itself; the round trip is shown."""
+    await page.locator("#robot-card button", has_text="Drive by hand").click()
+    await page.locator("#drive-latency", has_text="round trip").wait_for()
+    await page.keyboard.down("ArrowUp")
+    await page.keyboard.down("Space")
+    await made.until(lambda: made.velocities and made.velocities[-1] == pytest.approx((0.35, 0.0)))
+    await page.keyboard.up("Space")
+    await made.until(lambda: made.velocities[-1] == (0.0, 0.0))
+    await page.keyboard.up("ArrowUp")
+    pad = await page.locator("#drive-pad").bounding_box()
+    assert pad is not None
+    x, y = pad["x"] + pad["width"] / 2, pad["y"] + pad["height"] / 2
+    await page.mouse.move(x, y)
+    await page.mouse.down()
+    await page.mouse.move(x - pad["width"] / 2, y, steps=3)
+    await made.until(lambda: made.velocities[-1] == pytest.approx((0.0, 0.9), abs=0.05))
+    await page.mouse.up()
+    await made.until(lambda: made.velocities[-1] == (0.0, 0.0))
+    await page.keyboard.press("Escape")
+    await page.locator("#drive").wait_for(state="hidden")
+    await made.until(lambda: made.fleet.modes == [("Robot1", "manual"), ("Robot1", "automatic")])
+
+
+async def test_an_operator_stops_places_and_drives_a_robot() -> None:
+    async with site() as made, opened(made) as page:
+        await check_stops(made, page)
+        await check_pose(made, page)
+        await check_drive(made, page)

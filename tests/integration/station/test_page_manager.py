@@ -1,0 +1,135 @@
+"""The page with a real planner, fleet manager and robots: tasks, robots and zones in an operator's hands."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from support.fleet_station import fleet_station
+from support.managed_fleet import ManagedFleet, managed_fleet
+
+if TYPE_CHECKING:
+    from playwright.async_api import Page
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+BROWSER = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
+WAIT_MS = 150_000
+
+pytestmark = pytest.mark.needs("chromium")
+
+
+@asynccontextmanager
+async def opened(url: str) -> AsyncIterator[Page]:
+    """The page, once it shows two robots and what the manager says; errors of the browser fail the test."""
+    from playwright.async_api import async_playwright
+
+    problems: list[str] = []
+    async with async_playwright() as playwright:
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=BROWSER)
+        try:
+            page = await browser.new_page(viewport={"width": 1280, "height": 900})
+            page.on("console", lambda said: problems.append(said.text) if said.type == "error" else None)
+            page.on("pageerror", lambda error: problems.append(str(error)))
+            page.set_default_timeout(WAIT_MS)
+            await page.goto(url)
+            await page.wait_for_function("rceFleet.view.scene.robotCount === 2")
+            await page.wait_for_function("rceFleet.work.trouble === null")
+            yield page
+        finally:
+            await browser.close()
+    assert problems == []
+
+
+async def click_cell(page: Page, cell: int) -> None:
+    x, y = await page.evaluate("cell => rceFleet.view.screenOf(cell)", cell)
+    await page.locator("#map").click(position={"x": x, "y": y})
+
+
+async def check_task(page: Page) -> None:
+    """Pick and drop are clicked; the list shows the task until it is done."""
+    await page.locator("#tool-task").click()
+    await click_cell(page, 18)
+    await click_cell(page, 21)
+    await page.wait_for_selector("#tasks tr[data-task=T1]")
+    await page.wait_for_function(
+        "rceFleet.work.recent.some(({ id, state }) => id === 'T1' && state === 'done')"
+    )
+    row = await page.inner_text("#tasks tr[data-task=T1]")
+    assert "pick up at 18, drop at 21" in row
+    assert "done" in row
+
+
+async def check_buttons(page: Page, fleet: ManagedFleet) -> None:
+    """A task is held, resumed, given to another robot and cancelled by its buttons."""
+    created = await fleet.ask("POST", "/tasks", {"stops": [{"cell": 27, "confirm": True}]})
+    task = created.body["id"]
+    await page.locator(f"#task-{task}-hold").click()
+    await fleet.until_state(task, "held")
+    await page.locator(f"#task-{task}-resume").click()
+    running = await fleet.until_state(task, "running")
+    robot = running["robot_assigned"]
+    await fleet.ask("POST", f"/robots/{robot}/pause")  # a robot that arrives keeps the task: refused (409)
+    if not (await fleet.ask("GET", f"/tasks/{task}")).body["visits"]:
+        await page.wait_for_function("id => rceFleet.fleet.robots.get(id).task", arg=robot)
+        await page.evaluate("id => rceFleet.actions.reassign(id)", robot)
+    await fleet.ask("POST", f"/robots/{robot}/resume")
+    await page.locator(f"#task-{task}-confirm").click()
+    await fleet.until_state(task, "done")
+    later = (await fleet.ask("POST", "/tasks", {"stops": [{"cell": 5}], "earliest_start": 4e9})).body["id"]
+    await page.locator(f"#task-{later}-cancel").click()
+    await fleet.until_state(later, "cancelled")
+
+
+async def check_robot(page: Page) -> None:
+    """A robot is taken out by its card, and put in by undo; charging says what is missing."""
+    await page.locator("tr[data-robot=Robot2]").click()
+    await page.locator("#robot-card button", has_text="Take out").click()
+    await page.wait_for_function("rceFleet.fleet.robots.get('Robot2').activity === 'out'")
+    await page.locator("#robot-card button", has_text="Put in").wait_for()
+    await page.locator("#undo").click()
+    await page.wait_for_function("rceFleet.fleet.robots.get('Robot2').activity !== 'out'")
+    await page.locator("#robot-card button", has_text="Send to charge").click()
+    await page.wait_for_function(
+        "[...rceFleet.work.tasks.values()].some(({ name }) => name === 'charge Robot2')"
+    )
+    await page.wait_for_function(
+        "[...rceFleet.work.tasks.values()].some(({ reason }) => reason.includes('charger'))"
+    )
+
+
+async def check_zone(page: Page, fleet: ManagedFleet) -> None:
+    """A zone is made by a click, reaches the planner, and is removed by another click."""
+    await page.locator("#tool-zone").click()
+    await click_cell(page, 40)
+    await page.locator("#zone-kind").select_option("slow")
+    await page.locator("#zone-value").fill("0.2")
+    await page.locator("#zone-form [type=submit]").click()
+    await page.wait_for_function("rceFleet.work.zones.length === 1")
+    await until_zones(fleet, ["zone1"])
+    await click_cell(page, 40)
+    await page.locator("#zone-remove").click()
+    await page.wait_for_function("rceFleet.work.zones.length === 0")
+    await until_zones(fleet, [])
+
+
+async def until_zones(fleet: ManagedFleet, wanted: list[str]) -> None:
+    """Wait until the planner has these zones."""
+    async with asyncio.timeout(WAIT_MS / 1000):
+        while await fleet.planner_zones() != wanted:
+            await asyncio.sleep(0.1)
+
+
+async def test_an_operator_works_with_the_manager(tmp_path: Path) -> None:
+    async with managed_fleet(tmp_path / "journal.sqlite", [0, 7]) as fleet:
+        while (await fleet.ask("GET", "/map")).status != 200:
+            await asyncio.sleep(0.1)
+        async with fleet_station(fleet.core.uri) as url, opened(url) as page:
+            await check_task(page)
+            await check_buttons(page, fleet)
+            await check_robot(page)
+            await check_zone(page, fleet)

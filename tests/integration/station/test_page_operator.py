@@ -1,0 +1,241 @@
+"""What an operator does on the page: drags, undo, exceptions, replay, and what other operators see of it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from aiohttp.test_utils import TestServer
+from unit.station.test_station_view import changes, pose, robot, state
+
+from rce_fleet.station.feed import Feed
+from rce_fleet.station.fleet_link import FleetLink
+from rce_fleet.station.planner_client import PlannerUnavailableError
+from rce_fleet.station.recording import Recorder, Records
+from rce_fleet.station.server import Station
+from rce_fleet.station.view import FleetView
+
+if TYPE_CHECKING:
+    from playwright.async_api import Browser, Page
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+BROWSER = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
+WAIT_MS = 60_000
+
+pytestmark = pytest.mark.needs("chromium")
+
+
+class Planner(FleetLink):
+    """Takes goals and blocked cells, and tells the pages, as a planner would."""
+
+    can_ask_manager = expects_manager = False
+
+    def __init__(self, view: FleetView, feed: Feed) -> None:
+        """Need no wire to a planner."""
+        self.view, self.feed = view, feed
+        self.modes: list[str] = []
+
+    async def set_mode(self, robot: str, mode: str, *, reason: str, user: str) -> str:
+        del robot, reason, user
+        self.modes.append(mode)
+        self.feed.on_change(self.view.on_changes({**changes(), "mode": mode}))
+        return ""
+
+    async def set_goal(self, robot_id: str, cell: int | None) -> str:
+        goal = -1 if cell is None else cell
+        self.feed.on_change(self.view.on_changes(changes(robot(robot_id, goal=goal, cell=9))))
+        return f"{robot_id} goes to cell {cell}"
+
+    async def request(self, request: dict[str, Any]) -> dict[str, Any]:
+        raise PlannerUnavailableError("no manager")
+
+    async def block_cell(self, cell: int, *, blocked: bool) -> str:
+        change = changes(blocked=[cell]) if blocked else changes(freed=[cell])
+        self.feed.on_change(self.view.on_changes(change))
+        return f"cell {cell}"
+
+
+@dataclass
+class Site:
+    """A station with two robots, and browsers."""
+
+    url: str
+    browser: Browser
+    view: FleetView
+    feed: Feed
+    recorder: Recorder
+    modes: list[str]
+    problems: list[str] = field(default_factory=list)
+
+    async def open(self, width: int = 1280) -> Page:
+        page = await self.browser.new_page(viewport={"width": width, "height": 900})
+        page.on("pageerror", lambda error: self.problems.append(str(error)))
+        page.set_default_timeout(WAIT_MS)
+        await page.goto(self.url)
+        await page.wait_for_function("rceFleet.view.scene.robotCount === 2")
+        return page
+
+
+@asynccontextmanager
+async def site() -> AsyncIterator[Site]:
+    from playwright.async_api import async_playwright
+
+    view = FleetView()
+    feed = Feed(view)
+    feed.on_change(view.on_state(state(robot("Robot1", cell=9), robot("Robot2", cell=54))))
+    view.on_pose("Robot1", pose(1.5, 1.5, 0.0))
+    view.on_pose("Robot2", pose(6.5, 6.5, 0.0))
+    recorder = Recorder(view, Records())
+    planner = Planner(view, feed)
+    station = Station(view, planner, feed.pages, records=recorder.records)
+    async with TestServer(station.make_app()) as server, async_playwright() as playwright:
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=BROWSER)
+        made = Site(str(server.make_url("/")), browser, view, feed, recorder, planner.modes)
+        try:
+            yield made
+        finally:
+            await browser.close()
+    assert made.problems == []
+
+
+async def drag(page: Page, first: int, last: int) -> None:
+    """Drag the pointer from one cell to another."""
+    box = await page.locator("#map").bounding_box()
+    assert box is not None
+    (x0, y0), (x1, y1) = [
+        await page.evaluate("c => rceFleet.view.screenOf(c)", cell) for cell in (first, last)
+    ]
+    await page.mouse.move(box["x"] + x0, box["y"] + y0)
+    await page.mouse.down()
+    await page.mouse.move(box["x"] + x1, box["y"] + y1, steps=5)
+    await page.mouse.up()
+
+
+async def test_a_drag_blocks_cells_and_undo_frees_them() -> None:
+    """A second operator sees the cells, and who blocked them."""
+    async with site() as made:
+        page, other = await made.open(), await made.open()
+        await page.locator("#tool-block").click()
+        await drag(page, 18, 28)
+        for each in (page, other):
+            await each.wait_for_function("String([...rceFleet.fleet.blocked].sort()) === '18,19,20,26,27,28'")
+        await other.wait_for_function("document.querySelectorAll('#audit li').length === 6")
+        assert "block cell 28" in await other.inner_text("#audit")
+        await page.wait_for_selector("#undo:enabled")
+        await page.locator("#undo").click()
+        await other.wait_for_function("rceFleet.fleet.blocked.size === 0")
+        late = await made.open()
+        await late.wait_for_function("document.querySelectorAll('#audit li').length === 12")
+
+
+async def test_a_robot_is_dragged_to_its_goal() -> None:
+    async with site() as made:
+        page = await made.open()
+        await drag(page, 9, 44)
+        await page.wait_for_function("rceFleet.fleet.robots.get('Robot1').goal === 44")
+        await page.keyboard.press("Control+z")
+        await page.wait_for_function("rceFleet.fleet.robots.get('Robot1').goal === null")
+
+
+async def test_a_silent_robot_comes_first_with_its_answers() -> None:
+    async with site() as made:
+        page = await made.open()
+        made.feed.on_change(
+            made.view.on_changes(changes(robot("Robot2", state="silent", reason="no message for 9 s")))
+        )
+        await page.wait_for_selector("#attention-list .severe")
+        assert "Robot2" in await page.inner_text("#attention-list .severe")
+        assert "no message for 9 s" in await page.inner_text("#attention-list .severe")
+        take_out = page.locator("#attention-list button", has_text="Take out")
+        assert await take_out.count() == 0, "only a fleet manager takes robots out"
+        made.feed.pages.send("manager", json.dumps({"type": "manager", "here": True}))
+        await take_out.wait_for()
+        await page.wait_for_function(
+            "document.querySelector('#robots tr[data-robot]').dataset.robot === 'Robot2'"
+        )
+
+
+async def test_the_page_tells_that_the_fleet_is_paused() -> None:
+    """Only the button that does something is shown; what it asks for reaches the planner."""
+    async with site() as made:
+        page = await made.open()
+        assert not await page.locator("#fleet-resume").is_visible()
+        await page.locator("#fleet-pause").click()
+        await page.locator("#mode", has_text="the fleet is paused").wait_for()
+        assert not await page.locator("#fleet-pause").is_visible()
+        await page.locator("#fleet-resume").click()
+        await page.locator("#fleet-pause").wait_for()
+        assert not await page.locator("#mode").is_visible()
+        assert made.modes == ["paused", "automatic"]
+
+
+async def test_a_past_moment_is_shown_and_left_again() -> None:
+    async with site() as made:
+        start = time.time() - 100
+        for second in range(60):
+            made.view.on_pose("Robot1", pose(1.5 + 0.05 * second, 1.5, 0.0))
+            entry = made.recorder.take(start + second)
+            assert entry is not None
+            made.recorder.records.add(entry[0], entry[1], whole=entry[2])
+        for hours, count in ((3, 70), (0.5, 20), (0, 40)):
+            made.recorder.records.add_figures(time.time() - 3600 * hours - 5, {"moving": count})
+        page = await made.open()
+        await page.locator("#figures canvas[aria-label='Robots that drive: 40 (20 to 40)']").wait_for()
+        await page.locator("#figures-span").select_option("4")
+        await page.locator("#figures canvas[aria-label='Robots that drive: 40 (20 to 70)']").wait_for()
+        await page.evaluate("at => rceFleet.replay.show(at)", start + 20.4)
+        await page.wait_for_function(
+            "Math.abs(rceFleet.view.scene.replay.robots.get('Robot1').pose.x - 2.5) < 1e-6"
+        )
+        await page.locator("#replay-play").click()
+        await page.wait_for_function("rceFleet.view.scene.replay.robots.get('Robot1').pose.x >= 2.6 - 1e-6")
+        await page.locator("#replay-live").click()
+        assert await page.evaluate("rceFleet.view.scene.replay") is None
+
+
+async def test_the_page_fits_a_phone() -> None:
+    """Nothing is wider than the screen; every control has a name."""
+    async with site() as made:
+        page = await made.open(width=390)
+        assert await page.evaluate("document.documentElement.scrollWidth") <= 390
+        nameless = await page.evaluate(
+            """[...document.querySelectorAll("button, input, select, canvas[tabindex]")]
+                .filter(e => e.checkVisibility() && !e.textContent.trim())
+                .filter(e => !e.ariaLabel && !e.labels?.length)
+                .map(e => e.outerHTML)"""
+        )
+        assert nameless == []
+
+
+async def test_the_world_is_drawn_in_three_dimensions() -> None:
+    """A robot in the middle of the view has its colour; the floor under a pixel is known."""
+    async with site() as made:
+        page = await made.open()
+        await page.locator("#view-world").click()
+        await page.wait_for_function("rceFleet.world.canvas.width > 300")
+        drawn = await page.evaluate(
+            """() => {
+                const { world } = rceFleet;
+                Object.assign(world.orbit, { x: 1.5, y: 1.5, distance: 4, tilt: 1.5 });
+                const pixel = (right) => {
+                    world.draw();
+                    const at = [world.canvas.width / 2 + right, world.canvas.height / 2];
+                    const out = new Uint8Array(4);
+                    const { gl } = world;
+                    gl.readPixels(...at.map(Math.round), 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, out);
+                    return [...out];
+                };
+                const box = world.canvas.getBoundingClientRect();
+                const middle = { clientX: box.x + box.width / 2, clientY: box.y + box.height / 2 };
+                return [pixel(0), pixel(0.45 * world.canvas.height), world.floorAt(middle)];
+            }"""
+        )
+        assert drawn[0] == [255, 255, 255, 255], "the arrow on top of the robot"
+        assert drawn[1] != drawn[0]
+        assert drawn[2] == pytest.approx([1.5, 1.5], abs=0.02)

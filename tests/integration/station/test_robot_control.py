@@ -1,0 +1,157 @@
+"""Emergency stops, initial poses and driving by hand over HTTP, in a real ROS graph."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+from aiohttp import ClientWebSocketResponse
+from aiohttp.test_utils import TestClient, TestServer
+from unit.station.test_station_view import robot, state
+
+from rce.ros.core import Core
+from rce.ros.node import Node
+from rce.ros.packages import PackageIndex
+from rce.ros.types import Message, TypeRegistry
+from rce_fleet.station.commands.control import RobotControl
+from rce_fleet.station.commands.sources import RosCommandSource
+from rce_fleet.station.feed import Feed
+from rce_fleet.station.layers.ros_source import RosLayerSource
+from rce_fleet.station.server import Station
+from rce_fleet.station.view import FleetView
+
+TYPES = TypeRegistry(PackageIndex([]))
+LIMIT_S = 60
+
+
+class RecordingFleet:
+    """Stands for the planner: its services are not what is tested here."""
+
+    def __init__(self) -> None:
+        self.modes: list[tuple[str, str]] = []
+
+    async def set_mode(self, robot: str, mode: str, *, reason: str, user: str) -> str:
+        del reason, user
+        self.modes.append((robot, mode))
+        return ""
+
+
+@dataclass
+class Site:
+    """A station, and a robot in the same ROS graph."""
+
+    client: TestClient[Any, Any]
+    fleet: RecordingFleet
+    control: RobotControl
+    stops: deque[bool] = field(default_factory=deque)
+    velocities: deque[tuple[float, float]] = field(default_factory=deque)
+    poses: deque[Message] = field(default_factory=deque)
+
+    async def until(self, holds: Callable[[], object]) -> None:
+        async with asyncio.timeout(LIMIT_S):
+            while not holds():
+                await asyncio.sleep(0.02)
+
+    async def put(self, path: str, body: dict[str, Any]) -> tuple[int, str]:
+        async with self.client.put(f"/api/v1{path}", json=body) as reply:
+            answer = await reply.json()
+            return reply.status, answer.get("message") or answer["error"]
+
+
+@asynccontextmanager
+async def site() -> AsyncIterator[Site]:
+    view = FleetView()
+    feed = Feed(view)
+    feed.on_change(view.on_state(state(robot("Robot1"), robot("Robot2"))))
+    fleet = RecordingFleet()
+    async with (
+        Core(port=0) as core,
+        Node("hardware", argv=[], master_uri=core.uri, types=TYPES) as node,
+    ):
+        source = RosCommandSource(RosLayerSource(core.uri, TYPES))
+        control = RobotControl(
+            source, view.robot_ids, lambda: feed.on_control(control.stopped, control.driven)
+        )
+        station = Station(view, fleet, feed.pages, control=control)  # type: ignore[arg-type]  # as wide as what is called
+        async with TestClient(TestServer(station.make_app())) as client:
+            made = Site(client, fleet, control)
+            await node.subscribe(
+                "/Robot1/emergency_stop", "std_msgs/Bool", lambda said: made.stops.append(said.data)
+            )
+            await node.subscribe(
+                "/Robot1/raw_cmd_vel",
+                "geometry_msgs/Twist",
+                lambda said: made.velocities.append((said.linear.x, said.angular.z)),
+            )
+            await node.subscribe(
+                "/Robot1/initialpose", "geometry_msgs/PoseWithCovarianceStamped", made.poses.append
+            )
+            yield made
+        await control.close()
+
+
+async def test_a_stop_reaches_those_who_listen() -> None:
+    async with site() as made:
+        status, text = await made.put("/emergency-stop", {"stopped": True})
+        await made.until(lambda: True in made.stops)
+        assert (status, "Robot1 reached" in text, "not Robot2" in text) == (200, True, True)
+        assert set(made.control.stopped) == {"Robot1", "Robot2"}
+        status, _ = await made.put("/robots/Robot1/emergency-stop", {"stopped": False})
+        await made.until(lambda: False in made.stops)
+        assert (status, set(made.control.stopped)) == (200, {"Robot2"})
+        status, text = await made.put("/robots/Robot2/emergency-stop", {"stopped": True})
+        assert (status, "gets this when it is" in text) == (409, True)
+
+
+async def test_an_initial_pose_reaches_localization() -> None:
+    async with site() as made:
+        status, _ = await made.put("/robots/Robot1/pose", {"x": 1.5, "y": 2.5, "yaw": 3.0})
+        await made.until(lambda: made.poses)
+        pose = made.poses[0].pose.pose
+        assert (status, pose.position.x, pose.position.y) == (200, 1.5, 2.5)
+        assert made.poses[0].header.frame_id == "map"
+        status, text = await made.put("/robots/Robot2/pose", {"x": 0.0, "y": 0.0})
+        assert (status, "initialpose" in text) == (409, True)
+
+
+@pytest.mark.parametrize("body", [{}, {"stopped": "perhaps"}, {"stopped": True, "more": 1}])
+async def test_a_stop_that_cannot_be_read_is_refused(body: dict[str, Any]) -> None:
+    async with site() as made:
+        status, _ = await made.put("/emergency-stop", body)
+        assert (status, made.control.stopped) == (400, {})
+
+
+async def _frame(page: ClientWebSocketResponse, number: int, **fields: object) -> dict[str, Any]:
+    sent = {"number": number, "sent": asyncio.get_running_loop().time(), "held": True, "speed": 0.2}
+    await page.send_str(json.dumps({**sent, **fields}))
+    answer: dict[str, Any] = json.loads(await page.receive_str(timeout=LIMIT_S))
+    return answer
+
+
+async def test_a_robot_is_driven_while_the_switch_is_held() -> None:
+    """It stops when the switch is released, when frames stop, and when the page leaves."""
+    async with site() as made:
+        async with made.client.ws_connect("/api/v1/robots/Robot1/drive") as page:
+            assert (await _frame(page, 0))["speed"] == 0.2
+            await made.until(lambda: (0.2, 0.0) in made.velocities)
+            assert made.fleet.modes == [("Robot1", "manual")]
+            assert (await _frame(page, 1, held=False))["reason"] == "the dead-man's switch is released"
+            await made.until(lambda: made.velocities[-1] == (0.0, 0.0))
+            await _frame(page, 2)
+            made.velocities.clear()
+            await made.until(lambda: made.velocities and made.velocities[-1] == (0.0, 0.0))
+            async with made.client.ws_connect("/api/v1/robots/Robot1/drive") as second:
+                assert "is driven by" in json.loads(await second.receive_str(timeout=LIMIT_S))["error"]
+        await made.until(lambda: made.fleet.modes[-1] == ("Robot1", "automatic"))
+        assert made.control.driven == {}
+
+
+async def test_a_robot_that_does_not_listen_is_not_driven() -> None:
+    async with site() as made, made.client.ws_connect("/api/v1/robots/Robot2/drive") as page:
+        assert "raw_cmd_vel" in json.loads(await page.receive_str(timeout=LIMIT_S))["error"]

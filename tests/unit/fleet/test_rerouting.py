@@ -1,0 +1,148 @@
+"""New paths for some robots between those of the others: no collision, no circle, the others undisturbed."""
+
+from __future__ import annotations
+
+from itertools import takewhile
+from random import Random
+
+import numpy as np
+import pytest
+
+from rce_fleet.compiled import is_available
+from rce_fleet.coordination.ledger import CellLedger
+from rce_fleet.planning.graph import PlanningGraph
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.lacam import LacamPlanner
+from rce_fleet.planning.planner import PlanningProblem
+from rce_fleet.planning.rerouting import Rerouted, RoutedRobots, reroute
+from rce_fleet.planning.rerouting_loops import reroute_robots
+
+Route = list[tuple[int, float]]
+
+
+def planned(seed: int, count: int = 12) -> tuple[GridMap, list[int], list[int], list[Route]]:
+    """Return a map, the robots' starts, goals and paths."""
+    rng = Random(seed)
+    walls = frozenset(rng.sample(range(80), 12))
+    grid = GridMap(8, 10, blocked=walls)
+    free = sorted(grid.reachable(grid.free[0]))
+    starts, goals = rng.sample(free, count), rng.sample(free, count)
+    problem = PlanningProblem.of(PlanningGraph.from_grid(grid), starts, goals, seed=seed)
+    joint = LacamPlanner(compiled=False).plan(problem)
+    routes = [[(cell, float(step)) for step, cell in joint.route(robot)[1:]] for robot in range(count)]
+    return grid, starts, goals, routes
+
+
+def routed(starts: list[int], goals: list[int], routes: list[Route]) -> RoutedRobots:
+    visits = [visit for route in routes for visit in route]
+    return RoutedRobots(
+        starts=np.array(starts, np.int32),
+        begins=np.zeros(len(starts)),
+        goals=np.array(goals, np.int32),
+        rests=np.full(len(starts), -1, np.int32),
+        lengths=np.array([len(route) for route in routes], np.int32),
+        nodes=np.array([cell for cell, _ in visits], np.int32),
+        steps=np.array([step for _, step in visits]),
+        fixed=(np.empty(0, np.int32), np.empty(0)),
+        clock=0.0,
+    )
+
+
+def name(robot: int) -> str:
+    return f"Robot{robot}"
+
+
+def drive(starts: list[int], routes: list[Route], seed: int) -> CellLedger:
+    """Let robots drive their routes, in any order that the ledger grants, until none can drive on."""
+    ledger, rng = CellLedger(), Random(seed)
+    names = [name(index) for index in range(len(starts))]
+    for robot, start in zip(names, starts, strict=True):
+        ledger.place(robot, start)
+    for robot, route in zip(names, routes, strict=True):
+        ledger.insert(robot, route)
+    ledger.validate()
+    moved = True
+    while moved:
+        moved = False
+        for robot in rng.sample(names, len(names)):
+            ledger.grant(robot, rng.randint(1, 3))
+            granted = len(ledger.granted(robot))
+            if granted > 1:
+                ledger.arrive(robot, rng.randint(1, granted - 1))
+                moved = True
+        ledger.validate()
+    return ledger
+
+
+def find(seed: int) -> tuple[GridMap, list[int], list[int], list[Route], int, Rerouted | None]:
+    """Block a cell on robots' paths; return the map, starts, goals, paths, the cell and the new paths."""
+    grid, starts, goals, routes = planned(seed)
+    used = sorted({cell for route in routes for cell, _ in route} - set(starts) - set(goals))
+    blocked = Random(seed).choice(used)
+    left = [list(takewhile(lambda visit: visit[0] != blocked, route)) for route in routes]
+    members = [robot for robot, route in enumerate(routes) if len(left[robot]) < len(route)]
+    graph = PlanningGraph.from_grid(grid.with_blocked(grid.blocked | {blocked}))
+    found = reroute(graph, routed(starts, goals, left), members, effort=20_000, seed=seed)
+    if found is not None:
+        assert set(members) <= found.paths.keys()
+    return grid, starts, goals, routes, blocked, found
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_robots_with_new_paths_wait_in_no_circle(seed: int) -> None:
+    """Whatever the order in which robots drive, they arrive, or wait for one that is in its goal."""
+    grid, starts, goals, routes, blocked, found = find(seed)
+    if found is None:
+        return  # A plan for all follows then.
+    for robot, (cells, steps) in found.paths.items():
+        routes[robot] = list(zip(cells.tolist(), steps.tolist(), strict=True))
+        assert grid.is_path([starts[robot], *cells.tolist()])
+        assert grid.blocked.union([blocked]).isdisjoint(cells.tolist())
+        assert robot in found.unreachable or [starts[robot], *cells.tolist()][-1] == goals[robot]
+    ledger = drive(starts, routes, seed)
+    waits_for = {}
+    for robot in range(len(starts)):
+        route = ledger.route(name(robot))
+        if len(route) > 1:
+            ahead = min(
+                (step, other)
+                for other in map(name, range(len(starts)))
+                for cell, step in ledger.horizon(other)
+                if cell == route[1]
+            )
+            waits_for[name(robot)] = ahead[1]
+    for robot_id in waits_for:
+        first, seen = robot_id, set()
+        while first in waits_for:
+            assert first not in seen, f"{first} waits for itself"
+            seen.add(first)
+            first = waits_for[first]
+        index = int(first.removeprefix("Robot"))
+        assert ledger.route(first) == [goals[index]] or index in found.unreachable
+
+
+def test_most_blocked_cells_need_no_plan_for_all() -> None:
+    """New paths are found for most blocked cells, and most other robots keep theirs."""
+    results = [find(seed) for seed in range(100, 130)]
+    found = [result for *_, result in results if result is not None]
+    assert len(found) > len(results) / 2
+
+
+def test_compiled_and_plain_loops_find_the_same_paths() -> None:
+    """Both forms of the loops find the same paths."""
+    if not is_available():
+        pytest.skip("numba is not installed")
+    plain = [find(seed)[-1] for seed in range(6)]
+    reroute_robots.use_compiled()
+    try:
+        compiled = [find(seed)[-1] for seed in range(6)]
+    finally:
+        reroute_robots.use_numpy()
+    for one, other in zip(plain, compiled, strict=True):
+        assert (one is None) == (other is None)
+        if one is None or other is None:
+            continue
+        assert one.paths.keys() == other.paths.keys()
+        for robot, (cells, steps) in one.paths.items():
+            np.testing.assert_array_equal(cells, other.paths[robot][0])
+            np.testing.assert_array_equal(steps, other.paths[robot][1])

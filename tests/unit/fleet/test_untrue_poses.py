@@ -1,0 +1,68 @@
+"""Robots that lie about where they are, and move clients that answer nothing."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rce_fleet.coordination.events import GoalSet, PoseSeen, SendCancel
+from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.snapshot import RobotSnapshot, RobotState
+from rce_fleet.planning.grid import GridMap
+
+if TYPE_CHECKING:
+    from unit.fleet.conftest import SimulatedClients
+
+
+def robot(fleet: SimulatedClients, number: int = 1) -> RobotSnapshot:
+    return fleet.planner.snapshot().robots[number - 1]
+
+
+def test_a_pose_that_cannot_be_true_stops_the_robot(make_fleet: type[SimulatedClients]) -> None:
+    """It keeps the cells where it may be, and others in the way of where it says it is are stopped."""
+    fleet = make_fleet(FleetPlanner(GridMap()), [0, 24], 1, loss=0.0)
+    fleet.send([7, 31])
+    fleet.run(lambda: len(robot(fleet).granted) > 3)
+    before = fleet.planner.state.ledger.claims("Robot1")
+    x, y = fleet.grid.centre(robot(fleet, 2).granted[-1])
+    out = fleet.tell(PoseSeen("Robot1", x, y, 0.0))
+    assert {SendCancel("Robot1"), SendCancel("Robot2")} <= set(out)
+    assert "its pose jumped" in robot(fleet).reason
+    assert before <= fleet.planner.state.ledger.claims("Robot1")
+    fleet.run(fleet.all_arrived)
+
+
+def test_a_robot_that_jumps_to_and_fro_is_not_driven(make_fleet: type[SimulatedClients]) -> None:
+    fleet = make_fleet(FleetPlanner(GridMap()), [0], 1, loss=0.0)
+    fleet.send([])
+    assert fleet.ask(GoalSet("Robot1", 7)).ok
+    true, false = fleet.grid.centre(0), fleet.grid.centre(63)
+    for number in range(200):
+        fleet.now += 0.2
+        fleet.tell(PoseSeen("Robot1", *(false, true)[number % 2], 0.0))
+        assert 0 in fleet.planner.state.ledger.claims("Robot1")
+        assert robot(fleet).state in (RobotState.STOPPING, RobotState.SILENT)
+
+
+def test_a_move_client_that_answers_nothing_is_driven_by_poses(make_fleet: type[SimulatedClients]) -> None:
+    """It takes lists and cancellations; its robot keeps a cell more behind it than others."""
+    fleet = make_fleet(FleetPlanner(GridMap()), [0, 56], 1, loss=0.0, pose_step=0.2)
+    fleet.mute = {"Robot1"}
+    fleet.run(lambda: len(fleet.states()) == 2 and robot(fleet).state is RobotState.SILENT)
+    fleet.run(lambda: fleet.states() == [RobotState.IDLE] * 2)
+    assert (robot(fleet).pose_only, robot(fleet, 2).pose_only) == (True, False)
+    for name, goal in (("Robot1", 63), ("Robot2", 7)):
+        assert fleet.ask(GoalSet(name, goal)).ok
+    behind = set()
+
+    def arrived() -> bool:
+        here = fleet.grid.cell_at(fleet.robots["Robot1"].x, fleet.robots["Robot1"].y)
+        route = fleet.planner.state.ledger.route("Robot1")
+        if here in route:
+            behind.add(route.index(here))
+        return fleet.all_arrived()
+
+    fleet.run(arrived)
+    assert max(behind) >= 2
+    fleet.mute.clear()
+    fleet.run(lambda: not robot(fleet).pose_only)
+    fleet.run(fleet.all_arrived)

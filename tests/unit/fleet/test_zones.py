@@ -1,0 +1,198 @@
+"""Zones: cells and moves that are blocked, slow zones, one-way zones, zones with room for a few robots."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rce_fleet.coordination.events import CellBlocked, CellFreed, GoalSet, SendCells, Tick, ZonesSet
+from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.settings import FleetSettings
+from rce_fleet.coordination.snapshot import RobotSnapshot, RobotState
+from rce_fleet.coordination.zones import Direction, Zone, ZoneKind
+from rce_fleet.planning.grid import GridMap
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from unit.fleet.conftest import SimulatedClients
+
+    Make = Callable[[GridMap, list[int], list[int]], SimulatedClients]
+
+LOOP = GridMap(3, 9, blocked=frozenset({10, 11, 12, 13, 14, 15, 16}))
+"""A loop around a wall: rows 0 and 2, columns 0 and 8."""
+
+
+@pytest.fixture(params=[24, 0], ids=["one by one", "for all"])
+def make(request: pytest.FixtureRequest, make_fleet: type[SimulatedClients]) -> Make:
+    """Makes a fleet whose paths are found one by one, or for all at once."""
+
+    def of(grid: GridMap, starts: list[int], goals: list[int]) -> SimulatedClients:
+        fleet = make_fleet(FleetPlanner(grid, FleetSettings(repairs=request.param)), starts, 1, loss=0.0)
+        fleet.send(goals)
+        return fleet
+
+    return of
+
+
+def robot(fleet: SimulatedClients, number: int = 1) -> RobotSnapshot:
+    return fleet.planner.snapshot().robots[number - 1]
+
+
+def put(fleet: SimulatedClients, *zones: Zone) -> None:
+    reply = fleet.ask(ZonesSet(zones))
+    assert reply.ok, reply.message
+
+
+def blocked(name: str, *cells: int, **more: object) -> Zone:
+    return Zone(name, ZoneKind.BLOCKED, cells, **more)  # type: ignore[arg-type]  # the fields of a zone
+
+
+def test_a_blocked_zone_blocks_until_it_is_removed(make: Make) -> None:
+    fleet = make(LOOP, [0], [8])
+    put(fleet, blocked("spill", 6, reason="oil", by="anna"))
+    assert not fleet.ask(CellFreed(6)).ok
+    assert fleet.ask(GoalSet("Robot1", 6)).message == (
+        "cell 6 is blocked by zone 'spill' (oil, by anna); choose another goal"
+    )
+    fleet.run(fleet.all_arrived)
+    assert robot(fleet).replans == 1
+    assert fleet.ask(ZonesSet((), remove=("spill",))).ok
+    assert fleet.planner.state.blocked == set()
+
+
+def test_a_zone_ends_when_it_expires(make: Make) -> None:
+    fleet = make(LOOP, [0], [])
+    put(fleet, blocked("short", 6, expires=fleet.now + 2.0))
+    assert fleet.planner.state.blocked == {6}
+    fleet.run(lambda: not fleet.planner.state.zones.zones)
+    assert fleet.planner.state.blocked == set()
+    assert fleet.planner.state.zones.revision == 2
+
+
+def test_a_cell_stays_blocked_for_its_other_reasons(make: Make) -> None:
+    fleet = make(LOOP, [0], [])
+    put(fleet, blocked("one", 5, 6), blocked("two", 6, 7))
+    assert fleet.ask(CellBlocked(7)).ok
+    assert fleet.ask(ZonesSet((), remove=("one", "two"))).ok
+    assert fleet.planner.state.blocked == {7}
+    assert fleet.ask(CellFreed(7)).ok
+    assert fleet.planner.state.blocked == set()
+
+
+def test_a_zone_for_one_robot_leaves_the_way_to_others(make: Make) -> None:
+    fleet = make(LOOP, [0, 18], [8, 7])
+    put(fleet, blocked("narrow", 6, robots=("Robot1",)))
+    fleet.run(lambda: len(robot(fleet).plan) > 5)
+    assert 6 not in robot(fleet).plan
+    assert not fleet.ask(GoalSet("Robot1", 6)).ok
+    fleet.run(fleet.all_arrived)
+    assert fleet.ask(GoalSet("Robot2", 6)).ok
+    fleet.run(fleet.all_arrived)
+
+
+def test_robots_keep_to_the_direction_of_a_one_way_zone(make: Make) -> None:
+    """Rows 0 and 2 are a roundabout: the short way back is closed."""
+    fleet = make(LOOP, [0], [5])
+    put(
+        fleet,
+        Zone("out", ZoneKind.ONE_WAY, tuple(range(9)), direction=Direction.PLUS_X),
+        Zone("back", ZoneKind.ONE_WAY, tuple(range(18, 27)), direction=Direction.MINUS_X),
+    )
+    fleet.run(fleet.all_arrived)
+    assert fleet.ask(GoalSet("Robot1", 3)).ok
+    fleet.tell(Tick())
+    fleet.tell(Tick())
+    assert robot(fleet).plan[:2] == (5, 6)
+    assert len(robot(fleet).plan) == 19
+    fleet.run(fleet.all_arrived)
+
+
+def test_a_one_way_zone_may_reach_the_edge_of_the_map(make: Make) -> None:
+    """No move wraps around into the next row, or leaves the map."""
+    fleet = make(GridMap(2, 3), [0], [])
+    put(
+        fleet,
+        Zone("x", ZoneKind.ONE_WAY, (0, 2, 3, 5), direction=Direction.MINUS_X),
+        Zone("y", ZoneKind.ONE_WAY, (1, 4), direction=Direction.PLUS_Y),
+    )
+    closed = fleet.planner.state.zones.closed(fleet.grid)
+    assert closed == {(0, 1), (1, 2), (3, 4), (4, 5), (4, 1)}
+    assert fleet.ask(GoalSet("Robot1", 3)).ok
+    fleet.run(fleet.all_arrived)
+
+
+def test_a_blocked_move_is_blocked_in_one_direction(make: Make) -> None:
+    fleet = make(LOOP, [4], [])
+    put(fleet, Zone("step", ZoneKind.BLOCKED, edges=((4, 5),)))
+    assert fleet.ask(GoalSet("Robot1", 6)).ok
+    fleet.run(fleet.all_arrived)
+    assert robot(fleet).replans == 0
+    assert fleet.ask(GoalSet("Robot1", 4)).ok
+    fleet.tell(Tick())
+    assert robot(fleet).plan == (6, 5, 4)
+
+
+def test_a_slow_zone_limits_the_speed_and_is_avoided(make: Make) -> None:
+    fleet = make(LOOP, [4], [])
+    put(fleet, Zone("ramp", ZoneKind.SLOW, (5, 6, 7), speed=0.1))
+    out = [*fleet.tell(GoalSet("Robot1", 7)), *fleet.tell(Tick())]
+    sent = [done for done in out if isinstance(done, SendCells)][-1]
+    assert (sent.cells[0], sent.speed) == (4, 0.1 if 5 in sent.cells else inf)
+    fleet.run(fleet.all_arrived)
+    assert fleet.planner.state.zones.speed_limit("Robot1", [7]) == 0.1
+
+
+def test_a_limited_zone_has_room_for_its_capacity(make: Make) -> None:
+    """Two robots want into an area with room for one; the second waits until the first has left."""
+    fleet = make(LOOP, [0, 18], [])
+    area = (6, 7, 8, 17, 26, 25, 24)
+    put(fleet, Zone("lift", ZoneKind.LIMITED, area, capacity=1))
+    for name, goal in (("Robot1", 7), ("Robot2", 25)):
+        assert fleet.ask(GoalSet(name, goal)).ok
+    inside: list[int] = []
+
+    def one_is_there() -> bool:
+        claims = [fleet.planner.state.ledger.claims(name) for name in fleet.robots]
+        inside.append(sum(1 for cells in claims if not cells.isdisjoint(area)))
+        return RobotState.ARRIVED in fleet.states()
+
+    fleet.run(one_is_there)
+    first = fleet.states().index(RobotState.ARRIVED)
+    assert fleet.ask(GoalSet(f"Robot{first + 1}", (1, 19)[first])).ok
+    fleet.run(lambda: one_is_there() and fleet.states()[1 - first] is RobotState.ARRIVED)
+    assert max(inside) == 1
+
+
+def test_the_same_zone_twice_changes_nothing(make: Make) -> None:
+    fleet = make(LOOP, [0], [])
+    put(fleet, blocked("a", 5))
+    put(fleet, blocked("a", 5))
+    assert fleet.planner.state.zones.revision == 1
+    assert fleet.ask(ZonesSet((blocked("b", 6),), revision=0)).message == (
+        "the zones have revision 1, not 0: read them and try again"
+    )
+    assert fleet.ask(ZonesSet((blocked("b", 6),), replace=True, revision=1)).ok
+    assert set(fleet.planner.state.zones.zones) == {"b"}
+    assert fleet.planner.state.blocked == {6}
+
+
+@pytest.mark.parametrize(
+    ("zone", "message"),
+    [
+        (blocked("", 1), "a zone needs an id"),
+        (blocked("a"), "zone 'a' has no cells"),
+        (blocked("a", 27), r"zone 'a': cells \[27\] are not on the map of 27 cells"),
+        (blocked("a", edges=((0, 2),)), "are not neighbours"),
+        (blocked("a", edges=((0, 1),), robots=("Robot1",)), "apply to all robots"),
+        (Zone("a", ZoneKind.SLOW, (1,)), "needs a speed above 0 m/s, not 0.0"),
+        (Zone("a", ZoneKind.ONE_WAY, (1,)), "needs a direction"),
+        (Zone("a", ZoneKind.LIMITED, (1,)), "capacity of at least 1, not 0"),
+        (Zone("a", ZoneKind.SLOW, (1,), ((0, 1),), speed=1.0), "only a blocked zone has edges"),
+    ],
+)
+def test_a_zone_that_cannot_be_is_refused(zone: Zone, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        zone.check(LOOP)

@@ -1,0 +1,217 @@
+"""Batteries, chargers and parking places."""
+
+from __future__ import annotations
+
+from math import inf
+
+import pytest
+
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot
+from rce_fleet.tasks.charging import keeps_clear, place_to_wait
+from rce_fleet.tasks.dispatch import TaskRules
+from rce_fleet.tasks.energy import BatteryLevels, effort_of, share_needed
+from rce_fleet.tasks.order import Action, Order, Stop
+from rce_fleet.tasks.queueing import Queues, RobotQueue
+from rce_fleet.tasks.records import Places, RobotProfile, Zone
+from rce_fleet.tasks.task import Task, TaskState
+from rce_fleet.tasks.travel import REFRESHED, TravelCosts
+
+from .conftest import Floor
+
+HUNGRY = RobotProfile(capacity=1.0, drive=0.01, idle=0.0, acting=0.0)
+"""A robot that takes 1 % of its battery for each metre."""
+
+
+@pytest.fixture
+def hungry() -> Floor:
+    floor = Floor(rules=TaskRules(profile=HUNGRY), drain=0.01)
+    floor.book.emit(Places(chargers=(56,)), "places", floor.now)
+    return floor
+
+
+def test_a_task_takes_what_its_way_takes() -> None:
+    """Two metres to the first stop, five between the stops, three to the charger: 10 % of 1 Wh."""
+    travel, grid = TravelCosts(), GridMap()
+    travel.set_map(grid, frozenset(), {}, 0)
+    task = Task(1, Order((Stop(Action.PICK, (2,)), Stop(Action.DELIVER, (7,)))), "", "", 0.0, 0.0)
+    effort = effort_of(task, 0, travel, HUNGRY)
+    assert (effort.first, effort.metres, effort.end) == (2.0, 5.0, 7)
+    assert share_needed(effort, HUNGRY, 3.0) == pytest.approx(0.10)
+
+
+def test_no_task_without_energy_for_the_way_back(hungry: Floor) -> None:
+    """Cell 7 is 7 m away, and 14 m from the charger: 21 % and the critical 15 %."""
+    hungry.add("Robot1", 0, battery=0.35)
+    task = hungry.go(7)
+    hungry.dispatcher.update(hungry.now, hungry.facts)
+    assert hungry.task(task).state is TaskState.QUEUED
+    assert "enough energy for it now" in hungry.task(task).reason
+    hungry.add("Robot2", 0, battery=0.37)
+    hungry.dispatcher.update(hungry.now + 1, hungry.facts)
+    assert (hungry.task(task).state, hungry.task(task).robot) == (TaskState.RUNNING, "Robot2")
+
+
+def test_energy_is_checked_before_each_further_stop(hungry: Floor) -> None:
+    """The battery turns out to be worse than it was at the start: another robot makes the second stop."""
+    robot = hungry.add("Robot1", 0, battery=0.9)
+    task = hungry.go(3, 7)
+    hungry.run(1)
+    robot.battery = 0.3
+    hungry.run(4)
+    assert "its battery has" in next(e.text for e in hungry.events if e.name == "released")
+    hungry.add("Robot2", 6, battery=0.9)
+    hungry.run_until_ended(task)
+    assert [visit.robot for visit in hungry.task(task).visits] == ["Robot1", "Robot2"]
+    hungry.run(30)
+    assert robot.cell == 56
+
+
+def test_a_loaded_robot_with_a_low_battery_goes_on(hungry: Floor) -> None:
+    """Its load cannot be left behind: people are told, once, before the stop."""
+    robot = hungry.add("Robot1", 0, battery=0.9)
+    task = hungry.deliver(3, 7)
+    hungry.run(1)
+    robot.battery = 0.3
+    hungry.run_until_ended(task)
+    assert hungry.task(task).state is TaskState.DONE
+    assert [event.name for event in hungry.events].count("low battery") == 1
+
+
+def test_an_idle_robot_charges_until_full(hungry: Floor) -> None:
+    robot = hungry.add("Robot1", 0, battery=0.45)
+    hungry.run(10)
+    assert robot.cell == 56
+    robot.battery = 0.9
+    hungry.run(3)
+    assert hungry.dispatcher.activity("Robot1") == "charging"
+    robot.battery = 0.96
+    hungry.run(10)
+    assert hungry.dispatcher.activity("Robot1") == "parking"
+    assert robot.cell != 56, "it stays at the charger although it is full"
+
+
+def test_a_robot_with_a_sufficient_battery_leaves_its_charger_for_a_task(hungry: Floor) -> None:
+    robot = hungry.add("Robot1", 56, battery=0.3)
+    hungry.run(2)
+    task = hungry.go(58)
+    hungry.run(2)
+    assert hungry.task(task).state is TaskState.QUEUED
+    robot.battery = 0.41
+    hungry.run_until_ended(task)
+
+
+def test_chargers_are_given_to_the_emptiest_first(hungry: Floor) -> None:
+    hungry.add("Robot1", 0, battery=0.3)
+    hungry.add("Robot2", 7, battery=0.1)
+    third = hungry.add("Robot3", 63, battery=0.25)
+    hungry.run(1)
+    assert hungry.dispatcher.chargers.charging == {"Robot2": 56}
+    assert hungry.dispatcher.chargers.waiting == ["Robot3", "Robot1"]
+    hungry.facts.robots["Robot2"].battery = 0.97
+    hungry.run(1)
+    assert hungry.dispatcher.chargers.charging == {third.id: 56}
+
+
+def test_a_charge_stop_goes_to_a_charger(hungry: Floor) -> None:
+    robot = hungry.add("Robot1", 0, battery=0.2)
+    task = hungry.book.create(Order((Stop(Action.CHARGE), Stop(Action.GO, (5,)))), hungry.now)
+    hungry.run(12)
+    assert (robot.cell, hungry.task(task).target) == (56, 56)
+    robot.battery = 0.97
+    hungry.run_until_ended(task)
+
+
+def test_thresholds_out_of_order_are_refused() -> None:
+    with pytest.raises(ValueError, match="critical < sufficient <= full"):
+        BatteryLevels(critical=0.5, sufficient=0.4)
+
+
+def test_a_robot_in_a_corridor_is_in_the_way() -> None:
+    """A corridor one cell wide between two rooms; a niche in a room's corner is not in the way."""
+    grid = GridMap(3, 7, blocked=frozenset({2, 3, 4, 16, 17, 18}))
+    assert not keeps_clear(grid, grid.blocked, 10)
+    assert keeps_clear(grid, grid.blocked, 0)
+    assert place_to_wait(grid, grid.blocked, 10, set()) not in (9, 10, 11)
+
+
+def test_an_idle_robot_leaves_the_cell_of_a_task(floor: Floor) -> None:
+    robot = floor.add("Robot1", 20)
+    floor.go(20, earliest_start=floor.now + 1e6)
+    floor.run(20)
+    assert robot.cell != 20
+
+
+def test_idle_robots_wait_at_parking_places(floor: Floor) -> None:
+    floor.book.emit(Places(parking=(6, 7)), "places", floor.now)
+    robots = [floor.add(f"Robot{number}", cell) for number, cell in enumerate((20, 21, 22), 1)]
+    floor.run(30)
+    assert {6, 7} <= {robot.cell for robot in robots}
+
+
+def test_a_zone_costs_a_robot_more() -> None:
+    """The way through the zone is four metres long and counts ten; around it are six."""
+    travel, grid = TravelCosts(), GridMap(2, 5)
+    zone = {"ice": Zone("ice", "cost", (1, 2, 3))}
+    travel.set_map(grid, frozenset(), zone, 0)
+    assert travel.metres(0, 4) == 4.0
+    assert travel.metres(0, 4, {"ice": 3.0}) == 6.0
+
+
+def test_a_robot_may_leave_a_blocked_cell_but_not_enter_it() -> None:
+    travel, grid = TravelCosts(), GridMap(1, 3)
+    travel.set_map(grid, frozenset({1}), {}, 0)
+    assert travel.metres(1, 2) == 1.0
+    assert travel.metres(2, 1) == float("inf")
+    assert travel.metres(0, 2) == float("inf")
+
+
+def test_the_queue_with_the_earliest_end_gets_the_task() -> None:
+    travel, grid = TravelCosts(), GridMap()
+    travel.set_map(grid, frozenset(), {}, 0)
+    profile = RobotProfile(speed=1.0)
+    queues = [RobotQueue("Robot1", profile, 0, 50.0), RobotQueue("Robot2", profile, 63, 10.0)]
+    tasks = [Task(n, Order((Stop(Action.GO, (cell,)),)), "", "", 0.0, 0.0) for n, cell in ((1, 1), (2, 62))]
+    inserted = Queues(travel, 1).insert(tasks, queues)
+    assert {task.number: robot for task, robot in inserted} == {1: "Robot1", 2: "Robot2"}
+
+
+def test_the_sum_of_all_ways_is_the_least() -> None:
+    """By hand: 1 to its own row's task costs 1 + 1; the nearest task first would cost 0 + 7."""
+    travel, grid = TravelCosts(), GridMap(1, 10)
+    travel.set_map(grid, frozenset(), {}, 0)
+    assigner = Assigner(travel, AssignmentRules(), BatteryLevels())
+    robots = [FreeRobot("A", 3, RobotProfile(), None), FreeRobot("B", 4, RobotProfile(), None)]
+    tasks = [Task(n, Order((Stop(Action.GO, (cell,)),)), "", "", 0.0, 0.0) for n, cell in ((1, 4), (2, 9))]
+    chosen = {choice.robot: choice.task.number for choice in assigner.choose(tasks, robots, 0.0)}
+    assert chosen == {"A": 1, "B": 2}
+
+
+def test_hundreds_of_robots_get_tasks_in_one_call() -> None:
+    """All robots get one task each, no two the same."""
+    travel, grid = TravelCosts(), GridMap(20, 60)
+    travel.set_map(grid, frozenset(), {}, 0)
+    assigner = Assigner(travel, AssignmentRules(), BatteryLevels())
+    profile = RobotProfile()
+    robots = [FreeRobot(f"R{n}", 2 * n, profile, 0.9) for n in range(600)]
+    tasks = [Task(n, Order((Stop(Action.GO, (n % 100 * 12,)),)), "", "", 0.0, 0.0) for n in range(700)]
+    chosen = assigner.choose(tasks, robots, 0.0, (5, 6))
+    assert len({choice.robot for choice in chosen}) == len({choice.task.number for choice in chosen}) == 600
+
+
+def test_a_changed_map_is_measured_in_slices() -> None:
+    """After a cell is blocked, distances follow a few at a time; to a blocked cell no way leads at once."""
+    travel, grid = TravelCosts(), GridMap(3, 40)
+    travel.set_map(grid, frozenset(), {}, 0)
+    goals = range(80, 120)
+    before = [travel.metres(0, goal) for goal in goals]
+    shut = frozenset({1, 40, 119})
+    travel.set_map(grid, shut, {}, 1)
+    travel.begin_step()
+    first = [travel.metres(0, goal) for goal in goals]
+    assert sum(way == inf for way in first) == REFRESHED + 1
+    assert all(now in (way, inf) for way, now in zip(before, first, strict=True))
+    for _ in range(3):
+        travel.begin_step()
+        last = [travel.metres(0, goal) for goal in goals]
+    assert last == [inf] * len(goals)

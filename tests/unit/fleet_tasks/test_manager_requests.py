@@ -1,0 +1,388 @@
+"""Requests to the fleet manager without ROS: answers, roles, pages, revisions, bad input, a full disk."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import AsyncIterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rce_fleet.journal.journal import Journal
+from rce_fleet.manager.fleet_routes import ROUTES as FLEET_ROUTES
+from rce_fleet.manager.goals import GoalKeeper
+from rce_fleet.manager.manager import FleetManager
+from rce_fleet.manager.mirror import REFUSED_S
+from rce_fleet.manager.requests import FleetRequest, Router
+from rce_fleet.manager.task_routes import ROUTES as TASK_ROUTES
+from rce_fleet.manager.zones import zone_fields
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.tasks.dispatch import TaskRules
+from rce_fleet.tasks.facts import FleetFacts, RobotFacts
+from rce_fleet.tasks.loads import carried
+from rce_fleet.tasks.order import Action, Order, Stop
+from rce_fleet.tasks.records import BlockedCells, PlannerRun, RobotEntry, Zone
+from rce_fleet.tasks.task import TaskState
+
+GO = {"stops": [{"cell": 5}]}
+
+
+class Planner:
+    """Accepts all goals."""
+
+    def __init__(self) -> None:
+        self.goals: dict[str, int | None] = {}
+        self.calls: list[tuple[Any, ...]] = []
+        self.refusal = ""
+
+    async def set_goal(self, robot: str, cell: int | None) -> str:
+        self.goals[robot] = cell
+        return ""
+
+    async def block_cell(self, cell: int, *, blocked: bool) -> str:
+        self.calls.append(("cell", cell, blocked))
+        return self.refusal
+
+    async def set_mode(self, robot: str, mode: str, reason: str, user: str) -> str:
+        self.calls.append(("mode", robot, mode, reason, user))
+        return self.refusal
+
+    async def set_zone(self, name: str, zone: Zone | None, now: float) -> str:
+        self.calls.append(("zone", name, None if zone is None else zone_fields(zone, now)["kind"]))
+        return self.refusal
+
+
+class ManagerClient:
+    """A manager with a journal, and a client of it."""
+
+    def __init__(self, path: Path) -> None:
+        self.journal = Journal(path)
+        self.planner = Planner()
+        self.manager = FleetManager(self.journal, self.planner, TaskRules(), logging.getLogger("manager"))
+        self.manager.facts.grid = self.manager.book.grid = GridMap(blocked=frozenset({9}))
+        self.manager.facts.shut = frozenset({9})
+        self.manager.facts.is_live = True
+        self.router = Router(self.manager, [*TASK_ROUTES, *FLEET_ROUTES])
+
+    async def ask(self, method: str, path: str, body: Any = None, **fields: str) -> tuple[int, Any, str]:
+        text = body if isinstance(body, str) else "" if body is None else json.dumps(body)
+        given = {"user": "erp", "role": "operator", **fields}
+        answer = await self.router.answer(FleetRequest(method, path, text, **given))
+        return answer.status, json.loads(answer.body), answer.revision
+
+
+@pytest.fixture
+async def client(tmp_path: Path) -> AsyncIterator[ManagerClient]:
+    made = ManagerClient(tmp_path / "j.sqlite")
+    yield made
+    await made.manager.close()
+
+
+async def test_pages_of_tasks_follow_each_other(client: ManagerClient) -> None:
+    for _ in range(5):
+        assert (await client.ask("POST", "/tasks", GO))[0] == 201
+    first = (await client.ask("GET", "/tasks?limit=2"))[1]
+    second = (await client.ask("GET", f"/tasks?limit=2&cursor={first['next']}"))[1]
+    newest = (await client.ask("GET", "/tasks?order=desc&limit=1"))[1]
+    assert [task["id"] for task in first["tasks"] + second["tasks"]] == ["T1", "T2", "T3", "T4"]
+    assert newest["tasks"][0]["id"] == "T5"
+    await client.ask("DELETE", "/tasks/T3")
+    ended = (await client.ask("GET", "/tasks?state=ended"))[1]
+    assert ([task["id"] for task in ended["tasks"]], ended["next"]) == (["T3"], None)
+
+
+async def test_an_old_etag_is_refused(client: ManagerClient) -> None:
+    _, _, revision = await client.ask("POST", "/tasks", GO)
+    status, body, newer = await client.ask("PATCH", "/tasks/T1", {"priority": 3}, revision=revision)
+    assert (status, body["priority"], newer) == (200, 3, '"2"')
+    assert (await client.ask("PATCH", "/tasks/T1", {"priority": 4}, revision=revision))[0] == 412
+    assert (await client.ask("PUT", "/chargers", {"chargers": [63]}, revision='"0"'))[0] == 200
+    assert (await client.ask("PUT", "/chargers", {"chargers": []}, revision='"0"'))[0] == 412
+
+
+async def test_a_viewer_changes_nothing(client: ManagerClient) -> None:
+    assert (await client.ask("POST", "/tasks", GO, role="viewer"))[0] == 403
+    assert (await client.ask("GET", "/tasks", role="viewer"))[:2] == (200, {"tasks": [], "next": None})
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "status"),
+    [
+        ("POST", "/tasks", "{", 422),
+        ("POST", "/tasks", {"stops": []}, 422),
+        ("POST", "/tasks", {"stops": [{"cell": 5}], "colour": "red"}, 422),
+        ("POST", "/tasks", {"stops": [{"cell": 5, "cells": [6]}]}, 409),
+        ("POST", "/tasks", {"stops": [{"cell": 9}]}, 409),
+        ("POST", "/tasks", '{"stops": [{"cell": 5, "duration": NaN}]}', 422),
+        ("GET", "/tasks/T1", None, 404),
+        ("GET", "/tasks?state=sleeping", None, 422),
+        ("GET", "/tasks?limit=many", None, 422),
+        ("GET", "/tasks?limit=1.5", None, 422),
+        ("GET", "/tasks?cursor=x", None, 422),
+        ("GET", "/events?after=-1", None, 422),
+        ("GET", "/nothing", None, 404),
+        ("PUT", "/tasks", GO, 405),
+        ("POST", "/robots/Robot9/pause", None, 404),
+        ("PUT", "/chargers", {"chargers": [99]}, 409),
+        ("DELETE", "/zones/z", None, 404),
+        ("PUT", "/zones/z", {"kind": "icy", "cells": [1]}, 422),
+        ("PUT", "/cells/9", {"blocked": True}, 409),
+        ("PUT", "/cells/64", {"blocked": True}, 409),
+        ("PUT", "/cells/-1", {"blocked": True}, 404),
+        ("PUT", "/cells/8", {}, 422),
+        ("PUT", "/zones/z", {"kind": "blocked", "cells": [64]}, 409),
+        ("PUT", "/zones/z", {"kind": "blocked", "edges": [[0, 9]]}, 409),
+        ("PUT", "/zones/z", {"kind": "blocked", "cells": [1], "until": 1.0}, 409),
+    ],
+)
+async def test_bad_requests_say_why(
+    client: ManagerClient, method: str, path: str, body: Any, status: int
+) -> None:
+    said, answer, _ = await client.ask(method, path, body)
+    assert (said, set(answer)) == (status, {"error"})
+    assert client.manager.book.number == 0
+
+
+@pytest.mark.parametrize(
+    ("zone", "status", "text"),
+    [
+        ({"kind": "fast", "value": 1.0}, 422, "'slow', 'one_way', 'limited' or 'cost'"),
+        ({"kind": "slow"}, 409, "needs a value"),
+        ({"kind": "slow", "value": 0.0}, 409, "speed above 0"),
+        ({"kind": "one_way", "value": 0.8}, 409, "a direction is 0, pi/2, pi or -pi/2"),
+        ({"kind": "room", "value": 1.5}, 409, "whole number"),
+        ({"kind": "room", "value": 0}, 409, "from 1 on"),
+        ({"kind": "cost", "value": -1}, 409, "at least 1"),
+    ],
+)
+async def test_zones_that_cannot_be(client: ManagerClient, zone: Any, status: int, text: str) -> None:
+    said, answer, _ = await client.ask("PUT", "/zones/z", {"cells": [3], **zone})
+    assert (said, text in answer["error"]) == (status, True), answer
+
+
+async def test_former_words_of_zones_are_understood(client: ManagerClient) -> None:
+    body = {"kind": "room", "cells": [3], "value": 2}
+    assert (await client.ask("PUT", "/zones/lift", body))[1]["kind"] == "limited"
+
+
+async def test_a_task_is_given_to_another_robot(client: ManagerClient) -> None:
+    for name, cell in (("Robot1", 4), ("Robot2", 60)):
+        client.manager.facts.robots[name] = RobotFacts(name, "idle", cell=cell)
+    await client.ask("POST", "/tasks", {"stops": [{"cell": 7}]})
+    await client.manager.step()
+    assert (await client.ask("GET", "/tasks/T1"))[1]["robot_assigned"] == "Robot1"
+    status, task, _ = await client.ask("POST", "/tasks/T1/reassign")
+    assert (status, task["state"], task["robot_assigned"]) == (200, "queued", "")
+    await client.manager.step()
+    assert (await client.ask("GET", "/tasks/T1"))[1]["robot_assigned"] == "Robot2"
+
+
+async def test_zones_reach_the_planner(client: ManagerClient) -> None:
+    """Also when it was away; a zone that only costs does not."""
+    manager, planner = client.manager, client.planner
+    manager.facts.is_current = True
+    manager.planner_began(PlannerRun("1", "8 x 8"))
+    planner.refusal = "the planner does not answer"
+    slow = {"kind": "slow", "cells": [3, 4], "value": 0.2, "until": manager.clock() + 1000}
+    assert (await client.ask("PUT", "/zones/aisle", slow))[0] == 201
+    assert (await client.ask("PUT", "/zones/dear", {"kind": "cost", "cells": [6], "value": 2.0}))[0] == 201
+    planner.refusal = ""
+    planner.calls.clear()
+    await manager.step()
+    assert planner.calls == [], "it was sent again at once"
+    manager.clock._offset += REFUSED_S  # type: ignore[attr-defined]  # the clock is moved on
+    await manager.step()
+    assert planner.calls == [("zone", "aisle", "slow")]
+    manager.facts.zones["aisle"] = manager.book.zones["aisle"]
+    manager.clock._offset += 1000.0  # type: ignore[attr-defined]
+    await manager.step()
+    assert planner.calls[-1] == ("zone", "aisle", None)
+    assert [zone["id"] for zone in (await client.ask("GET", "/zones"))[1]["zones"]] == ["dear"]
+
+
+async def test_a_full_disk_refuses_and_recovers(client: ManagerClient) -> None:
+    """Nothing is accepted that is not in the journal; the book is as the journal has it."""
+    assert (await client.ask("POST", "/tasks", GO))[0] == 201
+    pages = client.journal._db.execute("PRAGMA page_count").fetchone()[0]
+    client.journal._db.execute(f"PRAGMA max_page_count = {pages}")
+    big = {"stops": [{"cell": 5, "label": "x" * 200}] * 400}
+    status, body, _ = await client.ask("POST", "/tasks", big)
+    assert (status, "the disk is full" in body["error"]) == (507, True)
+    assert len(client.manager.book.tasks) == 1
+    assert (await client.ask("POST", "/tasks", GO))[0] == 507
+    assert (await client.ask("GET", "/tasks/T1"))[0] == 200
+    client.journal._db.execute("PRAGMA max_page_count = 100000")
+    await client.manager.step()
+    assert (await client.ask("POST", "/tasks", GO))[1]["id"] == "T2"
+
+
+async def test_a_restarted_manager_knows_everything(tmp_path: Path) -> None:
+    first = ManagerClient(tmp_path / "j.sqlite")
+    await first.ask("POST", "/tasks", GO, key="order-1")
+    await first.ask("PUT", "/zones/ice", {"kind": "slow", "cells": [3], "value": 0.2})
+    facts = first.manager.facts
+    facts.is_current = True
+    first.manager.planner_began(PlannerRun("1", "8 x 8"))
+    facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+    facts.requested = frozenset({7})
+    await first.ask("POST", "/robots/Robot1/pause", {"reason": "tea"})
+    await first.manager.step()
+    assert first.planner.calls == [
+        *(("mode", "Robot1", "paused", "tea", "erp"), ("zone", "ice", "slow")),
+    ]
+    await first.manager.close()
+    second = ManagerClient(tmp_path / "j.sqlite")
+    status, body, _ = await second.ask("POST", "/tasks", GO, key="order-1")
+    assert (status, body["id"]) == (200, "T1")
+    assert (await second.ask("GET", "/zones/ice"))[1]["user"] == "erp"
+    second.manager.facts.is_current = True
+    second.manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+    second.manager.planner_began(PlannerRun("2", "8 x 8"))
+    await second.manager.step()
+    assert second.planner.calls == [
+        *(("mode", "Robot1", "paused", "tea", "erp"), ("zone", "ice", "slow"), ("cell", 7, True)),
+    ]
+    await second.manager.close()
+
+
+async def test_a_request_reaches_the_planner_after_a_kill(tmp_path: Path) -> None:
+    """The planner was away when it was accepted; once it has it, only changes at the planner count."""
+
+    def begin() -> ManagerClient:
+        made = ManagerClient(tmp_path / "j.sqlite")
+        made.manager.facts.is_current, made.manager.facts.requested = True, frozenset()
+        made.manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+        made.manager.planner_began(PlannerRun("1", "8 x 8"))
+        return made
+
+    first = begin()
+    await first.manager.step()
+    first.manager.facts.is_live = False
+    assert (await first.ask("POST", "/robots/Robot1/pause", {"reason": "tea"}))[0] == 200
+    await first.manager.close()
+    second = begin()
+    await second.manager.step()
+    assert second.planner.calls == [("mode", "Robot1", "paused", "tea", "erp")]
+    await second.manager.step()
+    await second.manager.close()
+    third = begin()
+    await third.manager.step()
+    assert (third.planner.calls, third.manager.book.entry("Robot1").mode) == ([], "automatic")
+    await third.manager.close()
+
+
+async def test_a_mode_that_the_planner_refuses_stays(client: ManagerClient) -> None:
+    client.manager.facts.is_current = True
+    client.manager.planner_began(PlannerRun("1", "8 x 8"))
+    client.manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+    client.planner.refusal = "not now"
+    status, body, _ = await client.ask("POST", "/robots/Robot1/take-out")
+    assert (status, body["error"]) == (409, "not now")
+    assert (await client.ask("GET", "/robots/Robot1"))[1]["mode"] == "automatic"
+
+
+async def test_a_goal_set_by_hand_holds_the_task(client: ManagerClient) -> None:
+    robot = client.manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+    await client.ask("POST", "/tasks", GO)
+    for _ in range(2):
+        await client.manager.step()
+        robot.goal, robot.state = client.planner.goals.get("Robot1"), "driving"
+    assert robot.goal == 5
+    await client.manager.step()
+    robot.goal = 60
+    await client.manager.step()
+    task = (await client.ask("GET", "/tasks/T1"))[1]
+    assert (task["state"], task["robot_assigned"]) == ("held", "")
+    assert "Robot1 was sent to cell 60 by hand" in task["reason"]
+    assert client.planner.goals["Robot1"] == 5, "the goal that was set by hand was overwritten"
+
+
+def test_goals_are_sent_again_after_a_restart() -> None:
+    keeper, facts = GoalKeeper(), FleetFacts(is_live=True)
+    robot = facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+    assert keeper.to_send(facts, {"Robot1": 5}, 0.0) == [("Robot1", 5)]
+    assert keeper.to_send(facts, {"Robot1": 5}, 0.5) == []
+    assert keeper.to_send(facts, {"Robot1": 5}, 2.0) == [("Robot1", 5)]
+    robot.goal = 5
+    assert keeper.notice(facts, {"Robot1": 5}) == {}
+    keeper.reset()
+    robot.goal = None
+    assert keeper.notice(facts, {"Robot1": 5}) == {}
+    assert keeper.to_send(facts, {"Robot1": 5}, 3.0) == [("Robot1", 5)]
+
+
+async def test_statistics_survive_a_restart(tmp_path: Path) -> None:
+    """A robot had a task for a whole minute before the manager was started again."""
+    now = 1000.0
+
+    def manager(journal: Journal) -> FleetManager:
+        log = logging.getLogger("manager")
+        made = FleetManager(journal, Planner(), TaskRules(), log, clock=lambda: now)
+        made.facts.grid, made.facts.is_live = GridMap(), True
+        made.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+        return made
+
+    first = manager(Journal(tmp_path / "j.sqlite"))
+    first.book.create(Order((Stop(Action.GO, (5,)),)), now)
+    await first.step()
+    for _ in range(7):
+        now += 10.0
+        await first.step()
+    await first.close()
+    again = manager(Journal(tmp_path / "j.sqlite"))
+    shown = again.statistics.show(now, 3600.0, again.facts, again.book)
+    assert shown.utilization == pytest.approx(1.0)
+    assert shown.tasks_open == 1
+    await again.close()
+
+
+async def test_a_blocked_cell_is_in_the_journal_first(client: ManagerClient) -> None:
+    """The planner is told what the journal has; a cell that only sensors blocked is freed as well."""
+    kept: list[tuple[int, ...]] = []
+    planner, block = client.planner, client.planner.block_cell
+
+    async def block_cell(cell: int, *, blocked: bool) -> str:
+        records, _ = client.journal.load()
+        kept.extend(record.unsent for record in records if isinstance(record, BlockedCells))
+        return await block(cell, blocked=blocked)
+
+    planner.block_cell = block_cell  # type: ignore[method-assign]  # looks into the journal first
+    status, said, _ = await client.ask("PUT", "/cells/12", {"blocked": True})
+    assert (status, said, kept) == (200, {"message": "cell 12 is blocked"}, [(12,)])
+    event = (await client.ask("GET", "/events"))[1]["events"][-1]
+    assert (event["kind"], event["name"], event["user"]) == ("cells", "blocked", "erp")
+    assert (await client.ask("PUT", "/cells/20", {"blocked": False}))[0] == 200
+    assert planner.calls == [("cell", 12, True), ("cell", 20, False)]
+    assert (await client.ask("PUT", "/cells/12", {"blocked": True}, role="viewer"))[0] == 403
+
+
+async def test_a_cell_that_the_planner_refuses_stays(client: ManagerClient) -> None:
+    for refusal, expected in (("remove the zone", 409), ("the planner does not answer: gone", 503)):
+        client.planner.refusal = refusal
+        status, said, _ = await client.ask("PUT", "/cells/12", {"blocked": True})
+        assert (status, said, client.manager.book.blocked.cells) == (expected, {"error": refusal}, ())
+    client.manager.facts.is_live = False
+    assert (await client.ask("PUT", "/cells/12", {"blocked": True}))[0] == 200
+    assert client.manager.book.blocked == BlockedCells((12,), (12,))
+
+
+async def test_a_robot_shows_what_it_carries(client: ManagerClient) -> None:
+    stops = [
+        {"cell": cell, "action": "pick", "label": label} for cell, label in ((1, "A"), (2, ""), (3, "C"))
+    ]
+    stops += [{"cell": cell, "action": "deliver", "label": label} for cell, label in ((4, "C"), (5, ""))]
+    await client.ask("POST", "/tasks", {"stops": [*stops, {"cell": 6, "action": "deliver"}], "name": "box"})
+    book, names = client.manager.book, list[list[str]]()
+    book.put_record(RobotEntry("Robot1"))
+    for position, loads in enumerate((0, 1, 2, 3, 2, 1, 0)):
+        task = replace(
+            book.find("T1"), robot="Robot1", position=position, loads=loads, state=TaskState.RUNNING
+        )
+        book.put_record(task)
+        names.append((await client.ask("GET", "/robots"))[1]["robots"][0]["loads"] if loads else [])
+        assert names[-1] == list(carried(task))
+    assert names == [[], ["A"], ["A", "box"], ["A", "box", "C"], ["A", "box"], ["box"], []]
+    assert carried(replace(book.find("T1"), position=0, loads=1)) == ("box",)

@@ -1,0 +1,286 @@
+"""Modes, zones and blocked cells that people change by the API or at the planner, and restarts of both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf, pi
+
+import pytest
+
+from rce_fleet.manager.planner_sync import BlockCell, PlannerCall, PlannerSync, SetMode, SetZone
+from rce_fleet.manager.zones import checked, read_zone, zone_fields
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.tasks.book import TaskBook
+from rce_fleet.tasks.energy import effort_of
+from rce_fleet.tasks.facts import FleetFacts, RobotFacts
+from rce_fleet.tasks.order import Action, Order, Stop
+from rce_fleet.tasks.records import FleetEntry, PlannerRun, RobotEntry, RobotProfile, Zone
+from rce_fleet.tasks.travel import TravelCosts
+from rce_fleet.tasks.zone_costs import zone_profiles
+
+RUN = PlannerRun("1.0", "8 x 8")
+SPILL = Zone("spill", "blocked", (5, 6), reason="oil", user="anna")
+
+
+class Both:
+    """A book, a planner that does what it is told, and a clock."""
+
+    def __init__(self, book: TaskBook | None = None, run: PlannerRun = RUN) -> None:
+        self.book = book or TaskBook()
+        self.facts = FleetFacts(is_live=True, is_current=True, requested=frozenset())
+        self.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+        self.sync = PlannerSync(self.book, self.facts)
+        self.now = 1000.0
+        self.sync.begin(run, self.now)
+        self.facts.requested = frozenset()
+
+    def step(self, seconds: float = 3.0, *, refused: bool = False) -> list[PlannerCall]:
+        """Let time pass; the planner carries out what it is told, unless it refuses."""
+        self.now += seconds
+        self.sync.adopt(self.now)
+        calls = self.sync.calls(self.now)
+        for call in calls:
+            self.sync.took(call, self.now, refused=refused)
+            if not refused:
+                self._carry_out(call)
+        return calls
+
+    def _carry_out(self, call: PlannerCall) -> None:
+        facts = self.facts
+        if isinstance(call, SetMode):
+            if call.robot:
+                facts.robots[call.robot].mode = call.mode
+            else:
+                facts.mode = call.mode
+        elif isinstance(call, BlockCell):
+            assert facts.requested is not None
+            facts.requested = facts.requested | {call.cell} if call.blocked else facts.requested - {call.cell}
+        elif call.zone is None:
+            del facts.zones[call.id]
+        else:
+            facts.zones[call.id] = read_zone(zone_fields(call.zone, self.now), self.now)
+
+    def mode(self, name: str = "Robot1") -> str:
+        return self.book.entry(name).mode
+
+
+def test_what_the_api_changed_goes_to_the_planner() -> None:
+    both = Both()
+    both.book.emit(RobotEntry("Robot1", "paused", reason="tea", user="bob"), "paused", both.now)
+    both.book.emit(SPILL, "zone", both.now)
+    assert both.step() == [SetMode("Robot1", "paused", "tea", "bob"), SetZone("spill", SPILL)]
+    assert both.step() == []
+    both.book.emit(replace(SPILL, is_removed=True), "zone removed", both.now)
+    assert both.step() == [SetZone("spill", None)]
+    assert (both.step(), both.facts.zones) == ([], {})
+
+
+def test_what_the_planner_was_told_is_adopted() -> None:
+    both = Both()
+    both.facts.robots["Robot1"].mode = "manual"
+    both.facts.robots["Robot1"].mode_reason = "by carl"
+    both.facts.mode = "paused"
+    both.facts.zones["spill"] = SPILL
+    both.facts.requested = frozenset({9})
+    assert both.step() == []
+    assert (both.mode(), both.book.entry("Robot1").reason) == ("manual", "by carl")
+    assert (both.book.fleet.mode, both.book.zones["spill"].reason) == ("paused", "oil")
+    assert both.book.blocked.cells == (9,)
+    both.facts.robots["Robot1"].mode = both.facts.mode = "automatic"
+    both.facts.zones.clear()
+    both.facts.requested = frozenset()
+    assert both.step() == []
+    assert (both.mode(), both.book.fleet.mode, both.book.zones) == ("automatic", "automatic", {})
+    assert not both.book.blocked.cells
+
+
+def test_a_restarted_planner_gets_everything_again() -> None:
+    both = Both()
+    both.facts.zones["spill"], both.facts.mode, both.facts.requested = SPILL, "stopped", frozenset({9})
+    both.facts.robots["Robot1"].mode = "dead"
+    both.step()
+    both.facts.zones, both.facts.mode = {}, "automatic"
+    both.facts.robots["Robot1"].mode = "automatic"
+    both.sync.begin(replace(RUN, started="2.0"), both.now)
+    assert both.facts.requested == frozenset()
+    calls = both.step()
+    assert {type(call) for call in calls} == {SetMode, SetZone, BlockCell}
+    assert (both.facts.mode, both.facts.robots["Robot1"].mode) == ("stopped", "dead")
+    assert (set(both.facts.zones), both.facts.requested) == ({"spill"}, frozenset({9}))
+    assert both.step() == []
+
+
+def test_a_restarted_manager_sees_what_changed() -> None:
+    """While it was away a person freed a cell and paused a robot at the same planner."""
+    first = Both()
+    first.facts.zones["spill"], first.facts.requested = SPILL, frozenset({9})
+    first.step()
+    again = Both(first.book)
+    again.facts.robots["Robot1"].mode = "paused"
+    assert again.step() == []
+    assert (again.mode(), again.book.zones, again.book.blocked.cells) == ("paused", {}, ())
+
+
+@pytest.mark.parametrize("is_told", [True, False])
+def test_a_request_not_sent_before_a_kill_is_sent(is_told: bool) -> None:
+    """The manager was killed after it accepted; changes at the planner do not undo what it was not told."""
+    first = Both()
+    first.book.emit(RobotEntry("Robot1", "paused", unsent=True), "paused", first.now)
+    first.book.emit(replace(SPILL, unsent=True), "zone", first.now)
+    if is_told:
+        first.step()
+        for record in first.sync.confirmed():
+            first.book.put_record(record)
+    assert first.sync.confirmed() == []
+    again = Both(first.book)
+    calls = again.step()
+    assert len(calls) == (0 if is_told else 2)
+    assert (again.mode(), set(again.book.zones)) == (
+        ("automatic", set()) if is_told else ("paused", {"spill"})
+    )
+
+
+@pytest.mark.parametrize("blocked", [True, False])
+@pytest.mark.parametrize("is_told", [True, False])
+def test_a_cell_not_sent_before_a_kill_is_sent(is_told: bool, blocked: bool) -> None:
+    """The manager was killed after it accepted; the planner went on, and people undid it there."""
+    first = Both()
+    first.facts.requested = frozenset() if blocked else frozenset({9})
+    first.step()
+    asked = first.book.blocked.changed({9: blocked}, unsent=True)
+    first.book.emit(asked, "blocked" if blocked else "freed", first.now)
+    if is_told:
+        assert first.step() == [BlockCell(9, blocked)]
+        for record in first.sync.confirmed():
+            first.book.put_record(record)
+        assert first.book.blocked.unsent == ()
+    assert first.sync.confirmed() == []
+    again = Both(first.book)
+    again.facts.requested = frozenset() if blocked else frozenset({9})
+    assert again.step() == ([] if is_told else [BlockCell(9, blocked)])
+    assert (9 in again.book.blocked.cells) == (blocked is not is_told)
+
+
+def test_a_late_list_of_cells_undoes_no_request() -> None:
+    """The planner's list comes seconds after its answer; a second request in between is sent as well."""
+    both = Both()
+    late = both.facts.requested
+    for blocked in (True, False, True):
+        both.book.emit(both.book.blocked.changed({9: blocked}, unsent=True), "cell", both.now)
+        assert both.step(0.5) == [BlockCell(9, blocked)]
+        both.facts.requested = late
+    assert (both.step(2.0), both.book.blocked.cells) == ([], (9,))
+    both.facts.requested = frozenset({9})
+    assert (both.step(10.0), both.book.blocked.cells) == ([], (9,))
+    both.facts.requested = frozenset()
+    assert (both.step(), both.book.blocked.cells) == ([], ())
+
+
+def test_another_grid_forgets_unsent_cells() -> None:
+    first = Both()
+    first.step()
+    first.book.emit(first.book.blocked.changed({9: True}, unsent=True), "blocked", first.now)
+    again = Both(first.book, PlannerRun("2.0", "16 x 16"))
+    assert (again.step(), again.book.blocked.cells) == ([], ())
+
+
+def test_a_zone_removed_before_a_kill_stays_removed() -> None:
+    first = Both()
+    first.facts.zones["spill"] = SPILL
+    first.step()
+    gone = replace(SPILL, is_removed=True, unsent=True)
+    first.book.emit(gone, "zone removed", first.now)
+    again = Both(first.book)
+    again.facts.zones["spill"] = SPILL
+    assert again.step() == [SetZone("spill", None)]
+    assert again.sync.confirmed() == [replace(gone, unsent=False)]
+    assert (again.facts.zones, again.book.zones) == ({}, {})
+
+
+def test_the_fleets_mode_hides_a_robots_own() -> None:
+    both = Both()
+    both.book.emit(FleetEntry("paused"), "paused", both.now)
+    both.step()
+    both.facts.robots["Robot1"].mode = "paused"
+    assert (both.step(), both.mode()) == ([], "automatic")
+    both.book.emit(RobotEntry("Robot1", "out_of_service"), "taken out", both.now)
+    assert [call.mode for call in both.step() if isinstance(call, SetMode)] == ["out_of_service"]
+
+
+def test_a_robot_that_joins_again_keeps_its_mode() -> None:
+    both = Both()
+    both.facts.robots["Robot1"].mode = "paused"
+    both.step()
+    robot = both.facts.robots.pop("Robot1")
+    assert (both.step(), both.mode()) == ([], "paused")
+    robot.mode = "automatic"
+    both.facts.robots["Robot1"] = robot
+    assert [call.mode for call in both.step() if isinstance(call, SetMode)] == ["paused"]
+
+
+def test_zones_expire_in_journal_and_planner() -> None:
+    both = Both()
+    both.book.emit(replace(SPILL, until=both.now + 10), "zone", both.now)
+    assert len(both.step()) == 1
+    assert both.step(20.0) == [SetZone("spill", None)]
+    assert both.book.zones == {}
+
+
+def test_a_refused_zone_is_sent_again_later() -> None:
+    both = Both()
+    both.book.emit(SPILL, "zone", both.now)
+    assert len(both.step(refused=True)) == 1
+    assert both.step() == []
+    assert len(both.step(20.0)) == 1
+
+
+def test_a_cell_that_is_still_occupied_is_blocked_once() -> None:
+    both = Both()
+    both.facts.requested = frozenset({9})
+    both.step()
+    both.facts.requested, both.facts.pending = frozenset(), frozenset({9})
+    assert (both.step(), both.book.blocked.cells) == ([], (9,))
+
+
+def test_another_grid_brings_the_planners_zones() -> None:
+    both = Both()
+    both.facts.zones["spill"] = SPILL
+    both.step()
+    both.facts.zones["spill"] = replace(SPILL, cells=(20, 21, 22))
+    assert "another grid" in both.sync.begin(PlannerRun("2.0", "16 x 16"), both.now)
+    assert both.step() == []
+    assert both.book.zones["spill"].cells == (20, 21, 22)
+
+
+@pytest.mark.parametrize(
+    "zone",
+    [
+        replace(SPILL, edges=((5, 6),)),
+        replace(SPILL, robots=("Robot2", "Robot1"), until=2000.0),
+        Zone("ice", "slow", (3,), 0.2, robots=("Robot1",)),
+        Zone("lane", "one_way", (3, 4), -pi / 2),
+        Zone("lift", "limited", (3, 4), 2.0),
+    ],
+)
+def test_zones_are_the_same_after_the_wire(zone: Zone) -> None:
+    kept = checked(zone, GridMap(), 1000.0)
+    back = read_zone(zone_fields(kept, 1000.0), 1000.0)
+    assert back == kept
+
+
+def test_ways_lead_around_a_robots_forbidden_cells() -> None:
+    """Cells 1 and 9 are blocked for one robot only: on a floor of two rows no way is left for it."""
+    grid = GridMap(2, 8)
+    book = TaskBook()
+    book.emit(Zone("shut", "blocked", (1, 9), robots=("Robot1",)), "zone", 0.0)
+    book.emit(Zone("mud", "cost", (2,), 5.0), "zone", 0.0)
+    facts = FleetFacts(robots={name: RobotFacts(name) for name in ("Robot1", "Robot2")})
+    profiles = zone_profiles(book, facts, RobotProfile())
+    assert profiles["Robot1"].zone_cost == {"mud": 5.0, "shut": inf}
+    assert profiles["Robot2"].zone_cost == {"mud": 5.0}
+    travel = TravelCosts()
+    travel.set_map(grid, grid.blocked, book.zones, 0)
+    task = book.create(Order((Stop(Action.GO, (3,)),)), 0.0)
+    assert effort_of(task, 0, travel, profiles["Robot1"]).first == inf
+    assert effort_of(task, 1, travel, profiles["Robot1"]).first < inf
+    assert effort_of(task, 0, travel, profiles["Robot2"]).first == 5.0

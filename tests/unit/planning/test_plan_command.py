@@ -1,0 +1,103 @@
+"""``rce plan``: the file that it writes, and what it says of bad input."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from rce_fleet.offline.plan_command import plan
+from rce_fleet.planning.checker import check_plan
+from rce_fleet.planning.movingai import read_map
+
+MAP = "type octile\nheight 4\nwidth 6\nmap\n......\n.@@.@.\n.@@.@.\n......\n"
+ROWS = ((0, 0, 5, 3), (5, 0, 0, 3), (0, 3, 5, 0), (3, 0, 3, 3))
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    map_, scen = tmp_path / "floor.map", tmp_path / "floor.scen"
+    map_.write_text(MAP)
+    rows = [f"0\tfloor.map\t6\t4\t{a}\t{b}\t{c}\t{d}\t1.0" for a, b, c, d in ROWS]
+    scen.write_text("version 1\n" + "\n".join(rows) + "\n")
+    return map_, scen
+
+
+def run(*arguments: object) -> tuple[int, str]:
+    app = typer.Typer()
+    app.command()(plan)
+    result = CliRunner().invoke(app, [*map(str, arguments)])
+    return result.exit_code, result.output
+
+
+def test_a_plan_is_written_and_is_right(files: tuple[Path, Path], tmp_path: Path) -> None:
+    map_, scen = files
+    output = tmp_path / "plan.json"
+    code, said = run(map_, "--scen", scen, "--robots", 4, "--seconds", 0.3, "--output", output)
+    assert code == 0, said
+    report = json.loads(output.read_text())
+    assert list(report) == [
+        "robots", "compile_s", "first_solution_s", "cost", "lower_bound", "makespan", "paths",
+    ]  # fmt: skip
+    starts = [y * 6 + x for x, y, _, _ in ROWS]
+    goals = [y * 6 + x for _, _, x, y in ROWS]
+    assert check_plan(read_map(map_), report["paths"], starts=starts, goals=goals) == []
+    assert report["cost"] == sum(len(path) - 1 for path in report["paths"]) >= report["lower_bound"] == 27
+    assert report["makespan"] == max(len(path) - 1 for path in report["paths"])
+
+
+def test_a_lifelong_run_names_the_goals(files: tuple[Path, Path], tmp_path: Path) -> None:
+    map_, _ = files
+    output = tmp_path / "plan.json"
+    code, said = run(map_, "--lifelong", "--steps", 30, "--robots", 3, "--seed", 2, "--output", output)
+    assert code == 0, said
+    report = json.loads(output.read_text())
+    assert {len(path) for path in report["paths"]} == {31}
+    assert check_plan(read_map(map_), report["paths"]) == []
+    assert report["tasks"] == sum(map(len, report["goals"]))
+    assert report["tasks_per_step"] == pytest.approx(report["tasks"] / 30)
+    for path, goals in zip(report["paths"], report["goals"], strict=True):
+        assert all(here != there for here, there in pairwise(goals))
+        at = 0
+        for goal in goals:
+            at = path.index(goal, at)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("--robots 4", "--robots 9"), "the scenario has 4 robots; --robots asks for 9"),
+        (("--scen {scen}", "--scen {scen}.missing"), "floor.scen.missing"),
+        (("--scen {scen}", ""), "a plan needs --scen FILE.scen"),
+        (("--robots 4", "--robots 4 --planner best"), "there is no planner 'best'; installed are"),
+        (("\t5\t0\t0\t3", "\t0\t0\t0\t3"), "robots 0 and 1 have the same start, cell 0"),
+        (("\t5\t0\t0\t3", "\t1\t1\t0\t3"), "line 3: (1, 1) is not a free cell of the map"),
+        (("......\n.@@.@.\n.@@.@.\n......", "...@..\n.@@@@.\n.@@@@.\n...@.."), "no path leads from cell"),
+    ],
+)
+def test_bad_input_is_a_clear_error(
+    files: tuple[Path, Path], tmp_path: Path, change: tuple[str, str], said: str
+) -> None:
+    map_, scen = files
+    for file in files:
+        file.write_text(file.read_text().replace(*change))
+    if "no path" in said:
+        scen.write_text("\n".join(scen.read_text().splitlines()[:4]) + "\n")
+    line = "{map} --scen {scen} --robots 4 --output {out}"
+    if "no path" in said:
+        line = line.replace("--robots 4", "--robots 3")
+    line = line.replace(*change).format(map=map_, scen=scen, out=tmp_path / "plan.json")
+    code, output = run(*line.split())
+    assert code == 1
+    assert said in output
+    assert not (tmp_path / "plan.json").exists()
+
+
+def test_too_many_lifelong_robots_are_refused(files: tuple[Path, Path], tmp_path: Path) -> None:
+    code, said = run(files[0], "--lifelong", "--robots", 40, "--output", tmp_path / "plan.json")
+    assert code == 1
+    assert "40 robots do not fit: the map has 18 connected free cells" in said

@@ -1,0 +1,115 @@
+"""Planners by name, graphs, and what plans say of themselves."""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint
+
+import numpy as np
+import pytest
+
+from rce_fleet.exceptions import PlannerError, PlanningError
+from rce_fleet.planning import planner
+from rce_fleet.planning.dijkstra import distances
+from rce_fleet.planning.fields import UNREACHABLE, distance_fields
+from rce_fleet.planning.graph import Lane, PlanningGraph
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.planning.planner import JointPlan, PlanningProblem, load_planner, planner_names
+
+
+def test_both_planners_are_installed() -> None:
+    assert {"dijkstra", "lacam"} <= set(planner_names())
+
+
+def test_an_unknown_planner_names_the_known_ones() -> None:
+    with pytest.raises(PlannerError, match=r"no planner 'best'; installed are .*dijkstra, lacam"):
+        load_planner("best")
+
+
+def test_an_object_that_cannot_plan_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    point = EntryPoint("broken", "builtins:object", planner.PLANNER_ENTRY_POINTS)
+    monkeypatch.setattr(planner, "entry_points", lambda *, group: [point] if group else [])
+    with pytest.raises(PlannerError, match=r"builtins:object.* has no method 'plan'"):
+        load_planner("broken")
+
+
+@pytest.mark.parametrize("name", ["dijkstra", "lacam"])
+def test_a_planner_avoids_walls_and_forbidden_cells(name: str) -> None:
+    grid = GridMap(3, 3, blocked=frozenset({4}))
+    problem = PlanningProblem.of(PlanningGraph.from_grid(grid), [0], [8], forbidden={0: frozenset({1})})
+    joint = load_planner(name).plan(problem)
+    assert joint.complete
+    assert joint.path(0) == [0, 3, 6, 7, 8]
+
+
+def test_dijkstra_does_not_promise_freedom_of_conflicts() -> None:
+    joint = load_planner("dijkstra").plan(
+        PlanningProblem.of(PlanningGraph.from_grid(GridMap(1, 3)), [0, 2], [2, 0])
+    )
+    assert joint.complete
+    assert not joint.conflict_free
+    assert joint.cost == 4
+
+
+def test_one_way_lanes_are_driven_in_their_direction() -> None:
+    ring = PlanningGraph.from_lanes(4, [Lane(node, (node + 1) % 4, 3) for node in range(4)])
+    joint = load_planner("lacam").plan(PlanningProblem.of(ring, [1], [0]))
+    assert joint.path(0) == [1, 2, 3, 0]
+    assert distance_fields(ring, [0])[0].tolist() == [0, 9, 6, 3]
+
+
+def test_closed_moves_and_costs_change_the_path() -> None:
+    grid = GridMap(2, 3)
+    straight = PlanningGraph.from_grid(grid)
+    closed = PlanningGraph.from_grid(grid, closed=[(0, 1)])
+    slow = PlanningGraph.from_grid(grid, costs=np.array([1, 9, 1, 1, 1, 1]))
+    assert distance_fields(straight, [2])[0, 0] == 2
+    assert distance_fields(closed, [2])[0, 0] == 4
+    assert distance_fields(slow, [2])[0, 0] == 4
+    assert distance_fields(closed, [0])[0, 2] == 2
+
+
+def test_fields_are_the_distances_of_the_grid() -> None:
+    rng = np.random.default_rng(3)
+    grid = GridMap(9, 7, blocked=frozenset(rng.choice(63, 20, replace=False).tolist()))
+    costs = rng.integers(1, 9, 63)
+    plain = distance_fields(PlanningGraph.from_grid(grid), grid.free)
+    weighted = distance_fields(PlanningGraph.from_grid(grid, costs=costs), grid.free)
+    for row, goal in enumerate(grid.free):
+        steps = distances(grid, goal)
+        for cell in grid.free:
+            assert plain[row, cell] == min(steps[cell], UNREACHABLE)
+        leaving = distances(grid, goal, costs.tolist())  # costs of leaving; ours are of entering
+        for cell in grid.free:
+            if leaving[cell] < UNREACHABLE:
+                assert weighted[row, cell] == leaving[cell] - costs[cell] + costs[goal]
+
+
+@pytest.mark.parametrize(
+    ("starts", "goals", "said"),
+    [
+        ([0, 0], [1, 2], "robots 0 and 1 have the same start, cell 0"),
+        ([0, 1], [2, 2], "robots 0 and 1 have the same goal, cell 2"),
+        ([0], [1, 2], "1 starts and 2 goals"),
+        ([0], [64], "the goal of robot 0, 64, is not within 0 .. 63"),
+    ],
+)
+def test_a_malformed_problem_says_which_robot(starts: list[int], goals: list[int], said: str) -> None:
+    with pytest.raises(PlanningError, match=said):
+        PlanningProblem.of(PlanningGraph.from_grid(GridMap()), starts, goals)
+
+
+def test_a_lane_to_a_missing_node_is_refused() -> None:
+    with pytest.raises(ValueError, match="from 0 to 5"):
+        PlanningGraph.from_lanes(2, [Lane(0, 5)])
+
+
+def test_a_plan_counts_steps_to_the_last_arrival() -> None:
+    joint = JointPlan.of([(0, 5), (1, 5), (2, 4), (1, 5), (2, 5)], complete=True)
+    assert joint.arrivals.tolist() == [4, 3]
+    assert (joint.cost, joint.makespan) == (7, 4)
+    assert joint.path(1) == [5, 5, 4, 5]
+    assert joint.route(0) == [(0, 0), (1, 1), (2, 2), (3, 1), (4, 2)]
+    steps, robots, cells = joint.visits()
+    assert list(zip(steps.tolist(), robots.tolist(), cells.tolist(), strict=True))[:3] == [
+        (1, 0, 1), (2, 0, 2), (2, 1, 4),
+    ]  # fmt: skip

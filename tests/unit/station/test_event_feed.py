@@ -1,0 +1,143 @@
+"""The station's events: kept ones, gaps, lost messages and numbers that begin anew."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from rce_fleet.exceptions import EventsRestartedError
+from rce_fleet.station import events as module
+from rce_fleet.station.event_streams import COLUMNS, csv_rows
+from rce_fleet.station.events import EventBatch, EventCursor, EventFeed
+
+
+class Journal:
+    """All events; counts how often it is asked."""
+
+    def __init__(self, count: int = 0, journal: str = "aa") -> None:
+        self.events: list[dict[str, Any]] = []
+        self.id = journal
+        self.asked = 0
+        self.grow(count)
+
+    def grow(self, count: int, time: float = 0.0) -> None:
+        for _ in range(count):
+            number = len(self.events) + 1
+            self.events.append({"number": number, "time": time + number, "kind": "task", "text": "x"})
+
+    async def ask(self, after: int, limit: int) -> EventBatch:
+        self.asked += 1
+        return EventBatch(self.events[after : after + limit], self.id, len(self.events))
+
+
+def numbers(events: Any) -> list[int]:
+    return [event["number"] for event in events]
+
+
+def tell(feed: EventFeed, journal: Journal, *wanted: int) -> None:
+    for number in wanted:
+        feed.take(json.dumps({**journal.events[number - 1], "journal": journal.id}))
+
+
+async def test_kept_events_cost_the_manager_nothing() -> None:
+    journal = Journal(10)
+    feed = EventFeed(journal.ask)
+    tell(feed, journal, 4, 5, 6)
+    assert numbers(await feed.after(3)) == [4, 5, 6]
+    assert numbers(await feed.after(6)) == []
+    assert journal.asked == 0
+    assert numbers(await feed.after(1)) == list(range(2, 11))
+
+
+async def test_a_gap_is_filled_by_a_request() -> None:
+    journal = Journal(9)
+    feed = EventFeed(journal.ask)
+    cursor = EventCursor(feed, 2)
+    tell(feed, journal, 3, 4)
+    assert numbers(await cursor.next()) == [3, 4]
+    tell(feed, journal, 8, 9)
+    assert numbers(await cursor.next()) == [5, 6, 7, 8, 9]
+
+
+async def test_a_new_client_gets_events_from_now_on() -> None:
+    journal = Journal(5)
+    feed = EventFeed(journal.ask)
+    first = EventCursor(feed, None)
+    tell(feed, journal, 4)
+    assert numbers(await first.next()) == [4]
+    second = EventCursor(feed, None)
+    tell(feed, journal, 5)
+    assert numbers(await second.next()) == [5]
+
+
+async def test_a_lost_message_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "RECHECK_S", 0.01)
+    journal = Journal(5)
+    feed = EventFeed(journal.ask)
+    tell(feed, journal, 4)
+    cursor = EventCursor(feed, 4)
+    feed.take("not json")
+    assert numbers(await cursor.next()) == [5]
+    assert numbers(await cursor.next()) == []
+
+
+async def test_numbers_that_begin_anew_are_told() -> None:
+    """A manager without a volume lost its journal with its container."""
+    journal = Journal(50)
+    feed = EventFeed(journal.ask)
+    told: list[str] = []
+    feed.on_restart = lambda: told.append(feed.journal)
+    tell(feed, journal, *range(40, 51))
+    cursor = EventCursor(feed, 50)
+    tell(feed, journal, 45)  # told twice
+    assert (feed.epoch, told) == (0, [])
+    journal.events, journal.id = Journal(3).events, "bb"
+    tell(feed, journal, 1, 2)
+    assert (feed.epoch, feed.newest, told) == (1, 2, ["bb"])
+    with pytest.raises(EventsRestartedError):
+        await cursor.next()
+    assert numbers(await cursor.next()) == [1, 2]
+    assert cursor.journal == "bb"
+
+
+@pytest.mark.parametrize(
+    ("number", "journal"), [(40, "aa"), (60, "aa"), (60, "")], ids=["passed", "ahead", "ahead, unknown"]
+)
+async def test_a_client_of_a_lost_journal_is_told(number: int, journal: str) -> None:
+    """The station was away when the journal was lost; the new one may have passed the client's number."""
+    feed = EventFeed(Journal(50, "bb").ask)
+    cursor = EventCursor(feed, number, journal)
+    with pytest.raises(EventsRestartedError) as caught:
+        await cursor.next()
+    assert caught.value.journal == "bb"
+    assert numbers(await cursor.next()) == list(range(1, 51))
+
+
+async def test_an_older_copy_of_the_journal_is_noticed() -> None:
+    journal = Journal(50)
+    feed = EventFeed(journal.ask)
+    tell(feed, journal, 50)
+    cursor = EventCursor(feed, 45)
+    journal.events = journal.events[:30]
+    with pytest.raises(EventsRestartedError):
+        await cursor.next()
+    assert numbers(await cursor.next()) == list(range(1, 31))
+
+
+async def test_a_client_that_knows_more_is_no_gap() -> None:
+    """Its events came by another way than the topic, whose last messages were lost."""
+    journal = Journal(50)
+    feed = EventFeed(journal.ask)
+    tell(feed, journal, 20, 21)
+    cursor = EventCursor(feed, 40, "aa")
+    assert numbers(await cursor.next()) == list(range(41, 51))
+
+
+def test_csv_has_times_and_no_formulas() -> None:
+    event = dict.fromkeys(COLUMNS, "") | {"number": 3, "time": 0.25, "text": '=SUM(A1), "x"', "user": "@erp"}
+    row = csv_rows([event]).splitlines()[0]
+    assert row.startswith("3,1970-01-01T00:00:00.250+00:00,")
+    assert "'@erp" in row
+    assert '"\'=SUM(A1), ""x"""' in row

@@ -1,0 +1,86 @@
+"""What the station records of a fleet, and how it is replayed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from unit.station.test_station_view import changes, pose, robot, state
+
+from rce_fleet.station.recording import WHOLE_EVERY_S, Recorder, Records
+from rce_fleet.station.view import FleetView
+
+START = 1000.0
+
+
+@pytest.fixture
+def view() -> FleetView:
+    made = FleetView()
+    made.on_state(state(robot("Robot1"), robot("Robot2"), blocked=[5]))
+    made.on_pose("Robot1", pose(1.0, 0.5, 0.0))
+    return made
+
+
+def record(recorder: Recorder, now: float) -> bool:
+    """Record a moment; return whether there was something."""
+    made = recorder.take(now)
+    if made is not None:
+        recorder.records.add(made[0], made[1], whole=made[2])
+    return made is not None
+
+
+def test_the_state_of_any_moment_is_known(view: FleetView) -> None:
+    recorder = Recorder(view, Records())
+    for second in range(100):
+        view.on_pose("Robot1", pose(0.1 * second, 0.5, 0.0))
+        if second == 50:
+            view.on_changes(changes(robot("Robot2", goal=7), blocked=[6], freed=[5]))
+        record(recorder, START + second)
+    assert recorder.records.range() == (START, START + 99)
+    whole, *later = recorder.records.read(START + 45.5, 10.0)
+    assert whole["time"] == START + 45.5
+    assert whole["robots"]["Robot1"][:2] == [4.5, 0.5]
+    assert (whole["blocked"], whole["robots"]["Robot2"][5]) == ([5], None)
+    assert [frame["time"] for frame in later] == [START + second for second in range(46, 56)]
+    changed = next(frame for frame in later if "blocked" in frame and not frame.get("whole"))
+    assert (changed["time"], changed["blocked"], changed["robots"]["Robot2"][5]) == (START + 50, [6], 7)
+    assert recorder.records.read(START + 70, 0.0)[0]["blocked"] == [6]
+
+
+def test_nothing_is_written_while_nothing_changes(view: FleetView) -> None:
+    recorder = Recorder(view, Records())
+    assert [record(recorder, START + second) for second in range(5)] == [True, False, False, False, False]
+    assert record(recorder, START + WHOLE_EVERY_S), "but a whole record, now and then"
+
+
+def test_a_removed_robot_is_gone_in_the_replay(view: FleetView) -> None:
+    recorder = Recorder(view, Records())
+    record(recorder, START)
+    view.on_changes(changes(removed=["Robot2"]))
+    record(recorder, START + 1)
+    assert set(recorder.records.read(START, 0.0)[0]["robots"]) == {"Robot1", "Robot2"}
+    assert set(recorder.records.read(START + 1, 0.0)[0]["robots"]) == {"Robot1"}
+
+
+def test_a_file_stays_within_its_bound(view: FleetView, tmp_path: Path) -> None:
+    """The newest records survive a restart of the station; the oldest make room."""
+    file, limit = tmp_path / "history", 20_000
+    recorder = Recorder(view, Records(file, limit))
+    for second in range(1000):
+        view.on_pose("Robot1", pose(0.1 * second, 0.01 * second, 0.0))
+        record(recorder, START + second)
+    recorder.records.close()
+    again = Records(file, limit)
+    span = again.range()
+    assert span is not None
+    assert span[0] > START + 100
+    assert span[1] == START + 999
+    assert again.read(span[1], 0.0)[0]["robots"]["Robot1"][0] == pytest.approx(99.9)
+    again.close()
+
+
+def test_nothing_is_recorded_before_the_first_state() -> None:
+    recorder = Recorder(FleetView(), Records())
+    assert recorder.take(START) is None
+    assert recorder.records.range() is None
+    assert recorder.records.read(START, 10.0) == []

@@ -1,0 +1,92 @@
+"""Webhooks: signatures, where events may be sent, and what is kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rce_fleet.api.webhooks import WebhookRequest, sign, verify
+from rce_fleet.exceptions import RequestRefusedError
+from rce_fleet.station.webhook_sender import PublicResolver
+from rce_fleet.station.webhook_store import MAX_WEBHOOKS, WebhookStore, check_url
+
+BODY = b'{"events": []}'
+
+
+def test_a_signature_covers_time_and_body() -> None:
+    signature = sign("secret", "1000", BODY)
+    assert verify("secret", "1000", BODY, signature, now=1000.0)
+    assert verify("secret", "1000", BODY, signature, now=1299.0)
+    for wrong in (
+        verify("other", "1000", BODY, signature, now=1000.0),
+        verify("secret", "1001", BODY, signature, now=1000.0),
+        verify("secret", "1000", BODY + b" ", signature, now=1000.0),
+        verify("secret", "1000", BODY, signature, now=1301.0),
+        verify("secret", "soon", BODY, signature, now=1000.0),
+        verify("secret", "1000", BODY, "v1=ä", now=1000.0),
+    ):
+        assert not wrong
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        *(
+            "ftp://example.com/x",
+            "file:///etc/passwd",
+            "example.com",
+            "https://",
+            "http://[::1",
+            "http://a:b/",
+        ),
+        *(
+            "https://name:password@example.com/",
+            "http://localhost/x",
+            "http://127.0.0.1/",
+            "http://10.0.0.8:80/x",
+        ),
+        *("http://[::1]/", "http://169.254.169.254/latest", "http://192.168.1.1/", "http://0.0.0.0/"),
+    ],
+)
+def test_urls_that_are_refused(url: str) -> None:
+    with pytest.raises(RequestRefusedError):
+        check_url(url, allow_private=False)
+
+
+def test_private_urls_need_to_be_allowed() -> None:
+    for url in ("http://127.0.0.1:9/x", "https://localhost/", "http://192.168.1.1/"):
+        check_url(url, allow_private=True)
+    check_url("https://erp.example.com/fleet?x=1", allow_private=False)
+
+
+async def test_a_name_of_a_private_address_is_refused() -> None:
+    """The name is looked up at each delivery, so that a later change is noticed too."""
+    with pytest.raises(OSError, match="private network"):
+        await PublicResolver().resolve("localhost", 80)
+
+
+def test_webhooks_are_kept_where_only_the_owner_reads(tmp_path: Path) -> None:
+    file = tmp_path / "station" / "webhooks.json"
+    store = WebhookStore(file)
+    store.load()
+    made = store.add(WebhookRequest(url="https://example.com/", kinds=["task"]), "anna", 7)
+    assert len(made.secret) > 30
+    assert made.secret not in repr(made)
+    made.position, made.failures = 12, 2
+    store.save()
+    assert file.stat().st_mode & 0o077 == 0
+    again = WebhookStore(file)
+    again.load()
+    (kept,) = again
+    assert (kept.position, kept.failures, kept.secret, kept.kinds) == (12, 2, made.secret, ("task",))
+    assert again.remove(made.id)
+    assert not again.remove(made.id)
+
+
+def test_there_are_at_most_so_many() -> None:
+    store = WebhookStore(None)
+    for _ in range(MAX_WEBHOOKS):
+        store.add(WebhookRequest(url="https://example.com/"), "anna", 0)
+    with pytest.raises(RequestRefusedError, match="20 webhooks already"):
+        store.add(WebhookRequest(url="https://example.com/"), "anna", 0)
