@@ -171,7 +171,8 @@ async def test_nodes_end_in_the_reverse_of_their_order(machine: Machine) -> None
                 own("hear.py", "third x 0", tag="third", after=("second",)),
             ),
         )
-        await machine.node_is(BOX, "third", NodeState.RUNNING)
+        for tag in ("first", "second", "third"):
+            await holds(machine, tag, "ready", LogStream.STDOUT)
         await machine.drop(BOX)
         left = {}
         for tag in ("first", "second", "third"):
