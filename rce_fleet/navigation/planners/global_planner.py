@@ -1,7 +1,9 @@
 """The global planner: the cheapest way to a goal on a costmap, straightened.
 
 It reads the way from the field of :mod:`~rce_fleet.navigation.planners.cost_to_go` and replaces parts of it
-by straight lines where these cost no more, so that the way is not bound to eight directions.
+by straight lines where these cost no more, so that the way is not bound to eight directions. The field is
+computed in a window around the goal, which grows until no way through the rest of the map can be cheaper: a
+plan costs what its way is long, not what the map is large.
 """
 
 from __future__ import annotations
@@ -13,11 +15,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rce_fleet.geometry.poses import Pose
+from rce_fleet.navigation.costmap.cost_grid import Area
 from rce_fleet.navigation.costmap.costs import INSCRIBED, LETHAL, UNKNOWN
-from rce_fleet.navigation.planners.cost_to_go import UNREACHED, descend, spread, steps_of
+from rce_fleet.navigation.planners.cost_to_go import NEUTRAL_COST, UNREACHED, descend, spread, steps_of
 from rce_fleet.navigation.planners.shortcuts import line_cost, straighten
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from rce_fleet.navigation.costmap.cost_grid import CostGrid
@@ -25,6 +30,8 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
 
+FIRST_RADIUS = 64
+"""Radius of the first window in cells, besides twice the distance between start and goal."""
 _ESCAPE_COST = 1000
 """Cost of a step in an inscribed cell beside a start that is in one too: out of it, on the shortest way."""
 
@@ -87,39 +94,132 @@ def make_plan(
             return _failed(f"the {name} ({pose.x}, {pose.y}, {pose.yaw}) is not finite")
     if not grid.has(start.x, start.y):
         return _failed(f"the start ({start.x:.2f}, {start.y:.2f}) is off the costmap{_extent(grid)}")
-    steps = steps_of(grid.values, allow_unknown=settings.allow_unknown)
     first = grid.cell_of(start.x, start.y)
-    _open_start(grid, steps, first)
-    last = _end_near(grid, steps, goal, reach)
-    if last is None:
-        return _failed(_why_no_end(grid, goal, reach))
-    columns = steps.shape[1]
-    begin, end = (first[0] + 1) * columns + first[1] + 1, (last[0] + 1) * columns + last[1] + 1
+    for area, radius in _windows(grid, first, goal, reach):
+        window = _Window(grid, area, steps_of(grid.values[area.slices], allow_unknown=settings.allow_unknown))
+        is_open = window.open_start(first)
+        last = window.end_near(goal, reach)
+        if last is not None:
+            limit = UNREACHED - 1 if area == grid.whole else radius * NEUTRAL_COST
+            path = _path_in(window, start, goal, last, limit)
+            if path is not None:
+                return Plan(path)
+        elif not is_open or area == grid.whole:
+            return _failed(_why_no_end(grid, goal, reach))
+    return _failed(f"no way leads from ({start.x:.2f}, {start.y:.2f}) to ({goal.x:.2f}, {goal.y:.2f})")
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """A part of the costmap.
+
+    Attributes:
+        grid: The costmap.
+        area: The part, cells of the costmap.
+        steps: Cost of a step from each cell of the part, with a border, as of ``steps_of``.
+    """
+
+    grid: CostGrid
+    area: Area
+    steps: Ints
+
+    def index_of(self, cell: tuple[int, int]) -> tuple[int, int]:
+        """Return the index of a cell of the costmap in ``steps``."""
+        return cell[0] - self.area.low + 1, cell[1] - self.area.left + 1
+
+    def cells_at(self, indices: Ints) -> Ints:
+        """Return the cells of the costmap at indices of ``steps``, both of shape (N, 2)."""
+        return indices - 1 + (self.area.low, self.area.left)
+
+    def point_of(self, point: Floats) -> Floats:
+        """Return row and column in ``steps``, with fractions, of a point in metres."""
+        grid = self.grid
+        inside: Floats = ((point - grid.origin) / grid.resolution)[::-1]
+        return inside - (self.area.low - 1, self.area.left - 1)
+
+    def open_start(self, start: tuple[int, int]) -> bool:
+        """Let a way lead out of the inscribed cells around the start; return whether the start is in one."""
+        row, column = self.index_of(start)
+        if self.steps[row, column]:
+            return False
+        # The nearest cell that can be entered tells how far the robot is inside.
+        rows, columns = np.nonzero(self.steps)
+        reach = ceil(np.hypot(rows - row, columns - column).min() + 0.5) if len(rows) else 0
+        near = Area(start[0], start[1], start[0] + 1, start[1] + 1).grown(reach)
+        shared = Area(
+            max(near.low, self.area.low),
+            max(near.left, self.area.left),
+            min(near.high, self.area.high),
+            min(near.right, self.area.right),
+        )
+        (low, left), (high, right) = (self.index_of(one) for one in (shared[:2], shared[2:]))
+        part = self.steps[low:high, left:right]
+        part[(part == 0) & (self.grid.values[shared.slices] == INSCRIBED)] = _ESCAPE_COST
+        self.steps[row, column] = _ESCAPE_COST
+        return True
+
+    def end_near(self, goal: Pose, reach: float) -> tuple[int, int] | None:
+        """Return the goal's cell, or if it cannot be entered the nearest one that can within ``reach``."""
+        grid = self.grid
+        cell = grid.cell_of(goal.x, goal.y)
+        if grid.has(goal.x, goal.y) and self.steps[self.index_of(cell)]:
+            return cell
+        near = grid.area_around(goal.x, goal.y, ceil(reach / grid.resolution) * grid.resolution)
+        if reach <= 0 or near.is_empty:
+            return None
+        (low, left), (high, right) = (self.index_of(one) for one in (near[:2], near[2:]))
+        cells = np.argwhere(self.steps[low:high, left:right]) + np.array((near.low, near.left))
+        away = np.hypot(*(grid.centres_of(cells) - (goal.x, goal.y)).T)
+        if not len(away) or away.min() > reach:
+            return None
+        best = cells[int(away.argmin())]
+        return int(best[0]), int(best[1])
+
+
+def _windows(grid: CostGrid, start: tuple[int, int], goal: Pose, reach: float) -> Iterator[tuple[Area, int]]:
+    """Yield growing areas that contain the start and all cells where the way may end; the last is the grid.
+
+    With each comes its radius around those cells: cells outside are farther away.
+    """
+    row, column = grid.cell_of(goal.x, goal.y)
+    margin = ceil(reach / grid.resolution) + 1
+    radius = 2 * (max(abs(row - start[0]), abs(column - start[1])) + margin) + FIRST_RADIUS
+    while True:
+        area = Area(row, column, row + 1, column + 1).grown(radius + margin).clipped(*grid.shape)
+        yield area, radius
+        if area == grid.whole:
+            return
+        radius *= 4
+
+
+def _path_in(window: _Window, start: Pose, goal: Pose, last: tuple[int, int], limit: int) -> Floats | None:
+    """Return the poses of the cheapest way in a window if it costs at most ``limit``, else None."""
+    grid, steps = window.grid, window.steps
+    ends = grid.cell_of(start.x, start.y), last
+    begin, end = (int(np.ravel_multi_index(window.index_of(one), steps.shape)) for one in ends)
     field = spread(steps, end, begin)
-    if field.reshape(-1)[begin] >= UNREACHED:
-        return _failed(f"no way leads from ({start.x:.2f}, {start.y:.2f}) to ({goal.x:.2f}, {goal.y:.2f})")
+    if field.reshape(-1)[begin] > limit:
+        return None
     way = np.array(descend(field, steps, begin))
-    cells = np.stack(divmod(way, columns), axis=1)
-    corners = straighten(steps, cells) - 1
-    points = _with_exact_ends(grid, steps, grid.centres_of(corners), start, goal, last)
-    return Plan(_with_headings(points, grid.resolution, goal.yaw))
+    corners = straighten(steps, np.stack(divmod(way, steps.shape[1]), axis=1))
+    points = _with_exact_ends(window, grid.centres_of(window.cells_at(corners)), start, goal, last)
+    return _with_headings(points, grid.resolution, goal.yaw)
 
 
 def _with_exact_ends(
-    grid: CostGrid, steps: Ints, points: Floats, start: Pose, goal: Pose, last: tuple[int, int]
+    window: _Window, points: Floats, start: Pose, goal: Pose, last: tuple[int, int]
 ) -> Floats:
     """Return a way from the start itself and, unless that is in an obstacle, to the goal itself.
 
     The centres of their cells stay where a straight line past them would cross an obstacle.
     """
-    reaches = last == grid.cell_of(goal.x, goal.y)
+    reaches = last == window.grid.cell_of(goal.x, goal.y)
     ends = [np.array(((start.x, start.y),)), np.array(((goal.x, goal.y),)) if reaches else points[-1:]]
     if len(points) == 1:
         return np.concatenate(ends)
 
     def is_free(one: Floats, other: Floats) -> bool:
-        at, to = (((p - grid.origin) / grid.resolution + 1)[::-1] for p in (one, other))
-        return bool(np.isfinite(line_cost(steps, at, to)))
+        return bool(np.isfinite(line_cost(window.steps, window.point_of(one), window.point_of(other))))
 
     first = 1 if is_free(ends[0][0], points[1]) else 0
     before = points[-2] if len(points) > first + 1 else ends[0][0]
@@ -135,40 +235,6 @@ def _extent(grid: CostGrid) -> str:
     rows, columns = grid.shape
     (left, low), size = grid.origin, grid.resolution
     return f" (x {left:.2f} to {left + columns * size:.2f} m, y {low:.2f} to {low + rows * size:.2f} m)"
-
-
-def _open_start(grid: CostGrid, steps: Ints, first: tuple[int, int]) -> None:
-    """Let a way lead out of the inscribed cells around the start."""
-    row, column = first
-    if steps[row + 1, column + 1]:
-        return
-    x, y = grid.centres_of(np.array((first,)))[0]
-    reach = 0.0
-    # The nearest cell that can be entered tells how far the robot is inside.
-    rows, columns = np.nonzero(steps)
-    if len(rows):
-        reach = float(np.hypot(rows - 1 - row, columns - 1 - column).min() + 1) * grid.resolution
-    area = grid.area_around(x, y, min(reach, grid.resolution * max(grid.shape)))
-    part = steps[area.low + 1 : area.high + 1, area.left + 1 : area.right + 1]
-    part[(part == 0) & (grid.values[area.slices] == INSCRIBED)] = _ESCAPE_COST
-    steps[row + 1, column + 1] = _ESCAPE_COST
-
-
-def _end_near(grid: CostGrid, steps: Ints, goal: Pose, reach: float) -> tuple[int, int] | None:
-    """Return the goal's cell, or if it cannot be entered the nearest one that can within ``reach``."""
-    row, column = grid.cell_of(goal.x, goal.y)
-    if grid.has(goal.x, goal.y) and steps[row + 1, column + 1]:
-        return row, column
-    area = grid.area_around(goal.x, goal.y, ceil(reach / grid.resolution) * grid.resolution)
-    if reach <= 0 or area.is_empty:
-        return None
-    rows, columns = np.nonzero(steps[area.low + 1 : area.high + 1, area.left + 1 : area.right + 1])
-    cells = np.stack((rows + area.low, columns + area.left), axis=1)
-    away = np.hypot(*(grid.centres_of(cells) - (goal.x, goal.y)).T)
-    if not len(away) or away.min() > reach:
-        return None
-    best = cells[int(away.argmin())]
-    return int(best[0]), int(best[1])
 
 
 def _why_no_end(grid: CostGrid, goal: Pose, reach: float) -> str:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.navigation.costmap.cost_grid import CostGrid
 from rce_fleet.navigation.costmap.costs import FREE, INSCRIBED, LETHAL, UNKNOWN
+from rce_fleet.navigation.planners import global_planner
 from rce_fleet.navigation.planners.cost_to_go import UNREACHED, spread, steps_of
 from rce_fleet.navigation.planners.global_planner import GlobalPlannerParameters, make_plan
 from rce_fleet.navigation.planners.shortcuts import line_cells
@@ -100,6 +101,42 @@ def test_the_compiled_field_equals_the_numpy_one(cells: list[tuple[int, int, int
     width = COLUMNS + 2
     goal, stop = 4 * width + 4, 21 * width + 26 if early else -1
     assert (spread.compile()(steps, goal, stop) == spread.numpy(steps, goal, stop)).all()
+
+
+@given(costmaps, places, places, st.sampled_from((0.0, 0.35)), st.integers(0, 40))
+@settings(max_examples=60)
+def test_a_growing_window_finds_what_the_whole_map_has(
+    cells: list[tuple[int, int, int]],
+    start: tuple[float, float],
+    goal: tuple[float, float],
+    tolerance: float,
+    gap: int,
+) -> None:
+    """The map is four times as wide; a wall with one gap makes some ways lead far around."""
+    costs = np.tile(painted(cells), (4, 4))
+    costs[:, 4 * COLUMNS // 3] = LETHAL
+    costs[gap, 4 * COLUMNS // 3] = FREE
+    ends = (Pose(*start, 0.0), Pose(2 * goal[0], goal[1], 1.0))
+    with pytest.MonkeyPatch.context() as patch:
+        plans = []
+        for radius in (0, 1000):
+            patch.setattr(global_planner, "FIRST_RADIUS", radius)
+            plans.append(make_plan(grid_of(costs), *ends, tolerance=tolerance))
+    assert plans[0].reason == plans[1].reason
+    np.testing.assert_array_equal(plans[0].path, plans[1].path)
+
+
+def test_a_short_way_on_a_large_map_looks_at_few_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked_at = []
+
+    def counting(costs: np.ndarray, *, allow_unknown: bool) -> np.ndarray:
+        looked_at.append(costs.size)
+        return steps_of(costs, allow_unknown=allow_unknown)
+
+    monkeypatch.setattr(global_planner, "steps_of", counting)
+    large = grid_of(np.zeros((1200, 2000), np.uint8), 0.05)
+    assert make_plan(large, Pose(50.0, 30.0, 0.0), Pose(52.0, 30.0, 0.0)).found
+    assert sum(looked_at) < 100_000
 
 
 def test_the_path_in_the_open_is_the_straight_line() -> None:
