@@ -23,6 +23,8 @@ from rce_fleet.wiring import fleet_config, light_config
 
 START_PER_ROBOT = 0.5
 """Seconds that the start may take longer for each robot: each has some ten connections in the engine."""
+JOIN_TOGETHER = 100
+"""So many robots join at once, at most."""
 
 
 class ModePrograms(Protocol):
@@ -76,19 +78,7 @@ class CloudPrograms:
         page = await group.wait_line(station, "rce ui ready:", START_TIMEOUT)
         if not config.slam:
             await start_robots(group, config, self)
-        named = {f"robot{number}": graph.uri for number, graph in enumerate(self._graphs, start=1)}
-        bridges = [
-            await group.start(
-                name,
-                [sys.executable, "-m", "rce_client.ros_bridge", str(config.folder / f"{name}.config")],
-                env={"ROS_MASTER_URI": uri},
-                restartable=True,
-            )
-            for name, uri in {**named, **light}.items()
-        ]
-        timeout = START_TIMEOUT + START_PER_ROBOT * len(config.scenario.robots)
-        for bridge in bridges:
-            await group.wait_line(bridge, "rce-ros ready:", timeout)
+        await self._start_bridges(group, light)
         await group.wait_line(world, "simulation ready:", START_TIMEOUT)
         return page
 
@@ -104,6 +94,30 @@ class CloudPrograms:
         """Read the message totals from the master."""
         account = self._config.account
         return await read_engine_totals(account.url, account.user, account.password)
+
+    async def _start_bridges(self, group: ProgramGroup, light: Mapping[str, str]) -> None:
+        """Connect all robots, the next ones when those before are ready: the master answers in time then.
+
+        Args:
+            group: Gets the programs.
+            light: ROS masters of the graphs that light robots share, by the name of their bridge.
+        """
+        config = self._config
+        bridges = [(f"robot{number}", graph.uri, 1) for number, graph in enumerate(self._graphs, start=1)]
+        bridges += [
+            (name, uri, last - first + 1)
+            for (name, uri), (first, last) in zip(light.items(), config.light_groups, strict=True)
+        ]
+        joining: list[Program] = []
+        robots = 0
+        for name, uri, count in bridges:
+            if robots + count > JOIN_TOGETHER:
+                await _wait_ready(group, joining, robots)
+                joining, robots = [], 0
+            argv = [sys.executable, "-m", "rce_client.ros_bridge", str(config.folder / f"{name}.config")]
+            joining.append(await group.start(name, argv, env={"ROS_MASTER_URI": uri}, restartable=True))
+            robots += count
+        await _wait_ready(group, joining, robots)
 
     def _write_files(self) -> None:
         config, account, folder = self._config, self._config.account, self._config.folder
@@ -156,6 +170,11 @@ class CloudPrograms:
         config, account = self._config, self._config.account
         program = [sys.executable, "-m", "rce_fleet.drivers", str(config.scene), "--services"]
         return [*program, "--report", str(config.report), "--master", account.url, "--user", account.user]
+
+
+async def _wait_ready(group: ProgramGroup, bridges: Sequence[Program], robots: int) -> None:
+    for bridge in bridges:
+        await group.wait_line(bridge, "rce-ros ready:", START_TIMEOUT + START_PER_ROBOT * robots)
 
 
 def _light_name(first: int, last: int) -> str:
