@@ -24,7 +24,7 @@ from rce_fleet.station.commands.kinds import LIGHT_COMMANDS, command_interfaces
 from rce_fleet.station.layers.kinds import MAP, SCAN, TF, TF_STATIC, TOPICS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping
 
 FLEET_CONTAINER = "cTag_fleet"
 OPERATOR = "fleetOperator"
@@ -148,7 +148,7 @@ def light_config(first: int, last: int, account: FleetAccount | None = None) -> 
 def fleet_config(
     account: FleetAccount | None = None,
     parameters: dict[str, bool | int | float | str | list[Any]] | None = None,
-    chargers: Sequence[int] = (),
+    manager: Mapping[str, bool | int | float | str | list[Any]] | None = None,
 ) -> dict[str, Any]:
     """Return the operator's config: the container with planner and fleet manager.
 
@@ -156,7 +156,7 @@ def fleet_config(
         account: Engine and user; None for those of a development engine.
         parameters: The planner's parameters by name, such as ``rows``; those of the floor of
             ``configs/scene.yaml`` if None.
-        chargers: Cells with chargers, which the manager has until people set others.
+        manager: The manager's parameters by name, such as ``chargers``.
     """
     account = account or FleetAccount()
     given = FLOOR_PARAMETERS if parameters is None else parameters
@@ -170,11 +170,10 @@ def fleet_config(
             {"cTag": FLEET_CONTAINER, "name": f"/fleet/{name}", "value": value}
             for name, value in given.items()
         ]
-        + (
-            [{"cTag": FLEET_CONTAINER, "name": "/fleet_manager/chargers", "value": list(chargers)}]
-            if chargers
-            else []
-        ),
+        + [
+            {"cTag": FLEET_CONTAINER, "name": f"/fleet_manager/{name}", "value": value}
+            for name, value in (manager or {}).items()
+        ],
         "nodes": [
             {"cTag": FLEET_CONTAINER, "nTag": tag, "pkg": "fleet", "exe": exe}
             for tag, exe in (("fleetPlanner", "fleet_planner.py"), ("fleetManager", "fleet_manager.py"))

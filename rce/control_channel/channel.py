@@ -209,14 +209,28 @@ class TaskSetChannel:
         self._pending[message.request] = pending
         self._post(pending.text)
         try:
-            async with asyncio.timeout(self._timeouts.request):
-                reply: Reply = await pending.reply
-        except TimeoutError as error:
-            raise MasterUnavailableError(self._timeouts.request) from error
+            await self._answered(pending)
         finally:
             del self._pending[message.request]
+        reply = pending.reply.result()
         assert isinstance(reply, kind)
         return reply
+
+    async def _answered(self, pending: _Pending) -> None:
+        """Wait for an answer; longer of a master that is connected, and so has seen the request.
+
+        Raises:
+            MasterUnavailableError: No answer in time.
+        """
+        limit, waited = self._timeouts.request, 0.0
+        while waited < self._timeouts.busy:
+            await asyncio.wait((pending.reply,), timeout=limit)
+            waited += limit
+            if pending.reply.done():
+                return
+            if not self.connected:
+                break
+        raise MasterUnavailableError(waited)
 
     async def _connect_once(self) -> float:
         """Run one connection to its end, and turn to the next master; return how long to wait, in seconds."""

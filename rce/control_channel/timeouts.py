@@ -19,6 +19,8 @@ class ControlTimeouts:
     close: float = 1.0
     request: float = 10.0
     """An answer of the master; long enough for a master that is being restarted."""
+    busy: float = 60.0
+    """An answer of a master that is connected all the time, but has much to do."""
     log: float = 5.0
     """A piece of a node's log."""
     backoff: Backoff = Backoff(first=0.05, longest=2.0, jitter=1.0)

@@ -19,6 +19,13 @@ ROBOT_RADIUS = 0.18
 """Radius of a TurtleBot's hull as the planner knows it, metres."""
 
 
+JOIN_TOGETHER = 100
+"""So many robots join the engine at once, at most."""
+PARK_AFTER_PER_ROBOT = 0.4
+"""Seconds for each robot of a large fleet before idle ones park. Robots that have not joined yet stand where
+nobody knows: those that have must not drive before."""
+
+
 class Mode(StrEnum):
     """What carries the fleet's messages."""
 
@@ -152,6 +159,15 @@ class DemoConfig:
     def chargers(self) -> tuple[int, ...]:
         """Cells with a charger."""
         return () if self.world is None else self.world.chargers
+
+    @property
+    def manager_parameters(self) -> dict[str, Any]:
+        """The fleet manager's parameters."""
+        count = len(self.scenario.robots)
+        found: dict[str, Any] = {"chargers": list(self.chargers)} if self.chargers else {}
+        if count > JOIN_TOGETHER:
+            found["park_after"] = PARK_AFTER_PER_ROBOT * count
+        return found
 
     @property
     def map_parameters(self) -> dict[str, Any]:

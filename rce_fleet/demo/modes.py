@@ -11,7 +11,7 @@ from typing import Protocol
 import aiohttp
 
 from rce.config.documents import write_items
-from rce_fleet.demo.config import DemoConfig, Mode
+from rce_fleet.demo.config import JOIN_TOGETHER, DemoConfig, Mode
 from rce_fleet.demo.exploration import Explored, block_cells, explore
 from rce_fleet.demo.programs import RCE, START_TIMEOUT, Program, ProgramGroup
 from rce_fleet.demo.robots import RobotGraph, client_config, cloud_arguments, start_robots
@@ -23,8 +23,6 @@ from rce_fleet.wiring import fleet_config, light_config
 
 START_PER_ROBOT = 0.5
 """Seconds that the start may take longer for each robot: each has some ten connections in the engine."""
-JOIN_TOGETHER = 100
-"""So many robots join at once, at most."""
 
 
 class ModePrograms(Protocol):
@@ -122,7 +120,7 @@ class CloudPrograms:
     def _write_files(self) -> None:
         config, account, folder = self._config, self._config.account, self._config.folder
         config.write_scene()
-        fleet = fleet_config(account, config.planner_parameters, config.chargers)
+        fleet = fleet_config(account, config.planner_parameters, config.manager_parameters)
         (folder / "fleet.config").write_text(write_items(fleet), encoding="utf-8")
         files = {f"robot{number}": client_config(config, number) for number in range(1, config.full + 1)}
         files |= {_light_name(*ends): light_config(*ends, account) for ends in config.light_groups}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from dataclasses import replace
 
 import pytest
 from support.control_ends import QUICK, SECRET, Master, TaskSet, headers, hello
@@ -19,6 +20,7 @@ from rce.control.exceptions import (
 from rce.control.messages import (
     CONTROL_VERSION,
     ClientReply,
+    ClientRequest,
     Drop,
     Gone,
     Left,
@@ -75,6 +77,32 @@ async def test_request_ends_with_a_clear_error_when_no_master_comes() -> None:
     timeouts = ControlTimeouts(request=0.1)
     async with TaskSet(free_port(), timeouts=timeouts).running() as robots:
         with pytest.raises(MasterUnavailableError, match=r"the master did not answer within 0\.1 s"):
+            await robots.channel.client_request("u/r", "DC", {"containerTag": "c"})
+
+
+async def test_a_connected_master_has_more_time_to_answer() -> None:
+    master = Master()
+    master.mute = True
+    timeouts = replace(QUICK, request=0.05)
+    async with master.server, TaskSet(master.server.port, timeouts=timeouts).running() as robots:
+        await robots.channel.wait_connected()
+        late = asyncio.create_task(robots.channel.client_request("u/r", "CC", {"containerTag": "c"}))
+        peer, _ = await master.hellos.get()
+        request = await master.messages.get()
+        assert isinstance(request, ClientRequest)
+        await asyncio.sleep(0.2)
+        assert not late.done()
+        peer.send(ClientReply(request=request.request, errors=("late",)))
+        assert (await late).errors == ("late",)
+
+
+async def test_a_connected_master_that_never_answers_is_given_up() -> None:
+    master = Master()
+    master.mute = True
+    timeouts = replace(QUICK, request=0.1, busy=0.3)
+    async with master.server, TaskSet(master.server.port, timeouts=timeouts).running() as robots:
+        await robots.channel.wait_connected()
+        with pytest.raises(MasterUnavailableError, match=r"within 0\.3 s"):
             await robots.channel.client_request("u/r", "DC", {"containerTag": "c"})
 
 

@@ -123,6 +123,16 @@ def test_light_robots_share_containers(tmp_path: Path) -> None:
     assert len(read.connections) == 10 * 10 + 1
 
 
+def test_robots_of_a_large_fleet_park_only_when_all_have_joined(tmp_path: Path) -> None:
+    world = find_world("warehouse")
+    few, many = (
+        DemoConfig(choose_scenario(count, 0, grid=world.grid), 0, Ports(), tmp_path, full_stack=0)
+        for count in (100, 200)
+    )
+    assert few.manager_parameters == {}
+    assert many.manager_parameters == {"park_after": pytest.approx(80.0)}
+
+
 def test_the_warehouse_charges_robots(tmp_path: Path) -> None:
     """Cells with chargers are docks of the world, and known to the fleet manager."""
     world = find_world("warehouse")
@@ -131,7 +141,7 @@ def test_the_warehouse_charges_robots(tmp_path: Path) -> None:
     config.write_scene()
     scene = load_scene(config.scene)
     assert len(scene.docks) == len(world.chargers) > 0
-    made = loads(write_items(fleet_config(None, config.planner_parameters, config.chargers)))
+    made = loads(write_items(fleet_config(None, config.planner_parameters, config.manager_parameters)))
     given = {item.parameter.name: item.parameter.value for item in made.parameters}
     assert given["/fleet_manager/chargers"] == list(world.chargers)
     built = scene.build()
