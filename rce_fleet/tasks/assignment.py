@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from rce_fleet.tasks.energy import BatteryLevels, Effort, charges, effort_of, share_needed
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Callable, Collection, Sequence
 
     from numpy.typing import NDArray
 
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _IMPOSSIBLE = 1e9
 _SPARE_TASKS = 50
 """So many tasks more than robots, and twice as many as robots, are looked at, the most urgent ones."""
+_ATTEMPTS = 4
+"""A step assigns at most so often, if robots turn out to have too little energy for tasks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +36,8 @@ class AssignmentRules:
         age: What a second of waiting is worth: no task waits without end.
         deadline: What a second less than ``deadline_window`` is worth ...
         deadline_window: ... that is left of the time before the last moment to begin.
-        keep: What it is worth to leave a task in the queue of its robot.
+        keep: What it is worth to leave a task in the queue of its robot: another one takes it over if it
+            is at the first stop so much earlier.
     """
 
     priority: float = 300.0
@@ -120,6 +123,7 @@ class Assigner:
         now: float,
         chargers: Sequence[int] = (),
         avoided: Collection[tuple[int, str]] = (),
+        begins: Callable[[Task], float] = lambda _task: inf,
     ) -> list[Choice]:
         """Return which robots begin with which tasks, with the smallest sum of costs.
 
@@ -129,27 +133,48 @@ class Assigner:
             now: Seconds since 1970.
             chargers: Cells with chargers.
             avoided: Numbers of tasks with robots that gave them up a short time ago.
+            begins: Returns in how many seconds the robot in whose queue a task is will be at its first stop.
         """
         if not tasks or not robots:
             return []
-        most = max(2 * len(robots), len(robots) + _SPARE_TASKS)
-        urgent = sorted(tasks, key=lambda task: (-self.urgency(task, now), task.number))[:most]
+        groups = [_Group(rows, [robots[row] for row in rows]) for rows in _rows_by_profile(robots)]
+        urgent = self._most_urgent(tasks, groups, now)
         costs = np.full((len(robots), len(urgent)), _IMPOSSIBLE)
-        seconds = np.full_like(costs, inf)
-        for rows in _rows_by_profile(robots):
-            group = _Group(rows, [robots[row] for row in rows])
+        ways = np.full_like(costs, inf)
+        for group in groups:
             for column, task in enumerate(urgent):
-                self._price(task, group, now, chargers, costs[:, column], seconds[:, column])
+                self._price(task, group, now, chargers, costs[:, column], ways[:, column])
         names = {robot.id: row for row, robot in enumerate(robots)}
         columns = {task.number: column for column, task in enumerate(urgent)}
         costs[
             [names[name] for number, name in avoided if number in columns and name in names],
             [columns[number] for number, name in avoided if number in columns and name in names],
         ] = _IMPOSSIBLE
-        queued = [(names[task.robot], columns[task.number]) for task in urgent if task.robot in names]
-        for place in queued:
-            costs[place] -= self._rules.keep
+        for column, task in enumerate(urgent):
+            if not task.robot:
+                continue
+            later = ways[:, column] + self._rules.keep >= begins(task)
+            row = names.get(task.robot)
+            if row is not None:
+                costs[row, column] -= self._rules.keep
+                later[row] = False
+            costs[later, column] = _IMPOSSIBLE
         return self._pairs(costs, urgent, robots, chargers)
+
+    def _most_urgent(self, tasks: Sequence[Task], groups: Sequence[_Group], now: float) -> list[Task]:
+        """Return the most urgent of the tasks that one of the robots may do."""
+        robots = sum(len(group.names) for group in groups)
+        most = max(2 * robots, robots + _SPARE_TASKS)
+        names = {name: group for group in groups for name in group.names}
+        urgent = []
+        for task in sorted(tasks, key=lambda task: (-self.urgency(task, now), task.number)):
+            only = task.order.robot
+            able = ([names[only]] if only in names else []) if only else groups
+            if any(not misfit(task, only or group.names[0], group.profile) for group in able):
+                urgent.append(task)
+                if len(urgent) == most:
+                    break
+        return urgent
 
     def _pairs(
         self,
@@ -158,14 +183,30 @@ class Assigner:
         robots: Sequence[FreeRobot],
         chargers: Sequence[int],
     ) -> list[Choice]:
-        """Return the cheapest pairs; their batteries are checked again, with the cells of all stops."""
+        """Return the cheapest pairs; their batteries are checked again, with the cells of all stops.
+
+        What is refused then is assigned anew among those that are left.
+        """
         chosen = []
-        for row, column in zip(*linear_sum_assignment(costs), strict=True):
-            robot, task = robots[row], urgent[column]
-            if costs[row, column] < _IMPOSSIBLE / 2:
+        rows, columns = np.arange(len(robots)), np.arange(len(urgent))
+        for _ in range(_ATTEMPTS):
+            pairs = np.transpose(linear_sum_assignment(costs[np.ix_(rows, columns)]))
+            done_rows, done_columns, refused = [], [], False
+            for row, column in zip(rows[pairs[:, 0]], columns[pairs[:, 1]], strict=True):
+                if costs[row, column] >= _IMPOSSIBLE / 2:
+                    continue
+                robot, task = robots[row], urgent[column]
                 effort = effort_of(task, robot.cell, self._travel, robot.profile)
-                if not self.refuse(task, robot, effort, chargers):
+                if self.refuse(task, robot, effort, chargers):
+                    costs[row, column] = _IMPOSSIBLE
+                    refused = True
+                else:
                     chosen.append(Choice(task, robot.id, effort.seconds(robot.profile)))
+                    done_rows.append(row)
+                    done_columns.append(column)
+            if not refused:
+                break
+            rows, columns = np.setdiff1d(rows, done_rows), np.setdiff1d(columns, done_columns)
         return chosen
 
     def _price(
@@ -177,7 +218,7 @@ class Assigner:
         costs: NDArray[np.float64],
         seconds: NDArray[np.float64],
     ) -> None:
-        """Write what a task costs the robots of one profile."""
+        """Write what a task costs the robots of one profile, and after how many seconds they can begin."""
         profile, order = group.profile, task.order
         if misfit(task, order.robot or group.names[0], profile):
             return
@@ -203,7 +244,7 @@ class Assigner:
         takes = (ways[fits] + tail.metres) / profile.speed + tail.acting
         worth = self.urgency(task, now, float(takes.min(initial=inf)) if len(takes) else 0.0)
         costs[rows] = ways[fits] / profile.speed - worth
-        seconds[rows] = takes
+        seconds[rows] = ways[fits] / profile.speed
 
 
 class _Group:

@@ -19,7 +19,7 @@ from rce_fleet.tasks.travel import TravelCosts
 from rce_fleet.tasks.zone_costs import zone_profiles
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable
 
     from rce_fleet.planning.grid import GridMap
     from rce_fleet.tasks.book import TaskBook
@@ -94,6 +94,7 @@ class Dispatcher:
         self._facts = facts
         book = self._book
         self._travel.begin_step()
+        self._queues.begin_step()
         self._profiles = zone_profiles(book, facts, self.rules.profile)
         if facts.grid is not None:
             self._travel.set_map(facts.grid, facts.shut, book.zones, facts.map_revision)
@@ -105,8 +106,13 @@ class Dispatcher:
         taken = self._progress.targets()
         self.chargers.adopt(idle, book.places.chargers, taken)
         free = [self._free(robot) for robot in idle.values() if self.chargers.can_work(robot)]
-        chosen = self._assigner.choose(ready, free, now, book.places.chargers, self._progress.avoid.keys())
-        for choice in chosen:
+        working = {robot.id for robot in free}
+
+        def begins(task: Task) -> float:
+            return self._begins(task, now, facts.robots.get(task.robot), working)
+
+        avoided = self._progress.avoid.keys()
+        for choice in self._assigner.choose(ready, free, now, book.places.chargers, avoided, begins):
             self._start(choice.task, choice.robot, now)
             idle.pop(choice.robot, None)
         self.chargers.update(idle, book.places.chargers, taken)
@@ -189,6 +195,9 @@ class Dispatcher:
     def _start(self, task: Task, robot: str, now: float) -> None:
         self._parking.pop(robot, None)
         self.chargers.charging.pop(robot, None)
+        if task.state is TaskState.ASSIGNED and task.robot != robot:
+            text = f"{robot} takes it from the queue of {task.robot}"
+            task = self._book.advance(task, TaskCause.RELEASE, now, text, robot="")
         started = now if task.started_at is None else task.started_at
         self._book.advance(
             task, TaskCause.START, now, f"{robot} begins", robot=robot, target=None, started_at=started
@@ -202,6 +211,21 @@ class Dispatcher:
             return RobotQueue(robot, profile, cell, 0.0)
         left, end = self._left(task, cell, profile, now)
         return RobotQueue(robot, profile, cell if end is None else end, left)
+
+    def _begins(self, task: Task, now: float, robot: RobotFacts | None, working: Collection[str]) -> float:
+        """Return in how many seconds the robot in whose queue a task is will be at its first stop.
+
+        Returns:
+            ``inf`` if it is not known: the robot does not drive now, or gets no task before it has charged.
+        """
+        if robot is None or not robot.is_driven or robot.by_hand or robot.cell is None:
+            return inf
+        present = self._book.task_of(robot.id)
+        if robot.id not in working and (present is None or present.state is not TaskState.RUNNING):
+            return inf
+        queue = self._queue_of(robot.id, now, robot)
+        queue.tasks = self._book.queue_of(robot.id)
+        return self._queues.begin(queue, task)
 
     def _left(self, task: Task, cell: int, profile: RobotProfile, now: float) -> tuple[float, int | None]:
         effort = effort_of(task, cell, self._travel, profile)

@@ -58,6 +58,10 @@ class Queues:
         self._length = length
         self._efforts: dict[tuple[int, int, int], Effort] = {}
 
+    def begin_step(self) -> None:
+        """Forget how long tasks take: the map may be another one."""
+        self._efforts.clear()
+
     def insert(
         self, tasks: Sequence[Task], queues: Sequence[RobotQueue], avoided: Collection[tuple[int, str]] = ()
     ) -> list[tuple[Task, str]]:
@@ -68,7 +72,6 @@ class Queues:
             queues: Of busy robots.
             avoided: Numbers of tasks with robots that gave them up a short time ago.
         """
-        self._efforts.clear()
         queues = [queue for queue in queues if len(queue.tasks) < self._length]
         queues = sorted(queues, key=lambda queue: (len(queue.tasks), queue.ready))[:MOST_QUEUES]
         room = sum(self._length - len(queue.tasks) for queue in queues)
@@ -95,6 +98,19 @@ class Queues:
             took, cell = self._leg(task, cell, queue.profile)
             seconds += took
         return seconds
+
+    def begin(self, queue: RobotQueue, task: Task) -> float:
+        """Return the seconds until a robot is at the first stop of a task in its queue.
+
+        Returns:
+            ``inf`` if it cannot get there.
+        """
+        place = next(place for place, each in enumerate(queue.tasks) if each.number == task.number)
+        seconds, cell = queue.ready, queue.cell
+        for each in queue.tasks[:place]:
+            took, cell = self._leg(each, cell, queue.profile)
+            seconds += took
+        return seconds + self._effort(task, cell, queue.profile).first / queue.profile.speed
 
     def _options(
         self, task: Task, queues: Sequence[RobotQueue], avoided: Collection[tuple[int, str]]
@@ -126,11 +142,15 @@ class Queues:
 
     def _leg(self, task: Task, cell: int, profile: RobotProfile) -> tuple[float, int]:
         """Return how long a task takes a robot in a cell, and where it is then."""
+        effort = self._effort(task, cell, profile)
+        return effort.seconds(profile), cell if effort.end is None else effort.end
+
+    def _effort(self, task: Task, cell: int, profile: RobotProfile) -> Effort:
         key = (task.number, cell, id(profile))
         effort = self._efforts.get(key)
         if effort is None:
             effort = self._efforts[key] = effort_of(task, cell, self._travel, profile)
-        return effort.seconds(profile), cell if effort.end is None else effort.end
+        return effort
 
 
 def _regret(options: list[tuple[float, int, RobotQueue]]) -> float:
