@@ -5,32 +5,26 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
-import sys
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from math import hypot
 from pathlib import Path
 
 import aiohttp
 import psutil
 import pytest
-from support.engine import Engine, Program, command_line, running_engine, until
+from support.by_hand import CONFIGS, WAIT_S, page_of, simulated, started, wait_state
+from support.engine import Engine, command_line, running_engine, until
 
 from rce.config.documents import write_items
 from rce.ros.node import Node
 from rce.ros.types import Message
-from rce_fleet.exceptions import StationError
 from rce_fleet.station.client import StationClient
 from rce_fleet.turtlebot_wiring import offloaded_config
 from rce_fleet.wiring import FleetAccount, fleet_config
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("pymunk")]
 
-CONFIGS = Path(__file__).parents[2] / "configs"
-BIN = Path(sys.executable).parent
 START = (0.5, 0.5)
 GOAL_CELL, GOAL = 6, (6.5, 0.5)
-WAIT_S = 150.0
 STOP_S = 0.5 + 0.6 + 3.0
 """``command_timeout``, braking, and what a busy machine may add."""
 
@@ -88,29 +82,6 @@ class Judge:
         self.localized.append((stamp, hypot(place.x - x, place.y - y)))
 
 
-@asynccontextmanager
-async def started(engine: Engine, uri: str, ready: str, name: str, *words: str) -> AsyncIterator[Program]:
-    home = {"ROS_HOME": str(engine.folder / "ros"), "ROS_LOG_DIR": str(engine.folder / "log")}
-    env = {**engine.env, "ROS_MASTER_URI": uri, **home}
-    program = Program(name, [str(BIN / words[0]), *words[1:]], env, engine.folder)
-    await program.start(ready=ready)
-    try:
-        yield program
-    finally:
-        if program.running:
-            await program.stop()
-        print(program.output())  # noqa: T201 - shown if the test fails
-
-
-@asynccontextmanager
-async def simulated(engine: Engine) -> AsyncIterator[str]:
-    """The fleet's floor with sensors and wheels only; gives the master of robot 1."""
-    words = ("rce", "sim", str(CONFIGS / "scene.yaml"), "--no-stand-ins", "--core-port", "0")
-    async with started(engine, "", "simulation ready", "sim", *words, "--world-port", "0") as sim:
-        line = next(line for line in sim.output().splitlines() if line.startswith("robot Robot1 "))
-        yield line.partition("ROS_MASTER_URI=")[2]
-
-
 def written(folder: Path, name: str, config: dict[str, object]) -> str:
     file = folder / name
     file.write_text(write_items(config))
@@ -127,24 +98,10 @@ def environment_of(engine: Engine, node: str) -> psutil.Process:
     raise AssertionError(f"{node} runs in no container")
 
 
-async def state_of(station: StationClient, robot: str) -> str:
-    with contextlib.suppress(StationError):
-        for one in (await station.fleet()).robots:
-            if one.id == robot:
-                return one.state
-    return ""
-
-
-async def has_state(station: StationClient, state: str) -> None:
-    async def has_it() -> bool:
-        return await state_of(station, "Robot1") == state
-
-    await until(has_it, timeout=WAIT_S, what=f"Robot1 is {state}")
-
-
 async def test_offloaded_robot_goes_on_after_its_cloud_was_away(tmp_path: Path) -> None:
     """The goal is set once; the network hangs under way, and the container is killed; the robot arrives."""
-    async with running_engine() as engine, simulated(engine) as uri:
+    async with running_engine() as engine, simulated(engine, "--no-stand-ins") as robots:
+        uri = robots["Robot1"]
         account = FleetAccount(url=engine.url)
         robot = written(tmp_path, "robot.config", offloaded_config(1, account, initial_pose=(*START, 0.0)))
         fleet = written(tmp_path, "fleet.config", fleet_config(account))
@@ -156,10 +113,10 @@ async def test_offloaded_robot_goes_on_after_its_cloud_was_away(tmp_path: Path) 
             Node("judge", argv=[], master_uri=uri, signals=False) as node,
             aiohttp.ClientSession() as session,
         ):
-            station = StationClient(session, page.output().partition("rce ui ready: ")[2].split()[0])
+            station = StationClient(session, page_of(page))
             judge = Judge(node)
             await judge.listen()
-            await has_state(station, "idle")
+            await wait_state(station, "idle", "Robot1")
             await station.set_goal("Robot1", GOAL_CELL)
 
             await judge.passes(1.2)
@@ -177,7 +134,7 @@ async def test_offloaded_robot_goes_on_after_its_cloud_was_away(tmp_path: Path) 
             killed_at = node.time()
             await judge.stops()
 
-            await has_state(station, "arrived")
+            await wait_state(station, "arrived", "Robot1")
             assert environment_of(engine, "move_base").pid != killed.pid
             assert judge.far_from(GOAL) < 0.25
             anew = [error for stamp, error in judge.localized if stamp > killed_at]
