@@ -77,7 +77,7 @@ class FleetSettings:
     quarter_turn: float = 0.0
     stop: float = 0.0
     repairs: int = 3
-    repair_effort: int = 3_000
+    repair_effort: int = 12_000
     manual_clearance: float = 0.3
     pose_only_after: float = 10.0
     pose_only_settle: float = 3.0
