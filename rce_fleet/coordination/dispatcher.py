@@ -80,6 +80,8 @@ class Dispatcher:
 
     def _expects(self) -> bool:
         """Return whether robots exist whose places are not known yet."""
+        if not self.expected:
+            return False
         robots = self.state.robots
         self.expected = {
             robot: until
@@ -155,6 +157,8 @@ class Dispatcher:
                 self.hold(other, f"{record.id} is in its way")
 
     def _block_left_cells(self) -> None:
+        if not self.left:
+            return
         left, self.left = self.left & self.state.pending, set()
         free = [cell for cell in left if self.state.ledger.owner(cell) is None]
         for cell in free:
@@ -165,7 +169,10 @@ class Dispatcher:
     def _grant(self) -> None:
         """Grant cells to robots whose turn it may be; to some of them, if there are many."""
         ledger = self.state.ledger
-        self._ripe |= dict.fromkeys(sorted(ledger.take_ripe()))
+        ripe = ledger.take_ripe()
+        if not ripe and not self._ripe:
+            return
+        self._ripe |= dict.fromkeys(sorted(ripe))
         for robot in list(islice(self._ripe, self.settings.robots_per_step)):
             del self._ripe[robot]
             record = self.state.robots.get(robot)

@@ -146,6 +146,8 @@ class FleetState:
     def refresh(self) -> None:
         """Update the indexes with the changes since the last call."""
         touched = self.ledger.take_changed() | self._touched
+        if not touched:
+            return
         self._touched = set()
         for robot in sorted(touched, key=self._held_at):
             self.log.note_robot(robot)

@@ -201,12 +201,18 @@ class CellLedger(LedgerView):
         """Return the place in a queue of a visit at ``step``: behind granted and earlier ones."""
         if not self.ordered:
             return len(queue)
-        for place, (robot, number) in enumerate(queue):
+        # By bisection: the granted visit is the first one, and the steps behind it grow.
+        low, high = 0, len(queue)
+        while low < high:
+            middle = (low + high) // 2
+            robot, number = queue[middle]
             account = self._accounts[robot]
             index = number - account.passed
             if index >= account.granted and account.steps[index] > step:
-                return place
-        return len(queue)
+                high = middle
+            else:
+                low = middle + 1
+        return low
 
     def grant(self, robot: str, ahead: int) -> bool:
         """Grant a robot the next cells of its route, at most ``ahead`` beyond its own.
