@@ -8,6 +8,7 @@ ledger. All visits stay in one order of steps, so no robots wait for each other 
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -85,29 +86,26 @@ def copy_ledger(state: FleetState, robots: Sequence[str], members: Sequence[str]
         members: Those of them that need new paths, in order.
     """
     places = {robot: index for index, robot in enumerate(robots)}
-    begins: list[float] = []
-    lengths: list[int] = []
-    cells: list[int] = []
-    steps: list[float] = []
-    granted: list[int] = []
-    leaves: list[float] = []
+    # Arrays that take lists do so in half the time that numpy needs, and the planner stands meanwhile.
+    begins, steps, leaves = array("d"), array("d"), array("d")
+    lengths, cells, granted = array("i"), array("i"), array("i")
     for robot in robots:
         account = state.ledger.account(robot)
         end = account.granted
         begins.append(account.steps[end - 1])
         lengths.append(len(account.route) - end)
-        cells += account.route[end:]
-        steps += account.steps[end:]
-        granted += account.route[: end - 1]
-        leaves += account.steps[1:end]
+        cells.fromlist(account.route[end:])
+        steps.fromlist(account.steps[end:])
+        granted.fromlist(account.route[: end - 1])
+        leaves.fromlist(account.steps[1:end])
     return LedgerCopy(
         members=tuple(places[robot] for robot in members),
-        begins=np.array(begins, np.float64).tobytes(),
-        lengths=np.array(lengths, np.int32).tobytes(),
-        cells=np.array(cells, np.int32).tobytes(),
-        steps=np.array(steps, np.float64).tobytes(),
-        granted=np.array(granted, np.int32).tobytes(),
-        leaves=np.array(leaves, np.float64).tobytes(),
+        begins=begins.tobytes(),
+        lengths=lengths.tobytes(),
+        cells=cells.tobytes(),
+        steps=steps.tobytes(),
+        granted=granted.tobytes(),
+        leaves=leaves.tobytes(),
         clock=state.ledger.clock,
     )
 

@@ -5,6 +5,7 @@ See :mod:`rce_fleet.planning.rerouting_loops` for the search, and :mod:`rce_flee
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -123,6 +124,31 @@ def reroute(
     return Rerouted(paths, unreachable)
 
 
+class _Buffers(threading.local):
+    """Memory that is used again with the next call: the pages of new memory cost more than the lists."""
+
+    def __init__(self) -> None:
+        self._times = np.empty(0)
+        self._tags = np.empty(0, np.int32)
+
+    def times(self, size: int, room: int) -> Floats:
+        """Return an array of shape (size, room, 2); its content is undefined."""
+        needed = size * room * 2
+        if len(self._times) < needed:
+            self._times = np.empty(needed + needed // 4)
+        return self._times[:needed].reshape(size, room, 2)
+
+    def tags(self, size: int, room: int) -> Ints:
+        """Return an array of shape (size, room, 2); its content is undefined."""
+        needed = size * room * 2
+        if len(self._tags) < needed:
+            self._tags = np.empty(needed + needed // 4, np.int32)
+        return self._tags[:needed].reshape(size, room, 2)
+
+
+_buffers = _Buffers()
+
+
 def _listed(size: int, robots: RoutedRobots, routes_at: Ints) -> tuple[Ints, Floats, Ints]:
     """Return the number, times and tags of each node's visits, in order."""
     count, total = len(robots.starts), len(robots.nodes)
@@ -146,13 +172,16 @@ def _listed(size: int, robots: RoutedRobots, routes_at: Ints) -> tuple[Ints, Flo
         (np.arange(count, dtype=np.int32), none, np.repeat(np.arange(count, dtype=np.int32), robots.lengths))
     )
     following = np.concatenate((starts_ahead, none, ahead))
-    order = np.lexsort((enter, node))
+    order = np.argsort(enter)
+    # By node, then by step: a stable sort of numbers of 16 bits is a radix sort.
+    short = np.uint16 if size <= 1 << 16 else np.int32
+    order = order[np.argsort(node[order].astype(short), kind="stable")]
     node = node[order]
     counts = np.bincount(node, minlength=size).astype(np.int32)
     begins = np.concatenate(([0], np.cumsum(counts)[:-1]))
     place = np.arange(len(node)) - begins[node]
     room = int(counts.max(initial=0)) + _LISTED
-    times, tags = np.empty((size, room, 2)), np.empty((size, room, 2), np.int32)
+    times, tags = _buffers.times(size, room), _buffers.tags(size, room)
     enter, leave = enter[order], leave[order]
     is_followed = np.append(node[1:] == node[:-1], False) & (following[order] < 0) & (leave < np.inf)
     leave[:-1] = np.where(is_followed[:-1], np.minimum(leave[:-1], enter[1:]), leave[:-1])
