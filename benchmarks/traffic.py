@@ -181,6 +181,8 @@ def block_times(traffic: Traffic, count: int, times: int) -> list[dict[str, Any]
     """Block cells that lie beyond many robots' granted cells, one after another."""
     fleet, rows = traffic.fleet, []
     ledger = fleet.planner.state.ledger
+    gc.collect()
+    gc.freeze()  # as the node and its process for plans do
     for _ in range(times):
         users: dict[int, set[str]] = {}
         claimed: set[int] = set()
@@ -220,6 +222,7 @@ def block_times(traffic: Traffic, count: int, times: int) -> list[dict[str, Any]
         )
         for _ in range(5):
             traffic.tick()
+    gc.unfreeze()
     return rows
 
 

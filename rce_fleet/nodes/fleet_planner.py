@@ -8,6 +8,7 @@ topics and parameters.
 from __future__ import annotations
 
 import asyncio
+import gc
 import re
 import time
 from typing import TYPE_CHECKING, Any, assert_never
@@ -121,6 +122,9 @@ class PlannerNode:
             planning = tasks.create_task(self._make_plans(worker))
             tasks.create_task(self._look_around())
             tasks.create_task(self._keep_known())
+            # Modules, message types and the map stay: no garbage collection between two ticks looks at them.
+            gc.collect()
+            gc.freeze()
             await self._keep_time()
             planning.cancel()
 

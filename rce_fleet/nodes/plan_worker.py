@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import os
 import signal
 import sys
@@ -196,6 +197,8 @@ def serve(requests: BinaryIO, results: BinaryIO) -> None:
         planners[DEFAULT_PLANNER] = load_compiled()
         results.write(_frame(b""))
         results.flush()
+    gc.collect()
+    gc.freeze()  # Compiled loops are many objects: a full collection would take longer than most plans.
     while len(head := requests.read(_LENGTH)) == _LENGTH:
         request = msgspec.msgpack.decode(requests.read(int.from_bytes(head)), type=PlanRequest)
         if request.planner not in planners:
