@@ -19,7 +19,6 @@ MIN_LINES = 40
 BASE = "the lowest module of its package: merged into one of its users, it would make a circle of imports"
 TYPER = "loads typer, which a program that gets its settings from another one does without"
 TINY = {
-    "rce/control_channel/timeouts.py": BASE,
     "rce/packages/limits.py": BASE,
     "rce/protocol/limits.py": BASE,
     "rce/aio/servers.py": "about one fault of the event loop, which five servers avoid by it",
