@@ -22,8 +22,8 @@ ROBOT_RADIUS = 0.18
 JOIN_TOGETHER = 100
 """So many robots join the engine at once, at most."""
 PARK_AFTER_PER_ROBOT = 0.4
-"""Seconds for each robot of a large fleet before idle ones park. Robots that have not joined yet stand where
-nobody knows: those that have must not drive before."""
+"""Seconds for each robot of a large fleet before idle ones park. The planner does not know where robots stand
+that have not joined yet, so the others must not drive before."""
 
 
 class Mode(StrEnum):
