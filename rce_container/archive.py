@@ -19,7 +19,7 @@ from msgspec import Struct, field
 
 from rce.model import EndpointId
 from rce_container.exceptions import StateError
-from rce_container.files import remove, size_of, write_whole
+from rce_container.files import UNFINISHED, remove, size_of, write_whole
 from rce_container.logs import last_line
 
 _log = logging.getLogger(__name__)
@@ -115,12 +115,15 @@ class LogArchive:
         return sorted(found, key=_age)
 
     def settle(self, living: Collection[str], now: float) -> None:
-        """Record the end of incarnations whose end no manager observed.
+        """Record the end of incarnations whose end no manager observed; remove half-written records.
+
+        A manager calls it when it starts, before it writes records of its own.
 
         Args:
             living: The marks of incarnations that may have processes or folders.
             now: The time.
         """
+        self._remove_unfinished()
         for kept in list(self._all()):
             if not kept.record.ended and kept.record.incarnation_id not in living:
                 self._settle(kept, now)
@@ -152,8 +155,16 @@ class LogArchive:
         remove(folder)
         with self._lock, contextlib.suppress(OSError):
             _record(folder).unlink()
-            folder.parent.rmdir()
-            folder.parent.parent.rmdir()
+            _remove_empty(folder.parent)
+
+    def _remove_unfinished(self) -> None:
+        """Remove what a manager left that was killed while it wrote a record."""
+        for folder in list(self._tags()):
+            with self._lock, contextlib.suppress(OSError):
+                for path in _children(folder):
+                    if path.suffix == UNFINISHED:
+                        path.unlink()
+                _remove_empty(folder)
 
     def _folder(self, id_: str) -> Path:
         endpoint = EndpointId.parse(id_)
@@ -181,6 +192,13 @@ def _children(folder: Path) -> list[Path]:
         return list(folder.iterdir())
     except (FileNotFoundError, NotADirectoryError):
         return []
+
+
+def _remove_empty(folder: Path) -> None:
+    """Remove the folder of a container, and that of its user, if they are empty."""
+    with contextlib.suppress(OSError):  # not empty
+        folder.rmdir()
+        folder.parent.rmdir()
 
 
 def _kept(folder: Path) -> Kept | None:

@@ -8,9 +8,12 @@ import shutil
 import subprocess
 from pathlib import Path
 
+UNFINISHED = ".new"
+"""Suffix of a file that is being written. One that is left is of a process that was killed meanwhile."""
+
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file atomically, through ``NAME.new`` beside it.
+    """Write a file atomically, through a file :data:`UNFINISHED` beside it.
 
     Args:
         path: The file.
@@ -19,7 +22,7 @@ def write_whole(path: Path, data: bytes) -> None:
     Raises:
         OSError: It cannot be written; the error names a file. A former version stays.
     """
-    temporary = path.with_name(f"{path.name}.new")
+    temporary = path.with_name(f"{path.name}{UNFINISHED}")
     try:
         temporary.write_bytes(data)
         temporary.replace(path)

@@ -157,6 +157,16 @@ class ManagedFleet:
         except TimeoutError as error:
             raise AssertionError(f"{task} is not {states}: {shown}") from error
 
+    async def until_standing(self, robot: str) -> int | None:
+        """Wait until a robot that is not driven has come to rest; return its cell."""
+        body = self.world.robots[robot]
+        async with asyncio.timeout(LONGEST_S):
+            before = None
+            while body.pose != before:
+                before = body.pose
+                await asyncio.sleep(1.0)
+        return self.grid.cell_at(body.pose.x, body.pose.y)
+
     async def _stop_all(self) -> None:
         for stack, _ in self._programs.values():
             await stack.aclose()

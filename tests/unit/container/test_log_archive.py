@@ -137,6 +137,20 @@ def test_dying_container_does_not_fill_the_archive(archive: LogArchive) -> None:
     assert incarnation_ids(archive) == [f"m{number}" for number in reversed(range(5, MAX_INCARNATIONS + 5))]
 
 
+def test_half_written_records_are_removed_at_the_start(archive: LogArchive, tmp_path: Path) -> None:
+    """What a manager leaves that is killed while it writes a record."""
+    live(archive, "one")
+    logs = tmp_path / "logs"
+    (logs / BOX / "one.json.new").write_bytes(b"{")
+    (logs / "bob" / "box").mkdir(parents=True)
+    (logs / "bob" / "box" / "two.json.new").touch()
+    (logs / "carl" / "box").mkdir(parents=True)
+    archive.settle({"one"}, 10.0)
+    assert sorted(str(path.relative_to(logs)) for path in logs.rglob("*.new")) == []
+    assert [path.name for path in logs.iterdir()] == ["anna"]
+    assert read(archive, living="one", streams=(LogStream.STDOUT,)) == "hello\n"
+
+
 def test_the_end_of_what_nobody_saw_end_is_noted_later(archive: LogArchive) -> None:
     live(archive, "there")
     live(archive, "gone")
