@@ -79,7 +79,7 @@ def discovery(
             send_mcast=send_mcast,
             listen_mcast=listen_mcast,
         )
-        uvloop.run(_list(master_uri) if list_ else _run(settings))
+        uvloop.run(_list(master_uri) if list_ else run_discovery(settings))
     except (RosError, ValueError) as error:
         typer.echo(f"rce discovery: {error}", err=True)
         raise typer.Exit(1) from error
@@ -88,7 +88,8 @@ def discovery(
         raise typer.Exit(1) from error
 
 
-async def _run(settings: DiscoverySettings) -> None:
+async def run_discovery(settings: DiscoverySettings) -> None:
+    """Announce a master and print what is found, until a signal ends it."""
     main = asyncio.current_task()
     assert main is not None
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -95,7 +95,7 @@ def sync(
         chosen["ignore_services"] += ["*"] if topics and not services else []
         chosen["ignore_topics"] += ["*"] if services and not topics else []
     try:
-        lists = _read_lists(interface, chosen)
+        lists = read_lists(interface, chosen)
         lists.sync_remote_nodes = lists.sync_remote_nodes or sync_remote_nodes
         settings = SyncSettings(
             master_uri,
@@ -108,7 +108,7 @@ def sync(
             relay_token=relay_token,
             relay_name=relay_name,
         )
-        uvloop.run(_run(settings))
+        uvloop.run(run_sync(settings))
     except OSError as error:
         typer.echo(f"rce sync: cannot listen for relay connections: {error.strerror or error}", err=True)
         raise typer.Exit(1) from error
@@ -138,7 +138,16 @@ def _address(text: str) -> tuple[str, int]:
     return host, int(port) if port else RELAY_PORT
 
 
-def _read_lists(file: Path | None, options: Mapping[str, list[str]]) -> SyncLists:
+def read_lists(file: Path | None, options: Mapping[str, list[Any]]) -> SyncLists:
+    """Return the lists of an interface file, with more entries.
+
+    Args:
+        file: A YAML file in the format of master_sync; None: no file.
+        options: What to add, by list.
+
+    Raises:
+        MultimasterError: The file cannot be read, or a list is unknown.
+    """
     values: dict[str, Any] = {}
     if file is not None:
         try:
@@ -154,7 +163,8 @@ def _read_lists(file: Path | None, options: Mapping[str, list[str]]) -> SyncList
     return SyncLists.read(values)
 
 
-async def _run(settings: SyncSettings) -> None:
+async def run_sync(settings: SyncSettings) -> None:
+    """Sync topics and services, until a signal ends it."""
     main = asyncio.current_task()
     assert main is not None
     for number in (signal.SIGINT, signal.SIGTERM):

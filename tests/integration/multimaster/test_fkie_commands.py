@@ -1,0 +1,65 @@
+"""fkie's command lines, as the paper prints them, and its launch files start our discovery and sync."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from contextlib import AbstractAsyncContextManager
+from pathlib import Path
+
+from support.multimaster import STRING, node, process
+from support.ports import free_port
+
+from rce.ros.core import Core, Graph
+
+RCE = str(Path(sys.executable).parent / "rce")
+LAUNCH = """<launch>
+  <node pkg="master_discovery_fkie" type="master_discovery" name="master_discovery">
+    <param name="mcast_group" value="224.0.0.1"/>
+    <param name="mcast_port" value="{port}"/>
+    <param name="name" value="robot"/>
+    <rosparam>{{heartbeat_hz: 10, rosmaster_hz: 10}}</rosparam>
+  </node>
+  <node pkg="master_sync_fkie" type="master_sync" name="master_sync">
+    <rosparam param="sync_topics">[/Robot1/goalNodesList, /map]</rosparam>
+  </node>
+</launch>
+"""
+
+
+def started(core: Core, home: Path, *words: str) -> AbstractAsyncContextManager[asyncio.subprocess.Process]:
+    env = {**os.environ, "ROS_MASTER_URI": core.uri, "ROS_IP": "127.0.0.1", "ROS_HOME": str(home)}
+    return process(RCE, *words, env=env)
+
+
+def topics(graph: Graph) -> set[str]:
+    return {name for name in graph.topic_types if not name.startswith(("/master_", "/rosout"))}
+
+
+async def test_command_lines_and_launch_files_of_fkie(tmp_path: Path) -> None:
+    """One machine by command lines, one by a launch file: each gets the topics that it wants, no others."""
+    port = free_port()
+    fast = (f"_mcast_port:={port}", "_heartbeat_hz:=10", "_rosmaster_hz:=10", "_name:=planner")
+    discovery = ("run", "master_discovery_fkie", "master_discovery", "_mcast_group:=224.0.0.1", *fast)
+    sync = ("run", "master_sync_fkie", "master_sync", "_sync_topics:=[/Robot1/amcl_pose]")
+    file = tmp_path / "robot.launch"
+    file.write_text(LAUNCH.format(port=port))
+    async with (
+        Core(port=0) as here,
+        Core(port=0) as there,
+        node("planner", here.uri) as planner,
+        node("robot", there.uri) as robot,
+        started(here, tmp_path, *discovery),
+        started(here, tmp_path, *sync),
+        started(there, tmp_path, "launch", str(file), "--wait", "--no-log"),
+    ):
+        for name in ("/Robot1/amcl_pose", "/scan"):
+            await robot.advertise(name, STRING)
+        for name in ("/Robot1/goalNodesList", "/fleet/state"):
+            await planner.advertise(name, STRING)
+        await here.wait_until(lambda graph: "/Robot1/amcl_pose" in graph.topic_types, timeout=120)
+        await there.wait_until(lambda graph: "/Robot1/goalNodesList" in graph.topic_types, timeout=120)
+        assert topics(here.graph) == {"/Robot1/amcl_pose", "/Robot1/goalNodesList", "/fleet/state"}
+        assert topics(there.graph) == {"/Robot1/goalNodesList", "/Robot1/amcl_pose", "/scan"}
+        assert here.graph.parameters.get("/master_sync/sync_topics") == ["/Robot1/amcl_pose"]
