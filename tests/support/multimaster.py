@@ -100,7 +100,7 @@ def ros_environment(master_uri: str, home: Path) -> dict[str, str]:
 
 @asynccontextmanager
 async def process(*argv: str, env: dict[str, str]) -> AsyncIterator[asyncio.subprocess.Process]:
-    """A program with its output kept, killed at the end."""
+    """A program, killed at the end. What it printed and nobody read is shown if the test fails."""
     started = await asyncio.create_subprocess_exec(
         *argv,
         env=env,
@@ -111,7 +111,8 @@ async def process(*argv: str, env: dict[str, str]) -> AsyncIterator[asyncio.subp
     try:
         yield started
     finally:
-        await finish(started)
+        output = await finish(started)
+        print(*argv, output.decode(errors="replace"), sep="\n")
 
 
 @asynccontextmanager

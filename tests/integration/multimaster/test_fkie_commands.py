@@ -9,7 +9,7 @@ from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 
 from support.multimaster import STRING, node, process
-from support.ports import free_port
+from support.ports import free_ports
 
 from rce.ros.core import Core, Graph
 
@@ -18,6 +18,7 @@ LAUNCH = """<launch>
   <node pkg="master_discovery_fkie" type="master_discovery" name="master_discovery">
     <param name="mcast_group" value="224.0.0.1"/>
     <param name="mcast_port" value="{port}"/>
+    <param name="rpc_port" value="{rpc_port}"/>
     <param name="name" value="robot"/>
     <rosparam>{{heartbeat_hz: 10, rosmaster_hz: 10}}</rosparam>
   </node>
@@ -39,12 +40,12 @@ def topics(graph: Graph) -> set[str]:
 
 async def test_command_lines_and_launch_files_of_fkie(tmp_path: Path) -> None:
     """One machine by command lines, one by a launch file: each gets the topics that it wants, no others."""
-    port = free_port()
-    fast = (f"_mcast_port:={port}", "_heartbeat_hz:=10", "_rosmaster_hz:=10", "_name:=planner")
+    port, here_rpc, there_rpc = free_ports(3)
+    fast = (f"_mcast_port:={port}", f"_rpc_port:={here_rpc}", "_heartbeat_hz:=10", "_rosmaster_hz:=10", "_name:=planner")
     discovery = ("run", "master_discovery_fkie", "master_discovery", "_mcast_group:=224.0.0.1", *fast)
     sync = ("run", "master_sync_fkie", "master_sync", "_sync_topics:=[/Robot1/amcl_pose]")
     file = tmp_path / "robot.launch"
-    file.write_text(LAUNCH.format(port=port))
+    file.write_text(LAUNCH.format(port=port, rpc_port=there_rpc))
     async with (
         Core(port=0) as here,
         Core(port=0) as there,
