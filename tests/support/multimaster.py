@@ -112,7 +112,7 @@ async def process(*argv: str, env: dict[str, str]) -> AsyncIterator[asyncio.subp
         yield started
     finally:
         output = await finish(started)
-        print(*argv, output.decode(errors="replace"), sep="\n")
+        print(*argv, output.decode(errors="replace"), sep="\n")  # noqa: T201 - pytest shows it
 
 
 @asynccontextmanager

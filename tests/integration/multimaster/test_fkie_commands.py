@@ -41,7 +41,8 @@ def topics(graph: Graph) -> set[str]:
 async def test_command_lines_and_launch_files_of_fkie(tmp_path: Path) -> None:
     """One machine by command lines, one by a launch file: each gets the topics that it wants, no others."""
     port, here_rpc, there_rpc = free_ports(3)
-    fast = (f"_mcast_port:={port}", f"_rpc_port:={here_rpc}", "_heartbeat_hz:=10", "_rosmaster_hz:=10", "_name:=planner")
+    ports = (f"_mcast_port:={port}", f"_rpc_port:={here_rpc}")
+    fast = (*ports, "_heartbeat_hz:=10", "_rosmaster_hz:=10", "_name:=planner")
     discovery = ("run", "master_discovery_fkie", "master_discovery", "_mcast_group:=224.0.0.1", *fast)
     sync = ("run", "master_sync_fkie", "master_sync", "_sync_topics:=[/Robot1/amcl_pose]")
     file = tmp_path / "robot.launch"
