@@ -20,6 +20,7 @@ from rce.config import ConfigError, ShippedFileError, examples_dir, start_loggin
 from rce.config.documents import read_file
 from rce.own_process import open_missing_streams
 from rce.ros.errors import RosError
+from rce.ros.names import parse_arguments
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.tls import CertificateError, Context, client_contexts
@@ -202,6 +203,12 @@ def main() -> None:
     """Run the program."""
     open_missing_streams()
     app()
+
+
+def node() -> None:
+    """Run the program as a node of a launch file; its name and remappings have no effect."""
+    sys.argv[1:] = parse_arguments(sys.argv[1:]).rest
+    main()
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import logging
+import sys
 from collections.abc import Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
@@ -22,6 +23,7 @@ from rce.config.folders import default_state_dir
 from rce.config.logs import start_logging
 from rce.masters import split_addresses
 from rce.own_process import end_signals
+from rce.ros.names import parse_arguments
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce.tls.choice import ENGINE, TlsChoice, default_folder, plain_warning
@@ -342,6 +344,12 @@ async def _until(done: Callable[[], Any], *work: Callable[[], Any]) -> None:
 def main() -> None:
     """Run the program."""
     typer.run(ui)
+
+
+def node() -> None:
+    """Run the program as a node of a launch file; its name and remappings have no effect."""
+    sys.argv[1:] = parse_arguments(sys.argv[1:]).rest
+    main()
 
 
 if __name__ == "__main__":

@@ -150,9 +150,7 @@ def _run(name: str, serve: Callable[[Sequence[str]], Coroutine[Any, Any, int]]) 
 async def _discover(argv: Sequence[str]) -> int:
     settings, values = await private_parameters("master_discovery", argv)
     await run_discovery(
-        discovery_settings(
-            values, master_uri=settings.master_uri, node_name=settings.resolver.node_name.rpartition("/")[2]
-        )
+        discovery_settings(values, master_uri=settings.master_uri, node_name=_base_name(settings))
     )
     return 0
 
@@ -160,11 +158,7 @@ async def _discover(argv: Sequence[str]) -> int:
 async def _sync(argv: Sequence[str]) -> int:
     settings, values = await private_parameters("master_sync", argv)
     lists = sync_lists(values)
-    await run_sync(
-        SyncSettings(
-            settings.master_uri, node_name=settings.resolver.node_name.rpartition("/")[2], lists=lists
-        )
-    )
+    await run_sync(SyncSettings(settings.master_uri, node_name=_base_name(settings), lists=lists))
     return 0
 
 
