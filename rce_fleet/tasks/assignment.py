@@ -142,8 +142,7 @@ class Assigner:
         costs = np.full((len(robots), len(urgent)), _IMPOSSIBLE)
         ways = np.full_like(costs, inf)
         for group in groups:
-            for column, task in enumerate(urgent):
-                self._price(task, group, now, chargers, costs[:, column], ways[:, column])
+            costs[group.rows], ways[group.rows] = self._price(urgent, group, now, chargers)
         names = {robot.id: row for row, robot in enumerate(robots)}
         columns = {task.number: column for column, task in enumerate(urgent)}
         costs[
@@ -210,41 +209,57 @@ class Assigner:
         return chosen
 
     def _price(
-        self,
-        task: Task,
-        group: _Group,
-        now: float,
-        chargers: Sequence[int],
-        costs: NDArray[np.float64],
-        seconds: NDArray[np.float64],
-    ) -> None:
-        """Write what a task costs the robots of one profile, and after how many seconds they can begin."""
-        profile, order = group.profile, task.order
-        if misfit(task, order.robot or group.names[0], profile):
-            return
+        self, tasks: Sequence[Task], group: _Group, now: float, chargers: Sequence[int]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return what tasks cost the robots of one profile, and after how many seconds they can begin.
+
+        Returns:
+            Costs and seconds, shape (robots, tasks); ``_IMPOSSIBLE`` and ``inf`` where a robot cannot.
+        """
+        profile = group.profile
+        ways = np.full((len(tasks), len(group.names)), inf)
+        needed = np.full(len(tasks), -_IMPOSSIBLE)
+        tails: dict[int, Effort] = {}
+        for row, task in enumerate(tasks):
+            tail = self._tail(task, group)
+            if tail is None:
+                continue
+            tails[row] = tail
+            self._write_ways(task, group, ways[row])
+            if not charges(task):
+                none = Effort(0.0, tail.metres, tail.acting, tail.end)
+                needed[row] = self.battery_needed(profile, none, chargers)
+        each = share_needed(Effort(1.0, 0.0, 0.0, None), profile)
+        if not np.isnan(group.batteries).all():
+            ways[needed[:, None] + ways * each > group.batteries] = inf
+        nearest = ways.min(axis=1, initial=inf)
+        worth = np.zeros(len(tasks))
+        for row, tail in tails.items():
+            takes = (nearest[row] + tail.metres) / profile.speed + tail.acting
+            worth[row] = self.urgency(tasks[row], now, takes if takes < inf else 0.0)
+        ways /= profile.speed
+        costs = ways - worth[:, None]
+        costs[np.isinf(costs)] = _IMPOSSIBLE
+        return costs.T, ways.T
+
+    def _tail(self, task: Task, group: _Group) -> Effort | None:
+        """Return what a task costs a robot of a profile after its first stop; None if it can never do it."""
+        if misfit(task, task.order.robot or group.names[0], group.profile):
+            return None
         stop = task.next_stop
-        first_cells = stop.cells if stop is not None else ()
-        start = first_cells[0] if first_cells else int(group.cells[0])
-        tail = effort_of(task, start, self._travel, profile)
-        if tail.first == inf:
-            return
-        ways = np.zeros(len(group.cells))
-        if first_cells:
-            fields = [self._travel.field(cell, profile.zone_cost)[group.cells] for cell in first_cells]
-            ways = np.min(fields, axis=0).astype(np.float64)
-        fits = np.isfinite(ways)
-        if order.robot:
-            fits &= np.array([name == order.robot for name in group.names])
-        if not charges(task):
-            none = Effort(0.0, tail.metres, tail.acting, tail.end)
-            each = share_needed(Effort(1.0, 0.0, 0.0, None), profile)
-            needed = self.battery_needed(profile, none, chargers) + np.where(fits, ways, 0.0) * each
-            fits &= np.isnan(group.batteries) | (group.batteries >= needed)
-        rows = group.rows[fits]
-        takes = (ways[fits] + tail.metres) / profile.speed + tail.acting
-        worth = self.urgency(task, now, float(takes.min(initial=inf)) if len(takes) else 0.0)
-        costs[rows] = ways[fits] / profile.speed - worth
-        seconds[rows] = ways[fits] / profile.speed
+        start = stop.cells[0] if stop is not None and stop.cells else int(group.cells[0])
+        tail = effort_of(task, start, self._travel, group.profile)
+        return tail if tail.first < inf else None
+
+    def _write_ways(self, task: Task, group: _Group, ways: NDArray[np.float64]) -> None:
+        """Write how far it is to a task's first stop for each robot that it is for, metres, shape (robots,)."""
+        stop = task.next_stop
+        cells = stop.cells if stop is not None else ()
+        ways[:] = inf if cells else 0.0
+        for cell in cells:
+            np.minimum(ways, self._travel.field(cell, group.profile.zone_cost)[group.cells], out=ways)
+        if task.order.robot:
+            ways[[name != task.order.robot for name in group.names]] = inf
 
 
 class _Group:
