@@ -252,7 +252,7 @@ class Assigner:
         return tail if tail.first < inf else None
 
     def _write_ways(self, task: Task, group: _Group, ways: NDArray[np.float64]) -> None:
-        """Write how far it is to a task's first stop for each robot that it is for, metres, shape (robots,)."""
+        """Write the metres to the first stop of a task for each robot that it is for, shape (robots,)."""
         stop = task.next_stop
         cells = stop.cells if stop is not None else ()
         ways[:] = inf if cells else 0.0
