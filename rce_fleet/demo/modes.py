@@ -230,7 +230,8 @@ async def start_demo(
         page = await group.run_while_alive(mode.start(group))
         explored = None
         if config.slam:
-            say(f"there is no map yet; see it grow at {page}")
+            (first, *_) = mode.graphs()
+            say(f"there is no map yet; see it grow at {page}#robot={first.robot}&layers=map,scan")
             explored = await group.run_while_alive(_explore(config, group, mode, page, say))
         yield RunningDemo(page, config, group, mode, explored)
 

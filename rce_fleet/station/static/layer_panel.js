@@ -6,6 +6,8 @@ import { t } from "./texts.js";
 
 export class LayerPanel {
   #notes = new Map();
+  #boxes = new Map();
+  #wanted = null; // id of a robot that the page's address names, until it is known
 
   constructor(fleet, layers, view) {
     this.fleet = fleet;
@@ -26,7 +28,24 @@ export class LayerPanel {
     for (const type of ["state", "changes"]) fleet.addEventListener(type, () => this.#listRobots());
     layers.addEventListener("change", () => this.#draw());
     setInterval(() => this.#draw(), 1000);
+    this.#readAddress();
+    addEventListener("hashchange", () => this.#readAddress());
     this.#listRobots();
+  }
+
+  // An address such as /#robot=Robot1&layers=map,scan shows these layers.
+  #readAddress() {
+    const fields = new URLSearchParams(location.hash.slice(1));
+    const names = (fields.get("layers") ?? "").split(",");
+    this.#wanted = fields.get("robot");
+    for (const [name, box] of this.#boxes) if (names.includes(name) && !box.checked) box.click();
+    this.#lookAtWanted();
+  }
+
+  #lookAtWanted() {
+    if (!this.fleet.robots.has(this.#wanted)) return;
+    this.layers.look(this.#wanted);
+    this.#wanted = null;
   }
 
   #addFleet(name, checked, toggle) {
@@ -52,6 +71,7 @@ export class LayerPanel {
     const note = element("span", "", "note");
     note.id = `layer-note-${name}`;
     this.#notes.set(name, note);
+    this.#boxes.set(name, box);
     row.append(box, swatch, t(`layer.${name}`));
     item.append(row, note);
     this.list.append(item);
@@ -65,6 +85,7 @@ export class LayerPanel {
     this.known = known;
     const ids = known.split(",").sort((a, b) => a.localeCompare(b, "en", { numeric: true }));
     this.robot.replaceChildren(new Option(t("layers.none"), ""), ...ids.filter(Boolean).map((id) => new Option(id, id)));
+    this.#lookAtWanted();
     this.#draw();
   }
 

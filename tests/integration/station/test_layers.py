@@ -258,6 +258,12 @@ async def test_the_page_draws_layers_that_are_checked() -> None:
             await page.screenshot(path=ARTIFACTS / "layers-dark.png")
             await page.get_by_label("Scan", exact=True).uncheck()
             await made.until_subscribed(lambda topics: "/Robot1/scan" not in topics)
+            another = await browser.new_page()
+            another.set_default_timeout(LIMIT_S * 1000)
+            await another.goto(f"{made.client.make_url('/')}#robot=Robot1&layers=map,scan")
+            await another.wait_for_function("rceFleet.layers.newest.get('map')?.cells?.length === 25600")
+            assert await another.get_by_label("of robot").input_value() == "Robot1"
+            assert await another.evaluate("[...rceFleet.layers.shown].join()") == "map,scan"
         finally:
             await browser.close()
     assert problems == []
