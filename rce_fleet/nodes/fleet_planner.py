@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import re
+import sys
 import time
 from typing import TYPE_CHECKING, Any, assert_never
 
@@ -43,13 +44,12 @@ from rce_fleet.nodes.grid_topics import GridTopics
 from rce_fleet.nodes.known_robots import KnownRobots, file_of_robots
 from rce_fleet.nodes.other_planner import stand_by
 from rce_fleet.nodes.plan_worker import PlanWorker
+from rce_fleet.nodes.planner_parameters import read_settings, unknown_parameters
 from rce_fleet.nodes.pose_publisher import PosePublisher
 from rce_fleet.nodes.robot_topics import RobotTopics
 from rce_fleet.nodes.state_publisher import StatePublisher
 from rce_fleet.nodes.throttled_log import ThrottledLog
 from rce_fleet.nodes.zone_messages import read_mode_set, read_zones_set
-from rce_fleet.planning.motion import Motion
-from rce_fleet.planning.planner import planner_names
 
 if TYPE_CHECKING:
     from rce.ros.types import Message
@@ -62,6 +62,8 @@ LOOK_AROUND = 0.5
 """Seconds between two searches for new robots, in a small graph."""
 KEEP_EVERY = 1.0
 """Seconds between two looks whether robots have other cells than those kept for the next planner."""
+BAD_PARAMETERS = 2
+"""Exit code of a planner that cannot start with its parameters."""
 ROBOT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/amcl_pose")
 CLIENT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/moveClient/status")
 
@@ -305,41 +307,35 @@ def warn_of_size(node: Node, grid: GridMap, settings: FleetSettings) -> None:
         )
 
 
-async def main() -> None:
-    """Run the planner until the node is stopped."""
+async def main() -> int:
+    """Run the planner until the node is stopped; return the program's exit code."""
     async with Node("fleet_planner") as node:
         values = await read_fleet_parameters(node)
-        settings = FleetSettings(
-            robot_radius=float(values.get("robot_radius", FleetSettings().robot_radius)),
-            seed=int(values.get("seed", 0)),
-            pose_only_after=float(values.get("pose_only_after", FleetSettings().pose_only_after)),
-            lost_spread=float(values.get("lost_spread", FleetSettings().lost_spread)),
-            lost_yaw=float(values.get("lost_yaw", FleetSettings().lost_yaw)),
-            planner=str(values.get("planner", FleetSettings().planner)),
-            resolve_deadlocks=bool(values.get("resolve_deadlocks", False)),
-            quarter_turn=float(values.get("quarter_turn", 0.0)),
-            stop=float(values.get("stop", 0.0)),
-        )
-        Motion(settings.quarter_turn, settings.stop)  # an impossible value ends the node with its reason
-        takes_answers = bool(values.get("answers", False))
-        if settings.planner not in planner_names():
-            known = ", ".join(planner_names())
-            raise PlannerError(
-                f"the parameter planner is {settings.planner!r}; installed planners are {known}"
-            )
-        chooser = GridChooser(values, make_grid(values))
-        grid, remark = await chooser.grid_at_start(None if takes_answers else values.get(CHOSEN))
+        for remark in unknown_parameters(values):
+            node.log.warning("%s", remark)
+        try:
+            settings = read_settings(values)
+            chooser = GridChooser(values, make_grid(values))
+            takes_answers = bool(values.get("answers", False))
+            grid, remark = await chooser.grid_at_start(None if takes_answers else values.get(CHOSEN))
+            blocked = chooser.blocked_at_start(grid)
+        except (ValueError, MapError, PlannerError, OSError) as error:
+            # With another map or other sizes than those that were meant, robots would not be safe.
+            node.log.error("the planner cannot start: %s", error)  # noqa: TRY400 - a user's mistake
+            print(f"fleet_planner: {error}", file=sys.stderr)  # noqa: T201
+            return BAD_PARAMETERS
         warn_of_size(node, grid, settings)
         if not await stand_by(node):
-            return
+            return 0
         if remark:
             node.log.warning("%s", remark)
         file = file_of_robots(values)
         kept = KnownRobots(file, settings.ahead) if file is not None else None
         made = FleetPlanner(grid, settings)
         planner = PlannerNode(node, made, chooser, takes_answers=takes_answers, known=kept)
-        await planner.run(chooser.blocked_at_start(grid))
+        await planner.run(blocked)
+    return 0
 
 
 if __name__ == "__main__":
-    run(main())
+    sys.exit(run(main()))

@@ -12,6 +12,7 @@ from rce_fleet.exceptions import MapError
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.maps.fleet_grid import BLOCKED_SHARE, fleet_grid, map_of_grid
 from rce_fleet.maps.ros_map import load_map
+from rce_fleet.nodes.grid_parameters import read_cells, read_number
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -61,11 +62,11 @@ class GridChooser:
     def __init__(self, values: Mapping[str, Any], grid: GridMap) -> None:
         self._first = grid
         self._values = {name: value for name, value in values.items() if name != CHOSEN}
-        self._walls = [int(cell) for cell in values.get("walls", [])] if values.get("map_yaml") else []
+        self._walls = read_cells(values, "walls") if values.get("map_yaml") else []
         self._drawn: OccupancyMap = (
-            load_map(values["map_yaml"]) if values.get("map_yaml") else map_of_grid(grid)
+            load_map(str(values["map_yaml"])) if values.get("map_yaml") else map_of_grid(grid)
         )
-        self.blocked_share = float(values.get("blocked_share", BLOCKED_SHARE))
+        self.blocked_share = read_number(values, "blocked_share", BLOCKED_SHARE)
 
     def read(self, request: Message) -> GridChoice:
         """Return the choice of a ``fleet/SetGrid`` request."""
@@ -123,7 +124,7 @@ class GridChooser:
 
     def blocked_at_start(self, grid: GridMap) -> list[int]:
         """Return the cells of a grid that the parameters block, and that can be freed."""
-        blocked = [int(cell) for cell in self._values.get("blocked", [])]
+        blocked = read_cells(self._values, "blocked")
         return blocked if grid is self._first else sorted(carried_cells(self._first, grid, blocked))
 
     def stored(self, choice: GridChoice) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,36 +30,72 @@ def make_grid(values: Mapping[str, Any]) -> GridMap:
         MapError: The map file cannot be read.
         OSError: The map file cannot be opened.
     """
-    size = float(values.get("cell_size", 1.0))
+    size = read_number(values, "cell_size", 1.0)
     if values.get("map_yaml"):
         return _grid_over(values, size)
     if values.get("map"):
-        return read_map(Path(values["map"]), cell_size=size)
+        return read_map(Path(str(values["map"])), cell_size=size)
     return GridMap(
-        rows=int(values.get("rows", 8)),
-        columns=int(values.get("columns", 8)),
+        rows=read_count(values, "rows", 8),
+        columns=read_count(values, "columns", 8),
         cell_size=size,
-        origin=(float(values.get("origin_x", 0.0)), float(values.get("origin_y", 0.0))),
-        blocked=frozenset(int(cell) for cell in values.get("walls", [])),
-        yaw=float(values.get("origin_yaw", 0.0)),
+        origin=(read_number(values, "origin_x", 0.0), read_number(values, "origin_y", 0.0)),
+        blocked=frozenset(read_cells(values, "walls")),
+        yaw=read_number(values, "origin_yaw", 0.0),
     )
 
 
 def _grid_over(values: Mapping[str, Any], cell_size: float) -> GridMap:
-    drawn = load_map(values["map_yaml"])
+    drawn = load_map(str(values["map_yaml"]))
     grid = fleet_grid(
         drawn,
         cell_size,
         origin=Pose(
-            float(values.get("origin_x", drawn.origin.x)),
-            float(values.get("origin_y", drawn.origin.y)),
-            float(values.get("origin_yaw", drawn.origin.yaw)),
+            read_number(values, "origin_x", drawn.origin.x),
+            read_number(values, "origin_y", drawn.origin.y),
+            read_number(values, "origin_yaw", drawn.origin.yaw),
         ),
-        rows=int(values["rows"]) if "rows" in values else None,
-        columns=int(values["columns"]) if "columns" in values else None,
-        blocked_share=float(values.get("blocked_share", BLOCKED_SHARE)),
+        rows=read_count(values, "rows", 0) if "rows" in values else None,
+        columns=read_count(values, "columns", 0) if "columns" in values else None,
+        blocked_share=read_number(values, "blocked_share", BLOCKED_SHARE),
     )
-    return grid.with_blocked(grid.blocked.union(int(cell) for cell in values.get("walls", [])))
+    return grid.with_blocked(grid.blocked.union(read_cells(values, "walls")))
+
+
+def read_number(values: Mapping[str, Any], name: str, default: float) -> float:
+    """Return a parameter that is a finite number.
+
+    Raises:
+        ValueError: It is something else; the text names it.
+    """
+    value = values.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+        raise ValueError(f"the parameter {name} must be a number, not {value!r}")
+    return float(value)
+
+
+def read_count(values: Mapping[str, Any], name: str, default: int) -> int:
+    """Return a parameter that is a whole number.
+
+    Raises:
+        ValueError: It is something else; the text names it.
+    """
+    value = read_number(values, name, default)
+    if not value.is_integer():
+        raise ValueError(f"the parameter {name} must be a whole number, not {value!r}")
+    return int(value)
+
+
+def read_cells(values: Mapping[str, Any], name: str) -> list[int]:
+    """Return a parameter that is a list of cells.
+
+    Raises:
+        ValueError: It is something else; the text names it.
+    """
+    value = values.get(name, [])
+    if not isinstance(value, list | tuple) or any(type(cell) is not int for cell in value):
+        raise ValueError(f"the parameter {name} must be a list of cells, such as [9, 20], not {value!r}")
+    return list(value)
 
 
 async def read_fleet_parameters(node: Node) -> dict[str, Any]:

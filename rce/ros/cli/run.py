@@ -12,6 +12,7 @@ import typer
 from rce.cli.main import Plugged
 from rce.config import ShippedFileError, configs_dir
 from rce.ros.errors import PackageError
+from rce.ros.node.settings import SHOW_WARNINGS
 from rce.ros.packages import PackageIndex
 from rce.ros.system import system_environ
 
@@ -34,7 +35,7 @@ def run(
         raise typer.Exit(1) from error
     if program.choice:
         typer.echo(program.choice, err=True)
-    environ = dict(os.environ)
+    environ = {SHOW_WARNINGS: "yes", **os.environ}
     if program.package.python == "system":
         environ = system_environ(environ, program.package.path)
     try:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rce.ros.launching.launched import LaunchedNode, StopTimeouts, describe_end
+from rce.ros.node.settings import SHOW_WARNINGS
 from rce.supervision.process import end_with
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ class NodeProcess(LaunchedNode):
 async def _spawn(command: NodeCommand, output: int | None) -> asyncio.subprocess.Process:
     return await asyncio.create_subprocess_exec(
         *command.argv,
-        env=command.env,
+        env={SHOW_WARNINGS: "yes", **command.env},
         cwd=command.folder,
         stdout=output,
         start_new_session=True,  # a Ctrl-C at the terminal reaches the launcher only

@@ -50,6 +50,7 @@ GOODBYE_TIMEOUT = 3.0
 """Seconds that the master may take to remove a node's registrations."""
 
 LOG_FORM = "[%(name)s][%(levelname)s] %(asctime)s: %(message)s"
+WARNING_FORM = "%(levelname)s %(name)s: %(message)s"
 LOG_BYTES = 50_000_000
 LOG_BACKUPS = 4
 """Form, length and number of older ones of a node's own log file: as rospy's."""
@@ -216,6 +217,8 @@ class GraphMember:
             await self._publish_log(stack)
         if self._settings.log_file is not None:
             self._keep_log(stack, self._settings.log_file)
+        if self._settings.shows_warnings and not logging.getLogger().handlers:
+            self._show_warnings(stack)
         for name, service_type, handler in Loggers(self.log).handlers(self._types):
             await self._provide(f"{self.name}/{name}", service_type, handler)
 
@@ -225,6 +228,13 @@ class GraphMember:
         )
         handler = rosout.RosoutHandler(publisher, self.name, self._clock, self._topics.names)
         publisher.on_subscriber = handler.flush
+        self.log.addHandler(handler)
+        stack.callback(self.log.removeHandler, handler)
+
+    def _show_warnings(self, stack: AsyncExitStack) -> None:
+        handler = logging.StreamHandler()
+        handler.setLevel(logging.WARNING)
+        handler.setFormatter(logging.Formatter(WARNING_FORM))
         self.log.addHandler(handler)
         stack.callback(self.log.removeHandler, handler)
 

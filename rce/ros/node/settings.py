@@ -6,6 +6,7 @@ import dataclasses
 import ipaddress
 import os
 import socket
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ MAX_QUEUED_BYTES = 64 * 2**20
 """Most bytes that one queue of messages holds, unless a single message is longer."""
 _DISCARD = 9
 """The port of the discard service (RFC 863)."""
+SHOW_WARNINGS = "RCE_SHOW_WARNINGS"
+"""Environment variable: ``yes`` has a node print its warnings and errors to standard error, ``no`` not."""
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - nodes of other machines must reach it
 
 
@@ -38,6 +41,8 @@ class NodeSettings:
     """Private parameters to set: name without ``~`` to value."""
     log_file: Path | None = None
     """Where to write the node's log, if it is set."""
+    shows_warnings: bool = False
+    """Whether warnings and errors go to standard error too, unless the program has set up its logging."""
 
     @classmethod
     def gather(
@@ -57,7 +62,8 @@ class NodeSettings:
             namespace: Its namespace; if empty, ``ROS_NAMESPACE``.
             argv: The command line, remappings among it.
             environ: ``ROS_MASTER_URI``, ``ROS_NAMESPACE``, ``ROS_IP``, ``ROS_HOSTNAME``
-                and where logs go (``ROS_LOG_DIR``, ``ROS_HOME``, ``HOME``) are read.
+                where logs go (``ROS_LOG_DIR``, ``ROS_HOME``, ``HOME``) and ``RCE_SHOW_WARNINGS``
+                are read. Without the latter, warnings are shown on a terminal.
             master_uri: The master, in place of ``ROS_MASTER_URI``.
             anonymous: Make the name unique.
 
@@ -83,7 +89,9 @@ class NodeSettings:
         parameters = {key: parse_value(text) for key, text in arguments.parameters.items()}
         log = specials.get("__log")
         log_file = log_folder(environ) / log if log else None  # an absolute path is taken as it is
-        return cls(resolver, master, host, parameters, log_file)
+        shown = environ.get(SHOW_WARNINGS)
+        shows_warnings = sys.stderr is not None and sys.stderr.isatty() if shown is None else shown == "yes"
+        return cls(resolver, master, host, parameters, log_file, shows_warnings)
 
     @property
     def bind(self) -> str:

@@ -1,0 +1,64 @@
+"""The parameters of the node ``fleet_planner``; ``share/README.md`` describes them."""
+
+from __future__ import annotations
+
+import difflib
+from typing import TYPE_CHECKING, Any
+
+from rce_fleet.coordination.settings import FleetSettings
+from rce_fleet.exceptions import PlannerError
+from rce_fleet.nodes.grid_choice import CHOSEN
+from rce_fleet.nodes.grid_parameters import read_count, read_number
+from rce_fleet.planning.motion import Motion
+from rce_fleet.planning.planner import planner_names
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+KNOWN = frozenset(
+    {
+        *("rows", "columns", "cell_size", "origin_x", "origin_y", "origin_yaw", "walls", "blocked"),
+        *("map", "map_yaml", "blocked_share", CHOSEN),
+        *("robot_radius", "seed", "pose_only_after", "lost_spread", "lost_yaw"),
+        *("planner", "resolve_deadlocks", "quarter_turn", "stop", "answers", "known_robots"),
+    }
+)
+"""Names of all parameters."""
+
+
+def read_settings(values: Mapping[str, Any]) -> FleetSettings:
+    """Return the planner's settings.
+
+    Raises:
+        ValueError: A value is of another type, or out of range; the text names its parameter.
+        PlannerError: There is no such planner.
+    """
+    default = FleetSettings()
+    settings = FleetSettings(
+        robot_radius=read_number(values, "robot_radius", default.robot_radius),
+        seed=read_count(values, "seed", 0),
+        pose_only_after=read_number(values, "pose_only_after", default.pose_only_after),
+        lost_spread=read_number(values, "lost_spread", default.lost_spread),
+        lost_yaw=read_number(values, "lost_yaw", default.lost_yaw),
+        planner=str(values.get("planner", default.planner)),
+        resolve_deadlocks=bool(values.get("resolve_deadlocks", False)),
+        quarter_turn=read_number(values, "quarter_turn", 0.0),
+        stop=read_number(values, "stop", 0.0),
+    )
+    for name in ("robot_radius", "pose_only_after", "lost_spread", "lost_yaw"):
+        if getattr(settings, name) <= 0:
+            raise ValueError(f"the parameter {name} must be above 0, not {getattr(settings, name):g}")
+    Motion(settings.quarter_turn, settings.stop)  # an impossible value has its reason
+    if settings.planner not in planner_names():
+        known = ", ".join(planner_names())
+        raise PlannerError(f"the parameter planner is {settings.planner!r}; installed planners are {known}")
+    return settings
+
+
+def unknown_parameters(names: Iterable[str]) -> list[str]:
+    """Return a remark about each name that is not a parameter of the planner, with the nearest known one."""
+    unknown = sorted(name for name in names if name not in KNOWN)
+    return [
+        f"unknown parameter {name}; did you mean {difflib.get_close_matches(name, KNOWN, 1, 0.0)[0]}?"
+        for name in unknown
+    ]

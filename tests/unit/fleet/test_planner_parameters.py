@@ -1,0 +1,69 @@
+"""The planner's parameters: bad ones are named, unknown ones are noted."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rce_fleet
+from rce_fleet.coordination.settings import FleetSettings
+from rce_fleet.exceptions import PlannerError
+from rce_fleet.nodes.grid_choice import CHOSEN
+from rce_fleet.nodes.grid_parameters import make_grid
+from rce_fleet.nodes.planner_parameters import KNOWN, read_settings, unknown_parameters
+
+README = Path(rce_fleet.__file__).parent / "share" / "README.md"
+
+
+def test_defaults_are_the_settings() -> None:
+    assert read_settings({}) == FleetSettings()
+    assert read_settings({"robot_radius": 1, "seed": 3.0}) == FleetSettings(robot_radius=1.0, seed=3)
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"robot_radius": "wide"}, "parameter robot_radius must be a number, not 'wide'"),
+        ({"robot_radius": -0.2}, "parameter robot_radius must be above 0, not -0.2"),
+        ({"robot_radius": float("nan")}, "parameter robot_radius must be a number, not nan"),
+        ({"seed": 0.5}, "parameter seed must be a whole number, not 0.5"),
+        ({"seed": True}, "parameter seed must be a number, not True"),
+        ({"quarter_turn": -1}, "-1"),
+    ],
+)
+def test_settings_that_cannot_be_used_are_named(values: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(text)):
+        read_settings(values)
+
+
+def test_unknown_planner_is_refused() -> None:
+    with pytest.raises(PlannerError, match=r"parameter planner is 'lacom'; installed planners are .*lacam"):
+        read_settings({"planner": "lacom"})
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"rows": -2}, "at least one row and one column, not -2 x 8"),
+        ({"rows": "eight"}, "parameter rows must be a number, not 'eight'"),
+        ({"walls": 9}, "parameter walls must be a list of cells, such as [9, 20], not 9"),
+        ({"walls": [1.5]}, "parameter walls must be a list of cells"),
+        ({"cell_size": [1]}, "parameter cell_size must be a number, not [1]"),
+    ],
+)
+def test_grids_that_cannot_be_made_are_named(values: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(text)):
+        make_grid(values)
+
+
+def test_unknown_parameters_are_noted_with_the_nearest_known_one() -> None:
+    assert unknown_parameters(["rows", "wals"]) == ["unknown parameter wals; did you mean walls?"]
+
+
+def test_the_documented_parameters_are_the_known_ones() -> None:
+    table = README.read_text().partition("## Parameters of the planner")[2].partition("\n## ")[0]
+    names = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    assert {name for cell in names for name in re.findall(r"`(\w+)`", cell)} == KNOWN - {CHOSEN}
