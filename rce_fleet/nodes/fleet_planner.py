@@ -39,12 +39,12 @@ from rce_fleet.exceptions import MapError, PlannerError, ZoneError
 from rce_fleet.nodes.graph_look import GraphLook
 from rce_fleet.nodes.grid_choice import CHOSEN, GridChoice, GridChooser
 from rce_fleet.nodes.grid_messages import GRID_TOPIC, grid_name
-from rce_fleet.nodes.grid_parameters import make_grid, read_fleet_parameters
+from rce_fleet.nodes.grid_parameters import make_grid, read_fleet_parameters, unknown_parameters
 from rce_fleet.nodes.grid_topics import GridTopics
 from rce_fleet.nodes.known_robots import KnownRobots, file_of_robots
 from rce_fleet.nodes.other_planner import stand_by
 from rce_fleet.nodes.plan_worker import PlanWorker
-from rce_fleet.nodes.planner_parameters import read_settings, unknown_parameters
+from rce_fleet.nodes.planner_parameters import KNOWN, read_settings
 from rce_fleet.nodes.pose_publisher import PosePublisher
 from rce_fleet.nodes.robot_topics import RobotTopics
 from rce_fleet.nodes.state_publisher import StatePublisher
@@ -311,7 +311,7 @@ async def main() -> int:
     """Run the planner until the node is stopped; return the program's exit code."""
     async with Node("fleet_planner") as node:
         values = await read_fleet_parameters(node)
-        for remark in unknown_parameters(values):
+        for remark in unknown_parameters(values, KNOWN):
             node.log.warning("%s", remark)
         try:
             settings = read_settings(values)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import difflib
+from collections.abc import Collection, Iterable, Mapping
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,15 @@ from rce_fleet.planning.movingai import read_map
 
 if TYPE_CHECKING:
     from rce.ros.node import Node
+
+
+GRID_PARAMETERS = frozenset(
+    {
+        *("rows", "columns", "cell_size", "origin_x", "origin_y", "origin_yaw", "walls"),
+        *("map", "map_yaml", "blocked_share"),
+    }
+)
+"""Names of the parameters that describe a grid."""
 
 
 def make_grid(values: Mapping[str, Any]) -> GridMap:
@@ -106,3 +116,12 @@ async def read_fleet_parameters(node: Node) -> dict[str, Any]:
         if isinstance(found, Mapping):
             values.update(found)
     return values
+
+
+def unknown_parameters(names: Iterable[str], known: Collection[str]) -> list[str]:
+    """Return a remark about each name that is no known parameter, with the nearest known one."""
+    unknown = sorted(name for name in names if name not in known)
+    return [
+        f"unknown parameter {name}; did you mean {difflib.get_close_matches(name, known, 1, 0.0)[0]}?"
+        for name in unknown
+    ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from math import inf
-from typing import TYPE_CHECKING, assert_never
+from typing import TYPE_CHECKING, Any, assert_never
 
 from rce.ros.node import MasterError, Message, Node, Publisher, Time, run
 from rce.ros.node.master import MasterClient
@@ -24,6 +24,7 @@ from rce_fleet.coordination.move_client import (
     SendStop,
 )
 from rce_fleet.coordination.robot_signs import RobotSigns
+from rce_fleet.exceptions import MapError
 from rce_fleet.geometry.angles import quaternion_z, yaw_of
 from rce_fleet.nodes.grid_messages import (
     GRID_TOPIC,
@@ -33,17 +34,20 @@ from rce_fleet.nodes.grid_messages import (
     grid_name,
     read_grid,
 )
-from rce_fleet.nodes.grid_parameters import make_grid
+from rce_fleet.nodes.grid_parameters import GRID_PARAMETERS, make_grid, unknown_parameters
 from rce_fleet.nodes.throttled_log import ThrottledLog
 from rce_fleet.planning.grid import GridMap
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rce_fleet.nodes.namespaced import NamespacedNode
 
 TICK = 0.25
 """Seconds between two timer events."""
 REPORT_EVERY = 0.5
 """Seconds after which the progress is published again."""
+_PARAMETERS = GRID_PARAMETERS | {"alive_topic", "answers"}
 OLD_MAP_AFTER = 5.0
 """Seconds without the grid after which a move client looks for it on its old topic."""
 
@@ -74,6 +78,20 @@ class MoveClientNode:
         self._throttled_log = ThrottledLog(node)
         self._alive_topic = ""
 
+    def _read_grid(self, values: Mapping[str, Any]) -> GridMap | None:
+        """Return the grid that the parameters describe; None if they describe none."""
+        if self._hears_grid:
+            for remark in unknown_parameters(values, _PARAMETERS):
+                self._node.log.warning("%s", remark)
+        if not values.keys() & {"rows", "map", "map_yaml"}:
+            return None
+        try:
+            return make_grid(values)
+        except (ValueError, MapError, OSError) as error:
+            text = "the grid on %s is waited for instead: %s"
+            self._node.log.error(text, GRID_TOPIC, error)  # noqa: TRY400 - a user's mistake
+            return None
+
     async def run(self) -> None:
         """Send the robot along until the node is stopped."""
         await self.start()
@@ -87,8 +105,9 @@ class MoveClientNode:
         self._stops = await node.advertise("move_base/cancel", "actionlib_msgs/GoalID")
         values = await node.get_param("~", {})
         self._answers = bool(values.get("answers", False))
-        if {"rows", "map", "map_yaml"} & values.keys():
-            self.take_grid(make_grid(values))
+        grid = self._read_grid(values)
+        if grid is not None:
+            self.take_grid(grid)
         elif self._hears_grid:
             await node.subscribe(GRID_TOPIC, "nav_msgs/OccupancyGrid", self._take_map)
         if self._answers:

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import TYPE_CHECKING, Any
 
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.exceptions import PlannerError
 from rce_fleet.nodes.grid_choice import CHOSEN
-from rce_fleet.nodes.grid_parameters import read_count, read_number
+from rce_fleet.nodes.grid_parameters import GRID_PARAMETERS, read_count, read_number
 from rce_fleet.planning.motion import Motion
 from rce_fleet.planning.planner import planner_names
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping
 
-KNOWN = frozenset(
+KNOWN = GRID_PARAMETERS | frozenset(
     {
-        *("rows", "columns", "cell_size", "origin_x", "origin_y", "origin_yaw", "walls", "blocked"),
-        *("map", "map_yaml", "blocked_share", CHOSEN),
-        *("robot_radius", "seed", "pose_only_after", "lost_spread", "lost_yaw"),
+        *("blocked", CHOSEN, "robot_radius", "seed", "pose_only_after", "lost_spread", "lost_yaw"),
         *("planner", "resolve_deadlocks", "quarter_turn", "stop", "answers", "known_robots"),
     }
 )
@@ -53,12 +50,3 @@ def read_settings(values: Mapping[str, Any]) -> FleetSettings:
         known = ", ".join(planner_names())
         raise PlannerError(f"the parameter planner is {settings.planner!r}; installed planners are {known}")
     return settings
-
-
-def unknown_parameters(names: Iterable[str]) -> list[str]:
-    """Return a remark about each name that is not a parameter of the planner, with the nearest known one."""
-    unknown = sorted(name for name in names if name not in KNOWN)
-    return [
-        f"unknown parameter {name}; did you mean {difflib.get_close_matches(name, KNOWN, 1, 0.0)[0]}?"
-        for name in unknown
-    ]

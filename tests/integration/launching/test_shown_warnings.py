@@ -67,3 +67,11 @@ async def test_bad_parameters_end_the_planner_with_one_line(shows: str) -> None:
     assert b"fleet_planner: a map needs at least one row and one column, not -2 x 8\n" in shown
     assert b"Traceback" not in shown
     assert (b"wals" in shown) == (shows == "yes")
+
+
+async def test_move_client_waits_for_the_planners_grid_if_its_own_is_wrong() -> None:
+    async with Core(port=0) as core:
+        text = b"the grid on /fleet/map is waited for instead: the parameter rows must be a number"
+        words = ("run", "fleet", "move_client.py", "__ns:=Robot1", "_rows:=x", "_anwsers:=true")
+        shown, _ = await printed(core, *words, until=text)
+    assert b"unknown parameter anwsers; did you mean answers?" in shown

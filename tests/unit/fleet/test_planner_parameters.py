@@ -12,8 +12,8 @@ import rce_fleet
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.exceptions import PlannerError
 from rce_fleet.nodes.grid_choice import CHOSEN
-from rce_fleet.nodes.grid_parameters import make_grid
-from rce_fleet.nodes.planner_parameters import KNOWN, read_settings, unknown_parameters
+from rce_fleet.nodes.grid_parameters import make_grid, unknown_parameters
+from rce_fleet.nodes.planner_parameters import KNOWN, read_settings
 
 README = Path(rce_fleet.__file__).parent / "share" / "README.md"
 
@@ -60,7 +60,7 @@ def test_grids_that_cannot_be_made_are_named(values: dict[str, Any], text: str) 
 
 
 def test_unknown_parameters_are_noted_with_the_nearest_known_one() -> None:
-    assert unknown_parameters(["rows", "wals"]) == ["unknown parameter wals; did you mean walls?"]
+    assert unknown_parameters(["rows", "wals"], KNOWN) == ["unknown parameter wals; did you mean walls?"]
 
 
 def test_the_documented_parameters_are_the_known_ones() -> None:
