@@ -72,6 +72,7 @@ def take(kind, topic):
         for text in texts[kind](message):
             heard.setdefault(topic, set()).add(text)
             times[text] = times.get(text, 0) + 1
+            print("took", topic, text, "of", message._connection_header["callerid"], flush=True)
     return on_message
 
 keep = [rospy.Subscriber(t, kinds[k], take(k, t)) for k, t in (s.split(":", 1) for s in subjects)]

@@ -100,6 +100,8 @@ class Graph:
                     line = await process.stdout.readline()
                     assert line, f"{argv} ended and printed {printed!r}"
                     printed += line.decode(errors="replace")
+        except TimeoutError:
+            raise AssertionError(f"{argv} has not said {text!r} in {TIMEOUT_S:g} s: {printed!r}") from None
         finally:
             await finish(process)
         return printed

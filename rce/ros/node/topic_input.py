@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from rce.aio.backoff import Backoff
 from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import HandshakeRefusedError, RosError, TcprosError, TypeMismatchError
+from rce.ros.node.input_link import HeaderReader, InputLink, says_latching
 from rce.ros.node.local import LocalLink, LocalMessage, find_neighbour
 from rce.ros.node.runtime import Runtime
 from rce.ros.node.subscriber import Subscriber
-from rce.ros.tcpros.connection import Connection
-from rce.ros.tcpros.header import ANY, check_type, decode_header, encode_header, raise_error_field
+from rce.ros.tcpros.connection import Connection, Owner
+from rce.ros.tcpros.header import ANY, encode_header
 from rce.ros.xmlrpc.dispatch import SUCCESS
 
 if TYPE_CHECKING:
@@ -23,6 +24,10 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 CONNECT_TIMEOUT = 10.0
+LATCH_TIMEOUT = 2.0
+"""Seconds that a publisher has to say again whether it latches; without an answer it does not."""
+ASKING = "_asks"
+"""Appended to the node's name where a publisher is asked only for its header."""
 RETRY = Backoff(first=0.05, longest=5.0, jitter=0.5)
 """Seconds between attempts to reach a publisher: the first wait and the longest."""
 
@@ -44,6 +49,11 @@ class TopicInput:
         self._following: dict[str, asyncio.Task[None]] = {}
         self._orphans: set[str] = set()
         """Publishers that a restarted master has not named yet: followed until their connection ends."""
+
+    @property
+    def tells_latched(self) -> bool:
+        """Whether a subscriber has to know which messages are latched."""
+        return any(not subscriber.decodes for subscriber in self.subscribers)
 
     def check(self, message_type_name: str, md5sum: str) -> None:
         """Check that another subscriber of the node expects the same type; the first concrete one counts.
@@ -166,21 +176,53 @@ class TopicInput:
             output.drop(link)
 
     async def _receive(self, link: InputLink) -> None:
-        loop = asyncio.get_running_loop()
-        host, port = await self._ask_for_address(link.uri)
-        async with asyncio.timeout(CONNECT_TIMEOUT):
-            _, connection = await loop.create_connection(
-                lambda: Connection(link, self._runtime.scratch), sock=await open_peer_socket(host, port)
-            )
+        connection = await self._connect(link, link.uri)
         self.links.append(link)
         try:
             connection.write((encode_header(self._header()),))
+            if await link.in_doubt:
+                latched = False
+                try:
+                    latched = await self._latches(link.uri)
+                finally:
+                    link.settle(connection, latched=latched)
             await link.ended
         finally:
             self.links.remove(link)
             self.lose(link.uri)
             connection.abort()
             await connection.gone.wait()
+
+    async def _connect(self, owner: Owner, uri: str) -> Connection:
+        host, port = await self._ask_for_address(uri)
+        loop = asyncio.get_running_loop()
+        async with asyncio.timeout(CONNECT_TIMEOUT):
+            _, connection = await loop.create_connection(
+                lambda: Connection(owner, self._runtime.scratch), sock=await open_peer_socket(host, port)
+            )
+        return connection
+
+    async def _latches(self, uri: str) -> bool:
+        """Ask a publisher that has published whether it latches, over a connection made for that.
+
+        A rospy publisher is registered a moment before it is told to latch, and says that it does not latch
+        to those who subscribe in between (``rospy.Publisher.__init__``). It keeps one connection of a name,
+        so this one has another name.
+        """
+        reader = HeaderReader()
+        try:
+            async with asyncio.timeout(LATCH_TIMEOUT):
+                connection = await self._connect(reader, uri)
+                try:
+                    header = self._header() | {"callerid": f"{self._runtime.name}{ASKING}"}
+                    connection.write((encode_header(header),))
+                    return says_latching(await reader.fields)
+                finally:
+                    connection.abort()
+                    await connection.gone.wait()
+        except (RosError, OSError, TimeoutError) as error:
+            _log.debug("%s from %s: not known whether it latches: %r", self.topic, uri, error)
+            return False
 
     async def _ask_for_address(self, uri: str) -> tuple[str, int]:
         protocols = [["TCPROS"]]
@@ -204,71 +246,3 @@ class TopicInput:
             "md5sum": self.md5sum,
             "tcp_nodelay": "1",
         }
-
-
-class InputLink:
-    """One publisher of a topic; owns the connection to it."""
-
-    transport = "TCPROS"
-
-    def __init__(self, target: TopicInput, uri: str) -> None:
-        self.uri = uri
-        self.messages = 0
-        self.bytes_in = 0
-        self.ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        """Done when the connection is gone; failed if the publisher refused."""
-        self.publisher = ""
-        """The publishing node's name, once it said so."""
-        self._target = target
-        self.is_greeted = False
-        """Whether the publisher has answered."""
-        self.kept: bytes | None = None
-        """The newest message of a latching publisher."""
-        self._latched = False
-
-    def connection_made(self, connection: Connection) -> None:
-        """Do nothing: the connecting side sends the header."""
-
-    def frame_received(self, connection: Connection, payload: bytes) -> None:
-        """Take the publisher's header, then messages."""
-        if self.is_greeted:
-            self.messages += 1
-            self.bytes_in += len(payload)
-            if self._latched:
-                self.kept = payload
-            self._target.deliver(payload, self._latched, self.uri)
-            return
-        self.is_greeted = True
-        try:
-            self._greet(decode_header(payload))
-        except TcprosError as error:
-            self._end(error)
-            connection.abort()
-        else:
-            connection.header_done()
-            self._target.changed.set()
-
-    def connection_lost(self, connection: Connection, error: Exception | None) -> None:
-        """Wake the task that waits for the end."""
-        del connection  # the only connection
-        self._end(error)
-
-    def writable(self, connection: Connection) -> None:
-        """Do nothing: nothing waits to be written."""
-
-    def _greet(self, fields: Mapping[str, str]) -> None:
-        raise_error_field(fields)
-        target = self._target
-        check_type(
-            fields, md5sum=target.md5sum, type_name=target.message_type_name, subject=f"topic {target.topic}"
-        )
-        self.publisher = fields.get("callerid", "")
-        self._latched = fields.get("latching") == "1"
-
-    def _end(self, error: Exception | None) -> None:
-        if self.ended.done():
-            return
-        if error is None:
-            self.ended.set_result(None)
-        else:
-            self.ended.set_exception(error)

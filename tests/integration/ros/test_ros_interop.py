@@ -42,6 +42,26 @@ rospy.logwarn("ready")
 rospy.spin()
 """
 
+SLOW_TO_LATCH = """
+import time
+import rospy
+from rospy.topics import _PublisherImpl
+from std_msgs.msg import String
+
+enable_latch = _PublisherImpl.enable_latch
+
+def enable_latch_late(self):
+    time.sleep(1)
+    enable_latch(self)
+
+_PublisherImpl.enable_latch = enable_latch_late
+rospy.init_node("slow")
+publisher = rospy.Publisher("latched", String, queue_size=1, latch=True)
+publisher.publish("kept")
+rospy.spin()
+"""
+"""A rospy node that is registered a second before it latches; without the change it is a moment."""
+
 
 def environment(core: Core) -> dict[str, str]:
     """What programs of a real ROS need; without this project's Python path."""
@@ -183,3 +203,30 @@ async def test_parameter_tools(core: Core, make_node: MakeNode, tmp_path: Path) 
         assert await ours.get_param("/back/c/d") is True
         assert "/back/a" in await tool(core, "rosparam", "list")
         assert "noetic" in await tool(core, "rosparam", "get", "/rosdistro")
+
+
+async def test_rospy_publisher_that_was_connected_before_it_latched(
+    core: Core, make_node: MakeNode, tmp_path: Path
+) -> None:
+    script = tmp_path / "slow.py"
+    script.write_text(SLOW_TO_LATCH)
+    async with make_node("ours") as ours:
+        heard: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
+        subscriber = await ours.subscribe_serialized(
+            "latched", STRING, lambda *message: heard.put_nowait(message)
+        )
+        process = await asyncio.create_subprocess_exec(
+            "/usr/bin/python3",
+            str(script),
+            env=environment(core) | {"HOME": str(tmp_path)},
+            start_new_session=True,
+        )
+        try:
+            await subscriber.wait_for_publishers(timeout=30)
+            assert heard.empty(), "the publisher is not connected before it latches"
+            payload, is_latched = await asyncio.wait_for(heard.get(), 30)
+            assert (payload[4:], is_latched) == (b"kept", True)
+            await asyncio.sleep(0.2)
+            assert heard.empty()
+        finally:
+            await finish(process)

@@ -10,6 +10,7 @@ from support.ros_nodes import MakeNode
 from rce.ros.core import Core
 from rce.ros.errors import MasterUnreachableError, NodeClosedError, TypeMismatchError
 from rce.ros.node import Node, Publisher, Subscriber
+from rce.ros.node.input_link import HeaderReader
 from rce.ros.tcpros.header import encode_header
 from rce.ros.types import Message, TypeRegistry
 from rce.ros.xmlrpc import RpcClient
@@ -40,6 +41,44 @@ async def test_messages_of_any_size(make_node: MakeNode, size: int) -> None:
         for body in (payload, publisher.type.serialize({"data": "small"}), payload):
             publisher.publish_serialized(body)
             assert await asyncio.wait_for(received.get(), 20) == (body, False)
+
+
+async def test_publisher_is_asked_again_whether_it_latches(make_node: MakeNode) -> None:
+    """It said that it does not, before its first message; each message comes once, in order."""
+    async with make_node("a") as a, make_node("b") as b:
+        received: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
+        await b.subscribe_serialized("t", STRING, lambda *message: received.put_nowait(message))
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        payloads = [publisher.type.serialize({"data": str(number)}) for number in range(5)]
+        for payload in payloads:
+            publisher.publish_serialized(payload, latch=True)
+        async with asyncio.timeout(20):
+            assert [await received.get() for _ in payloads] == [(payload, True) for payload in payloads]
+            later: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
+            await b.subscribe_serialized("t", STRING, lambda *message: later.put_nowait(message))
+            assert await later.get() == (payloads[-1], True)
+            while publisher.connections > 1:
+                await asyncio.sleep(0.01)
+        assert received.empty()
+
+
+async def test_publisher_that_ends_while_it_is_asked_loses_no_message(
+    make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(HeaderReader, "frame_received", lambda *_: None)  # it waits for ever
+    async with make_node("b") as b:
+        received: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
+        await b.subscribe_serialized("t", STRING, lambda *message: received.put_nowait(message))
+        async with make_node("a") as a:
+            publisher = await a.advertise("t", STRING)
+            await publisher.wait_for_subscribers(timeout=10)
+            publisher.publish(data="last words")
+            async with asyncio.timeout(20):
+                while publisher.connections < 2:
+                    await asyncio.sleep(0.01)
+        payload, _ = await asyncio.wait_for(received.get(), 20)
+        assert payload[4:] == b"last words"
 
 
 async def test_many_messages_arrive_whole_and_in_order(make_node: MakeNode) -> None:
