@@ -24,6 +24,7 @@
     |   +-- StationUnavailableError    station or planner cannot be reached; try again later
     |   +-- RequestRefusedError        the station refused the request
     |   +-- EventsRestartedError       the fleet manager lost its journal: its events are numbered anew
+    +-- ExperimentError     an experiment that cannot be done, or data of one that cannot be read
     +-- DemoError           errors of ``rce demo``, see rce_fleet.demo.exceptions
 """
 
@@ -190,3 +191,7 @@ class PlanWorkerError(FleetError):
 
 class LogError(FleetError):
     """A log of laser scans, or a trajectory, that cannot be read."""
+
+
+class ExperimentError(FleetError):
+    """An experiment cannot be done, or its data cannot be read."""

@@ -1,0 +1,118 @@
+"""The raw data of experiments: one table with a row for each value that was measured in a run.
+
+The columns of the CSV file are ``experiment``, ``system``, ``software``, ``factors`` (``name=value`` pairs,
+sorted, separated by ``;``), ``run``, ``metric``, ``value`` and ``unit``. A file beside it describes the
+machine.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from rce_fleet.exceptions import ExperimentError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+COLUMNS = ("experiment", "system", "software", "factors", "run", "metric", "value", "unit")
+
+
+class Setting(NamedTuple):
+    """What is measured in several runs: an experiment, a system, its software, and the factors."""
+
+    experiment: str
+    system: str
+    software: str
+    factors: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def of(cls, experiment: str, system: str, software: str, **factors: object) -> Setting:
+        """Make a setting; the order of the factors does not matter."""
+        return cls(experiment, system, software, tuple(sorted((k, str(v)) for k, v in factors.items())))
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A value that was measured."""
+
+    setting: Setting
+    run: int
+    metric: str
+    value: float
+    unit: str
+
+
+def write_rows(path: Path, rows: Iterable[Row]) -> None:
+    """Append rows to a table, which is made if it does not exist. They are on disk when this returns.
+
+    Raises:
+        OSError: The file cannot be written.
+        ExperimentError: A name contains a separator.
+    """
+    is_new = not path.exists()
+    with path.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        if is_new:
+            writer.writerow(COLUMNS)
+        for row in rows:
+            experiment, system, software, factors = row.setting
+            writer.writerow(
+                (
+                    experiment,
+                    system,
+                    software,
+                    _joined(factors),
+                    row.run,
+                    row.metric,
+                    repr(row.value),
+                    row.unit,
+                )
+            )
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Read a table. A last line that was not completely written is left out.
+
+    Raises:
+        OSError: The file cannot be read.
+        ExperimentError: It is not such a table; the text names the line.
+    """
+    with path.open(newline="", encoding="utf-8") as file:
+        text = file.read()
+    lines = text[: text.rfind("\n") + 1].splitlines()
+    if not lines or tuple(next(csv.reader(lines[:1]))) != COLUMNS:
+        raise ExperimentError(f"{path} has no columns {', '.join(COLUMNS)}")
+    found = []
+    for number, fields in enumerate(csv.reader(lines[1:]), 2):
+        try:
+            experiment, system, software, factors, run, metric, value, unit = fields
+            setting = Setting(experiment, system, software, _split(factors))
+            found.append(Row(setting, int(run), metric, float(value), unit))
+        except ValueError as error:
+            raise ExperimentError(f"{path}:{number}: {error}") from error
+    return found
+
+
+def by_setting(rows: Iterable[Row], metric: str) -> Mapping[Setting, list[float]]:
+    """Return the values of a metric for each setting, in the order of the runs."""
+    found: dict[Setting, list[tuple[int, float]]] = defaultdict(list)
+    for row in rows:
+        if row.metric == metric:
+            found[row.setting].append((row.run, row.value))
+    return {setting: [value for _, value in sorted(pairs)] for setting, pairs in found.items()}
+
+
+def _joined(factors: tuple[tuple[str, str], ...]) -> str:
+    for name, value in factors:
+        if any(mark in f"{name}{value}" for mark in ";=\n"):
+            raise ExperimentError(f"a factor must not contain ; = or a line break: {name!r} = {value!r}")
+    return ";".join(f"{name}={value}" for name, value in factors)
+
+
+def _split(text: str) -> tuple[tuple[str, str], ...]:
+    pairs = (part.partition("=") for part in text.split(";") if part)
+    return tuple((name, value) for name, _, value in pairs)
