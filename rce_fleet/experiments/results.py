@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 COLUMNS = ("experiment", "system", "software", "factors", "run", "metric", "value", "unit")
 
 
-class Setting(NamedTuple):
+class Condition(NamedTuple):
     """What is measured in several runs: an experiment, a system, its software, and the factors."""
 
     experiment: str
@@ -30,8 +30,8 @@ class Setting(NamedTuple):
     factors: tuple[tuple[str, str], ...] = ()
 
     @classmethod
-    def of(cls, experiment: str, system: str, software: str, **factors: object) -> Setting:
-        """Make a setting; the order of the factors does not matter."""
+    def of(cls, experiment: str, system: str, software: str, **factors: object) -> Condition:
+        """Make a condition; the order of the factors does not matter."""
         return cls(experiment, system, software, tuple(sorted((k, str(v)) for k, v in factors.items())))
 
 
@@ -39,7 +39,7 @@ class Setting(NamedTuple):
 class Row:
     """A value that was measured."""
 
-    setting: Setting
+    condition: Condition
     run: int
     metric: str
     value: float
@@ -59,7 +59,7 @@ def write_rows(path: Path, rows: Iterable[Row]) -> None:
         if is_new:
             writer.writerow(COLUMNS)
         for row in rows:
-            experiment, system, software, factors = row.setting
+            experiment, system, software, factors = row.condition
             writer.writerow(
                 (
                     experiment,
@@ -90,20 +90,20 @@ def read_rows(path: Path) -> list[Row]:
     for number, fields in enumerate(csv.reader(lines[1:]), 2):
         try:
             experiment, system, software, factors, run, metric, value, unit = fields
-            setting = Setting(experiment, system, software, _split(factors))
-            found.append(Row(setting, int(run), metric, float(value), unit))
+            condition = Condition(experiment, system, software, _split(factors))
+            found.append(Row(condition, int(run), metric, float(value), unit))
         except ValueError as error:
             raise ExperimentError(f"{path}:{number}: {error}") from error
     return found
 
 
-def by_setting(rows: Iterable[Row], metric: str) -> Mapping[Setting, list[float]]:
-    """Return the values of a metric for each setting, in the order of the runs."""
-    found: dict[Setting, list[tuple[int, float]]] = defaultdict(list)
+def by_condition(rows: Iterable[Row], metric: str) -> Mapping[Condition, list[float]]:
+    """Return the values of a metric for each condition, in the order of the runs."""
+    found: dict[Condition, list[tuple[int, float]]] = defaultdict(list)
     for row in rows:
         if row.metric == metric:
-            found[row.setting].append((row.run, row.value))
-    return {setting: [value for _, value in sorted(pairs)] for setting, pairs in found.items()}
+            found[row.condition].append((row.run, row.value))
+    return {condition: [value for _, value in sorted(pairs)] for condition, pairs in found.items()}
 
 
 def _joined(factors: tuple[tuple[str, str], ...]) -> str:

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from rce_fleet.exceptions import ExperimentError
-from rce_fleet.experiments.results import Row, Setting, by_setting, read_rows, write_rows
+from rce_fleet.experiments.results import Condition, Row, by_condition, read_rows, write_rows
 from rce_fleet.experiments.schedule import WARM_UP, Run, remaining, schedule
 
-SMS = Setting.of("laser", "SMS", "ros", robots=5, printed="yes")
-CRS = Setting.of("laser", "CRS", "rce", printed="yes", robots=5)
+SMS = Condition.of("laser", "SMS", "ros", robots=5, printed="yes")
+CRS = Condition.of("laser", "CRS", "rce", printed="yes", robots=5)
 
 
 def test_rows_are_read_as_they_were_written(tmp_path: Path) -> None:
@@ -51,24 +51,26 @@ def test_other_files_are_refused(tmp_path: Path, text: str, error: str) -> None:
 
 
 def test_factors_must_not_contain_separators(tmp_path: Path) -> None:
-    row = Row(Setting.of("laser", "SMS", "ros", path="a;b"), 1, "network", 1.0, "B/s")
+    row = Row(Condition.of("laser", "SMS", "ros", path="a;b"), 1, "network", 1.0, "B/s")
     with pytest.raises(ExperimentError, match="'path' = 'a;b'"):
         write_rows(tmp_path / "raw.csv", [row])
 
 
 def test_values_are_grouped_in_the_order_of_runs() -> None:
     rows = [Row(SMS, 2, "cpu", 0.2, ""), Row(SMS, 1, "cpu", 0.1, ""), Row(CRS, 1, "network", 3.0, "B/s")]
-    assert by_setting(rows, "cpu") == {SMS: [0.1, 0.2]}
+    assert by_condition(rows, "cpu") == {SMS: [0.1, 0.2]}
 
 
 def test_each_round_has_each_setting_once_in_random_order() -> None:
-    settings = [Setting.of("laser", name, "ros") for name in "abcdef"]
-    runs = schedule(settings, 10, seed=1)
-    assert Counter(runs) == Counter(Run(setting, number) for setting in settings for number in range(11))
-    rounds = [[run.setting for run in runs[6 * number : 6 * number + 6]] for number in range(11)]
-    assert all(sorted(each) == settings for each in rounds)
+    conditions = [Condition.of("laser", name, "ros") for name in "abcdef"]
+    runs = schedule(conditions, 10, seed=1)
+    assert Counter(runs) == Counter(
+        Run(condition, number) for condition in conditions for number in range(11)
+    )
+    rounds = [[run.condition for run in runs[6 * number : 6 * number + 6]] for number in range(11)]
+    assert all(sorted(each) == conditions for each in rounds)
     assert len({tuple(each) for each in rounds}) > 5
-    assert runs == schedule(settings, 10, seed=1) != schedule(settings, 10, seed=2)
+    assert runs == schedule(conditions, 10, seed=1) != schedule(conditions, 10, seed=2)
 
 
 def test_a_resumed_experiment_warms_up_only_what_is_open() -> None:
