@@ -1,0 +1,52 @@
+"""Machines with shaped links: what was asked for is what programs measure."""
+
+from __future__ import annotations
+
+import subprocess
+
+import pytest
+
+from rce_fleet.exceptions import ExperimentError
+from rce_fleet.experiments import machines as module
+from rce_fleet.experiments.delay_line import LinkShape
+from rce_fleet.experiments.machines import MachineLink, MachineNetwork
+
+needs_machines = pytest.mark.needs("netns")
+
+
+def namespaces() -> str:
+    return subprocess.run(["ip", "netns"], check=True, capture_output=True, text=True).stdout
+
+
+@needs_machines
+async def test_links_are_shaped_as_asked_for() -> None:
+    slow = MachineLink(rate=20e6, shape=LinkShape(delay=0.01, jitter=0.001))
+    async with MachineNetwork({"server": MachineLink(), "robot": slow}) as network:
+        assert [machine.address for machine in network.machines.values()] == ["10.89.0.1", "10.89.0.2"]
+        before = await network.traffic("robot")
+        found = await network.probe("robot", "server")
+        after = await network.traffic("robot")
+        assert found.round_trip_s >= 0.018
+        assert found.lost == 0
+        assert found.rate <= 20e6
+        sent = after.sent_bytes - before.sent_bytes
+        assert sent > found.rate / 8, "the stream took over a second"
+        assert after.received_packets > before.received_packets
+        server = await network.traffic("server")
+        assert server.received_bytes >= 0.9 * sent
+    assert network._tag not in namespaces()
+
+
+@needs_machines
+async def test_what_was_made_is_removed_if_a_part_cannot_be_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "SUBNET", "10.89.999")
+    network = MachineNetwork({"server": MachineLink()})
+    with pytest.raises(ExperimentError, match=r"address add 10\.89\.999\.1/24 dev wlan0"):
+        await network.__aenter__()
+    assert network._tag not in namespaces()
+
+
+async def test_a_missing_tool_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "TOOLS", ("ip", "no-such-tool"))
+    with pytest.raises(ExperimentError, match="making them needs the program no-such-tool"):
+        await MachineNetwork({}).__aenter__()
