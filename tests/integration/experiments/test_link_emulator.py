@@ -110,13 +110,14 @@ def test_both_directions_are_delayed(target: str) -> None:
 
 
 def test_frames_are_lost_and_counted() -> None:
-    with link("--loss", "0.5", "--seed", "3") as (left, right, emulator):
+    with link("--loss", "0.3", "--seed", "3") as (left, right, emulator):
         found = trips(left, right, RIGHT, 20)
         assert 0 < len(found) < 20
         emulator.terminate()
         out, _ = emulator.communicate(timeout=START_S)
         figures = json.loads(out)
-        assert figures["there"]["lost"] + figures["back"]["lost"] >= 20 - len(found)
+        assert figures["there"]["lost"] > 0
+        assert figures["back"]["lost"] > 0
         assert figures["there"]["carried"] >= len(found)
         assert figures["cpu_s"] > 0
 

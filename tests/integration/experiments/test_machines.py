@@ -27,7 +27,7 @@ async def test_links_are_shaped_as_asked_for() -> None:
         found = await network.probe("robot", "server")
         after = await network.traffic("robot")
         assert found.round_trip_s >= 0.018
-        assert found.lost == 0
+        assert found.lost < 0.2
         assert found.rate <= 20e6
         sent = after.sent_bytes - before.sent_bytes
         assert sent > found.rate / 8, "the stream took over a second"
