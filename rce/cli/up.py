@@ -11,7 +11,7 @@ import typer
 from msgspec.structs import replace
 
 from rce.cli.settings import SettingsOptions
-from rce.config import LOOPBACK, EngineSettings, MasterSettings, SettingError, as_document, fields_of
+from rce.config import EngineSettings, MasterSettings, SettingError, as_document, fields_of
 from rce.supervision.plan import Plan, Program
 from rce.tls.choice import WARNED_VARIABLE, plain_warning
 
@@ -118,7 +118,7 @@ def programs(settings: EngineSettings) -> Iterable[Program]:
 def _document(settings: EngineSettings) -> dict[str, Any]:
     return as_document(settings) | {
         "state_dir": str(settings.state_dir.absolute()),
-        "master_host": settings.master_host or LOOPBACK,
+        "master_host": settings.master_host or settings.near_host,
     }
 
 

@@ -171,11 +171,17 @@ class EngineSettings(Section, frozen=True, kw_only=True):
         return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.master.control_port}"
 
     @property
-    def http_url(self) -> str:
-        """The URL of the master for clients on this machine."""
+    def near_host(self) -> str:
+        """Where programs on this machine reach the master: loopback, unless it listens elsewhere only."""
         host = self.master.bind or LOOPBACK
         with contextlib.suppress(ValueError):
             if ipaddress.ip_address(host).is_unspecified:
-                host = LOOPBACK
+                return LOOPBACK
+        return host
+
+    @property
+    def http_url(self) -> str:
+        """The URL of the master for clients on this machine."""
+        host = self.near_host
         scheme = "https" if self.tls.enabled or self.tls.cert else "http"
         return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.master.http_port}/"

@@ -99,6 +99,16 @@ def test_defaults_arrive() -> None:
     assert (found["robot"].robot.link_port, found["container"].container.link_port) == (10030, 10031)
 
 
+@pytest.mark.parametrize(
+    ("host", "master"),
+    [("10.0.0.7", "10.0.0.7"), ("0.0.0.0", "127.0.0.1"), ("::", "127.0.0.1"), ("cloud.local", "cloud.local")],
+)
+def test_task_sets_dial_the_address_at_which_the_master_listens(host: str, master: str) -> None:
+    found = received(bound_to(host, EngineSettings()))
+    assert {one.master_host for one in found.values()} == {master}
+    assert received(bound_to(host, SETTINGS))["robot1"].master_host == "127.0.0.2", "as it is set"
+
+
 @pytest.mark.parametrize("host", ["10.0.0.7", "0.0.0.0"])
 def test_one_address_for_all_programs(host: str) -> None:
     found = received(bound_to(host, SETTINGS))
