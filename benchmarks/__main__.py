@@ -41,8 +41,10 @@ OTHERS = {
         ("mapping", "--only", "intel", "--scans", "400"),
     ),
     "fleet": (("light",), ("fleet",), ("traffic",), ("assignment",), ("planning",)),
+    "scale": (("scale",),),
 }
-"""Other programs by part; each prints and saves its own figures. ``fleet`` needs no engine."""
+"""Other programs by part; each prints and saves its own figures. :data:`WITHOUT_ENGINE` need no engine."""
+WITHOUT_ENGINE = ("fleet", "scale")
 
 
 def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awaitable[Rows]]]]:
@@ -106,13 +108,13 @@ async def measure_engine(
 async def measure(names: list[str], *, quick: bool, runtime: str) -> None:
     """Run the chosen suites, and the programs that belong to them."""
     chosen = suites(quick=quick)
-    parts = names or [*chosen, "fleet"]
+    parts = names or [*chosen, *WITHOUT_ENGINE]
     of_engine = [name for name in parts if name in chosen]
     if of_engine:
         await measure_engine({name: chosen[name] for name in of_engine}, runtime)
     for part in parts:
         for program, *options in OTHERS.get(part, ()):
-            short = ["--quick"] if quick and part == "fleet" else []
+            short = ["--quick"] if quick and part in WITHOUT_ENGINE else []
             argv = [sys.executable, "-m", f"benchmarks.{program}", *options, *short]
             other = await asyncio.create_subprocess_exec(*argv, cwd=ROOT)
             if await other.wait():
@@ -124,7 +126,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer sizes, clients and seconds")
     parser.add_argument(
-        "--only", nargs="+", choices=[*suites(quick=True), "fleet"], default=[], metavar="NAME"
+        "--only", nargs="+", choices=[*suites(quick=True), *WITHOUT_ENGINE], default=[], metavar="NAME"
     )
     parser.add_argument("--runtime", default="auto", choices=("auto", "namespace", "process"))
     options = parser.parse_args()

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 
 from rce_master.exceptions import MasterError, RefusedError, StoreError
 from rce_master.state.changes import Changes, Touched, make_row
+from rce_master.state.commands import Continue
 from rce_master.state.core import State
 from rce_master.state.migration import conversion
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from rce.control import EndpointSpec, SpecPatch
     from rce_master.state.commands import Command
@@ -27,7 +28,9 @@ _log = logging.getLogger(__name__)
 MAX_WAITING = 10_000
 MAX_BATCH = 256
 MAX_COMMANDS = 512
-"""Approximate number of commands in one batch, which blocks the event loop."""
+"""Approximate number of commands in one batch: so many wait for its last one before they are stored."""
+MAX_HOLD_S = 0.01
+"""Time after which input and output of the master go before the next command."""
 
 Outcome = MasterError | None
 """The result of a command: None on success, else the error."""
@@ -38,6 +41,19 @@ class _Job:
     commands: Sequence[Command]
     done: asyncio.Future[list[Outcome]]
     outcomes: list[Outcome] = field(default_factory=list)
+
+
+class _Turn:
+    """A turn of the event loop."""
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter()
+
+    async def end_if_over(self) -> None:
+        """Let everything else have its turn, if this one took long enough."""
+        if time.perf_counter() - self._began >= MAX_HOLD_S:
+            await asyncio.sleep(0)
+            self._began = time.perf_counter()
 
 
 class StateService:
@@ -66,6 +82,8 @@ class StateService:
         self._clock = clock
         self._jobs: asyncio.Queue[_Job] = asyncio.Queue(MAX_WAITING)
         self._store_fault = ""
+        self._is_unfinished = False
+        """Whether a command left work that is continued after the commands that wait."""
 
     @classmethod
     async def open(
@@ -159,27 +177,65 @@ class StateService:
     async def run(self) -> None:
         """Work until cancelled."""
         while True:
-            jobs = [await self._jobs.get()]
-            size = len(jobs[0].commands)
-            while len(jobs) < MAX_BATCH and size < MAX_COMMANDS and not self._jobs.empty():
-                jobs.append(self._jobs.get_nowait())
-                size += len(jobs[-1].commands)
-            await self._work(jobs)
+            continues = self._is_unfinished
+            if continues:
+                # Without this, work that writes nothing would leave the event loop to no other task.
+                await asyncio.sleep(0)
+            jobs = [] if continues else [await self._jobs.get()]
+            await self._work(jobs, takes_more=True, continues=continues)
 
-    async def _work(self, jobs: list[_Job]) -> None:
+    async def _work(self, jobs: list[_Job], *, takes_more: bool = False, continues: bool = False) -> None:
+        """Do jobs in one transaction of the store.
+
+        Args:
+            jobs: The jobs.
+            takes_more: Whether to add those that wait.
+            continues: Whether to do more of what was left over, after the jobs.
+        """
         done: list[Changes] = []
-        for job in jobs:
-            job.outcomes = [self._apply(command, done) for command in job.commands]
         try:
+            await self._apply_all(jobs, done, takes_more=takes_more, continues=continues)
             await self._save(done)
         except StoreError as error:
+            _revert(done)
+            # The next tick does what was left over: a store that fails is not asked again at once.
+            self._is_unfinished = False
             await self._stand_alone(jobs, error)
             return
+        except BaseException:
+            _revert(done)
+            raise
+        self._is_unfinished = any(changes.unfinished for changes in done)
         _touch_once(done)
+        turn = _Turn()
         for changes in done:
             for listener in self.listeners:
                 listener(changes)
+            await turn.end_if_over()
         self._answer(jobs, None)
+
+    async def _apply_all(
+        self, jobs: list[_Job], done: list[Changes], *, takes_more: bool, continues: bool
+    ) -> None:
+        turn = _Turn()
+        for job in self._taken(jobs) if takes_more else jobs:
+            job.outcomes = []
+            for command in job.commands:
+                # Between two turns, readers see what is not stored yet, as they do while it is being stored.
+                await turn.end_if_over()
+                job.outcomes.append(self._apply(command, done))
+        if continues:
+            await turn.end_if_over()
+            self._apply(Continue(), done)
+
+    def _taken(self, jobs: list[_Job]) -> Iterator[_Job]:
+        """Iterate over jobs, and add those that wait, up to the size of a batch."""
+        yield from jobs
+        size = sum(len(job.commands) for job in jobs)
+        while len(jobs) < MAX_BATCH and size < MAX_COMMANDS and not self._jobs.empty():
+            jobs.append(self._jobs.get_nowait())
+            size += len(jobs[-1].commands)
+            yield jobs[-1]
 
     async def _save(self, done: list[Changes]) -> None:
         # Of a key that several commands wrote, only the newest record counts; nothing is encoded twice.
@@ -189,15 +245,13 @@ class StateService:
             if rows:
                 await self._store.save(rows, self._term)
                 self._store_fault = ""
-        except BaseException as error:
-            self._store_fault = str(error) if isinstance(error, StoreError) else self._store_fault
-            for changes in reversed(done):
-                changes.revert()
+        except StoreError as error:
+            self._store_fault = str(error)
             raise
 
     async def _stand_alone(self, jobs: list[_Job], error: StoreError) -> None:
         """Do jobs one by one after their common transaction failed: reports need no store."""
-        if len(jobs) == 1:
+        if len(jobs) <= 1:
             _log.error("%s", error)
             self._answer(jobs, error)
             return
@@ -220,6 +274,11 @@ class StateService:
         for job in jobs:
             if not job.done.done():
                 job.done.set_result([outcome or error for outcome in job.outcomes])
+
+
+def _revert(done: Sequence[Changes]) -> None:
+    for changes in reversed(done):
+        changes.revert()
 
 
 async def load_converted(store: Store, term: int) -> Snapshot:

@@ -29,6 +29,7 @@ REQUEST_S = 30.0
 UPLOAD_S = 300.0
 """Seconds to wait for an answer to an upload, which the master checks first."""
 RETRY_S = 1.0
+PAGE_ITEMS = 1000
 _OK = 400
 _REDIRECTS = 300, 400
 _CLOSE = aiohttp.ClientWSTimeout(ws_close=5.0)
@@ -102,6 +103,34 @@ class ApiClient:
                     continue
                 raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
         raise AssertionError("there is a master at least")
+
+    async def items(
+        self, path: str, name: str = "", query: dict[str, str | int] | None = None
+    ) -> list[dict[str, Any]]:
+        """Get a whole list, page by page; a master of an earlier release answers with all of it at once.
+
+        Args:
+            path: Its path.
+            name: Its field in the answers; empty: that of the path.
+            query: Query parameters.
+
+        Raises:
+            ApiError: The master refused.
+            CliError: The master could not be reached.
+        """
+        return (await self.pages(path, name or path.strip("/"), query))[1]
+
+    async def pages(
+        self, path: str, name: str, query: dict[str, str | int] | None = None
+    ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+        """Get a whole list as :meth:`items` does; return the first answer too, for its other fields."""
+        query = {**(query or {}), "limit": PAGE_ITEMS}
+        first = page = await self.call("GET", path, query=query)
+        found = list(page[name])
+        while page.get("next"):
+            page = await self.call("GET", path, query={**query, "cursor": page["next"]})
+            found += page[name]
+        return first, found
 
     @contextlib.asynccontextmanager
     async def websocket(

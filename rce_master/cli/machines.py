@@ -29,7 +29,7 @@ def machines(
 
 async def _machines(as_json: bool) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        found = (await client.call("GET", "/machines"))["machines"]
+        found = await client.items("/machines")
     if as_json:
         typer.echo(json.dumps(found, indent=2))
         return
@@ -111,7 +111,7 @@ async def _drain(machine: str, *, wait: bool) -> None:
             if not said or not wait:
                 return
             await asyncio.sleep(POLL_S)
-            everything = (await client.call("GET", "/machines"))["machines"]
+            everything = await client.items("/machines")
             found = [one for one in everything if machine in (one["process"], one["machine"])]
             if not any(one["draining"] for one in found):
                 raise CliError(f"{machine} is not drained any more")

@@ -79,7 +79,7 @@ async def fetch(client: ApiClient, *names: str) -> Everything:
 
 async def _fetch(client: ApiClient, name: str) -> list[dict[str, Any]]:
     try:
-        return list((await client.call("GET", f"/{name}"))[name])
+        return await client.items(f"/{name}")
     except ApiError as error:
         if error.status == _FORBIDDEN:
             return []

@@ -64,7 +64,8 @@ class Look:
             client: Connects to the master.
             interval: Seconds since the last reading.
         """
-        usage = await client.call("GET", "/usage")
+        first, containers = await client.pages("/usage", "containers")
+        usage = {**first, "containers": containers}
         parts: list[RenderableType] = [layout(usage, self)]
         if self.interfaces:
             now = (await fetch(client, "interfaces"))["interfaces"]

@@ -143,7 +143,7 @@ class _ApiDirectory:
         await self._client.call("POST", "/users", {"name": name, "role": role, "password": password})
 
     async def list(self) -> list[dict[str, Any]]:
-        return list((await self._client.call("GET", "/users"))["users"])
+        return await self._client.items("/users")
 
     async def set_password(self, name: str, password: str, old: str) -> None:
         body = {"password": password, "old_password": old}

@@ -25,7 +25,7 @@ def list_(user: OfUser = "") -> None:
 
 async def _list(user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        found = (await client.call("GET", "/volumes", query=_of(user)))["volumes"]
+        found = await client.items("/volumes", query=_of(user))
     several = len({one["user"] for one in found}) > 1
     table = Table("volume", "used", "size", "machine", "container", "path", box=None)
     for one in found:

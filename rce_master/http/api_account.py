@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from rce_master.auth import client_digest
 from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError, WrongCredentialsError
 from rce_master.http import models
+from rce_master.http.paging import PAGE, Listing, Span, answer, keys_of
 from rce_master.http.routes import Call, route_table
 from rce_master.http.views import Views
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
 from rce_master.tokens import new_token, token_digest
+
+if TYPE_CHECKING:
+    from aiohttp import web
 
 routes = route_table("account")
 
@@ -46,11 +52,20 @@ async def show_caller(call: Call) -> models.UserOut:
     return _views(call).user(call.caller)
 
 
-@routes.route("GET", "/users", "List all users", reply=models.UsersOut, admin=True)
-async def list_users(call: Call) -> models.UsersOut:
+@routes.route("GET", "/users", "List all users", reply=models.UsersOut, query=PAGE, admin=True)
+async def list_users(call: Call) -> web.Response:
     """List all users."""
     views = _views(call)
-    return models.UsersOut(users=[views.user(user) for user in call.services.state_service.tables.users])
+    users = call.services.state_service.tables.users
+
+    def items(key: str, span: Span) -> list[tuple[str, models.UserOut]]:
+        user = users.get(key)
+        return [] if user is None else [(name, views.user(user)) for name in span.of(("",))]
+
+    listing = Listing(
+        name="users", whole=lambda: [user.name for user in users], keys=keys_of(users), items=items
+    )
+    return await answer(call, listing)
 
 
 @routes.route(

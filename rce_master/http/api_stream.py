@@ -10,12 +10,14 @@ from typing import TypeVar
 
 import msgspec
 from aiohttp import web
+from msgspec.structs import asdict
 
 from rce.control import LogLevel, LogQuery, LogStream
 from rce.web.openapi import Query
 from rce_master.events import AT_ONCE, Event
 from rce_master.exceptions import InvalidRequestError
 from rce_master.http import models
+from rce_master.http.paging import MAX_ITEMS, PAGE
 from rce_master.http.routes import ENDED, OF_USER, Call, route_table
 
 routes = route_table("stream")
@@ -104,22 +106,52 @@ def _one_of(words: type[E], name: str, word: str) -> E:
 @routes.route(
     "GET",
     "/events",
-    "Follow what happens, as server-sent events; Last-Event-ID resumes",
-    media="text/event-stream",
+    "Follow what happens, as server-sent events; Last-Event-ID resumes. With Accept: application/json, return"
+    " a page of what happened",
+    reply=models.EventsOut,
+    other_media=("text/event-stream",),
     query=(
         OF_USER,
-        Query(name="since", description="Id after which to begin; default: now.", type="integer"),
+        Query(
+            name="since",
+            description="Id after which to begin. Default: now; of pages: the oldest that is kept.",
+            type="integer",
+        ),
+        *PAGE,
     ),
 )
-async def stream_events(call: Call) -> web.StreamResponse:
-    """Stream events until the client or the server ends it, or the token becomes invalid."""
+async def stream_events(call: Call) -> models.EventsOut | web.StreamResponse:
+    """Return a page, or stream until the client or the server ends it, or the token becomes invalid."""
+    if call.request.headers.get("Accept", "").partition(";")[0].strip() == "application/json":
+        return _page(call, call.scope)
     with call.services.quotas.stream(call.caller):
         return await _stream(call, call.scope, _start(call))
 
 
-async def _stream(call: Call, scope: str | None, last: int) -> web.StreamResponse:
+def _page(call: Call, scope: str | None) -> models.EventsOut:
+    log = call.services.events
+    limit, since = call.number("limit", MAX_ITEMS), call.number("cursor", call.number("since", 0))
+    if not 0 < limit <= MAX_ITEMS:
+        raise InvalidRequestError(f"query parameter 'limit' must be 1 to {MAX_ITEMS}")
+    born = _born(call, scope)
+    found = log.since(since, limit + 1, scope)
+    has_more, found = len(found) > limit, found[:limit]
+    shown = [event for event in found if event.time >= born and _concerns(call, event)]
+    return models.EventsOut(
+        events=[models.EventOut(**asdict(event)) for event in shown],
+        newest=max(since, log.last_id),
+        next=str(found[-1].id) if has_more else None,
+    )
+
+
+def _born(call: Call, scope: str | None) -> float:
+    """Return when a user was made: earlier events belong to a former user of that name."""
     owner = call.services.state_service.tables.users.get(scope or "")
-    born = owner.created if owner is not None else 0.0  # earlier events belong to a former user of that name
+    return owner.created if owner is not None else 0.0
+
+
+async def _stream(call: Call, scope: str | None, last: int) -> web.StreamResponse:
+    born = _born(call, scope)
     response = web.StreamResponse(
         headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     )

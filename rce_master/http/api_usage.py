@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from aiohttp import web
+from msgspec import json
 
 from rce.web.openapi import Query
 from rce_master.exceptions import InvalidRequestError
+from rce_master.http.paging import PAGE, Listing, Span, answer, keys_of_users, whole
 from rce_master.http.routes import ENDED, OF_USER, Call, route_table
-from rce_master.http.usage_models import UsageOut
+from rce_master.http.usage_models import ContainerUsageOut, UsageOut
 from rce_master.http.usage_views import UsageViews
 
 routes = route_table("usage")
@@ -20,11 +22,15 @@ LEAST_INTERVAL_S, MOST_INTERVAL_S = 1, 3600
     "/usage",
     "Show what containers, nodes and machines consume now, and what could be better",
     reply=UsageOut,
-    query=(OF_USER,),
+    query=(OF_USER, *PAGE),
 )
-async def show_usage(call: Call) -> UsageOut:
+async def show_usage(call: Call) -> web.Response:
     """Show the usage."""
-    return _usage(call, call.scope)
+    views = _views(call)
+    # The machines belong to the first page: the others are about containers only.
+    return await answer(
+        call, _listing(call, views), **_others(call, views, is_first="cursor" not in call.request.query)
+    )
 
 
 @routes.route(
@@ -45,35 +51,53 @@ async def stream_usage(call: Call) -> web.StreamResponse:
             f"query parameter 'interval' must be {LEAST_INTERVAL_S} to {MOST_INTERVAL_S}"
         )
     with call.services.quotas.stream(call.caller):
-        return await _stream(call, call.scope, interval)
+        return await _stream(call, interval)
 
 
-async def _stream(call: Call, scope: str | None, interval: int) -> web.StreamResponse:
+async def _stream(call: Call, interval: int) -> web.StreamResponse:
     response = web.StreamResponse(
         headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     )
     await response.prepare(call.request)
     try:
-        await response.write(_frame(_usage(call, scope)))
+        await response.write(await _frame(call))
         while True:
             if not await call.lasts(interval):
                 await response.write(b": %s\n\n" % ENDED.encode())
                 return response
-            await response.write(_frame(_usage(call, scope)))
+            await response.write(await _frame(call))
     except ConnectionError:
         # The client disconnected: a stream does not end in another way from its side.
         return response
 
 
-def _usage(call: Call, scope: str | None) -> UsageOut:
-    services = call.services
-    views = UsageViews(services.state_service.tables, services.reconciler.book)
-    return UsageOut(
-        time=services.clock(),
-        containers=views.containers(scope),
-        machines=views.machines() if call.is_admin else [],
+async def _frame(call: Call) -> bytes:
+    views = _views(call)
+    usage = await whole(_listing(call, views), **_others(call, views, is_first=True))
+    return b"event: usage\ndata: %s\n\n" % usage
+
+
+def _listing(call: Call, views: UsageViews) -> Listing:
+    tables, scope = call.services.state_service.tables, call.scope
+
+    def items(key: str, span: Span) -> list[tuple[str, ContainerUsageOut]]:
+        container = tables.container(key)
+        return [] if container is None else [(name, views.container(container)) for name in span.of(("",))]
+
+    return Listing(
+        name="containers",
+        whole=lambda: [container.id for container in tables.containers(scope)],
+        keys=keys_of_users(tables, tables.endpoints, "containers_of", scope),
+        items=items,
     )
 
 
-def _frame(usage: UsageOut) -> bytes:
-    return b"event: usage\ndata: %s\n\n" % usage.model_dump_json().encode()
+def _others(call: Call, views: UsageViews, *, is_first: bool) -> dict[str, bytes]:
+    machines = views.machines() if call.is_admin and is_first else []
+    rows = b",".join(machine.model_dump_json().encode() for machine in machines)
+    return {"time": json.encode(call.services.clock()), "machines": b"[%s]" % rows}
+
+
+def _views(call: Call) -> UsageViews:
+    services = call.services
+    return UsageViews(services.state_service.tables, services.reconciler.book)

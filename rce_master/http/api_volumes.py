@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from rce_master.http.model import Model
+from typing import TYPE_CHECKING
+
+from rce_master.http.model import Model, Page
+from rce_master.http.paging import PAGE, Listing, Span, answer, keys_of_users
 from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.http.views import Views
 from rce_master.state import commands
+
+if TYPE_CHECKING:
+    from aiohttp import web
 
 routes = route_table("volumes")
 
@@ -33,22 +39,28 @@ class VolumeOut(Model):
     """Where that container sees it."""
 
 
-class VolumesOut(Model):
+class VolumesOut(Page):
     """Volumes."""
 
     volumes: list[VolumeOut]
 
 
-@routes.route("GET", "/volumes", "List volumes", reply=VolumesOut, query=_QUERY)
-async def list_volumes(call: Call) -> VolumesOut:
+@routes.route("GET", "/volumes", "List volumes", reply=VolumesOut, query=(*_QUERY, *PAGE))
+async def list_volumes(call: Call) -> web.Response:
     """List volumes."""
     tables = call.services.state_service.tables
     views = Views(tables, call.services.reconciler.usage)
     scope = call.scope
-    found = tables.volumes if scope is None else tables.volumes.by("user", scope)
-    return VolumesOut(
-        volumes=[VolumeOut(**views.volume(known)) for known in sorted(found, key=lambda known: known.id)]
-    )
+
+    def whole() -> list[str]:
+        return sorted(one.id for one in tables.volumes if scope in (None, one.user))
+
+    def items(key: str, span: Span) -> list[tuple[str, VolumeOut]]:
+        known = tables.volumes.get(key)
+        return [] if known is None else [(name, VolumeOut(**views.volume(known))) for name in span.of(("",))]
+
+    keys = keys_of_users(tables, tables.volumes, "user", scope)
+    return await answer(call, Listing(name="volumes", whole=whole, keys=keys, items=items))
 
 
 @routes.route("DELETE", "/volumes/{name}", "Remove a volume with its files", status=204, query=_QUERY)

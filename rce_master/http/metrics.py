@@ -19,7 +19,6 @@ from prometheus_client.registry import Collector
 
 from rce.control import EndpointUsage, InterfaceUsage, NodeUsage, Usage
 from rce_master.http.views import Views
-from rce_master.state import capacity
 from rce_master.state.lifecycle import ContainerPhase, RobotSession
 from rce_master.state.records import Container, Endpoint
 
@@ -98,7 +97,7 @@ class EngineCollector(Collector):
         yield _gauge(
             "rce_containers", "Containers by state.", "state", {p.value: phases[p] for p in ContainerPhase}
         )
-        nodes = Counter(node.state for c in tables.containers() for node in self._views.nodes(c))
+        nodes = Counter(state for c in tables.containers() for state in self._views.node_states(c))
         yield _gauge("rce_nodes", "Nodes by state.", "state", nodes)
         yield GaugeMetricFamily("rce_users", "Users.", value=len(tables.users))
         counted = {counter.name: counter.value for counter in tables.counters}
@@ -166,7 +165,7 @@ class ConsumptionCollector(Collector):
             for interface in self._tables.interfaces.by("endpoint", endpoint.id):
                 tag = interface.spec.tag
                 _interface(families, endpoint.id, tag, usage.interfaces.get(tag))
-        for room in capacity.rooms(self._tables, away=True).values():
+        for room in self._tables.rooms:
             _machine(families, room)
         yield from families
         yield GaugeMetricFamily(

@@ -11,6 +11,13 @@ class Model(BaseModel):
     model_config = ConfigDict(defer_build=True)
 
 
+class Page(Model):
+    """Base of answers that are a page of a list, or the whole list."""
+
+    next: str | None = None
+    """The cursor of the next page; null: there is none."""
+
+
 class Body(Model):
     """Base of request bodies; rejects unknown keys."""
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from rce_master.http.model import Body, Model
+from rce_master.http.model import Body, Model, Page
 
 ROLES = "^(viewer|user|operator|admin)$"
 Amount = int | float | str
@@ -251,22 +251,46 @@ class MachineOut(Model):
     """While the machine is drained: the containers that it still has."""
 
 
-class UsersOut(Model):
+class UsersOut(Page):
     """Users."""
 
     users: list[UserOut]
 
 
-class RobotsOut(Model):
+class RobotsOut(Page):
     """Robots."""
 
     robots: list[RobotOut]
 
 
-class MachinesOut(Model):
+class MachinesOut(Page):
     """Task sets and their machines."""
 
     machines: list[MachineOut]
+
+
+class EventOut(Model):
+    """An event."""
+
+    id: int
+    """Increases by one; by more across a restart."""
+    time: float
+    """Seconds since 1970."""
+    kind: str
+    """Such as ``robot_connected`` or ``node_failed``."""
+    user: str
+    """The owner; empty: for administrators only."""
+    subject: str
+    """The object of the event, such as ``user/container/node``."""
+    text: str
+
+
+class EventsOut(Page):
+    """Events, oldest first."""
+
+    events: list[EventOut]
+    newest: int
+    """Id of the newest event; where ``next`` is null, a later request continues there."""
 
 
 class LogOut(Model):

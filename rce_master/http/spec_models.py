@@ -27,7 +27,7 @@ from rce.model import (
 )
 from rce.model.spelling import Field, Spelling, fields_of
 from rce.model.written import Value
-from rce_master.http.model import Body, Model
+from rce_master.http.model import Body, Model, Page
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -246,31 +246,31 @@ class ConnectionOut(Model):
     """Whether both ends report it as open."""
 
 
-class ContainersOut(Model):
+class ContainersOut(Page):
     """Containers."""
 
     containers: list[ContainerOut]
 
 
-class NodesOut(Model):
+class NodesOut(Page):
     """Nodes."""
 
     nodes: list[NodeOut]
 
 
-class ParametersOut(Model):
+class ParametersOut(Page):
     """Parameters."""
 
     parameters: list[ParameterOut]
 
 
-class InterfacesOut(Model):
+class InterfacesOut(Page):
     """Interfaces."""
 
     interfaces: list[InterfaceOut]
 
 
-class ConnectionsOut(Model):
+class ConnectionsOut(Page):
     """Connections."""
 
     connections: list[ConnectionOut]

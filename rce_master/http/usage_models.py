@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rce_master.http.model import Model
+from rce_master.http.model import Model, Page
 
 
 class AdviceOut(Model):
@@ -85,11 +85,11 @@ class MachineUsageOut(Model):
     advice: list[AdviceOut]
 
 
-class UsageOut(Model):
-    """The present resource usage."""
+class UsageOut(Page):
+    """The present resource usage; ``next`` is about the containers."""
 
     time: float
     """Seconds since 1970."""
     containers: list[ContainerUsageOut]
     machines: list[MachineUsageOut]
-    """For administrators; else empty."""
+    """For administrators, and in the first page only; else empty."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from heapq import nsmallest
 from typing import TYPE_CHECKING
 
 from rce.control import EndpointUsage, NodeStatus, NodeUsage
 from rce_master import advice
 from rce_master.http import usage_models as models
-from rce_master.state import capacity
 from rce_master.usage import NO_RATES, History, UsageBook
 
 if TYPE_CHECKING:
@@ -33,13 +33,10 @@ class UsageViews:
     def __init__(self, tables: Tables, book: UsageBook) -> None:
         self._tables = tables
         self._book = book
-        self._rooms = capacity.rooms(tables, away=True)
+        self._rooms = {room.process: room for room in tables.rooms}
 
-    def containers(self, scope: str | None) -> list[models.ContainerUsageOut]:
-        """Show the containers of a user, or of all."""
-        return [self._container(container) for container in self._tables.containers(scope)]
-
-    def _container(self, container: Container) -> models.ContainerUsageOut:
+    def container(self, container: Container) -> models.ContainerUsageOut:
+        """Show a container."""
         history = self._book.history(container.task_set, container.id)
         usage = history.now.usage if history else _NOTHING
         rates = history.rates if history else NO_RATES
@@ -87,8 +84,11 @@ class UsageViews:
 
     def machines(self) -> list[models.MachineUsageOut]:
         """Show all container machines."""
+        # The emptiest one, and the one that takes its place when the advice is about the emptiest one itself.
+        open_ = (room for room in self._rooms.values() if not room.draining)
+        emptiest = nsmallest(2, open_, key=lambda room: room.load)
         return [
-            self._machine(room, [other for other in self._rooms.values() if other is not room])
+            self._machine(room, [other for other in emptiest if other is not room])
             for room in self._rooms.values()
         ]
 

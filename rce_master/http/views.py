@@ -10,13 +10,14 @@ from rce_master.http.spec_models import shown
 from rce_master.state import capacity
 from rce_master.state.records import Container, Endpoint, Robot, TaskSet, User, UserVolume
 from rce_master.state.volumes import holder_of
-from rce_master.state.wiring_records import Connection, Link, open_end_key
+from rce_master.state.wiring_records import Connection, Interface, open_end_key
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from rce_master.state.tables import Tables
 
+_UNKNOWN = "unknown"
 _NO_USAGE = EndpointUsage()
 _NO_INTERFACE_USAGE = InterfaceUsage()
 
@@ -39,8 +40,8 @@ class Views:
             name=user.name,
             role=user.role.value,
             created=user.created,
-            robots=len(self._tables.robots(user.name)),
-            containers=len(self._tables.containers(user.name)),
+            robots=self._tables.endpoints.count("robots_of", user.name),
+            containers=self._tables.endpoints.count("containers_of", user.name),
         )
 
     def robot(self, robot: Robot) -> models.RobotOut:
@@ -96,59 +97,58 @@ class Views:
             moving_to=move.to if (move := self._tables.moves.get(container.id)) else "",
         )
 
-    def nodes(self, container: Container) -> list[spec_models.NodeOut]:
-        """Show the nodes of a container."""
+    def node_states(self, container: Container) -> list[str]:
+        """Return the states of all nodes of a container."""
+        status = self._tables.container_live(container.id).status
+        reported = {node.tag: node.state.value for node in status.nodes} if status else {}
+        return [reported.get(tag, _UNKNOWN) for tag in container.nodes]
+
+    def nodes(self, container: Container, tags: Iterable[str]) -> list[spec_models.NodeOut]:
+        """Show nodes of a container."""
         status = self._tables.container_live(container.id).status
         reported = {node.tag: node for node in status.nodes} if status else {}
-        return [self._node(container, tag, reported.get(tag)) for tag in container.nodes]
+        return [self._node(container, tag, reported.get(tag)) for tag in tags]
 
     def _node(self, container: Container, tag: str, status: NodeStatus | None) -> spec_models.NodeOut:
         return spec_models.NodeOut(
             **shown(container.nodes[tag]),
             user=container.user,
             container=container.tag,
-            state=status.state.value if status else "unknown",
+            state=status.state.value if status else _UNKNOWN,
             pid=status.pid if status else 0,
             exit_code=status.exit_code if status else None,
             detail=status.detail if status else "",
             restarts=status.restarts if status else 0,
         )
 
-    def parameters(self, container: Container) -> list[spec_models.ParameterOut]:
-        """Show the parameters of a container."""
-        return [
-            spec_models.ParameterOut(user=container.user, container=container.tag, name=name, value=value)
-            for name, value in container.parameters.items()
-        ]
+    def parameter(self, container: Container, name: str) -> spec_models.ParameterOut:
+        """Show a parameter of a container."""
+        return spec_models.ParameterOut(
+            user=container.user, container=container.tag, name=name, value=container.parameters[name]
+        )
 
-    def interfaces(self, endpoint: Endpoint) -> list[spec_models.InterfaceOut]:
-        """Show the interfaces of a robot or container."""
+    def interface(self, endpoint: Endpoint, interface: Interface) -> spec_models.InterfaceOut:
+        """Show an interface of a robot or container."""
         usage = self.usage_of(endpoint).interfaces
-        return [
-            spec_models.InterfaceOut(
-                **shown(interface.spec),
-                user=endpoint.user,
-                endpoint=endpoint.tag,
-                active=interface.id in self._tables.active,
-                **_counters(usage.get(interface.spec.tag, _NO_INTERFACE_USAGE)),
-            )
-            for interface in self._tables.interfaces.by("endpoint", endpoint.id)
-        ]
+        return spec_models.InterfaceOut(
+            **shown(interface.spec),
+            user=endpoint.user,
+            endpoint=endpoint.tag,
+            active=interface.id in self._tables.active,
+            **_counters(usage.get(interface.spec.tag, _NO_INTERFACE_USAGE)),
+        )
 
-    def connections(self, link: Link) -> list[spec_models.ConnectionOut]:
-        """Show the connections of a link."""
-        user, _, tag_a = link.a.partition("/")
-        tag_b = link.b.partition("/")[2]
-        return [
-            spec_models.ConnectionOut(
-                id=c.id,
-                user=user,
-                tag_a=f"{tag_a}/{c.interface_a}",
-                tag_b=f"{tag_b}/{c.interface_b}",
-                established=self.is_established(c),
-            )
-            for c in self._tables.connections.by("link", link.id)
-        ]
+    def connection(self, connection: Connection) -> spec_models.ConnectionOut:
+        """Show a connection."""
+        user, _, tag_a = connection.a.partition("/")
+        tag_b = connection.b.partition("/")[2]
+        return spec_models.ConnectionOut(
+            id=connection.id,
+            user=user,
+            tag_a=f"{tag_a}/{connection.interface_a}",
+            tag_b=f"{tag_b}/{connection.interface_b}",
+            established=self.is_established(connection),
+        )
 
     def machine(self, task_set: TaskSet) -> models.MachineOut:
         """Show a task set."""

@@ -1,4 +1,4 @@
-"""The capacity and the promises of machines, from the tables; and the limits of one user's requests."""
+"""Where a container may be and where it belongs, from the tables; and the limits of one user's requests."""
 
 from __future__ import annotations
 
@@ -12,70 +12,62 @@ from rce_master.exceptions import ConflictError, ForbiddenError, InvalidRequestE
 from rce_master.state import limits, volumes
 from rce_master.state.placement import Room
 from rce_master.state.records import Container, TaskSet, UserRole, tombstone_key
+from rce_master.state.waiting import group_key
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
     from rce_master.state.changes import Transaction
     from rce_master.state.tables import Tables
 
 
-def is_draining(tables: Tables, task_set: TaskSet) -> bool:
-    """Whether a machine is being drained."""
-    return task_set.machine.draining or task_set.process in tables.drains
-
-
 def room_at(tables: Tables, task_set: TaskSet) -> Room:
-    """Sum up the promises of a machine: to its containers and to those that move there."""
-    placed = [e for e in tables.endpoints.by("task_set", task_set.process) if isinstance(e, Container)]
-    coming = [tables.container(move.id) for move in tables.moves.by("to", task_set.process)]
-    room = Room(
-        process=task_set.process,
-        machine=task_set.machine,
-        alias=_alias(tables, task_set),
-        draining=is_draining(tables, task_set),
+    """Return the room of a machine; that of a robot task set's has no promises."""
+    room = tables.rooms.get(task_set.process)
+    return room or Room(
+        process=task_set.process, machine=task_set.machine, draining=task_set.machine.draining
     )
-    return room.filled(container.resources for container in (*placed, *coming) if container is not None)
-
-
-def _alias(tables: Tables, task_set: TaskSet) -> str:
-    """Return a name that distinguishes task sets on the same machine."""
-    namesakes = sum(
-        s.machine.name == task_set.machine.name and s.kind is TaskSetKind.CONTAINER for s in tables.task_sets
-    )
-    return task_set.process if namesakes > 1 else ""
-
-
-def rooms(tables: Tables, *, away: bool = False) -> dict[str, Room]:
-    """Return all connected container machines, or also those that may still come back, by process."""
-    return {
-        task_set.process: room_at(tables, task_set)
-        for task_set in tables.task_sets
-        if task_set.kind is TaskSetKind.CONTAINER and (away or tables.is_connected(task_set.process))
-    }
 
 
 def group_mates(tables: Tables, container: Container) -> list[Container]:
     """Return the other containers that must be on the same machine: those of its group's network."""
-    requested = container.resources
-    if requested.network is not Network.GROUP:
+    if container.resources.network is not Network.GROUP:
         return []
-    return [
-        other
-        for other in tables.containers(container.user)
-        if other.id != container.id
-        and (other.resources.network, other.resources.group) == (Network.GROUP, requested.group)
-    ]
+    return [other for other in _of_group(tables, container) if other.resources.network is Network.GROUP]
 
 
-def open_to(tables: Tables, container: Container, found: dict[str, Room]) -> list[Room]:
-    """Return the machines where a container may be: with its group, and not where it is still ending."""
-    tied = {mate.task_set for mate in group_mates(tables, container) if mate.task_set}
-    return [
-        room
-        for room in found.values()
-        if (not tied or room.process in tied)
-        and tombstone_key(room.process, container.id) not in tables.tombstones
-        and volumes.admits(tables, container, room.process)
-    ]
+def _of_group(tables: Tables, container: Container) -> list[Container]:
+    """Return the other containers of a container's group, in its network or not."""
+    key = group_key(container)
+    found = tables.endpoints.by("group", key) if key else []
+    return [other for other in found if isinstance(other, Container) and other.id != container.id]
+
+
+def tied_to(tables: Tables, container: Container) -> Collection[str] | None:
+    """Return the processes of the only machines where a container may be; None: it may be on any.
+
+    It is bound to the machines of its group's network and to that of its volumes.
+    """
+    mates = {mate.task_set for mate in group_mates(tables, container) if mate.task_set}
+    place = volumes.tied_to(tables, container)
+    if place:
+        return mates & {place} if mates else {place}
+    return mates or None
+
+
+def admission(tables: Tables, container: Container) -> Callable[[str], bool]:
+    """Return what tells of a process whether its machine may have a container, whatever its room is.
+
+    It may not where the container, or one of the same name before it, or its volume, is still ending.
+    """
+    has_volumes = bool(container.resources.volumes)
+
+    def admits(process: str) -> bool:
+        if tombstone_key(process, container.id) in tables.tombstones:
+            return False
+        return not has_volumes or volumes.admits(tables, container, process)
+
+    return admits
 
 
 def company(tables: Tables, container: Container) -> Counter[str]:
@@ -89,13 +81,8 @@ def company(tables: Tables, container: Container) -> Counter[str]:
             continue
         peer = tables.endpoints[link.peer(container.id)]
         found.update(_processes_near(tables, peer.task_set))
-    group = container.resources.group
-    if group:
-        found.update(
-            other.task_set
-            for other in tables.containers(container.user)
-            if other.id != container.id and other.resources.group == group
-        )
+    if container.resources.group:
+        found.update(other.task_set for other in _of_group(tables, container))
     return found
 
 
@@ -103,16 +90,7 @@ def _processes_near(tables: Tables, process: str) -> list[str]:
     task_set = tables.task_sets.get(process)
     if task_set is None or task_set.kind is TaskSetKind.CONTAINER:
         return [process]
-    return [
-        other.process
-        for other in tables.task_sets
-        if other.kind is TaskSetKind.CONTAINER and other.machine.name == task_set.machine.name
-    ]
-
-
-def own(tables: Tables, container: Container) -> Counter[str]:
-    """Count, by process, the other containers of a container's user."""
-    return Counter(c.task_set for c in tables.containers(container.user) if c.id != container.id)
+    return [other.process for other in tables.task_sets.by("machine", task_set.machine.name)]
 
 
 # Limits of users' requests
@@ -135,11 +113,15 @@ def check_resources(tx: Transaction, user: str, id_: str, requested: Resources) 
             f"memory: {requested.memory / MEGABYTE:.3g} MB are too little; a container itself needs "
             f"{MIN_MEMORY // MEGABYTE} MB (a plain number is MB)"
         )
-    others = [c for c in tx.tables.containers(user) if c.id != id_]
-    _check_group(requested, others)
+    _check_group(tx.tables, Container(id=id_, resources=requested))
     if tx.tables.users[user].role is not UserRole.ADMIN:
         _check_privileges(requested)
-    limits.check_all_resources(tx, user, [requested, *(c.resources for c in others)])
+    known = tx.tables.container(id_)
+    total = tx.tables.requested.sum_of(user)
+    if known is not None:
+        total.add(known.resources, -1)
+    total.add(requested)
+    limits.check_all_resources(tx, user, total)
 
 
 def _check_privileges(requested: Resources) -> None:
@@ -149,13 +131,14 @@ def _check_privileges(requested: Resources) -> None:
         raise ForbiddenError("image: folders of the machine are for administrators; use an OCI image's name")
 
 
-def _check_group(requested: Resources, others: list[Container]) -> None:
+def _check_group(tables: Tables, container: Container) -> None:
+    requested = container.resources
     if requested.network is not Network.GROUP or not requested.group_ip:
         return
     address = _address(requested.group_ip)
-    for other in others:
+    for other in group_mates(tables, container):
         theirs = other.resources
-        if (theirs.network, theirs.group) != (Network.GROUP, requested.group) or not theirs.group_ip:
+        if not theirs.group_ip:
             continue
         there = _address(theirs.group_ip)
         if there.ip == address.ip:

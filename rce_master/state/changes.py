@@ -32,11 +32,11 @@ from rce_master.state.wiring_records import ActiveInterface, Connection, Interfa
 from rce_master.store.base import Row
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
-    from rce.control import TaskSetKind
     from rce_master.state.settings import StateSettings
-    from rce_master.state.tables import Table, Tables
+    from rce_master.state.table import Table
+    from rce_master.state.tables import Tables
 
 R = TypeVar("R")
 
@@ -121,6 +121,8 @@ class Changes:
     """Process names and endpoint ids: which task sets are to get which whole specs again."""
     wanted_statuses: list[tuple[str, str]] = field(default_factory=list)
     """Process names and endpoint ids: which task sets are to report which endpoints as a whole."""
+    unfinished: bool = False
+    """Whether work is left that a :class:`rce_master.state.commands.Continue` has to do."""
     _writes: list[_Write] = field(default_factory=list)
 
     def written(self) -> dict[tuple[str, str], Table[Any]]:
@@ -166,6 +168,7 @@ class Transaction:
         self.settings = settings
         self.changes = Changes()
         self._make_token = make_token
+        self._work_left = settings.max_work
 
     def put(
         self,
@@ -255,6 +258,17 @@ class Transaction:
         owner = subject.partition("/")[0] if user is None else user
         self.changes.events.append(StateEvent(kind, owner, subject, text))
 
+    def spend(self, work: int) -> None:
+        """Note work that may be continued by a later command."""
+        self._work_left -= work
+
+    def is_out_of_work(self) -> bool:
+        """Whether to leave the rest to a later command; notes that there is a rest."""
+        if self._work_left > 0:
+            return False
+        self.changes.unfinished = True
+        return True
+
     def seal(self) -> Changes:
         """Give every touched endpoint its new revision and return the changes."""
         touched = self.changes.touched
@@ -267,10 +281,6 @@ class Transaction:
                 self.changes.touched[id_] = parts
         return self.changes
 
-    def connected_task_sets(self, kind: TaskSetKind) -> Iterable[TaskSet]:
-        """List the task sets of a kind that are connected."""
-        return (s for s in self.tables.task_sets if s.kind is kind and self.tables.is_connected(s.process))
-
     def _assign(self, table: Table[R], record: R) -> None:
         key = table.key(record)
         before = table.get(key)
@@ -279,29 +289,31 @@ class Transaction:
             table.assign(key, record)
 
     def _table_of(self, record: Any) -> Table[Any]:
-        tables = self.tables
-        by_type: dict[type, Table[Any]] = {
-            User: tables.users,
-            Token: tables.tokens,
-            KnownLogin: tables.known_logins,
-            UserLimits: tables.user_limits,
-            PackageKey: tables.package_keys,
-            UserPackage: tables.packages,
-            UserVolume: tables.volumes,
-            VolumeRemoval: tables.volume_removals,
-            Robot: tables.endpoints,
-            Container: tables.endpoints,
-            Interface: tables.interfaces,
-            Link: tables.links,
-            Connection: tables.connections,
-            ActiveInterface: tables.active,
-            OpenEnd: tables.open_ends,
-            TaskSet: tables.task_sets,
-            RobotLive: tables.live,
-            ContainerLive: tables.live,
-            Presence: tables.presence,
-            Tombstone: tables.tombstones,
-            Drain: tables.drains,
-            Move: tables.moves,
-        }
-        return by_type[type(record)]
+        table: Table[Any] = getattr(self.tables, _TABLES[type(record)])
+        return table
+
+
+_TABLES: dict[type, str] = {
+    User: "users",
+    Token: "tokens",
+    KnownLogin: "known_logins",
+    UserLimits: "user_limits",
+    PackageKey: "package_keys",
+    UserPackage: "packages",
+    UserVolume: "volumes",
+    VolumeRemoval: "volume_removals",
+    Robot: "endpoints",
+    Container: "endpoints",
+    Interface: "interfaces",
+    Link: "links",
+    Connection: "connections",
+    ActiveInterface: "active",
+    OpenEnd: "open_ends",
+    TaskSet: "task_sets",
+    RobotLive: "live",
+    ContainerLive: "live",
+    Presence: "presence",
+    Tombstone: "tombstones",
+    Drain: "drains",
+    Move: "moves",
+}

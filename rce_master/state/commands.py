@@ -256,6 +256,11 @@ class SetDraining:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Continue:
+    """Do more of the work that a command left over (:attr:`rce_master.state.changes.Changes.unfinished`)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Tick:
     """Time passed: grace times end, waiting containers are placed."""
 
@@ -407,6 +412,7 @@ Command: TypeAlias = (
     | RobotLogin
     | RobotLeft
     | SetDraining
+    | Continue
     | Tick
     | Request
 )

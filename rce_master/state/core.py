@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import secrets
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +33,7 @@ from rce_master.state.specs import build_patch, build_spec
 from rce_master.state.tables import Tables
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from rce.control import EndpointSpec, SpecPatch
     from rce_master.store.base import Snapshot
@@ -62,6 +64,7 @@ _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
     commands.FaultReported: task_sets.fault,
     commands.RobotLogin: robots.login,
     commands.RobotLeft: robots.left,
+    commands.Continue: task_sets.continue_work,
     commands.Tick: task_sets.tick,
     commands.SetDraining: draining.set_draining,
     commands.ResizeContainer: resizing.resize_container,
@@ -93,6 +96,18 @@ _HANDLERS[commands.VolumeRemoved] = _remove_and_place
 
 def _new_token() -> str:
     return secrets.token_hex(24)
+
+
+@contextlib.contextmanager
+def _without_collections() -> Iterator[None]:
+    """Make many objects that stay: looking for garbage among them would take as long as making them."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 class State:
@@ -131,13 +146,14 @@ class State:
             StoreError: A record cannot be read.
         """
         state = cls(settings)
-        try:
-            snapshot = converted(snapshot)
-            for table in state.tables.all:
-                table.load(snapshot.get(table.name, {}))
-        except msgspec.MsgspecError as error:
-            raise StoreError(f"a record in the store cannot be read: {error}") from error
-        task_sets.restart(state._begin(now), revision)
+        with _without_collections():
+            try:
+                snapshot = converted(snapshot)
+                for table in state.tables.all:
+                    table.load(snapshot.get(table.name, {}))
+            except msgspec.MsgspecError as error:
+                raise StoreError(f"a record in the store cannot be read: {error}") from error
+            task_sets.restart(state._begin(now), revision)
         return state
 
     def apply(self, command: commands.Command, now: float) -> Changes:

@@ -20,16 +20,20 @@ from rce.control import EndpointState, EndpointStatus, NodeState, TaskSetKind, w
 from rce_master.exceptions import NotFoundError
 from rce_master.state import activity, capacity, endpoints, placing, volumes
 from rce_master.state.lifecycle import ContainerEvent
-from rce_master.state.placement import Room, choose, refusals
-from rce_master.state.records import Container, Drain, Move, TaskSet, tombstone_key
+from rce_master.state.placement import Room, best_of, refusals
+from rce_master.state.records import Container, Drain, Move
 
 if TYPE_CHECKING:
+    from rce.model import Resources
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import SetDraining
     from rce_master.state.tables import Tables
 
 _NOT_YET = frozenset({NodeState.WAITING, NodeState.STARTING})
 _UP = frozenset({NodeState.RUNNING, NodeState.EXITED})
+_LOOK = 10
+"""The work of looking at a container, as :attr:`StateSettings.max_work` counts it; and of a move."""
+_MOVE = 100
 
 
 def set_draining(tx: Transaction, command: SetDraining) -> None:
@@ -64,85 +68,120 @@ def _processes(tables: Tables, name: str) -> list[str]:
 
 def advance(tx: Transaction) -> None:
     """Begin the next move from each machine that is draining, and give up moves that take too long."""
+    begin_round(tx)
+    continue_round(tx)
+
+
+def begin_round(tx: Transaction) -> None:
+    """Note that all machines that are draining have to be looked at."""
+    for process in tx.tables.rooms.draining:
+        tx.tables.drain_round.setdefault(process, 0)
+
+
+def continue_round(tx: Transaction) -> None:
+    """Look at as many machines that are draining as a command may."""
     for move in list(tx.tables.moves):
         if tx.now - move.since >= tx.settings.move_timeout:
+            if tx.is_out_of_work():
+                return
+            tx.spend(_MOVE)
             give_up(tx, move, f"did not come up there within {tx.settings.move_timeout:.0f} s")
-    for task_set in list(tx.connected_task_sets(TaskSetKind.CONTAINER)):
-        if capacity.is_draining(tx.tables, task_set):
-            _advance(tx, task_set)
+    waiting, draining = tx.tables.drain_round, set(tx.tables.rooms.draining)
+    search = _Search(tx)
+    while waiting and not tx.is_out_of_work():
+        process = next(iter(waiting))
+        if process not in draining or _advance(tx, process, search):
+            del waiting[process]
 
 
-def _advance(tx: Transaction, task_set: TaskSet) -> None:
-    here = [e for e in tx.tables.endpoints.by("task_set", task_set.process) if isinstance(e, Container)]
+def _advance(tx: Transaction, process: str, search: _Search) -> bool:
+    """Begin the next move from a machine; return whether it is done with, for now."""
+    here = [e for e in tx.tables.endpoints.by("task_set", process) if isinstance(e, Container)]
     if any(container.id in tx.tables.moves for container in here):
-        return
-    for container in sorted(here, key=lambda c: c.number):
-        live = tx.tables.container_live(container.id)
-        if tx.now < live.rest_until:
+        return True
+    reached = tx.tables.drain_round[process]
+    for container in sorted((one for one in here if one.number > reached), key=lambda c: c.number):
+        if tx.now < tx.tables.container_live(container.id).rest_until:
             continue
+        if tx.is_out_of_work():
+            return False
+        tx.spend(_LOOK)
         unit = _unit(tx.tables, container)
-        target = _target(tx, unit)
+        target = search.target(unit)
         if target:
+            tx.spend(_MOVE * len(unit))
             for each in unit:
                 _begin(tx, each, target)
-            return
-        _stay(tx, container, obstacle(tx.tables, container))
+            return True
+        _stay(tx, container, search.obstacle(unit))
+        tx.tables.drain_round[process] = container.number
+    return True
+
+
+class _Search:
+    """Finds machines for containers that are to move; remembers what no machine takes.
+
+    Rooms only fill up meanwhile: what found none finds none later.
+    """
+
+    def __init__(self, tx: Transaction) -> None:
+        self._tx = tx
+        self._too_much: set[Resources] = set()
+        self._texts: dict[tuple[str, Resources], str] = {}
+
+    def target(self, unit: list[Container]) -> str:
+        """Return a machine that takes all of some containers; empty if none does."""
+        tx, first = self._tx, unit[0]
+        requested, tables = first.resources, tx.tables
+        if requested in self._too_much:
+            return ""
+
+        def admits(process: str) -> bool:
+            return all(capacity.admission(tables, each)(process) for each in unit) and _takes_all(
+                tables.rooms.get(process), unit
+            )
+
+        company = capacity.company(tables, first)
+        found = tables.rooms.candidates(requested, admits, near=company)
+        tx.spend(found.looks)
+        if not found.rooms and not tables.rooms.candidates(requested, lambda _: True, most=1).rooms:
+            self._too_much.add(requested)
+        room = best_of(found.rooms, requested, company=company, own=tables.rooms.of_user(first.user))
+        return room.process if room is not None else ""
+
+    def obstacle(self, unit: list[Container]) -> str:
+        """Report why containers cannot be handed over."""
+        tables, first = self._tx.tables, unit[0]
+        bound = next((each for each in unit if volumes.tied_to(tables, each)), None)
+        if bound is not None:
+            return f"the volumes of container {bound.tag!r} are on this machine and stay there"
+        mates = len(unit) - 1
+        whole = f"it moves with {mates} others of its group; " if mates else ""
+        key = (first.task_set, first.resources)
+        if key not in self._texts:
+            rooms = [room for room in tables.rooms.connected if room.process != first.task_set]
+            self._tx.spend(len(rooms))
+            self._texts[key] = refusals(rooms, first.resources) if rooms else "there is no other machine"
+        said = "no machine has room for all of them" if mates else "it is about to move"
+        return whole + (self._texts[key] or said)
+
+
+def _takes_all(room: Room | None, unit: list[Container]) -> bool:
+    """Whether a machine has room for all of some containers together."""
+    if room is None:
+        return False
+    for each in unit:
+        if not room.fits(each.resources):
+            return False
+        if len(unit) > 1:
+            room = room.with_(each.resources)
+    return True
 
 
 def _unit(tables: Tables, container: Container) -> list[Container]:
     """Return the containers that move together with a container, itself first."""
     mates = capacity.group_mates(tables, container)
     return [container, *(mate for mate in mates if mate.task_set == container.task_set)]
-
-
-def _target(tx: Transaction, unit: list[Container]) -> str:
-    """Return a machine that takes all of some containers; empty if none does."""
-    rooms = capacity.rooms(tx.tables)
-    first = unit[0]
-    company, own = capacity.company(tx.tables, first), capacity.own(tx.tables, first)
-    while rooms:
-        room = choose(
-            [r for r in rooms.values() if _open(tx, unit, r.process)],
-            first.resources,
-            company=company,
-            own=own,
-        )
-        if room is None:
-            return ""
-        process = room.process
-        filled = room.with_(first.resources)
-        for other in unit[1:]:
-            filled = filled.with_(other.resources) if filled.fits(other.resources) else filled
-        if filled.containers == room.containers + len(unit):
-            return process
-        del rooms[process]
-    return ""
-
-
-def _open(tx: Transaction, unit: list[Container], process: str) -> bool:
-    return all(
-        tombstone_key(process, each.id) not in tx.tables.tombstones
-        and volumes.admits(tx.tables, each, process)
-        for each in unit
-    )
-
-
-def obstacle(tables: Tables, container: Container) -> str:
-    """Report why a container cannot be handed over."""
-    rooms = [r for r in capacity.rooms(tables).values() if r.process != container.task_set]
-    unit = _unit(tables, container)
-    bound = next((each for each in unit if volumes.tied_to(tables, each)), None)
-    if bound is not None:
-        return f"the volumes of container {bound.tag!r} are on this machine and stay there"
-    mates = len(unit) - 1
-    whole = f"it moves with {mates} others of its group; " if mates else ""
-    return whole + (refusals(rooms, container.resources) or _nothing_said(rooms, mates))
-
-
-def _nothing_said(rooms: list[Room], mates: int) -> str:
-    if not rooms:
-        return "there is no other machine"
-    return "no machine has room for all of them" if mates else "it is about to move"
 
 
 def _begin(tx: Transaction, container: Container, to: str) -> None:

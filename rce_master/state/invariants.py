@@ -6,9 +6,11 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from rce.control import TaskSetKind
-from rce.model import EndpointId, Form, InterfaceType, Role
-from rce_master.state import endpoints
+from rce.model import EndpointId, Form, InterfaceType, Resources, Role
+from rce_master.state import capacity, endpoints
 from rce_master.state.lifecycle import RobotSession
+from rce_master.state.placement import Room
+from rce_master.state.promises import Promises
 from rce_master.state.records import Container, ContainerLive, Endpoint, Robot, RobotLive
 
 if TYPE_CHECKING:
@@ -23,6 +25,8 @@ def validate(tables: Tables) -> None:
         AssertionError: An invariant does not hold; the text says which.
     """
     _check_indexes(tables)
+    _check_rooms(tables)
+    _check_queue(tables)
     for endpoint in tables.endpoints:
         _check_endpoint(tables, endpoint)
     for link in tables.links:
@@ -43,6 +47,59 @@ def _check_indexes(tables: Tables) -> None:
             computed = {value: sorted(keys) for value, keys in table.computed_entries(index).items()}
             assert kept == computed, f"{table.name}: index {index} is out of date"
         assert table.totals == table.computed_totals, f"{table.name}: totals are out of date"
+
+
+def _check_rooms(tables: Tables) -> None:
+    """Compare the rooms with a new count of all containers."""
+    promised, requested = Promises(), Promises()
+    of_users: dict[str, Counter[str]] = {}
+    for container in tables.containers():
+        requested.add(container.user, container.resources)
+        if container.task_set:
+            promised.add(container.task_set, container.resources)
+            of_users.setdefault(container.user, Counter())[container.task_set] += 1
+    for move in tables.moves:
+        coming = tables.container(move.id)
+        if coming is not None:
+            promised.add(move.to, coming.resources)
+    assert tables.rooms.promises.sums == promised.sums, "promises of machines are out of date"
+    assert tables.requested.sums == requested.sums, "what users ask for is out of date"
+    for user in tables.users:
+        assert tables.rooms.of_user(user.name) == of_users.get(user.name, {}), f"{user.name}: places"
+    machines = [s for s in tables.task_sets if s.kind is TaskSetKind.CONTAINER]
+    names = Counter(s.machine.name for s in machines)
+    computed = {
+        s.process: Room(
+            process=s.process,
+            machine=s.machine,
+            alias=s.process if names[s.machine.name] > 1 else "",
+            draining=s.machine.draining or s.process in tables.drains,
+            slots=(sums := promised.sum_of(s.process)).slots,
+            cpu=sums.cpu,
+            memory=sums.memory_of(s.machine.memory // s.machine.slots if s.machine.slots else 0),
+            containers=sums.containers,
+        )
+        for s in machines
+    }
+    assert {room.process: room for room in tables.rooms} == computed, "rooms are out of date"
+    open_ = [room for room in computed.values() if tables.is_connected(room.process) and not room.draining]
+    order = sorted(open_, key=lambda room: (room.load_with(Resources()), room.process))
+    assert tables.rooms.order == [room.process for room in order], "the order of machines is out of date"
+
+
+def _check_queue(tables: Tables) -> None:
+    """Check that all that wait are in the queue, and that what need not be looked at fits nowhere."""
+    waiting = sorted((c for c in tables.containers() if not c.task_set), key=lambda c: c.number)
+    assert tables.queue.waiting == [c.id for c in waiting], "the queue is out of date"
+    if tables.queue.has_work:
+        return
+    for container in waiting:
+        tied, admits = capacity.tied_to(tables, container), capacity.admission(tables, container)
+        for room in tables.rooms.connected:
+            is_open = (tied is None or room.process in tied) and admits(room.process)
+            assert not (is_open and room.fits(container.resources)), (
+                f"{container.id}: waits, and {room.process} has room"
+            )
 
 
 def _check_endpoint(tables: Tables, endpoint: Endpoint) -> None:

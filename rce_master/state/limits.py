@@ -6,16 +6,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec.structs import asdict, replace
 
-from rce.control import TaskSetKind
-from rce.model import MEGABYTE, Resources, write_cores
+from rce.model import MEGABYTE, write_cores
 from rce_master.exceptions import LimitReachedError, NotFoundError
 from rce_master.state.records import UserLimits, UserRole
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import SetLimits
+    from rce_master.state.promises import Promise
     from rce_master.state.settings import StateSettings
     from rce_master.state.tables import Tables
 
@@ -69,11 +67,11 @@ def limit_of(tables: Tables, settings: StateSettings, user: str, kind: str) -> L
 
 def used_of(tables: Tables, user: str) -> dict[str, float]:
     """Return a user's usage of each kind."""
-    all_requested = [container.resources for container in tables.containers(user)]
+    requested = tables.requested.sum_of(user)
     packages = tables.packages.by("user", user)
     return {
-        "containers": len(all_requested),
-        **{kind: _asked(all_requested, kind) for kind in _OF_MACHINES},
+        "containers": requested.containers,
+        **{kind: _asked(requested, kind) for kind in _OF_MACHINES},
         "packages": len(packages),
         "disk": sum(package.size for package in packages)
         + sum(volume.size for volume in tables.volumes.by("user", user)),
@@ -87,13 +85,13 @@ def check_containers(tx: Transaction, user: str) -> None:
         LimitReachedError: The limit is reached.
     """
     limit = limit_of(tx.tables, tx.settings, user, "containers")
-    if limit.most and len(tx.tables.containers(user)) >= limit.most:
+    if limit.most and tx.tables.endpoints.count("containers_of", user) >= limit.most:
         raise LimitReachedError(
             f"you have {limit.most:g} containers already; destroy one first, or {_advice(user, 'containers')}"
         )
 
 
-def check_all_resources(tx: Transaction, user: str, all_requested: list[Resources]) -> None:
+def check_all_resources(tx: Transaction, user: str, total: Promise) -> None:
     """Check the total of the requests of a user's containers.
 
     Raises:
@@ -101,7 +99,7 @@ def check_all_resources(tx: Transaction, user: str, all_requested: list[Resource
     """
     for kind in _OF_MACHINES:
         limit = limit_of(tx.tables, tx.settings, user, kind)
-        asked = _asked(all_requested, kind)
+        asked = _asked(total, kind)
         if limit.most and asked > limit.most + _EPSILON:
             share = (
                 f", {tx.settings.user_share:.0%} of what the machines have"
@@ -154,14 +152,12 @@ _SETTINGS = {
 
 def _offered(tables: Tables, kind: str) -> float:
     """Sum up the resources of all known machines, including those that are away."""
-    machines = [s.machine for s in tables.task_sets if s.kind is TaskSetKind.CONTAINER]
-    return sum({"slots": m.slots, "cpu": m.cores, "memory": m.memory}[kind] for m in machines)
+    offered = tables.rooms.offered
+    return {"slots": offered.slots, "cpu": offered.cores, "memory": offered.memory}[kind]
 
 
-def _asked(all_requested: Iterable[Resources], kind: str) -> float:
-    if kind == "slots":
-        return sum(max(1, requested.size) for requested in all_requested)
-    return sum(requested.cpu if kind == "cpu" else requested.memory for requested in all_requested)
+def _asked(total: Promise, kind: str) -> float:
+    return {"slots": total.slots, "cpu": total.cpu, "memory": total.memory}[kind]
 
 
 def _plain(kind: str, amount: float) -> str:

@@ -152,7 +152,18 @@ class Room:
 
     def fits(self, requested: Resources) -> bool:
         """Whether it takes a container now."""
-        return not self.obstacles(requested) and not self.shortages(requested)
+        machine, slots = self.machine, max(1, requested.size)
+        # The same as :meth:`shortages`, without texts: this is asked of many machines for each container.
+        if machine.slots and slots > machine.slots - self.slots:
+            return False
+        if machine.cores and requested.cpu > machine.cores - self.cpu + _TINY:
+            return False
+        if machine.memory and (requested.memory or slots * self._share) > machine.memory - self.memory:
+            return False
+        is_plain = not (requested.special_features or requested.image or requested.volumes)
+        if is_plain and requested.network is Network.NONE:
+            return not self.draining
+        return not self.obstacles(requested)
 
     def why_not(self, requested: Resources) -> str:
         """Say why it does not take a container now; empty if it does."""
@@ -173,8 +184,28 @@ class Room:
     @property
     def load(self) -> float:
         """How much is promised of what it is shortest of."""
-        crowd = 0.0 if self.machine.slots else self.containers / (CROWD * max(1, self.machine.cores))
-        return max(crowd, *self.shares.values(), 0.0)
+        return self._load(self.slots, self.cpu, self.memory, self.containers)
+
+    def load_with(self, requested: Resources) -> float:
+        """Return the load with one more container; as that of :meth:`with_`, but quick."""
+        slots = max(1, requested.size)
+        memory = requested.memory or slots * self._share
+        return self._load(
+            self.slots + slots, self.cpu + requested.cpu, self.memory + memory, self.containers + 1
+        )
+
+    def _load(self, slots: int, cpu: float, memory: int, containers: int) -> float:
+        machine = self.machine
+        load = 0.0
+        if machine.slots:
+            load = slots / machine.slots
+        elif containers:
+            load = containers / (CROWD * max(1, machine.cores))
+        if machine.cores:
+            load = max(load, cpu / machine.cores)
+        if machine.memory:
+            load = max(load, memory / machine.memory)
+        return load
 
 
 def choose(
@@ -195,10 +226,21 @@ def choose(
     Returns:
         The best, or None if it fits nowhere.
     """
-    fitting = [room for room in rooms if room.fits(requested)]
+    return best_of((room for room in rooms if room.fits(requested)), requested, company=company, own=own)
+
+
+def best_of(
+    rooms: Iterable[Room],
+    requested: Resources,
+    *,
+    company: Mapping[str, int] | None = None,
+    own: Mapping[str, int] | None = None,
+) -> Room | None:
+    """Choose the machine for a container of those that take it; the arguments are as for :func:`choose`."""
+    fitting = list(rooms)
     if not fitting:
         return None
-    loads = {room.process: room.with_(requested).load for room in fitting}
+    loads = {room.process: room.load_with(requested) for room in fitting}
     near = min(loads.values()) + DETOUR + _TINY
     company, own = company or {}, own or {}
 
@@ -211,7 +253,13 @@ def choose(
 
 
 def refusals(rooms: Iterable[Room], requested: Resources, *, most: int = 8) -> str:
-    """Say of each machine why it does not take a container."""
-    found = [text for room in rooms if (text := room.why_not(requested))]
-    more = f"; and {len(found) - most} more machines" if len(found) > most else ""
-    return "; ".join(found[:most]) + more
+    """Say of the first few machines why they do not take a container, and how many more do not."""
+    found: list[str] = []
+    more = 0
+    for room in rooms:
+        if len(found) < most:
+            if text := room.why_not(requested):
+                found.append(text)
+        elif not room.fits(requested):
+            more += 1
+    return "; ".join(found) + (f"; and {more} more machines" if more else "")

@@ -8,6 +8,8 @@
   each that fits is placed: one passes another only while that one fits nowhere. No room is kept free for
   large ones, because the end of a container cannot be predicted; an operator makes room by ``rce drain`` or
   ``rce resize``.
+- A command looks at as many as :attr:`StateSettings.max_work` allows; the next ones continue there
+  (:mod:`rce_master.state.waiting`).
 """
 
 from __future__ import annotations
@@ -19,12 +21,22 @@ from msgspec.structs import replace
 from rce_master.exceptions import NoRoomError
 from rce_master.state import capacity, volumes
 from rce_master.state.lifecycle import ContainerEvent
-from rce_master.state.placement import Room, choose, refusals
+from rce_master.state.placement import Room, best_of, refusals
 from rce_master.state.records import Container, ContainerLive
+from rce_master.state.tables import WAITING
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from rce.model import Resources
     from rce_master.state.changes import Transaction
+    from rce_master.state.tables import Tables
+
+_LOOK = 8
+"""The work of looking at a container, as :attr:`StateSettings.max_work` counts it; then of placing one, and
+of telling its user that it waits. Each machine that is looked at for it counts beside that."""
+_PLACING = 200
+_TELLING = 100
 
 
 def admit(tx: Transaction, container: Container, *, wait: bool) -> None:
@@ -33,12 +45,9 @@ def admit(tx: Transaction, container: Container, *, wait: bool) -> None:
     Raises:
         NoRoomError: No machine takes it, and its user does not want to wait.
     """
-    known = capacity.rooms(tx.tables, away=True)
-    if not any(tx.tables.is_connected(process) for process in known):
+    if not tx.tables.rooms.is_any_connected or _is_admitted(tx.tables, container):
         return
-    if any(room.fits(container.resources) for room in _with_group(tx, container, known)):
-        return
-    why = _why_nowhere(tx, container, capacity.rooms(tx.tables))
+    why = _why_nowhere(tx, container, {})
     if not wait:
         raise NoRoomError(
             f"no machine takes container {container.tag!r} now: {why}; to wait for room, ask with wait"
@@ -46,37 +55,76 @@ def admit(tx: Transaction, container: Container, *, wait: bool) -> None:
     _tell(tx, container, why)
 
 
-def place_waiting(tx: Transaction) -> None:
-    """Place every unplaced container that fits on a machine."""
-    waiting = [e for e in tx.tables.endpoints.by("task_set", "") if isinstance(e, Container)]
-    if not waiting:
-        return
-    rooms = capacity.rooms(tx.tables)
-    too_much: set[Resources] = set()  # rooms only fill up here: what found none finds none later
-    for container in sorted(waiting, key=lambda c: c.number):
-        requested = container.resources
-        if requested in too_much:
-            continue
-        if not any(room.fits(requested) for room in rooms.values()):
-            too_much.add(requested)
-            continue
-        room = best(tx, container, rooms)
-        if room is not None:
-            told = tx.tables.container_live(container.id).told
-            bind(tx, container, room.process)
-            rooms[room.process] = room.with_(container.resources)
-            if told:
-                tx.notify(container.user, f"container {container.tag!r} has a machine now: {room.name}")
+def _is_admitted(tables: Tables, container: Container) -> bool:
+    """Whether a machine takes a container now or soon: it may be away, or still end what it was before."""
 
+    def admits(process: str) -> bool:
+        return volumes.admits(tables, container, process)
 
-def best(tx: Transaction, container: Container, rooms: dict[str, Room]) -> Room | None:
-    """Choose, of machines, the best one for a container; None if none takes it."""
-    return choose(
-        capacity.open_to(tx.tables, container, rooms),
-        container.resources,
-        company=capacity.company(tx.tables, container),
-        own=capacity.own(tx.tables, container),
+    requested, tied = container.resources, capacity.tied_to(tables, container)
+    if tables.rooms.candidates(requested, admits, among=tied, most=1).rooms:
+        return True
+    return any(
+        room.fits(requested) and (tied is None or room.process in tied) and admits(room.process)
+        for room in tables.rooms.away
     )
+
+
+def place_waiting(tx: Transaction) -> None:
+    """Place the unplaced containers that fit on a machine."""
+    queue, rooms = tx.tables.queue, tx.tables.rooms
+    too_much: set[tuple[bool, Resources]] = set()
+    for look in queue.looks():
+        if tx.is_out_of_work():
+            return
+        container = tx.tables.container(look.id)
+        assert container is not None
+        tx.spend(_LOOK)
+        # Rooms only fill up here: what found none finds none later.
+        hopeless = (look.among is None, container.resources)
+        if hopeless in too_much:
+            continue
+        found = rooms.candidates(container.resources, _anywhere, among=look.among, most=1)
+        if not found.rooms:
+            tx.spend(found.looks)
+            too_much.add(hopeless)
+            continue
+        room = best(tx, container, look.among)
+        if room is None:
+            continue
+        told = tx.tables.container_live(container.id).told
+        bind(tx, container, room.process)
+        tx.spend(_PLACING)
+        if told:
+            tx.notify(container.user, f"container {container.tag!r} has a machine now: {room.name}")
+
+
+def _anywhere(_: str) -> bool:
+    return True
+
+
+def best(tx: Transaction, container: Container, among: Collection[str] | None = None) -> Room | None:
+    """Choose the machine for a container.
+
+    Args:
+        tx: The transaction.
+        container: The container.
+        among: Processes of the only machines that may be taken; None: all.
+
+    Returns:
+        The best of the candidates; None if no machine takes it.
+    """
+    tables = tx.tables
+    tied = capacity.tied_to(tables, container)
+    if tied is not None:
+        among = tied if among is None else [process for process in among if process in tied]
+    company = capacity.company(tables, container)
+    found = tables.rooms.candidates(
+        container.resources, capacity.admission(tables, container), among=among, near=company
+    )
+    tx.spend(found.looks)
+    own = tables.rooms.of_user(container.user)
+    return best_of(found.rooms, container.resources, company=company, own=own)
 
 
 def bind(tx: Transaction, container: Container, process: str) -> None:
@@ -96,14 +144,17 @@ def happened(tx: Transaction, id_: str, event: ContainerEvent) -> None:
 
 def tell_waiting(tx: Transaction) -> None:
     """Tell users once of containers that have been waiting for a machine for long."""
-    rooms: dict[str, Room] | None = None
-    for endpoint in tx.tables.endpoints.by("task_set", ""):
-        live = tx.tables.live[endpoint.id]
-        if not isinstance(endpoint, Container) or not isinstance(live, ContainerLive) or live.told:
+    texts: dict[Resources, str] = {}
+    for live in tx.tables.live.by("untold", WAITING):
+        assert isinstance(live, ContainerLive)
+        if tx.now - live.since < tx.settings.placement_timeout:
             continue
-        if tx.now - live.since >= tx.settings.placement_timeout:
-            rooms = capacity.rooms(tx.tables) if rooms is None else rooms
-            _tell(tx, endpoint, _why_nowhere(tx, endpoint, rooms))
+        if tx.is_out_of_work():
+            return
+        container = tx.tables.container(live.id)
+        assert container is not None
+        tx.spend(_TELLING)
+        _tell(tx, container, _why_nowhere(tx, container, texts))
 
 
 def _tell(tx: Transaction, container: Container, why: str) -> None:
@@ -113,23 +164,30 @@ def _tell(tx: Transaction, container: Container, why: str) -> None:
     tx.happen("container_waiting", container.id, text)
 
 
-def _why_nowhere(tx: Transaction, container: Container, rooms: dict[str, Room]) -> str:
-    if not rooms:
+def _why_nowhere(tx: Transaction, container: Container, texts: dict[Resources, str]) -> str:
+    """Say why no machine takes a container.
+
+    Args:
+        tx: The transaction.
+        container: The container.
+        texts: The texts for containers that are not bound to a machine, which others like them use too.
+    """
+    requested, tables, rooms = container.resources, tx.tables, tx.tables.rooms
+    if not rooms.is_any_connected:
         return "no container task set is connected"
-    open_ = capacity.open_to(tx.tables, container, rooms)
-    place = volumes.tied_to(tx.tables, container)
-    if place and place not in rooms:
-        names = ", ".join(volume.name for volume in container.resources.volumes)
+    place, tied = volumes.tied_to(tables, container), capacity.tied_to(tables, container)
+    connected = rooms.connected
+    if place and all(room.process != place for room in connected):
+        names = ", ".join(volume.name for volume in requested.volumes)
         return f"the machine with its volumes ({names}) is away: {place}"
-    if not open_ and capacity.group_mates(tx.tables, container):
-        return f"the machine with its group {container.resources.group!r} is away"
-    return refusals(open_, container.resources) or "what it was before is still ending"
-
-
-def _with_group(tx: Transaction, container: Container, rooms: dict[str, Room]) -> list[Room]:
-    tied = {mate.task_set for mate in capacity.group_mates(tx.tables, container) if mate.task_set}
-    return [
-        room
-        for room in rooms.values()
-        if (not tied or room.process in tied) and volumes.admits(tx.tables, container, room.process)
-    ]
+    if tied is None and requested in texts:
+        return texts[requested]
+    tx.spend(2 * len(connected))
+    admits = capacity.admission(tables, container)
+    open_ = [room for room in connected if (tied is None or room.process in tied) and admits(room.process)]
+    if not open_ and tied is not None:
+        return f"the machine with its group {requested.group!r} is away"
+    text = refusals(open_, requested)
+    if text and tied is None and len(open_) == len(connected):
+        texts[requested] = text
+    return text or "what it was before is still ending"

@@ -18,10 +18,14 @@ from rce_master.exceptions import (
 from rce_master.state import activity, endpoints
 from rce_master.state.lifecycle import RobotEvent, RobotSession
 from rce_master.state.records import Robot, RobotLive
+from rce_master.state.tables import WAITING
 
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import RobotLeft, RobotLogin
+
+_REMOVAL = 100
+"""The work of removing a robot or a connection, as :attr:`StateSettings.max_work` counts it."""
 
 
 def login(tx: Transaction, command: RobotLogin) -> None:
@@ -131,10 +135,15 @@ def reported(tx: Transaction, robot: Robot, status: EndpointStatus) -> None:
 
 def expire(tx: Transaction) -> None:
     """Remove the robots whose grace time is over, and give up those that were let in and never came."""
-    for robot in tx.tables.robots():
-        live = tx.tables.robot_live(robot.id)
+    for live in tx.tables.live.by("unsettled", WAITING):
+        robot = tx.tables.robot(live.id)
+        assert robot is not None
+        assert isinstance(live, RobotLive)
         waited = tx.now - live.since
         if live.session is RobotSession.ABSENT and waited >= tx.settings.robot_grace:
+            if tx.is_out_of_work():
+                return
+            tx.spend(_REMOVAL * (1 + tx.tables.connections.count("endpoint", robot.id)))
             live.after(RobotEvent.EXPIRE, tx.now)  # it is checked, and nothing is left to record
             endpoints.remove(tx, robot.id, "the robot stayed away")
             tx.happen("robot_gone", robot.id, "its interfaces and connections were removed")

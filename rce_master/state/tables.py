@@ -1,11 +1,12 @@
-"""The tables that hold the state's records, their indexes, and their form in the store."""
+"""The tables that hold the state's records, and what is derived from them."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any
 
-import msgspec
-
+from rce.control import TaskSetKind
+from rce_master.state.lifecycle import RobotSession
+from rce_master.state.promises import Promises
 from rce_master.state.records import (
     Container,
     ContainerLive,
@@ -27,7 +28,11 @@ from rce_master.state.records import (
     UserPackage,
     UserVolume,
     VolumeRemoval,
+    user_volume_key,
 )
+from rce_master.state.rooms import Rooms
+from rce_master.state.table import Table
+from rce_master.state.waiting import PlacementQueue, group_key
 from rce_master.state.wiring_records import (
     ActiveInterface,
     Connection,
@@ -38,157 +43,12 @@ from rce_master.state.wiring_records import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Iterable
 
     from rce.model import InterfaceSpec
 
-R = TypeVar("R")
-
-
-class Table(Generic[R]):
-    """Records by key, with indexes that are always up to date.
-
-    Args:
-        name: Name in the store.
-        persistent: Whether the records go to the store.
-        type_: What records are decoded as.
-        key: Tells a record's key.
-        order: Tells a record's place among those that are loaded; without it they come as the store has them.
-        amount: Tells what a record adds to the total of which key.
-        indexes: By name.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        *,
-        type_: Any,
-        key: Callable[[R], str],
-        persistent: bool = True,
-        order: Callable[[R], int] | None = None,
-        amount: Callable[[R], tuple[str, int]] | None = None,
-        **indexes: Callable[[R], Iterable[str]],
-    ) -> None:
-        self.name = name
-        self.persistent = persistent
-        self.key = key
-        self._decoder = msgspec.json.Decoder(type_)
-        self._rows: dict[str, R] = {}
-        self._order = order
-        self._amount = amount
-        self._totals: dict[str, int] = {}
-        self._indexes = indexes
-        # Inner dicts instead of sets keep the order of arrival, so that everything stays reproducible.
-        self._found: dict[str, dict[str, dict[str, None]]] = {name: {} for name in indexes}
-
-    def __contains__(self, key: str) -> bool:
-        return key in self._rows
-
-    def __iter__(self) -> Iterator[R]:
-        return iter(self._rows.values())
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def __getitem__(self, key: str) -> R:
-        return self._rows[key]
-
-    def get(self, key: str) -> R | None:
-        """Find a record."""
-        return self._rows.get(key)
-
-    def by(self, index: str, value: str) -> list[R]:
-        """List the records that an index finds for a value, in order of arrival."""
-        return [self._rows[key] for key in self._found[index].get(value, ())]
-
-    def count(self, index: str, value: str) -> int:
-        """Tell how many records an index finds for a value."""
-        return len(self._found[index].get(value, ()))
-
-    def total(self, key: str) -> int:
-        """Return the sum of what the records add to a key."""
-        return self._totals.get(key, 0)
-
-    def assign(self, key: str, record: R | None) -> None:
-        """Put a record in place of what was there; None removes it."""
-        before = self._rows.pop(key, None) if record is None else self._rows.get(key)
-        for name, of in self._indexes.items():
-            old = () if before is None else of(before)
-            new = () if record is None else of(record)
-            self._reindex(self._found[name], key, list(old), list(new))
-        self._count(before, -1)
-        self._count(record, 1)
-        if record is not None:
-            self._rows[key] = record
-
-    def encode(self, record: R) -> bytes:
-        """Encode a record for the store."""
-        return msgspec.json.encode(record)
-
-    def load(self, rows: Mapping[str, bytes]) -> None:
-        """Fill the table from the store.
-
-        Raises:
-            msgspec.ValidationError: A record cannot be read.
-        """
-        records = [(key, self._decoder.decode(body)) for key, body in rows.items()]
-        if (order := self._order) is not None:
-            records.sort(key=lambda item: order(item[1]))
-        for key, record in records:
-            self.assign(key, record)
-
-    def index_entries(self, index: str) -> dict[str, list[str]]:
-        """Show an index: value to keys."""
-        return {value: list(keys) for value, keys in self._found[index].items()}
-
-    def computed_entries(self, index: str) -> dict[str, list[str]]:
-        """Compute again what :meth:`index_entries` must hold, up to the order."""
-        entries: dict[str, list[str]] = {}
-        for key, record in self._rows.items():
-            for value in self._indexes[index](record):
-                entries.setdefault(value, []).append(key)
-        return entries
-
-    @property
-    def indexes(self) -> tuple[str, ...]:
-        """Names of the indexes."""
-        return tuple(self._indexes)
-
-    @property
-    def totals(self) -> dict[str, int]:
-        """What :meth:`total` returns, by key."""
-        return dict(self._totals)
-
-    @property
-    def computed_totals(self) -> dict[str, int]:
-        """Compute again what :attr:`totals` must hold."""
-        totals: dict[str, int] = {}
-        for record in self._rows.values():
-            if self._amount is not None:
-                key, amount = self._amount(record)
-                totals[key] = totals.get(key, 0) + amount
-        return {key: total for key, total in totals.items() if total}
-
-    def _count(self, record: R | None, sign: int) -> None:
-        if record is None or self._amount is None:
-            return
-        key, amount = self._amount(record)
-        total = self._totals.get(key, 0) + sign * amount
-        if total:
-            self._totals[key] = total
-        else:
-            self._totals.pop(key, None)
-
-    @staticmethod
-    def _reindex(entries: dict[str, dict[str, None]], key: str, before: list[str], after: list[str]) -> None:
-        if before == after:
-            return
-        for value in before:
-            del entries[value][key]
-            if not entries[value]:
-                del entries[value]
-        for value in after:
-            entries.setdefault(value, {})[key] = None
+WAITING = "waiting"
+"""The only value of the indexes ``untold`` and ``unsettled`` of ``live``."""
 
 
 class Tables:
@@ -239,6 +99,9 @@ class Tables:
             user=lambda e: [e.user],
             robots_of=lambda e: [e.user] if isinstance(e, Robot) else [],
             task_set=lambda e: [e.task_set],
+            containers_of=lambda e: [e.user] if isinstance(e, Container) else [],
+            group=_groups,
+            volume=_volumes,
         )
         self.interfaces = Table[Interface](
             "interfaces",
@@ -266,10 +129,17 @@ class Tables:
             end=lambda c: dict.fromkeys(c.ends),
             ends=lambda c: [" ".join(c.ends)],
         )
-        self.task_sets = Table[TaskSet]("task_sets", type_=TaskSet, key=lambda s: s.process)
+        self.task_sets = Table[TaskSet](
+            "task_sets",
+            type_=TaskSet,
+            key=lambda s: s.process,
+            machine=lambda s: [s.machine.name] if s.kind is TaskSetKind.CONTAINER else [],
+        )
         self.counters = Table[Counter]("counters", type_=Counter, key=lambda c: c.name)
         self.drains = Table[Drain]("drains", type_=Drain, key=lambda d: d.process)
-        self.live = Table[Live]("live", type_=Any, key=lambda o: o.id, persistent=False)
+        self.live = Table[Live](
+            "live", type_=Any, key=lambda o: o.id, persistent=False, untold=_untold, unsettled=_unsettled
+        )
         self.active = Table[ActiveInterface](
             "active", type_=Any, key=lambda a: a.id, persistent=False, endpoint=lambda a: [a.endpoint]
         )
@@ -285,6 +155,20 @@ class Tables:
         )
         self.first_revision = 0
         """Revisions that this run of the master gives are above this."""
+        self.queue = PlacementQueue(self.endpoints, self.tombstones, self.volume_removals)
+        self.rooms = Rooms(
+            endpoints=self.endpoints,
+            moves=self.moves,
+            task_sets=self.task_sets,
+            presence=self.presence,
+            drains=self.drains,
+            on_gain=self.queue.offer,
+        )
+        self.requested = Promises()
+        """What each user's containers ask for."""
+        self.endpoints.watch(self._count_requests)
+        self.drain_round: dict[str, int] = {}
+        """Draining machines that have to be looked at, with the number of the last container there."""
 
     @property
     def all(self) -> tuple[Table[Any], ...]:
@@ -325,11 +209,13 @@ class Tables:
 
     def robots(self, user: str | None = None) -> list[Robot]:
         """List the robots, of one user or of all."""
-        return [e for e in self._of(user) if isinstance(e, Robot)]
+        found = self.endpoints if user is None else self.endpoints.by("robots_of", user)
+        return [e for e in found if isinstance(e, Robot)]
 
     def containers(self, user: str | None = None) -> list[Container]:
         """List the containers, of one user or of all."""
-        return [e for e in self._of(user) if isinstance(e, Container)]
+        found = self.endpoints if user is None else self.endpoints.by("containers_of", user)
+        return [e for e in found if isinstance(e, Container)]
 
     def robot_live(self, endpoint: str) -> RobotLive:
         """Tell what is observed of a robot."""
@@ -357,5 +243,34 @@ class Tables:
         found = self.interfaces.get(interface_key(endpoint, tag))
         return None if found is None else found.spec
 
-    def _of(self, user: str | None) -> Iterable[Endpoint]:
-        return self.endpoints if user is None else self.endpoints.by("user", user)
+    def _count_requests(self, before: Endpoint | None, after: Endpoint | None) -> None:
+        was = before if isinstance(before, Container) else None
+        now = after if isinstance(after, Container) else None
+        if was is not None and now is not None and was.resources == now.resources:
+            return
+        if was is not None:
+            self.requested.remove(was.user, was.resources)
+        if now is not None:
+            self.requested.add(now.user, now.resources)
+
+
+def _groups(endpoint: Endpoint) -> list[str]:
+    key = group_key(endpoint) if isinstance(endpoint, Container) else ""
+    return [key] if key else []
+
+
+def _volumes(endpoint: Endpoint) -> Iterable[str]:
+    volumes = endpoint.resources.volumes if isinstance(endpoint, Container) else ()
+    return dict.fromkeys(user_volume_key(endpoint.user, volume.name) for volume in volumes)
+
+
+def _untold(live: Live) -> list[str]:
+    """Index containers that wait, and whose users were not told."""
+    waits = isinstance(live, ContainerLive) and not live.told and not live.phase.is_placed
+    return [WAITING] if waits else []
+
+
+def _unsettled(live: Live) -> list[str]:
+    """Index robots for which a time runs: they are absent, or were admitted and not reported yet."""
+    runs = isinstance(live, RobotLive) and (live.session is RobotSession.ABSENT or live.status is None)
+    return [WAITING] if runs else []

@@ -23,6 +23,7 @@ from rce_master.state.records import (
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import (
+        Continue,
         EndpointGone,
         FaultReported,
         SpecRequested,
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
         Tick,
     )
 
+_LOSS = 200
+"""The work of giving up a container, as :attr:`StateSettings.max_work` counts it."""
 _PROCESS = re.compile(r"[^\s\x00-\x1f\x7f]{1,255}")
 
 
@@ -248,11 +251,20 @@ def fault(tx: Transaction, command: FaultReported) -> None:
 
 def tick(tx: Transaction, _: Tick) -> None:
     """End expired grace times, place waiting containers, and notify users who have waited for long."""
+    draining.begin_round(tx)
+    _advance(tx)
+
+
+def continue_work(tx: Transaction, _: Continue) -> None:
+    """Do more of what a command left over."""
+    _advance(tx)
+
+
+def _advance(tx: Transaction) -> None:
     robots.expire(tx)
-    for presence in list(tx.tables.presence):
-        if not presence.connected:
-            _expire(tx, presence)
-    draining.advance(tx)
+    for presence in [one for one in tx.tables.presence if not one.connected]:
+        _expire(tx, presence)
+    draining.continue_round(tx)
     placing.place_waiting(tx)
     placing.tell_waiting(tx)
 
@@ -264,8 +276,11 @@ def _expire(tx: Transaction, presence: Presence) -> None:
         return
     for endpoint in tx.tables.endpoints.by("task_set", presence.process):
         if isinstance(endpoint, Container):
+            if tx.is_out_of_work():
+                return
+            tx.spend(_LOSS)
             containers.lose(tx, endpoint)
-    if not tx.tables.endpoints.by("task_set", presence.process):
+    if not tx.tables.endpoints.count("task_set", presence.process):
         tx.delete(tx.tables.task_sets, presence.process)
         tx.delete(tx.tables.presence, presence.process)
         tx.happen("task_set_gone", presence.process, f"away for {grace:.0f} s", user="")

@@ -133,9 +133,8 @@ def removed(tx: Transaction, command: VolumeRemoved) -> None:
 
 def holder_of(tables: Tables, user: str, name: str) -> Container | None:
     """Return the container that has a volume; None if none has."""
-    return next(
-        (one for one in tables.containers(user) if any(v.name == name for v in one.resources.volumes)), None
-    )
+    found = tables.endpoints.by("volume", user_volume_key(user, name))
+    return next((one for one in found if isinstance(one, Container)), None)
 
 
 def tied_to(tables: Tables, container: Container) -> str:

@@ -31,6 +31,7 @@ from rce_master.exceptions import StoreError
 from rce_master.reconciler import Reconciler
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
+from rce_master.state.settings import StateSettings
 from rce_master.state_service import StateService
 from rce_master.store import MemoryStore, Row
 
@@ -151,8 +152,8 @@ class Cloud:
 
 
 @asynccontextmanager
-async def running(store: FragileStore) -> AsyncIterator[Cloud]:
-    cloud = Cloud(await StateService.open(store), store)
+async def running(store: FragileStore, settings: StateSettings | None = None) -> AsyncIterator[Cloud]:
+    cloud = Cloud(await StateService.open(store, settings), store)
     async with asyncio.TaskGroup() as group:
         workers = [
             group.create_task(cloud.state_service.run()),

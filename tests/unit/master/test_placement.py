@@ -162,3 +162,10 @@ def test_the_choice_does_not_depend_on_the_order(
     shuffled = list(rooms)
     random.shuffle(shuffled)
     assert choose(rooms, requested) == choose(shuffled, requested)
+
+
+@given(ROOMS, REQUESTS)
+def test_the_quick_answers_are_those_of_the_texts(rooms: list[Room], requested: Resources) -> None:
+    for each in rooms:
+        assert each.fits(requested) == (not each.why_not(requested))
+        assert each.load_with(requested) == pytest.approx(each.with_(requested).load)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace as replace_dataclass
+
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
@@ -12,8 +14,9 @@ from rce.control.desired import DesiredState, Fit
 from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
 from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
 from rce.model.specs import InterfaceSpec, Network, NodeSpec, ResourceChanges, Resources
+from rce.model.volumes import Volume
 from rce_master.exceptions import RefusedError
-from rce_master.state import capacity, commands
+from rce_master.state import commands
 from rce_master.state.changes import Changes
 from rce_master.state.core import State
 from rce_master.state.records import User, UserRole
@@ -63,9 +66,11 @@ def in_order(spec: EndpointSpec) -> EndpointSpec:
 class Histories(RuleBasedStateMachine):
     """Everything that can happen, in any order."""
 
+    limits = LIMITS
+
     def __init__(self) -> None:
         super().__init__()
-        self.state = State(LIMITS)
+        self.state = State(self.limits)
         self.now = 0.0
         self.stored: dict[str, dict[str, bytes]] = {}
         self.numbers: set[int] = set()
@@ -135,7 +140,7 @@ class Histories(RuleBasedStateMachine):
 
     @invariant()
     def promises_no_more_than_there_is(self) -> None:
-        for room in capacity.rooms(self.state.tables, away=True).values():
+        for room in self.state.tables.rooms:
             assert room.slots <= SLOTS, f"{room.process}: {room.slots} slots promised"
 
     @invariant()
@@ -147,13 +152,17 @@ class Histories(RuleBasedStateMachine):
     @rule()
     def restart(self) -> None:
         specs = {e.id: self.state.spec(e.id) for e in self.state.tables.endpoints}
-        self.state = State.load(self.stored, self.now, LIMITS)
+        self.state = State.load(self.stored, self.now, self.limits)
         assert {e.id: self.state.spec(e.id) for e in self.state.tables.endpoints} == specs
 
     @rule(seconds=st.floats(0, 4))
     def tick(self, seconds: float) -> None:
         self.now += seconds
         self.do(commands.Tick())
+
+    @rule()
+    def continue_work(self) -> None:
+        self.do(commands.Continue())
 
     @rule(process=ROBOT_SETS, address=ADDRESSES, endpoints=st.lists(STATUSES, max_size=3))
     def robot_set_arrives(self, process: str, address: LinkAddress, endpoints: list[EndpointStatus]) -> None:
@@ -170,7 +179,7 @@ class Histories(RuleBasedStateMachine):
             version=CONTROL_VERSION,
             kind=kind,
             process=process,
-            machine=MachineInfo(name=process, slots=SLOTS, networks=("none", "group")),
+            machine=MachineInfo(name=process, slots=SLOTS, networks=("none", "group"), volumes="image"),
             address=address,
             endpoints=tuple(endpoints),
         )
@@ -202,6 +211,20 @@ class Histories(RuleBasedStateMachine):
             Resources(size=size, network=Network.GROUP, group="g") if grouped else Resources(size=size)
         )
         self.do(commands.CreateContainer(user=user, tag=tag, resources=requested, wait=wait))
+
+    @rule(user=USERS, tag=TAGS, name=st.sampled_from(["v", "w"]), wait=st.booleans())
+    def create_with_volume(self, user: str, tag: str, name: str, wait: bool) -> None:
+        resources = Resources(volumes=(Volume(name=name, path="/v", size=64 << 20),))
+        self.do(commands.CreateContainer(user=user, tag=tag, resources=resources, wait=wait))
+
+    @rule(user=USERS, name=st.sampled_from(["v", "w"]))
+    def remove_volume(self, user: str, name: str) -> None:
+        self.do(commands.RemoveVolume(user=user, name=name))
+
+    @rule(first=st.booleans())
+    def volume_is_removed(self, first: bool) -> None:
+        for removal in list(self.state.tables.volume_removals)[: 1 if first else None]:
+            self.do(commands.VolumeRemoved(process=removal.process, volume=removal.volume))
 
     @rule(user=USERS, tag=TAGS, size=st.sampled_from([1, 2, 3, 4]))
     def resize(self, user: str, tag: str, size: int) -> None:
@@ -272,3 +295,13 @@ Histories.TestCase.settings = settings(
     max_examples=60, stateful_step_count=40, deadline=None, suppress_health_check=list(HealthCheck)
 )
 TestHistories = pytest.mark.timeout(120)(Histories.TestCase)
+
+
+class SlicedHistories(Histories):
+    """The same while each command does so little that most work is left to later ones."""
+
+    limits = replace_dataclass(LIMITS, max_work=1)
+
+
+SlicedHistories.TestCase.settings = settings(Histories.TestCase.settings, max_examples=30)
+TestSlicedHistories = pytest.mark.timeout(120)(SlicedHistories.TestCase)

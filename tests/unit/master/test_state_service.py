@@ -14,6 +14,7 @@ from rce.control.messages import (
 from rce.control.model import EndpointState, EndpointStatus, LinkAddress
 from rce_master.exceptions import MasterError, NotFoundError, StoreError
 from rce_master.state import commands
+from rce_master.state.settings import StateSettings
 
 # StateService
 
@@ -72,6 +73,55 @@ async def test_a_storm_is_stored_at_once(cloud: Cloud) -> None:
     await asyncio.gather(*made)
     assert cloud.store.saves - saves <= 2
     assert len(cloud.store.tables["endpoints"]) == 100
+
+
+async def test_work_that_is_left_over_is_continued() -> None:
+    """A command that leaves work is answered; the rest is done at once, in turns with others."""
+    count = 100
+    async with running(FragileStore(), StateSettings(max_work=1)) as cloud:
+        for number in range(count):
+            await cloud.state_service.submit(commands.CreateContainer(user="anna", tag=f"c{number}"))
+        await cloud.containers().hello()
+        others = 0
+        while any(not c.task_set for c in cloud.state_service.tables.containers()):
+            await cloud.state_service.submit(commands.SpecRequested(process="c1", id="anna/none"))
+            others += 1
+        assert others <= count, "each command is followed by a piece of the work"
+
+
+async def test_long_batch_lets_others_have_their_turn(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rce_master.state_service.MAX_HOLD_S", 0.0)
+    count = 50
+    creating = asyncio.ensure_future(
+        cloud.state_service.submit_all(
+            [commands.CreateContainer(user="anna", tag=f"c{number}") for number in range(count)]
+        )
+    )
+    others = 0
+    while not creating.done():
+        await asyncio.sleep(0)
+        others += 1
+    assert others > count
+    assert await creating == [None] * count
+
+
+async def test_store_that_fails_leaves_work_to_the_next_tick() -> None:
+    async with running(FragileStore(), StateSettings(max_work=1)) as cloud:
+        for number in range(200):
+            await cloud.state_service.submit(commands.CreateContainer(user="anna", tag=f"c{number}"))
+        await cloud.containers().hello()
+        cloud.store.broken = True
+        with pytest.raises(StoreError, match="disk full"):
+            await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="more"))
+        saves = cloud.store.saves
+        for _ in range(100):
+            await asyncio.sleep(0)
+        assert cloud.store.saves <= saves + 1, "a store that fails is not asked again and again"
+        assert any(not c.task_set for c in cloud.state_service.tables.containers())
+        cloud.store.broken = False
+        await cloud.state_service.submit(commands.Tick())
+        while any(not c.task_set for c in cloud.state_service.tables.containers()):
+            await asyncio.sleep(0)
 
 
 async def test_of_several_commands_only_the_bad_ones_are_refused(cloud: Cloud) -> None:
