@@ -196,6 +196,26 @@ _EXPLORATION = [
     )
 ]
 
+_SCALE = [
+    Target(
+        f"1000 machines, 100 000 containers in the master's state: {what}",
+        f"scale.{suite}",
+        _column(column, machines=1000),
+        limit,
+        unit,
+    )
+    for suite, what, column, limit, unit in (
+        ("placing", "create a container, CPU, p50", "create p50, ms", 1, "ms"),
+        ("placing", "a machine of 100 is lost and all are placed again, CPU", "lost, ms", 100, "ms"),
+        ("placing", "the longest slice of that", "longest slice, ms", 20, "ms"),
+        ("placing", "the longest slice when 40 machines are lost", "its longest, ms", 20, "ms"),
+        ("placing", "a tick when nothing happens, CPU", "tick, ms", 20, "ms"),
+        ("store", "load from the store, CPU", "load, s", 2.8, "s"),
+        ("store", "size of the store", "stored, MB", 40, "MB"),
+        ("store", "memory of the tables", "tables, MB", 147, "MB"),
+    )
+]
+
 TARGETS = [
     *_ROUND_TRIPS,
     *_IN_TLS,
@@ -260,6 +280,20 @@ TARGETS = [
         "traffic.block",
         _greatest("ms", robots=1000),
         100,
+        "ms",
+    ),
+    Target(
+        "1000 tasks are given to 1000 idle robots, CPU",
+        "assignment.choose",
+        _column("ms", robots=1000),
+        60,
+        "ms",
+    ),
+    Target(
+        "1000 tasks on a new grid: longest stop of the fleet manager for distances, CPU",
+        "assignment.choose",
+        _column("new grid, longest slice ms", robots=1000),
+        50,
         "ms",
     ),
     *(
@@ -340,6 +374,7 @@ TARGETS = [
         "%",
         at_least=True,
     ),
+    *_SCALE,
     Target("container start to first message, p50", "start", _column("p50_ms"), 250, "ms"),
     Target("100 containers at once", "many", _column("all at once", containers=100), 20, "s"),
     Target("idle container, PSS", "many", _column("idle container PSS MB"), 15, "MB"),

@@ -138,6 +138,10 @@ class FleetManager:
 
     async def step(self) -> None:
         """Take over what the robots did, and send them on. To be called several times a second."""
+        is_behind = True
+        while is_behind:
+            is_behind = self.dispatcher.measure(self.facts)
+            await asyncio.sleep(0)  # Requests are answered meanwhile.
         if self._failure:
             await self._try_journal()
             return

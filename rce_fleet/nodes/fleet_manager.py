@@ -29,6 +29,7 @@ from rce_fleet.nodes.graph_look import GraphLook
 from rce_fleet.nodes.known_robots import VOLUME_VARIABLE
 from rce_fleet.nodes.manager_parameters import ManagerParameters, rules_of
 from rce_fleet.nodes.parameters import read_parameters
+from rce_fleet.nodes.task_loops import COMPILE_FROM, compile_beside
 from rce_fleet.nodes.throttled_log import ThrottledLog
 from rce_fleet.tasks.records import Places, Zone
 
@@ -144,8 +145,12 @@ class ManagerNode:
         node.log.info("the fleet manager has %d open tasks", sum(1 for _ in self._manager.book.open_tasks()))
         async with asyncio.TaskGroup() as tasks:
             others = [tasks.create_task(self._follow_planner()), tasks.create_task(self._look_around())]
+            is_compiling = False
             while await node.sleep(STEP_S):
                 await self._step()
+                if not is_compiling and len(self._manager.facts.robots) >= COMPILE_FROM:
+                    is_compiling = True
+                    others.append(tasks.create_task(compile_beside(node.log)))
             for other in others:
                 other.cancel()
         await self._manager.close()

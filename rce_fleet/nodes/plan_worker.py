@@ -216,9 +216,11 @@ def load_compiled() -> Planner:
     return load_planner(DEFAULT_PLANNER)
 
 
-def _end_with_input() -> None:
+def end_with_input() -> None:
     """End this process when its input ends, in the middle of compiling too: the node was killed."""
-    sys.stdin.buffer.read()
+    # Not by sys.stdin: its lock would be held while the interpreter ends, which then aborts.
+    while os.read(sys.stdin.fileno(), 1024):
+        pass
     os._exit(0)
 
 
@@ -230,7 +232,7 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the node, which then ends this process.
     if _FILL in sys.argv:
         os.nice(_LEAST_PRIORITY)
-        threading.Thread(target=_end_with_input, daemon=True).start()
+        threading.Thread(target=end_with_input, daemon=True).start()
         load_compiled()
         sys.exit()
     with contextlib.suppress(BrokenPipeError):

@@ -25,13 +25,15 @@ MODULES = (
         "rce_fleet.mapping.match_kernels",
         "rce_fleet.maps.ray_casting",
         "rce_fleet.navigation.planners.cost_to_go",
+        "rce_fleet.tasks.matching",
+        "rce_fleet.tasks.travel",
     ),
 )
 """The modules that have inner loops, in parts that take about the same time."""
 
 
 def compile_loops() -> None:
-    """Compile the inner loops of planning, localization, mapping and navigation once, for this machine.
+    """Compile the inner loops of the fleet's programs once, for this machine.
 
     Otherwise each node compiles what it uses when it starts. Run it after an update; what has not changed is
     not compiled again.

@@ -35,11 +35,14 @@ if TYPE_CHECKING:
 
 _STATES = 60_000
 """States of one search."""
-_GIVE_UP = 4_000
-"""States after which the search for one path gives up, and robots are taken out of its way."""
-_ASIDE = 4
-"""Robots that are taken out of the way at once."""
-_TURNS = 12
+_GIVE_UP = 12_000
+"""States after which the search for one path gives up, and robots are taken out of its way. A longer search
+costs less than new paths for robots that were not in the way."""
+_ASIDE = 8
+"""Most robots that are taken out of the way at once: one at first ..."""
+_GROWS = 4
+"""... and one more after so many turns, in which the same robots took each other out of the way."""
+_TURNS = 40
 """Times that a robot is planned, and may take others out of its way."""
 FREE, PLANNED, KEPT = -1, -2, -3
 """In place of a path's length: it has no path now, it was not looked at, it has its old path again."""
@@ -63,9 +66,10 @@ def _take_aside(
     found: Ints,
     random: NDArray[np.int64],
 ) -> int:
-    """Write the robots in the way of a robot on its shortest path into ``found``; return how many."""
+    """Write the first robots in the way of a robot on its shortest path into ``found``; return how many."""
     here, step, size, moved = start, begin, 0, True
-    while moved and size < _ASIDE:
+    most = min(_ASIDE, 1 + turns[slots[robot]] // _GROWS)
+    while moved and size < most:
         for place in range(counts[here]):
             other = tags[here, place, ROBOT]
             enter, leave = times[here, place, ENTER], times[here, place, LEAVE]
@@ -73,7 +77,7 @@ def _take_aside(
             if other < 0 or other == robot or not is_near or leave < step - 1.0:
                 continue
             has_path = slots[other] < 0 or lengths[slots[other]] >= 0 or lengths[slots[other]] == KEPT
-            if size < _ASIDE and has_path and (slots[other] < 0 or turns[slots[other]] < _TURNS):
+            if size < most and has_path and (slots[other] < 0 or turns[slots[other]] < _TURNS):
                 is_new = True
                 for index in range(size):
                     is_new = is_new and found[index] != other

@@ -25,6 +25,7 @@ _log = logging.getLogger(__name__)
 
 POLL_S = 1.0
 RATES_EVERY_S = 5.0
+PAGE_ITEMS = 1000
 """How often the counters of all interfaces are read."""
 TIMEOUT = aiohttp.ClientTimeout(total=5)
 
@@ -164,11 +165,21 @@ class EngineWatch:
         return {} if rate is None else {"messages_s": round(rate.messages, 1), "bytes_s": round(rate.bytes)}
 
     async def _get(self, session: aiohttp.ClientSession, kind: str) -> dict[str, Any]:
+        """Read a list page by page; a master of an earlier release answers with all of it at once."""
+        name = "containers" if kind == "usage" else kind
+        found = page = await self._get_page(session, kind, "")
+        while page.get("next"):
+            page = await self._get_page(session, kind, page["next"])
+            found[name] += page[name]
+        return found
+
+    async def _get_page(self, session: aiohttp.ClientSession, kind: str, cursor: str) -> dict[str, Any]:
         headers = {"Authorization": f"Bearer {self._token}"}
+        params = {"user": self._login["userID"], "limit": str(PAGE_ITEMS)}
         async with session.get(
             self._api / kind,
             headers=headers,
-            params={"user": self._login["userID"]},
+            params=params | ({"cursor": cursor} if cursor else {}),
             **self._request_options,
         ) as reply:
             found: dict[str, Any] = await reply.json()

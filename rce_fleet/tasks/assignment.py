@@ -7,9 +7,9 @@ from math import inf, nan
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from rce_fleet.tasks.energy import BatteryLevels, Effort, charges, effort_of, share_needed
+from rce_fleet.tasks.matching import cheapest_pairs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from rce_fleet.tasks.task import Task
     from rce_fleet.tasks.travel import TravelCosts
 
-_IMPOSSIBLE = 1e9
 _SPARE_TASKS = 50
 """So many tasks more than robots, and twice as many as robots, are looked at, the most urgent ones."""
 _ATTEMPTS = 4
@@ -137,28 +136,31 @@ class Assigner:
         """
         if not tasks or not robots:
             return []
-        groups = [_Group(rows, [robots[row] for row in rows]) for rows in _rows_by_profile(robots)]
+        robots = sorted(robots, key=lambda robot: robot.cell)  # Distances are read in the order of cells.
+        groups = [
+            _Group(columns, [robots[column] for column in columns]) for columns in _columns_by_profile(robots)
+        ]
         urgent = self._most_urgent(tasks, groups, now)
-        costs = np.full((len(robots), len(urgent)), _IMPOSSIBLE)
-        ways = np.full_like(costs, inf)
         for group in groups:
-            costs[group.rows], ways[group.rows] = self._price(urgent, group, now, chargers)
-        names = {robot.id: row for row, robot in enumerate(robots)}
-        columns = {task.number: column for column, task in enumerate(urgent)}
-        costs[
-            [names[name] for number, name in avoided if number in columns and name in names],
-            [columns[number] for number, name in avoided if number in columns and name in names],
-        ] = _IMPOSSIBLE
-        for column, task in enumerate(urgent):
-            if not task.robot:
-                continue
-            later = ways[:, column] + self._rules.keep >= begins(task)
-            row = names.get(task.robot)
-            if row is not None:
+            self._price(urgent, group, now, chargers)
+        costs, ways = _joined(groups, len(urgent), len(robots))
+        speeds = np.empty(len(robots))
+        for group in groups:
+            speeds[group.columns] = group.profile.speed
+        column_of = {robot.id: column for column, robot in enumerate(robots)}
+        row_of = {task.number: row for row, task in enumerate(urgent)}
+        for number, name in avoided:
+            if number in row_of and name in column_of:
+                costs[row_of[number], column_of[name]] = inf
+        queued = [(row, task) for row, task in enumerate(urgent) if task.robot]
+        for row, task in queued:
+            later = ways[row] / speeds + self._rules.keep >= begins(task)
+            column = column_of.get(task.robot)
+            if column is not None:
                 costs[row, column] -= self._rules.keep
-                later[row] = False
-            costs[later, column] = _IMPOSSIBLE
-        return self._pairs(costs, urgent, robots, chargers)
+                later[column] = False
+            costs[row, later] = inf
+        return self._pairs(costs, urgent, robots, groups, chargers)
 
     def _most_urgent(self, tasks: Sequence[Task], groups: Sequence[_Group], now: float) -> list[Task]:
         """Return the most urgent of the tasks that one of the robots may do."""
@@ -180,67 +182,82 @@ class Assigner:
         costs: NDArray[np.float64],
         urgent: Sequence[Task],
         robots: Sequence[FreeRobot],
+        groups: Sequence[_Group],
         chargers: Sequence[int],
     ) -> list[Choice]:
-        """Return the cheapest pairs; their batteries are checked again, with the cells of all stops.
+        """Return the cheapest pairs.
 
-        What is refused then is assigned anew among those that are left.
+        If a robot can choose among cells, the way to the next stop was not known before: its battery is
+        checked again. What is refused then is assigned anew among those that are left.
         """
         chosen = []
-        rows, columns = np.arange(len(robots)), np.arange(len(urgent))
+        group_of = {column: group for group in groups for column in group.columns.tolist()}
         for _ in range(_ATTEMPTS):
-            pairs = np.transpose(linear_sum_assignment(costs[np.ix_(rows, columns)]))
-            done_rows, done_columns, refused = [], [], False
-            for row, column in zip(rows[pairs[:, 0]], columns[pairs[:, 1]], strict=True):
-                if costs[row, column] >= _IMPOSSIBLE / 2:
-                    continue
-                robot, task = robots[row], urgent[column]
-                effort = effort_of(task, robot.cell, self._travel, robot.profile)
-                if self.refuse(task, robot, effort, chargers):
-                    costs[row, column] = _IMPOSSIBLE
-                    refused = True
+            refused = False
+            done: list[tuple[int, int]] = []
+            for row, column in np.transpose(cheapest_pairs(costs)).tolist():
+                robot, task, group = robots[column], urgent[row], group_of[column]
+                stop = task.next_stop
+                if stop is not None and len(stop.cells) == 1:
+                    first = float(group.ways[row, group.places[robot.id]])
+                    effort = group.tails[row]._replace(first=first)
                 else:
-                    chosen.append(Choice(task, robot.id, effort.seconds(robot.profile)))
-                    done_rows.append(row)
-                    done_columns.append(column)
+                    effort = effort_of(task, robot.cell, self._travel, robot.profile)
+                    if self.refuse(task, robot, effort, chargers):
+                        costs[row, column] = inf
+                        refused = True
+                        continue
+                chosen.append(Choice(task, robot.id, effort.seconds(robot.profile)))
+                done.append((row, column))
             if not refused:
                 break
-            rows, columns = np.setdiff1d(rows, done_rows), np.setdiff1d(columns, done_columns)
+            for row, column in done:
+                costs[row] = costs[:, column] = inf
         return chosen
 
-    def _price(
-        self, tasks: Sequence[Task], group: _Group, now: float, chargers: Sequence[int]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return what tasks cost the robots of one profile, and after how many seconds they can begin.
-
-        Returns:
-            Costs and seconds, shape (robots, tasks); ``_IMPOSSIBLE`` and ``inf`` where a robot cannot.
-        """
+    def _price(self, tasks: Sequence[Task], group: _Group, now: float, chargers: Sequence[int]) -> None:
+        """Write what tasks cost the robots of one profile, and how far they are, into the group."""
         profile = group.profile
-        ways = np.full((len(tasks), len(group.names)), inf)
-        needed = np.full(len(tasks), -_IMPOSSIBLE)
-        tails: dict[int, Effort] = {}
+        to_chargers: NDArray[np.float32] | None = None
+        if chargers:
+            to_chargers = np.min([self._travel.field(cell) for cell in chargers], axis=0)
+        ways = group.ways = np.full((len(tasks), len(group.names)), inf, np.float32)
+        needed = np.full(len(tasks), -inf)
         for row, task in enumerate(tasks):
             tail = self._tail(task, group)
             if tail is None:
                 continue
-            tails[row] = tail
+            group.tails[row] = tail
             self._write_ways(task, group, ways[row])
             if not charges(task):
-                none = Effort(0.0, tail.metres, tail.acting, tail.end)
-                needed[row] = self.battery_needed(profile, none, chargers)
-        each = share_needed(Effort(1.0, 0.0, 0.0, None), profile)
-        if not np.isnan(group.batteries).all():
-            ways[needed[:, None] + ways * each > group.batteries] = inf
+                end = tail.end
+                to_charger = 0.0 if to_chargers is None or end is None else float(to_chargers[end])
+                needed[row] = share_needed(tail._replace(first=0.0), profile, to_charger)
+        needed += self._levels.critical
+        self._forbid_beyond_batteries(group, needed)
         nearest = ways.min(axis=1, initial=inf)
         worth = np.zeros(len(tasks))
-        for row, tail in tails.items():
-            takes = (nearest[row] + tail.metres) / profile.speed + tail.acting
+        for row, tail in group.tails.items():
+            takes = (float(nearest[row]) + tail.metres) / profile.speed + tail.acting
             worth[row] = self.urgency(tasks[row], now, takes if takes < inf else 0.0)
-        ways /= profile.speed
-        costs = ways - worth[:, None]
-        costs[np.isinf(costs)] = _IMPOSSIBLE
-        return costs.T, ways.T
+        group.costs = np.divide(ways, profile.speed, dtype=np.float64)
+        group.costs -= worth[:, None]
+
+    def _forbid_beyond_batteries(self, group: _Group, needed: NDArray[np.float64]) -> None:
+        """Make ways infinite that lead robots so far that their batteries are not enough for the task then.
+
+        Args:
+            group: Robots, and their ways.
+            needed: What each task needs after its first stop, shares of a battery.
+        """
+        if np.isnan(group.batteries).all():
+            return
+        each = share_needed(Effort(1.0, 0.0, 0.0, None), group.profile)
+        with np.errstate(divide="ignore", invalid="ignore"):  # an unknown battery forbids nothing
+            rows = np.flatnonzero(group.ways.max(axis=1) > (np.nanmin(group.batteries) - needed) / each)
+            ways = group.ways[rows]
+            ways[ways > (group.batteries - needed[rows, None]) / each] = inf
+        group.ways[rows] = ways
 
     def _tail(self, task: Task, group: _Group) -> Effort | None:
         """Return what a task costs a robot of a profile after its first stop; None if it can never do it."""
@@ -251,43 +268,75 @@ class Assigner:
         tail = effort_of(task, start, self._travel, group.profile)
         return tail if tail.first < inf else None
 
-    def _write_ways(self, task: Task, group: _Group, ways: NDArray[np.float64]) -> None:
+    def _write_ways(self, task: Task, group: _Group, ways: NDArray[np.float32]) -> None:
         """Write the metres to the first stop of a task for each robot that it is for, shape (robots,)."""
         stop = task.next_stop
         cells = stop.cells if stop is not None else ()
-        ways[:] = inf if cells else 0.0
-        for cell in cells:
-            np.minimum(ways, self._travel.field(cell, group.profile.zone_cost)[group.cells], out=ways)
+        if len(cells) == 1:
+            self._travel.field(cells[0], group.profile.zone_cost).take(group.cells, out=ways, mode="clip")
+        else:
+            ways[:] = inf if cells else 0.0
+            for cell in cells:
+                np.minimum(ways, self._travel.field(cell, group.profile.zone_cost)[group.cells], out=ways)
         if task.order.robot:
-            ways[[name != task.order.robot for name in group.names]] = inf
+            place = group.places.get(task.order.robot)
+            way = inf if place is None else ways[place]
+            ways[:] = inf
+            if place is not None:
+                ways[place] = way
 
 
 class _Group:
-    """Robots of one profile, as arrays."""
+    """Robots of one profile, as arrays, and what tasks cost them.
 
-    def __init__(self, rows: list[int], robots: list[FreeRobot]) -> None:
-        self.rows = np.array(rows)
+    Attributes:
+        columns: Their places among all robots.
+        places: Place of each robot in this group, by name.
+        tails: What each task costs after its first stop, by row; tasks that none of them can do are missing.
+        ways: Metres to the first stop, shape (tasks, robots); ``inf``: a robot cannot do the task.
+        costs: What is to be least, seconds, shape (tasks, robots); ``inf`` likewise.
+    """
+
+    ways: NDArray[np.float32]
+    costs: NDArray[np.float64]
+
+    def __init__(self, columns: list[int], robots: list[FreeRobot]) -> None:
+        self.columns = np.array(columns)
         self.profile = robots[0].profile
         self.names = [robot.id for robot in robots]
+        self.places = {name: place for place, name in enumerate(self.names)}
         self.cells = np.array([robot.cell for robot in robots])
         self.batteries = np.array(
             [nan if robot.battery is None else robot.battery for robot in robots], np.float64
         )
+        self.tails: dict[int, Effort] = {}
 
 
-def _rows_by_profile(robots: Sequence[FreeRobot]) -> list[list[int]]:
+def _joined(
+    groups: Sequence[_Group], tasks: int, robots: int
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Return costs and ways of all groups, shape (tasks, robots) both."""
+    if len(groups) == 1:
+        return groups[0].costs, groups[0].ways
+    costs, ways = np.empty((tasks, robots)), np.empty((tasks, robots), np.float32)
+    for group in groups:
+        costs[:, group.columns], ways[:, group.columns] = group.costs, group.ways
+    return costs, ways
+
+
+def _columns_by_profile(robots: Sequence[FreeRobot]) -> list[list[int]]:
     groups: list[tuple[RobotProfile, list[int]]] = []
     places: dict[int, list[int]] = {}
-    for row, robot in enumerate(robots):
-        rows = places.get(id(robot.profile))
-        if rows is None:
-            rows = next((known for profile, known in groups if profile == robot.profile), None)
-            if rows is None:
-                rows = []
-                groups.append((robot.profile, rows))
-            places[id(robot.profile)] = rows
-        rows.append(row)
-    return [rows for _, rows in groups]
+    for column, robot in enumerate(robots):
+        columns = places.get(id(robot.profile))
+        if columns is None:
+            columns = next((known for profile, known in groups if profile == robot.profile), None)
+            if columns is None:
+                columns = []
+                groups.append((robot.profile, columns))
+            places[id(robot.profile)] = columns
+        columns.append(column)
+    return [columns for _, columns in groups]
 
 
 def misfit(task: Task, robot: str, profile: RobotProfile) -> str:
@@ -295,8 +344,7 @@ def misfit(task: Task, robot: str, profile: RobotProfile) -> str:
     order = task.order
     if order.robot and order.robot != robot:
         return f"only {order.robot} may do it"
-    missing = sorted(set(order.capabilities) - set(profile.capabilities))
-    if missing:
+    if order.capabilities and (missing := sorted(set(order.capabilities) - set(profile.capabilities))):
         return f"it lacks {', '.join(missing)}"
     if order.payload > profile.payload:
         return f"it carries {profile.payload:g} kg, not {order.payload:g} kg"

@@ -79,10 +79,52 @@ class Dispatcher:
         self._queues_due = -inf
         self._explained = 0
         self._facts: FleetFacts | None = None
+        self._measured: set[int] = set()
+        """Numbers of tasks; the distances to their stops were measured."""
+        self._measured_epoch = 0
 
     def profile(self, robot: str) -> RobotProfile:
         """Return what a robot can do."""
         return self._profiles.get(robot) or self._book.entry(robot).profile or self.rules.profile
+
+    def measure(self, facts: FleetFacts) -> bool:
+        """Measure some of the distances that the next step needs, so that it does not stop for all of them.
+
+        :meth:`update` measures what is missing then.
+
+        Args:
+            facts: What is known of the robots.
+
+        Returns:
+            Whether more are left; to be called again when other work has been done meanwhile.
+        """
+        travel, book = self._travel, self._book
+        if facts.grid is None or not facts.is_live:
+            return False
+        travel.set_map(facts.grid, facts.shut, book.zones, facts.map_revision)
+        if travel.epoch != self._measured_epoch:
+            self._measured_epoch, self._measured = travel.epoch, set()
+        tasks = [task for task in book.open_tasks() if task.number not in self._measured]
+        if not tasks:
+            return False
+        self._profiles = zone_profiles(book, facts, self.rules.profile)
+        zone_costs = {str(cost): cost for cost in (self.profile(name).zone_cost for name in facts.robots)}
+        missing: dict[str, set[int]] = {name: set() for name in zone_costs}
+        tasks.sort(key=lambda task: (-task.order.priority, task.number))
+        for task in tasks:
+            # More than are kept are left to the steps that need them.
+            if sum(map(len, missing.values())) >= travel.at_once or len(self._measured) >= travel.capacity:
+                break
+            last = min(task.order.length, task.position + len(task.order.stops))
+            cells = [cell for stop in range(task.position, last) for cell in task.order.stop(stop).cells]
+            for name, cost in zone_costs.items():
+                missing[name].update(travel.missing(cells, cost))
+            self._measured.add(task.number)
+        else:
+            tasks = []
+        for name, cost in zone_costs.items():
+            travel.measure(sorted(missing[name]), cost)
+        return bool(tasks) and len(self._measured) < travel.capacity
 
     def update(self, now: float, facts: FleetFacts) -> None:
         """Take one step.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from rce_fleet.tasks.order import Action
 
@@ -42,8 +42,7 @@ class BatteryLevels:
             raise ValueError(f"the level good must be within {self.critical} .. {self.full}, not {self.good}")
 
 
-@dataclass(frozen=True, slots=True)
-class Effort:
+class Effort(NamedTuple):
     """What the rest of a task costs a robot.
 
     Attributes:
@@ -72,8 +71,9 @@ def effort_of(task: Task, start: int, travel: TravelCosts, profile: RobotProfile
     here, first, metres, acting = start, 0.0, 0.0, 0.0
     zones = profile.zone_cost
     is_first = True
-    for number in range(task.position, task.order.length):
-        stop = task.order.stop(number)
+    order = task.order
+    for number in range(task.position, order.length):
+        stop = order.stop(number)
         acting += stop.duration
         if not stop.cells:
             continue

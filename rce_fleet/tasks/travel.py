@@ -7,11 +7,11 @@ from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
+
+from rce_fleet.tasks.travel_loops import measure_ways
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from rce_fleet.tasks.records import Zone
 
     Floats = NDArray[np.float32]
+    Costs = tuple[tuple[str, float], ...]
+    """How much a metre in zones counts, by zone's name."""
+    Graph = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]
 
 MOST_BYTES = 128_000_000
 """Memory of the distances that are kept: on a map of 10 000 cells those to 3000 cells, more than the stops of
@@ -26,12 +29,19 @@ MOST_BYTES = 128_000_000
 REFRESHED = 16
 """After a change of the map so many distances are computed anew in each step, and those from before count
 until then: they differ by a detour. Computing all at once would stop the manager for a second."""
+_AT_ONCE = 64
+"""So many distances are measured in one go by the compiled loop ..."""
+_AT_ONCE_PLAIN = 16
+"""... and without it, so that the manager answers after some milliseconds."""
 
 
 class TravelCosts:
     """Distances on the map, in metres that count as the robots' zones make them.
 
     A robot may leave a cell that is shut, and may not enter one.
+
+    Attributes:
+        epoch: Grows when all distances are forgotten: with each new grid.
     """
 
     def __init__(self) -> None:
@@ -39,9 +49,10 @@ class TravelCosts:
         self._shut: frozenset[int] = frozenset()
         self._revision: object = None
         self._zones: dict[str, tuple[int, ...]] = {}
-        self._graphs: dict[tuple[tuple[str, float], ...], csr_array] = {}
-        self._fields: OrderedDict[tuple[int, tuple[tuple[str, float], ...]], Floats] = OrderedDict()
-        self._stale: dict[tuple[int, tuple[tuple[str, float], ...]], Floats] = {}
+        self.epoch = 0
+        self._graphs: dict[Costs, Graph] = {}
+        self._fields: OrderedDict[tuple[int, Costs], Floats] = OrderedDict()
+        self._stale: dict[tuple[int, Costs], Floats] = {}
         self._budget = REFRESHED
 
     def begin_step(self) -> None:
@@ -63,6 +74,7 @@ class TravelCosts:
         if revision == self._revision and cells == self._zones and grid is self._grid:
             return
         self._stale = {**self._stale, **self._fields} if grid is self._grid else {}
+        self.epoch += grid is not self._grid
         self._grid, self._shut, self._revision, self._zones = grid, shut, revision, cells
         self._graphs.clear()
         self._fields.clear()
@@ -86,7 +98,7 @@ class TravelCosts:
         """
         if self._grid is None:
             return np.zeros(0, np.float32)
-        costs = tuple(sorted((zone_cost or {}).items()))
+        costs = _costs(zone_cost)
         field = self._fields.get((goal, costs))
         if field is None:
             stale = self._stale.get((goal, costs))
@@ -94,13 +106,42 @@ class TravelCosts:
                 return stale
             self._budget -= stale is not None
             self._stale.pop((goal, costs), None)
-            field = self._compute(self._grid, goal, costs)
-            self._fields[goal, costs] = field
-            while (len(self._fields) + len(self._stale)) * field.nbytes > MOST_BYTES and self._forget():
-                pass
+            (field,) = self._compute(self._grid, [goal], costs)
+            self._keep(goal, costs, field)
         else:
             self._fields.move_to_end((goal, costs))
         return field
+
+    @property
+    def capacity(self) -> int:
+        """How many cells' distances are kept at most."""
+        return MOST_BYTES // (4 * max(1, len(self._grid or ())))
+
+    @property
+    def at_once(self) -> int:
+        """How many cells' distances should be measured in one go."""
+        return _AT_ONCE if measure_ways.is_compiled else _AT_ONCE_PLAIN
+
+    def missing(self, goals: Iterable[int], zone_cost: Mapping[str, float] | None = None) -> list[int]:
+        """Return those of some cells whose distances are not known, not even those before a cell was shut."""
+        costs = _costs(zone_cost)
+        return [
+            goal
+            for goal in dict.fromkeys(goals)
+            if (goal, costs) not in self._fields and (goal, costs) not in self._stale
+        ]
+
+    def measure(self, goals: Sequence[int], zone_cost: Mapping[str, float] | None = None) -> None:
+        """Compute the distances to some cells together, which takes a fraction of the time."""
+        if self._grid is not None:
+            costs = _costs(zone_cost)
+            for goal, field in zip(goals, self._compute(self._grid, goals, costs), strict=True):
+                self._keep(goal, costs, field)
+
+    def _keep(self, goal: int, costs: Costs, field: Floats) -> None:
+        self._fields[goal, costs] = field
+        while len(self._fields) + len(self._stale) > self.capacity and self._forget():
+            pass
 
     def _forget(self) -> bool:
         """Forget the distances that were not used for the longest time; return whether there were some."""
@@ -120,19 +161,23 @@ class TravelCosts:
         distance, goal = min(found, default=(inf, -1))
         return goal if distance < inf else None
 
-    def _can_enter(self, goal: int, costs: tuple[tuple[str, float], ...]) -> bool:
+    def _can_enter(self, goal: int, costs: Costs) -> bool:
         forbidden = (name for name, factor in costs if factor == inf)
         return goal not in self._shut and not any(goal in self._zones.get(name, ()) for name in forbidden)
 
-    def _compute(self, grid: GridMap, goal: int, costs: tuple[tuple[str, float], ...]) -> Floats:
-        if goal not in grid or not self._can_enter(goal, costs):
-            return np.full(len(grid), inf, np.float32)
-        graph = self._graphs.get(costs)
-        if graph is None:
-            graph = self._graphs[costs] = self._graph(grid, costs)
-        return np.asarray(dijkstra(graph, indices=goal), np.float32)
+    def _compute(self, grid: GridMap, goals: Sequence[int], costs: Costs) -> list[Floats]:
+        open_goals = [goal for goal in goals if goal in grid and self._can_enter(goal, costs)]
+        fields: dict[int, Floats] = {}
+        if open_goals:
+            graph = self._graphs.get(costs)
+            if graph is None:
+                graph = self._graphs[costs] = self._graph(grid, costs)
+            measured = measure_ways(*graph, np.array(open_goals, np.int32))
+            # A copy of each: one that is forgotten must not be kept in memory by the others.
+            fields = {goal: field.copy() for goal, field in zip(open_goals, measured, strict=True)}
+        return [fields[goal] if goal in fields else np.full(len(grid), inf, np.float32) for goal in goals]
 
-    def _graph(self, grid: GridMap, costs: tuple[tuple[str, float], ...]) -> csr_array:
+    def _graph(self, grid: GridMap, costs: Costs) -> Graph:
         """Return the graph of ways backwards: an edge from each free cell to the cells around it."""
         cells = np.arange(len(grid), dtype=np.int32).reshape(grid.rows, grid.columns)
         pairs = [(cells[:, 1:], cells[:, :-1]), (cells[1:], cells[:-1])]
@@ -149,4 +194,11 @@ class TravelCosts:
                 weight[inside] *= factor
         keep = free[heads]
         heads, tails = heads[keep], tails[keep]
-        return csr_array(((weight[heads] + weight[tails]) / 2, (heads, tails)), shape=(len(grid), len(grid)))
+        order = np.argsort(heads, kind="stable")
+        heads, tails = heads[order], tails[order]
+        indptr = np.concatenate(([0], np.cumsum(np.bincount(heads, minlength=len(grid)))))
+        return indptr.astype(np.int32), tails, (weight[heads] + weight[tails]) / 2
+
+
+def _costs(zone_cost: Mapping[str, float] | None) -> Costs:
+    return tuple(sorted(zone_cost.items())) if zone_cost else ()

@@ -177,14 +177,14 @@ def test_the_queue_with_the_earliest_end_gets_the_task() -> None:
 
 
 def test_the_sum_of_all_ways_is_the_least() -> None:
-    """By hand: 1 to its own row's task costs 1 + 1; the nearest task first would cost 0 + 7."""
+    """By hand: 3 + 1 cells; the nearest task for A first would cost 1 + 5."""
     travel, grid = TravelCosts(), GridMap(1, 10)
     travel.set_map(grid, frozenset(), {}, 0)
     assigner = Assigner(travel, AssignmentRules(), BatteryLevels())
-    robots = [FreeRobot("A", 3, RobotProfile(), None), FreeRobot("B", 4, RobotProfile(), None)]
-    tasks = [Task(n, Order((Stop(Action.GO, (cell,)),)), "", "", 0.0, 0.0) for n, cell in ((1, 4), (2, 9))]
+    robots = [FreeRobot("A", 3, RobotProfile(), None), FreeRobot("B", 5, RobotProfile(), None)]
+    tasks = [Task(n, Order((Stop(Action.GO, (cell,)),)), "", "", 0.0, 0.0) for n, cell in ((1, 4), (2, 0))]
     chosen = {choice.robot: choice.task.number for choice in assigner.choose(tasks, robots, 0.0)}
-    assert chosen == {"A": 1, "B": 2}
+    assert chosen == {"A": 2, "B": 1}
 
 
 def test_hundreds_of_robots_get_tasks_in_one_call() -> None:

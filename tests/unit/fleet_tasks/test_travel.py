@@ -1,0 +1,85 @@
+"""Distances to many cells: both forms of the loop agree, and a new grid is measured a slice at a time."""
+
+from __future__ import annotations
+
+from math import inf
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rce_fleet.compiled import is_available
+from rce_fleet.planning.grid import GridMap
+from rce_fleet.tasks import travel as travel_module
+from rce_fleet.tasks.records import Zone
+from rce_fleet.tasks.travel import TravelCosts
+from rce_fleet.tasks.travel_loops import measure_ways
+
+COST = {"ice": 2.5, "shut": inf}
+
+
+def measured(seed: int, loop: Any, size: int = 6) -> list[Any]:
+    """Return the distances to all cells of a random floor."""
+    rng = Random(seed)
+    grid = GridMap(size, size + 1, cell_size=0.1)
+    cells = range(len(grid))
+    zones = {name: Zone(name, "cost", tuple(rng.sample(cells, 6))) for name in COST}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(travel_module, "measure_ways", loop)
+        travel = TravelCosts()
+        travel.set_map(grid, frozenset(rng.sample(cells, 8)), zones, 0)
+        travel.measure(list(cells), COST)
+        assert travel.missing(cells, COST) == []
+        return [travel.field(cell, COST).tolist() for cell in cells]
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 2**32))
+def test_loop_and_scipy_measure_the_same(seed: int) -> None:
+    assert measured(seed, measure_ways.loop, 4) == measured(seed, measure_ways.numpy, 4)
+
+
+def test_compiled_loop_and_scipy_measure_the_same() -> None:
+    if not is_available():
+        pytest.skip("numba is not installed")
+    for seed in range(20):
+        assert measured(seed, measure_ways.compile()) == measured(seed, measure_ways.numpy)
+
+
+def test_together_and_alone_are_the_same() -> None:
+    grid = GridMap(5, 9)
+    both = []
+    for together in (True, False):
+        travel = TravelCosts()
+        travel.set_map(grid, frozenset({3, 12, 13}), {}, 0)
+        if together:
+            travel.measure([0, 3, 44])
+        both.append([travel.field(cell) for cell in (0, 3, 44)])
+    np.testing.assert_array_equal(both[0], both[1])
+
+
+def test_new_grid_is_measured_in_slices(floor: Any) -> None:
+    """No slice measures more than a few cells, and a step after them measures none."""
+    floor.grid = floor.facts.grid = floor.book.grid = GridMap(10, 30)
+    rng = Random(1)
+    for number, cell in enumerate(rng.sample(range(300), 40)):
+        floor.add(f"Robot{number}", cell)
+    pairs = list(zip(range(0, 300, 3), range(1, 300, 3), strict=True))
+    for source, target in pairs:
+        floor.deliver(source, target)
+    travel = floor.dispatcher._travel
+    most, slices = 0, 0
+    known = 0
+    is_behind = True
+    while is_behind:
+        is_behind = floor.dispatcher.measure(floor.facts)
+        slices, most, known = slices + 1, max(most, len(travel._fields) - known), len(travel._fields)
+    assert slices > 5
+    assert most <= travel.at_once + 1
+    assert known == 2 * len(pairs)
+    floor.run(1)
+    assert len(travel._fields) == known
+    assert not floor.dispatcher.measure(floor.facts)
