@@ -26,8 +26,7 @@ from rce_fleet.wiring import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
+    from collections.abc import Collection, Iterator, Mapping
 
 LAUNCH_FILE = "turtlebot/botmotion.launch"
 _MAP = "/map.yaml"
@@ -95,17 +94,11 @@ def offloaded_config(
     x, y, yaw = initial_pose
     pose = {"initial_pose_x": f"{x}", "initial_pose_y": f"{y}", "initial_pose_a": f"{yaw}"}
     given = {name: str(value) for name, value in (launch_arguments or {}).items()}
-    everything = _launch_plan({"map": _MAP, "robot": namespace, **pose, **given})
-    stays = {node.name for node in _launch_plan({"offload": "true"}).nodes}
     # The planner hears the pose from the container itself.
     left_out = {"relay", "map_server"} if own_map else {"relay"}
-    moved = [node for node in everything.nodes if node.name not in stays and node.type not in left_out]
-    names = [f"{node.name}/" for node in moved]
-    config["parameters"] = [
-        {"cTag": container, "name": name, "value": value}
-        for name, value in everything.parameters.items()
-        if name.startswith(tuple(names))
-    ]
+    nodes, config["parameters"] = moved_nodes(
+        container, {"robot": namespace, **pose, **given}, left_out=left_out
+    )
     more = {"last_pose_timeout": LAST_POSE_TIMEOUT, **({"use_map_topic": True} if own_map else {})}
     config["parameters"] += [
         {"cTag": container, "name": f"/amcl/{name}", "value": value} for name, value in more.items()
@@ -117,7 +110,7 @@ def offloaded_config(
     )
     # What the container's nodes say does not show that the robot is there; its odometry does.
     client["args"] += " _alive_topic:=/odom"
-    config["nodes"] = [*(_node(container, node) for node in moved), client]
+    config["nodes"] = [*nodes, client]
     robot = config["robotID"]
     config["interfaces"] = [
         *layer_interfaces(robot, namespace, container, own_map=own_map),
@@ -129,10 +122,37 @@ def offloaded_config(
     return config
 
 
-def _launch_plan(arguments: dict[str, str]) -> LaunchPlan:
+def moved_nodes(
+    container: str, arguments: Mapping[str, str], *, file: str = LAUNCH_FILE, left_out: Collection[str] = ()
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return the nodes and parameters of a container, for what a launch file does not start if off-loaded.
+
+    Args:
+        container: Tag of the container.
+        arguments: Of the launch file.
+        file: The launch file, in the folder of the shipped configs; its arguments include ``map`` and
+            ``offload``.
+        left_out: Types of nodes that stay where they are.
+
+    Raises:
+        LaunchFileError: The launch file cannot be read.
+    """
+    everything = _launch_plan(file, {"map": _MAP, **arguments})
+    stays = {node.name for node in _launch_plan(file, {"offload": "true"}).nodes}
+    moved = [node for node in everything.nodes if node.name not in stays and node.type not in left_out]
+    names = tuple(f"{node.name}/" for node in moved)
+    parameters = [
+        {"cTag": container, "name": name, "value": value}
+        for name, value in everything.parameters.items()
+        if name.startswith(names)
+    ]
+    return [_node(container, node) for node in moved], parameters
+
+
+def _launch_plan(file: str, arguments: dict[str, str]) -> LaunchPlan:
     folder = configs_dir()
     inputs = MachineInputs(PackageIndex([folder]), {})
-    return load_launch_files([folder / LAUNCH_FILE], arguments, inputs=inputs)
+    return load_launch_files([folder / file], arguments, inputs=inputs)
 
 
 def _node(container: str, node: NodePlan) -> dict[str, Any]:

@@ -15,7 +15,7 @@ class LinkShape:
     Attributes:
         delay: Seconds.
         jitter: Largest difference from the delay, seconds; each frame's is uniform. Frames keep their order.
-        loss: Share of frames that are lost, each independently of the others.
+        loss: Share of frames that are lost, each independently of the others; 1: the link is cut.
     """
 
     delay: float = 0.0
@@ -27,8 +27,8 @@ class LinkShape:
             raise ValueError(
                 f"jitter and delay need 0 <= jitter <= delay, not {self.jitter:g} and {self.delay:g}"
             )
-        if not 0 <= self.loss < 1:
-            raise ValueError(f"the share of lost frames must be within 0 .. 1, without 1, not {self.loss:g}")
+        if not 0 <= self.loss <= 1:
+            raise ValueError(f"the share of lost frames must be within 0 .. 1, not {self.loss:g}")
 
 
 class DelayLine:
@@ -51,6 +51,10 @@ class DelayLine:
         self._held: deque[tuple[float, bytes]] = deque()
         self.carried = 0
         self.lost = 0
+
+    def reshape(self, shape: LinkShape) -> None:
+        """Treat further frames in another way; those that are held come out first."""
+        self._shape = shape
 
     @property
     def next_at(self) -> float:

@@ -1,8 +1,12 @@
 """A link between two TAP interfaces that delays and loses frames: ``python -m ...link_emulator``.
 
 It carries Ethernet frames, multicast among them. The kernel's ``netem`` would do the same and is not
-everywhere. Prints ``ready``, and when it ends one line of JSON: frames carried and lost in each direction,
-and the processor time that it took, seconds.
+everywhere. Prints ``ready``.
+
+Each line of standard input is a JSON object: ``{"delay": 0.01, "jitter": 0, "loss": 0}`` gives the link
+another shape, ``{}`` none. The answer is a line of JSON with what was measured so far: frames carried and
+lost in each direction, and the processor time that it took, seconds. The same line is printed at the end,
+which comes with SIGINT, SIGTERM, or the end of standard input.
 """
 
 from __future__ import annotations
@@ -56,8 +60,51 @@ def open_tap(name: str) -> int:
     return file
 
 
-def carry(directions: list[Direction], wake: int) -> None:
-    """Carry frames until ``wake`` can be read."""
+class Orders:
+    """What the program is told on its standard input, and its answers.
+
+    Args:
+        source: File descriptor of the orders.
+        directions: What they are about.
+    """
+
+    def __init__(self, source: int, directions: list[Direction]) -> None:
+        self.source = source
+        self._directions = directions
+        self._rest = b""
+
+    def read(self) -> bool:
+        """Follow the orders that have arrived; return whether there may be more.
+
+        Raises:
+            ValueError, TypeError: An order is not one.
+        """
+        data = os.read(self.source, _MAX_FRAME)
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        for line in lines:
+            values = json.loads(line)
+            if values:
+                shape = LinkShape(**values)
+                for direction in self._directions:
+                    direction.line.reshape(shape)
+            self.answer()
+        return bool(data)
+
+    def answer(self) -> None:
+        """Print what was measured."""
+        figures = {
+            name: {"carried": direction.line.carried, "lost": direction.line.lost}
+            for name, direction in zip(("there", "back"), self._directions, strict=True)
+        }
+        print(json.dumps({**figures, "cpu_s": time.process_time()}), flush=True)  # noqa: T201
+
+
+def carry(directions: list[Direction], wake: int, orders: Orders) -> None:
+    """Carry frames until ``wake`` can be read, or the orders end.
+
+    Raises:
+        ValueError, TypeError: An order is not one.
+    """
     by_source = {direction.source: direction for direction in directions}
     while True:
         now = time.monotonic()
@@ -65,10 +112,10 @@ def carry(directions: list[Direction], wake: int) -> None:
             for frame in direction.line.take(now):
                 _write(direction.target, frame)
         waits = max(0.0, min(direction.line.next_at for direction in directions) - time.monotonic())
-        readable, _, _ = select.select([*by_source, wake], [], [], min(waits, 3600.0))
-        if wake in readable:
+        readable, _, _ = select.select([*by_source, wake, orders.source], [], [], min(waits, 3600.0))
+        if wake in readable or (orders.source in readable and not orders.read()):
             return
-        for source in readable:
+        for source in by_source.keys() & set(readable):
             _read(by_source[source])
 
 
@@ -111,13 +158,15 @@ def main() -> int:
     signal.set_wakeup_fd(waker)
     there = Direction(left, right, DelayLine(shape, options.seed))
     back = Direction(right, left, DelayLine(shape, options.seed + 1))
+    directions = [there, back]
+    orders = Orders(sys.stdin.fileno(), directions)
     print("ready", flush=True)  # noqa: T201
-    carry([there, back], woken)
-    figures = {
-        name: {"carried": direction.line.carried, "lost": direction.line.lost}
-        for name, direction in (("there", there), ("back", back))
-    }
-    print(json.dumps({**figures, "cpu_s": time.process_time()}), flush=True)  # noqa: T201
+    try:
+        carry(directions, woken, orders)
+    except (ValueError, TypeError) as error:
+        print(f"link_emulator: an order cannot be followed: {error}", file=sys.stderr)  # noqa: T201
+        return 1
+    orders.answer()
     return 0
 
 

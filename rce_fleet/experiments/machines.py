@@ -13,7 +13,8 @@ import secrets
 import shutil
 import sys
 from contextlib import AsyncExitStack
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from rce_fleet.exceptions import ExperimentError
@@ -102,14 +103,18 @@ class MachineNetwork:
     Args:
         links: The machines' links, by name.
         seed: Of jitter and loss.
+        tag: What the names of namespaces and interfaces begin with; at most 12 characters; if empty, one that
+            nothing else has.
     """
 
-    def __init__(self, links: Mapping[str, MachineLink], *, seed: int = 0) -> None:
+    def __init__(self, links: Mapping[str, MachineLink], *, seed: int = 0, tag: str = "") -> None:
         self._links = dict(links)
         self._seed = seed
-        self._tag = f"rcx{secrets.token_hex(2)}"
+        self._tag = tag or f"rcx{secrets.token_hex(2)}"
         self._stack = AsyncExitStack()
         self._emulators: dict[str, asyncio.subprocess.Process] = {}
+        self._sides: dict[str, tuple[tuple[str, str], ...]] = {}
+        """Both ends of each machine's link: namespace and interface."""
         self.machines: dict[str, Machine] = {}
 
     async def __aenter__(self) -> Self:
@@ -147,6 +152,50 @@ class MachineNetwork:
             *(counted[side]["packets"] for side in ("tx", "rx")),
         )
 
+    async def reshape(self, name: str, shape: LinkShape) -> None:
+        """Give a machine's emulated link another shape.
+
+        Raises:
+            ExperimentError: The link is not emulated, or its emulator has ended.
+        """
+        await self._order(name, json.dumps(asdict(shape)))
+
+    async def set_rate(self, name: str, rate: float) -> None:
+        """Give a machine's link another rate, bits per second in each direction.
+
+        Raises:
+            ExperimentError: The link has no rate so far.
+        """
+        if not self._links[name].rate:
+            raise ExperimentError(f"the link of {name} was made without a rate, so it cannot get one")
+        for place, interface in self._sides[name]:
+            await _run("tc", "-n", place, "qdisc", "change", "dev", interface, "root", *_limit(rate))
+
+    async def emulation_s(self) -> float:
+        """Return the processor time that the emulators of all links took so far, seconds.
+
+        Raises:
+            ExperimentError: One has ended.
+        """
+        answers = [await self._order(name, "{}") for name in self._emulators]
+        return float(sum(json.loads(answer)["cpu_s"] for answer in answers))
+
+    async def _order(self, name: str, order: str) -> bytes:
+        emulator = self._emulators.get(name)
+        if emulator is None:
+            raise ExperimentError(f"the link of {name} has no delay, jitter or loss, so it is not emulated")
+        assert emulator.stdin is not None
+        assert emulator.stdout is not None
+        try:
+            emulator.stdin.write(f"{order}\n".encode())
+            async with asyncio.timeout(START_S):
+                answer = await emulator.stdout.readline()
+        except (OSError, TimeoutError) as error:
+            raise ExperimentError(f"the emulator of {name}'s link does not answer: {error}") from error
+        if not answer:
+            raise ExperimentError(f"the emulator of {name}'s link has ended")
+        return answer
+
     async def probe(self, name: str, other: str) -> LinkFigures:
         """Measure the way from one machine to another and back.
 
@@ -169,8 +218,9 @@ class MachineNetwork:
 
     async def _namespace(self, stack: AsyncExitStack, name: str) -> str:
         namespace = f"{self._tag}-{name}"
+        # Registered first: a cancellation may come while the namespace is made.
+        stack.push_async_callback(_delete_namespace, namespace)
         await _ip("netns", "add", namespace)
-        stack.push_async_callback(_ip, "netns", "del", namespace)
         await _ip("-n", namespace, "link", "set", "lo", "up")
         return namespace
 
@@ -179,6 +229,7 @@ class MachineNetwork:
         namespace = await self._namespace(stack, name)
         near, far = f"{self._tag}n{number}", f"{self._tag}f{number}"
         if link.shape == LinkShape():
+            stack.push_async_callback(_delete_link, near)
             await _ip("link", "add", near, "type", "veth", "peer", "name", far)
         else:
             await self._emulate(stack, name, near, far, link.shape, number)
@@ -189,8 +240,9 @@ class MachineNetwork:
         await _ip("-n", namespace, "link", "set", INTERFACE, "up")
         await _ip("-n", namespace, "route", "add", "224.0.0.0/4", "dev", INTERFACE)
         await _ip("-n", switch, "link", "set", far, "master", "bridge", "up")
+        self._sides[name] = ((namespace, INTERFACE), (switch, far))
         if link.rate:
-            for place, interface in ((namespace, INTERFACE), (switch, far)):
+            for place, interface in self._sides[name]:
                 await _run("tc", "-n", place, "qdisc", "add", "dev", interface, "root", *_limit(link.rate))
         return Machine(name, address, namespace)
 
@@ -202,6 +254,7 @@ class MachineNetwork:
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "rce_fleet.experiments.link_emulator", near, far, *options),
             *("--seed", str(self._seed + 2 * number)),
+            stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
         )
         stack.push_async_callback(_end, process)
@@ -227,6 +280,21 @@ async def _end(process: asyncio.subprocess.Process) -> None:
     await process.communicate()
 
 
+async def _delete_namespace(name: str) -> None:
+    if _is_there("/run/netns", name):
+        await _ip("netns", "del", name)
+
+
+async def _delete_link(name: str) -> None:
+    """Delete an interface that was not moved to its machine yet."""
+    if _is_there("/sys/class/net", name):
+        await _ip("link", "del", name)
+
+
+def _is_there(folder: str, name: str) -> bool:
+    return Path(folder, name).exists()
+
+
 async def _ip(*words: str) -> str:
     return await _run("ip", *words)
 
@@ -235,7 +303,11 @@ async def _run(*argv: str) -> str:
     process = await asyncio.create_subprocess_exec(
         *argv, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
     )
-    out, error = await process.communicate()
+    try:
+        out, error = await process.communicate()
+    except asyncio.CancelledError:
+        await process.wait()  # what it makes is removed afterwards
+        raise
     if process.returncode:
         raise ExperimentError(f"{' '.join(argv)}: {error.decode(errors='replace').strip()}")
     return out.decode()

@@ -65,7 +65,7 @@ def write_rows(path: Path, rows: Iterable[Row]) -> None:
                     experiment,
                     system,
                     software,
-                    _joined(factors),
+                    joined_factors(factors),
                     row.run,
                     row.metric,
                     repr(row.value),
@@ -90,7 +90,7 @@ def read_rows(path: Path) -> list[Row]:
     for number, fields in enumerate(csv.reader(lines[1:]), 2):
         try:
             experiment, system, software, factors, run, metric, value, unit = fields
-            condition = Condition(experiment, system, software, _split(factors))
+            condition = Condition(experiment, system, software, split_factors(factors))
             found.append(Row(condition, int(run), metric, float(value), unit))
         except ValueError as error:
             raise ExperimentError(f"{path}:{number}: {error}") from error
@@ -106,13 +106,19 @@ def by_condition(rows: Iterable[Row], metric: str) -> Mapping[Condition, list[fl
     return {condition: [value for _, value in sorted(pairs)] for condition, pairs in found.items()}
 
 
-def _joined(factors: tuple[tuple[str, str], ...]) -> str:
+def joined_factors(factors: tuple[tuple[str, str], ...]) -> str:
+    """Return factors as they are written in tables, ``name=value;name=value``.
+
+    Raises:
+        ExperimentError: A name or value contains a separator.
+    """
     for name, value in factors:
         if any(mark in f"{name}{value}" for mark in ";=\n"):
             raise ExperimentError(f"a factor must not contain ; = or a line break: {name!r} = {value!r}")
     return ";".join(f"{name}={value}" for name, value in factors)
 
 
-def _split(text: str) -> tuple[tuple[str, str], ...]:
+def split_factors(text: str) -> tuple[tuple[str, str], ...]:
+    """Return the factors of a text that :func:`joined_factors` made."""
     pairs = (part.partition("=") for part in text.split(";") if part)
     return tuple((name, value) for name, _, value in pairs)

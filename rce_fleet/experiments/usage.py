@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, Protocol
 from rce_fleet.exceptions import ExperimentError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Iterator
 
 ROOT = Path("/sys/fs/cgroup")
 PERIOD_US = 100_000
-"""Period in which a limited machine gets its share of the processor."""
+"""Longest period in which a limited machine gets its share of the processor."""
+QUOTA_US = 2_000
+"""The share of a period that is aimed at: a slow processor is slow, but it does not stop for long."""
 REMOVE_TRIES = 50
 _SECONDS = os.sysconf("SC_CLK_TCK")
 _PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -59,8 +61,16 @@ class Meter(Protocol):
     def read(self) -> Usage:
         """Return what was used."""
 
+    def processes(self) -> set[int]:
+        """Return the ids of the processes that are counted now."""
+
     def close(self) -> None:
         """Stop counting; the programs must have ended."""
+
+
+def period_us(cores: float) -> int:
+    """Return the period in which a machine gets so much of a core, microseconds."""
+    return min(PERIOD_US, int(QUOTA_US / cores)) if cores else PERIOD_US
 
 
 def make_meter(name: str, namespace: str) -> Meter:
@@ -101,9 +111,13 @@ class ControlGroups1:
 
     def limit(self, cores: float) -> None:
         """Give the machine so much of a core at most; 0: no limit."""
-        quota = int(cores * PERIOD_US) if cores else -1
-        (self._groups["cpu"] / "cpu.cfs_period_us").write_text(str(PERIOD_US))
-        (self._groups["cpu"] / "cpu.cfs_quota_us").write_text(str(quota))
+        period = period_us(cores)
+        quota = self._groups["cpu"] / "cpu.cfs_quota_us"
+        # The kernel refuses a pair that it does not take as a whole: no limit fits every period.
+        quota.write_text("-1")
+        (self._groups["cpu"] / "cpu.cfs_period_us").write_text(str(period))
+        if cores:
+            quota.write_text(str(int(cores * period)))
 
     def read(self) -> Usage:
         """Return what was used; cached files do not count."""
@@ -111,10 +125,14 @@ class ControlGroups1:
         fields = _fields(self._groups["memory"] / "memory.stat")
         return Usage(nanoseconds / 1e9, fields.get("total_rss", 0))
 
+    def processes(self) -> set[int]:
+        """Return the ids of the processes that are counted now."""
+        return {pid for group in self._groups.values() for pid in processes_in_group(group)}
+
     def close(self) -> None:
         """Remove the groups."""
         for group in self._groups.values():
-            _remove(group)
+            remove_group(group)
 
 
 class ControlGroup2:
@@ -141,17 +159,22 @@ class ControlGroup2:
 
     def limit(self, cores: float) -> None:
         """Give the machine so much of a core at most; 0: no limit."""
-        quota = str(int(cores * PERIOD_US)) if cores else "max"
-        (self._group / "cpu.max").write_text(f"{quota} {PERIOD_US}")
+        period = period_us(cores)
+        quota = str(int(cores * period)) if cores else "max"
+        (self._group / "cpu.max").write_text(f"{quota} {period}")
 
     def read(self) -> Usage:
         """Return what was used; cached files do not count."""
         microseconds = _fields(self._group / "cpu.stat").get("usage_usec", 0)
         return Usage(microseconds / 1e6, _fields(self._group / "memory.stat").get("anon", 0))
 
+    def processes(self) -> set[int]:
+        """Return the ids of the processes that are counted now."""
+        return set(processes_in_group(self._group))
+
     def close(self) -> None:
         """Remove the group."""
-        _remove(self._group)
+        remove_group(self._group)
 
 
 class ProcessTable:
@@ -175,19 +198,17 @@ class ProcessTable:
 
     def read(self) -> Usage:
         """Return what was used."""
-        shown = subprocess.run(  # noqa: S603 - a fixed program
-            ["ip", "netns", "pids", self._namespace],  # noqa: S607 - wherever the system has it
-            check=False,
-            capture_output=True,
-            text=True,
-        ).stdout
         memory = 0
-        for pid in map(int, shown.split()):
+        for pid in self.processes():
             with contextlib.suppress(OSError, IndexError):
                 fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
                 self._most[pid, int(fields[19])] = sum(map(int, fields[11:13])) / _SECONDS
                 memory += int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * _PAGE
         return Usage(sum(self._most.values()), memory)
+
+    def processes(self) -> set[int]:
+        """Return the ids of the processes that are counted now."""
+        return processes_in(self._namespace)
 
     def close(self) -> None:
         """Nothing is left to remove."""
@@ -203,7 +224,33 @@ def _fields(path: Path) -> dict[str, int]:
     return {pair[0]: int(pair[1]) for pair in pairs if len(pair) == 2}  # noqa: PLR2004 - name and value
 
 
-def _remove(group: Path) -> None:
+def processes_in(namespace: str) -> set[int]:
+    """Return the ids of the processes in a network namespace."""
+    shown = subprocess.run(  # noqa: S603 - a fixed program
+        ["ip", "netns", "pids", namespace],  # noqa: S607 - wherever the system has it
+        check=False,
+        capture_output=True,
+        text=True,
+    ).stdout
+    return {int(pid) for pid in shown.split()}
+
+
+def processes_in_group(group: Path) -> Iterator[int]:
+    """Yield the ids of the processes in a control group and those below it."""
+    for file in group.rglob("cgroup.procs"):
+        with contextlib.suppress(FileNotFoundError):
+            yield from map(int, file.read_text().split())
+
+
+def remove_group(group: Path) -> None:
+    """Remove a control group and those below it; their processes must have been told to end.
+
+    Raises:
+        OSError: A process of it does not end.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        for below in [path for path in group.iterdir() if path.is_dir()]:
+            remove_group(below)
     for attempt in range(REMOVE_TRIES):
         try:
             group.rmdir()

@@ -58,7 +58,7 @@ def link(*options: str) -> Iterator[tuple[str, str, subprocess.Popen[str]]]:
     tag = f"rcl{os.getpid()}"
     names = {f"{tag}a": LEFT, f"{tag}b": RIGHT}
     argv = [sys.executable, "-m", "rce_fleet.experiments.link_emulator", *names, *options]
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as emulator:
+    with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as emulator:
         try:
             assert emulator.stdout is not None
             assert emulator.stdout.readline() == "ready\n"
@@ -120,6 +120,32 @@ def test_frames_are_lost_and_counted() -> None:
         assert figures["back"]["lost"] > 0
         assert figures["there"]["carried"] >= len(found)
         assert figures["cpu_s"] > 0
+
+
+def test_a_link_gets_another_shape_and_tells_what_it_carried() -> None:
+    with link() as (left, right, emulator):
+        assert emulator.stdin is not None
+        assert emulator.stdout is not None
+        assert statistics.median(trips(left, right, RIGHT, 5)) < 0.04
+        emulator.stdin.write('{"delay": 0.05}\n')
+        emulator.stdin.flush()
+        carried = json.loads(emulator.stdout.readline())["there"]["carried"]
+        assert carried >= 5
+        assert statistics.median(trips(left, right, RIGHT, 5)) >= 0.095
+        emulator.stdin.write("{}\n")
+        emulator.stdin.flush()
+        assert json.loads(emulator.stdout.readline())["there"]["carried"] >= carried + 5
+        emulator.stdin.close()
+        assert emulator.wait(START_S) == 0, "it ends with its standard input"
+
+
+def test_a_bad_order_is_named() -> None:
+    names = [f"rcl{os.getpid()}a", f"rcl{os.getpid()}b"]
+    argv = [sys.executable, "-m", "rce_fleet.experiments.link_emulator", *names]
+    order = '{"delay": -1}\n'
+    done = subprocess.run(argv, check=False, input=order, capture_output=True, text=True, timeout=START_S)
+    assert done.returncode == 1
+    assert "an order cannot be followed: jitter and delay need" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -50,3 +50,27 @@ async def test_a_missing_tool_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "TOOLS", ("ip", "no-such-tool"))
     with pytest.raises(ExperimentError, match="making them needs the program no-such-tool"):
         await MachineNetwork({}).__aenter__()
+
+
+@needs_machines
+async def test_a_link_gets_another_shape_while_it_is_in_use() -> None:
+    links = {"server": MachineLink(), "robot": MachineLink(shape=LinkShape(delay=0.001))}
+    async with MachineNetwork(links) as network:
+        near = await network.probe("robot", "server")
+        await network.reshape("robot", LinkShape(delay=0.03))
+        far = await network.probe("robot", "server")
+        assert near.round_trip_s < 0.04
+        assert far.round_trip_s >= 0.055
+        assert await network.emulation_s() > 0
+        with pytest.raises(ExperimentError, match="the link of server has no delay"):
+            await network.reshape("server", LinkShape(delay=0.03))
+
+
+@needs_machines
+async def test_a_link_gets_another_rate_while_it_is_in_use() -> None:
+    async with MachineNetwork({"server": MachineLink(), "robot": MachineLink(rate=20e6)}) as network:
+        await network.set_rate("robot", 2e6)
+        found = await network.probe("robot", "server")
+        assert found.rate <= 2e6
+        with pytest.raises(ExperimentError, match="server was made without a rate"):
+            await network.set_rate("server", 2e6)

@@ -12,7 +12,14 @@ import pytest
 
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.machines import MachineLink, MachineNetwork
-from rce_fleet.experiments.usage import ControlGroup2, ControlGroups1, Meter, ProcessTable, make_meter
+from rce_fleet.experiments.usage import (
+    ControlGroup2,
+    ControlGroups1,
+    Meter,
+    ProcessTable,
+    make_meter,
+    period_us,
+)
 
 BURN = """
 import os, sys, time
@@ -93,3 +100,10 @@ def test_the_best_meter_is_chosen() -> None:
         assert made.limits or isinstance(made, ProcessTable)
     finally:
         made.close()
+
+
+@pytest.mark.parametrize(("cores", "period"), [(0.0, 100_000), (0.01, 100_000), (0.2, 10_000), (1.0, 2_000)])
+def test_a_limited_machine_stops_only_shortly(cores: float, period: int) -> None:
+    """The kernel takes periods from 1 ms to 1 s, and shares of them from 1 ms on."""
+    assert period_us(cores) == period
+    assert not cores or cores * period_us(cores) >= 1000

@@ -57,7 +57,7 @@ def test_a_full_line_loses_frames() -> None:
         ({"delay": 0.1, "jitter": 0.2}, "0 <= jitter <= delay, not 0.2 and 0.1"),
         ({"delay": -1.0, "jitter": -2.0}, "not -2 and -1"),
         ({"delay": inf}, "not 0 and inf"),
-        ({"loss": 1.0}, "without 1, not 1"),
+        ({"loss": 1.1}, "within 0 .. 1, not 1.1"),
     ],
 )
 def test_impossible_shapes_are_refused(values: dict[str, float], text: str) -> None:

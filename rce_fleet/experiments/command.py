@@ -1,0 +1,199 @@
+"""``rce experiment NAME``: the paper's experiments and more, on this machine."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rce.own_process import end_signals
+from rce_fleet.exceptions import ExperimentError
+from rce_fleet.experiments import environment
+from rce_fleet.experiments.catalogue import experiments_of
+from rce_fleet.experiments.experiment import PAPER_SYSTEMS, Options
+from rce_fleet.experiments.ownership import sweep
+from rce_fleet.experiments.report import make_report
+from rce_fleet.experiments.runner import TABLE, Plan, Runner
+from rce_fleet.experiments.systems.registry import system_of
+from rce_fleet.experiments.systems.software import SOFTWARES, software_of
+
+RUNS = 10
+PAGE = "experiments.md"
+INTERRUPTED = 130
+"""Exit code after Ctrl-C."""
+QUICK_SECONDS = 1.0
+QUICK_ROBOTS = 2
+"""More robots show nothing that two do not."""
+
+
+def experiment(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The experiment, or all.", show_default=False)],
+    runs: Annotated[int, typer.Option(min=1, help="Runs of each set-up that count.")] = RUNS,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the order of runs and of random choices.")] = 1,
+    *,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="One short run of a few conditions, to see that all works.")
+    ] = False,
+    plan: Annotated[
+        bool, typer.Option("--plan", help="Print what would run and how long it takes; run nothing.")
+    ] = False,
+    resume: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Go on where the run in this folder ended.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="New folder for the raw data.", show_default="experiment-TIME"),
+    ] = None,
+    robots: Annotated[int, typer.Option(min=1, max=20, help="Robots, where an experiment has no own.")] = 5,
+    systems: Annotated[str, typer.Option(metavar="NAME,...", help="Systems that are compared.")] = ",".join(
+        PAPER_SYSTEMS
+    ),
+    software: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME,...",
+            help="Software of the robots; the first one has all conditions.",
+            show_default="those that are installed of ros,rce",
+        ),
+    ] = None,
+    page: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Page that is made of the raw data; its figures are in a folder of its name beside it.",
+            show_default="experiments.md in the folder",
+        ),
+    ] = None,
+    second: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Raw data of a second run: the page compares both."),
+    ] = None,
+) -> None:
+    """Compare Single Master, Multi Master and Cloud Robotics System by experiments.
+
+    Machines are network namespaces with links like a wireless LAN. Raw data go to results.csv in the folder,
+    what they depend on to environment.json. A page of tables, figures and claims is made of them.
+    """
+    try:
+        options = _options(systems, software, robots, quick=quick)
+        planned = Plan(experiments_of(name), options, 1 if quick else runs, seed)
+        if plan:
+            _show(planned, resume)
+            return
+        folder = _folder(planned, resume, output)
+        for left in sweep():
+            typer.echo(f"removed what an experiment left that was killed: {left}")
+        asyncio.run(_run(Runner(planned, folder, typer.echo)))
+        typer.echo(f"raw data: {folder / TABLE}")
+        page = page or folder / PAGE
+        make_report(folder, page=page, figures=page.with_suffix(""), second=second)
+        typer.echo(f"page: {page}")
+    except (ExperimentError, OSError) as error:
+        typer.echo(f"rce experiment: {error}", err=True)
+        raise typer.Exit(1) from error
+    except asyncio.CancelledError:
+        typer.echo(f"interrupted; go on with --resume {folder}", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+
+
+async def _run(runner: Runner) -> None:
+    task = asyncio.current_task()
+    assert task is not None
+    loop = asyncio.get_running_loop()
+
+    def interrupt() -> None:
+        if not task.cancelling():  # a second Ctrl-C does not stop the removal of what was made
+            task.cancel()
+
+    for number in end_signals():
+        loop.add_signal_handler(number, interrupt)
+    try:
+        await runner.run()
+    finally:
+        for number in end_signals():
+            with contextlib.suppress(ValueError):
+                loop.remove_signal_handler(number)
+
+
+def _options(systems: str, software: str | None, robots: int, *, quick: bool) -> Options:
+    chosen = _names(systems, "--systems")
+    for name in chosen:
+        system_of(name)
+    if software is None:
+        names = tuple(name for name, one in SOFTWARES.items() if not one.missing())
+    else:
+        names = _names(software, "--software")
+        for name in names:
+            software_of(name)
+    if quick:
+        return Options(chosen, names, min(robots, QUICK_ROBOTS), QUICK_SECONDS, quick=True)
+    return Options(chosen, names, robots)
+
+
+def _names(text: str, option: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    if not names:
+        raise ExperimentError(f"{option} needs at least one name")
+    return names
+
+
+def _folder(planned: Plan, resume: Path | None, output: Path | None) -> Path:
+    """Return the folder of the raw data; make it and describe what they depend on."""
+    if resume is not None and output is not None:
+        raise ExperimentError(
+            "--resume DIR goes on in its folder; --output DIR needs a new one: give one of both"
+        )
+    description = environment.describe(planned.options, planned.seed, planned.runs)
+    if resume is not None:
+        _check_same(resume, description)
+        return resume
+    folder = output or Path(time.strftime("experiment-%Y%m%d-%H%M%S"))
+    try:
+        folder.mkdir(parents=True)
+        environment.write(folder, description)
+    except FileExistsError:
+        raise ExperimentError(f"{folder} exists already; go on in it with --resume {folder}") from None
+    except OSError as error:
+        raise ExperimentError(f"{folder} cannot be made: {error}") from error
+    return folder
+
+
+def _check_same(folder: Path, description: dict[str, Any]) -> None:
+    """Make sure that a folder's raw data were made in the same way.
+
+    Raises:
+        ExperimentError: They were not, or cannot be read.
+    """
+    try:
+        former = environment.read(folder)
+    except (OSError, ValueError) as error:
+        raise ExperimentError(f"--resume {folder}: {error}") from error
+    for key in ("commit", "seed", "options"):
+        if former.get(key) != description[key]:
+            raise ExperimentError(
+                f"--resume {folder}: its {key} is {_shown(former.get(key))}, now it is "
+                f"{_shown(description[key])}; data of both cannot be in one table"
+            )
+
+
+def _shown(value: object) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _show(planned: Plan, resume: Path | None) -> None:
+    rows = [] if resume is None else Runner(planned, resume, typer.echo).rows()
+    total = 0.0
+    for one in planned.experiments:
+        seconds = planned.seconds(one, rows)
+        total += seconds
+        works = planned.works(one, rows)
+        setups = len(one.setups(planned.options))
+        typer.echo(
+            f"{one.name:12} {setups:3} set-ups {len(works):4} runs {seconds / 60:6.1f} min  {one.title}"
+        )
+    typer.echo(f"{'all' if len(planned.experiments) > 1 else 'in total':12} {total / 60:34.1f} min")

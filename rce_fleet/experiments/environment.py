@@ -1,0 +1,109 @@
+"""Where raw data come from: the machine, the versions, the commit, the options."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import rce
+from rce_fleet.experiments.ownership import new_tag
+from rce_fleet.experiments.usage import make_meter
+
+if TYPE_CHECKING:
+    from rce_fleet.experiments.experiment import Options
+
+FILE = "environment.json"
+PACKAGES = ("numpy", "uvloop", "websockets", "aiohttp", "msgspec")
+PROGRAMS = {"roscore": ("rosversion", "roslaunch"), "bwrap": ("bwrap", "--version")}
+"""Programs that take part, and what prints their versions."""
+
+
+def describe(options: Options, seed: int, runs: int) -> dict[str, Any]:
+    """Return what raw data depend on, as a JSON document."""
+    return {
+        "machine": platform.machine(),
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        "kernel": platform.release(),
+        "python": sys.version.split()[0],
+        "cpu_shares": "limited" if can_limit() else "not limited",
+        "versions": _versions(),
+        "commit": commit(),
+        "seed": seed,
+        "runs": runs,
+        "started": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
+        "options": {
+            "systems": list(options.systems),
+            "software": list(options.software),
+            "robots": options.robots,
+            "seconds": options.seconds,
+            "quick": options.quick,
+        },
+    }
+
+
+def write(folder: Path, description: dict[str, Any]) -> None:
+    """Write a description beside the raw data."""
+    (folder / FILE).write_text(json.dumps(description, indent=2) + "\n")
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """Read the description of raw data.
+
+    Raises:
+        OSError: The file cannot be read.
+        ValueError: It is not one.
+    """
+    found = json.loads((folder / FILE).read_text())
+    if not isinstance(found, dict):
+        raise ValueError(f"{folder / FILE} is not a JSON object")  # noqa: TRY004 - it is the file's fault
+    return found
+
+
+def can_limit() -> bool:
+    """Return whether a machine's processor time can be limited here."""
+    meter = make_meter(new_tag(), "")
+    meter.close()
+    return meter.limits
+
+
+def _processor() -> str:
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+        name, _, value = line.partition(":")
+        if name.strip() == "model name":
+            return value.strip()
+    return platform.processor()
+
+
+def _versions() -> dict[str, str]:
+    found = {"rce": rce.__version__}
+    for name in PACKAGES:
+        found[name] = metadata.version(name)
+    for name, argv in PROGRAMS.items():
+        if shutil.which(argv[0]) is not None:
+            done = subprocess.run(argv, check=False, capture_output=True, text=True, timeout=30)  # noqa: S603
+            found[name] = done.stdout.strip().removeprefix("bubblewrap ") or "unknown"
+    return found
+
+
+def commit() -> str:
+    """Return the commit of the checkout that this package is in; with ``+`` if files were changed."""
+    folder = Path(rce.__file__).parent
+    git = ("git", "-C", str(folder))
+    if shutil.which("git") is None:
+        return "unknown"
+    head = subprocess.run((*git, "rev-parse", "HEAD"), check=False, capture_output=True, text=True)  # noqa: S603
+    if head.returncode:
+        return "unknown"
+    status = ("status", "--porcelain", "--untracked-files=no")
+    changed = subprocess.run((*git, *status), check=False, capture_output=True, text=True).stdout  # noqa: S603
+    return head.stdout.strip() + ("+" if changed.strip() else "")

@@ -1,0 +1,119 @@
+"""Compares two full runs: which medians of the second one lie in the intervals of the first one.
+
+Two runs of the same thing do not agree in 95 % of the medians: an interval contains the true median in 95 of
+100 experiments, but the second run's median varies too. For large samples some 83 % lie in the interval.
+Source: G. Cumming, R. Maillardet, "Confidence intervals and replication: Where will the next mean fall?",
+2006. Therefore medians that are outside by little are counted apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isnan
+from typing import TYPE_CHECKING
+
+from rce_fleet.experiments.report.labels import condition_order
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from rce_fleet.experiments.report.summary import Summary
+
+GOAL = 0.9
+"""Share of the medians that must lie in the first run's intervals."""
+EXPECTED = 0.83
+"""Share that does if nothing has changed, for intervals of 95 %."""
+NEAR = 0.05
+"""A median outside of the interval is near if it differs from the first one by this share at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """A metric of a condition in two runs."""
+
+    first: Summary
+    second: Summary
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether the second median lies in the first one's interval."""
+        return self.second.estimate.median in self.first.estimate
+
+    @property
+    def change(self) -> float:
+        """The second median's difference from the first one, as a share of the first one."""
+        first, second = self.first.estimate.median, self.second.estimate.median
+        if first == second:
+            return 0.0
+        return (second - first) / abs(first) if first else float("inf")
+
+    @property
+    def is_near(self) -> bool:
+        """Whether the second median is outside of the interval by little."""
+        return not self.is_inside and abs(self.change) <= NEAR
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Two full runs.
+
+    Attributes:
+        pairs: What both measured, with an interval in the first one.
+        without_interval: Metrics that both measured, in the first one with too few runs for an interval.
+        only_first: Metrics of conditions that the second one did not measure.
+        only_second: Those that the first one did not measure.
+    """
+
+    pairs: tuple[Pair, ...]
+    without_interval: int
+    only_first: tuple[Summary, ...]
+    only_second: tuple[Summary, ...]
+
+    @property
+    def inside(self) -> float:
+        """Share of the second medians that lie in the first one's intervals."""
+        return sum(pair.is_inside for pair in self.pairs) / len(self.pairs) if self.pairs else float("nan")
+
+    @property
+    def inside_or_near(self) -> float:
+        """Share of those that lie in the intervals, or outside by little."""
+        near = sum(pair.is_inside or pair.is_near for pair in self.pairs)
+        return near / len(self.pairs) if self.pairs else float("nan")
+
+    @property
+    def reaches_goal(self) -> bool:
+        """Whether enough medians lie in the intervals."""
+        return bool(self.pairs) and self.inside >= GOAL
+
+    @property
+    def outside(self) -> list[Pair]:
+        """What does not lie in the intervals, the largest change first."""
+        return sorted((pair for pair in self.pairs if not pair.is_inside), key=lambda pair: -abs(pair.change))
+
+    def experiments(self) -> Iterator[tuple[str, Comparison]]:
+        """Yield the comparison of each experiment by itself."""
+        for name in sorted({pair.first.condition.experiment for pair in self.pairs}):
+            pairs = tuple(pair for pair in self.pairs if pair.first.condition.experiment == name)
+            yield name, Comparison(pairs, 0, (), ())
+
+
+def compare(first: Iterable[Summary], second: Iterable[Summary]) -> Comparison:
+    """Compare two full runs by their summaries; metrics over time (``name@seconds``) do not count.
+
+    Numbers of both are rounded as in the file of a summary, so that a committed one can be compared.
+    """
+    one, other = _by_name(first), _by_name(second)
+    both = [Pair(found, other[name]) for name, found in one.items() if name in other]
+    pairs = tuple(pair for pair in both if not isnan(pair.first.estimate.low))
+    return Comparison(
+        pairs,
+        len(both) - len(pairs),
+        tuple(found for name, found in one.items() if name not in other),
+        tuple(found for name, found in other.items() if name not in one),
+    )
+
+
+def _by_name(summaries: Iterable[Summary]) -> dict[object, Summary]:
+    kept = (one for one in summaries if "@" not in one.metric)
+    ordered = sorted(kept, key=lambda one: (condition_order(one.condition), one.metric))
+    return {(one.condition, one.metric): one for one in ordered}

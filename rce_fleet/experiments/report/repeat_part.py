@@ -1,0 +1,73 @@
+"""The part of the page that compares a second full run with the first one."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import TYPE_CHECKING
+
+from rce_fleet.experiments.report.labels import (
+    factors_label,
+    interval,
+    scale_for,
+    scaled,
+    software_label,
+    system_label,
+)
+from rce_fleet.experiments.report.repeat import EXPECTED, GOAL, NEAR
+from rce_fleet.experiments.report.tables import folded, markdown
+
+if TYPE_CHECKING:
+    from rce_fleet.experiments.report.repeat import Comparison, Pair
+
+
+def comparison_text(comparison: Comparison) -> str:
+    """Return how many medians of the second run lie in the first one's intervals, and which do not."""
+    if not comparison.pairs:
+        return "Nothing can be compared: no metric has an interval in the first run and a second value."
+    parts = [_verdict(comparison), _shares(comparison)]
+    if comparison.outside:
+        head = ("experiment", "system", "software", "factors", "metric", "first", "second", "unit", "change")
+        rows = [_row(pair) for pair in comparison.outside]
+        parts.append(folded("Medians outside of the intervals", markdown(head, rows)))
+    counts = {
+        "have no interval in the first run": comparison.without_interval,
+        "were measured in the first run only": len(comparison.only_first),
+        "were measured in the second run only": len(comparison.only_second),
+    }
+    parts += [f"{count} metrics of conditions {what}." for what, count in counts.items() if count]
+    return "\n\n".join(parts)
+
+
+def _verdict(comparison: Comparison) -> str:
+    reached = "reached" if comparison.reaches_goal else "not reached"
+    return (
+        f"Of {len(comparison.pairs)} medians of the second run, {_percent(comparison.inside)} lie in the "
+        f"intervals of the first one; the goal of {_percent(GOAL)} is {reached}. With those that are "
+        f"outside by {_percent(NEAR)} of the first median at most, it is "
+        f"{_percent(comparison.inside_or_near)}. If nothing differs but chance, some {_percent(EXPECTED)} "
+        "lie in the intervals, since the second medians vary too. Values over time are not counted."
+    )
+
+
+def _shares(comparison: Comparison) -> str:
+    rows = [
+        (name, str(len(part.pairs)), _percent(part.inside), _percent(part.inside_or_near))
+        for name, part in comparison.experiments()
+    ]
+    head = ("experiment", "medians", "in the intervals", f"or outside by {_percent(NEAR)} at most")
+    return markdown(head, rows)
+
+
+def _row(pair: Pair) -> list[str]:
+    condition, first, second = pair.first.condition, pair.first.estimate, pair.second.estimate
+    scale = scale_for(pair.first.unit, [first.median])
+    change = f"{100 * pair.change:+.1f} %" if isfinite(pair.change) else "from 0"
+    return [
+        *(condition.experiment, system_label(condition.system), software_label(condition.software)),
+        *(factors_label(condition.factors), f"`{pair.first.metric}`"),
+        *(interval(first, scale), scaled(second.median, scale), scale.unit, change),
+    ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"

@@ -1,0 +1,190 @@
+"""What the page says about each experiment, and its tables; with the page's parts that no data change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rce_fleet.experiments.report.explanations import NETWORK
+from rce_fleet.experiments.report.judging import MIN_RATIO, SAME_RATIO
+from rce_fleet.experiments.report.measurements import Quantity
+from rce_fleet.experiments.report.repeat import EXPECTED
+from rce_fleet.experiments.report.tables import TableSpec
+from rce_fleet.experiments.statistics import CONFIDENCE, MIN_RUNS, RESAMPLES
+
+_CLIENT_NETWORK = Quantity("client.network_in", "+", "client.network_out")
+_PACKETS = tuple(
+    Quantity(f"{machine}.packets_in", "+", f"{machine}.packets_out") for machine in ("server", "client")
+)
+
+
+def _quantities(*names: str) -> tuple[Quantity, ...]:
+    return tuple(Quantity(name) for name in names)
+
+
+_DELIVERY = TableSpec(
+    "Rate, delay and loss",
+    _quantities("rate", "received", "lost", "delay_p50", "delay_p95", "delay_p99"),
+)
+_TRAFFIC = TableSpec("Network", (NETWORK, _CLIENT_NETWORK, *_PACKETS, *_quantities("message_bytes")))
+_USE = TableSpec(
+    "CPU and memory",
+    _quantities("server.cpu", "client.cpu", "link.cpu", "server.memory", "client.memory"),
+)
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page about an experiment.
+
+    Attributes:
+        experiment: Its name in the raw data.
+        title: The heading.
+        text: What is measured.
+        tables: Its tables.
+    """
+
+    experiment: str
+    title: str
+    text: str
+    tables: tuple[TableSpec, ...]
+
+
+SECTIONS = (
+    Section(
+        "laser",
+        "Laser scans",
+        "Machine 2 simulates TurtleBots that publish laser scans; machine 1 subscribes to all scans and "
+        "prints them (`printed=yes`) or not. `client_cpu=full` limits machine 2 to a share of the "
+        "processor at which the robots of SMS publish at about 7.5 Hz, as in the paper. `rate=free` "
+        "publishes as fast as possible, at most as asked; `rate=fixed` publishes at the same rate in all "
+        "systems. Rates are per robot; a delay is the time from the scan's stamp until it is printed.",
+        (_DELIVERY, _TRAFFIC, _USE),
+    ),
+    Section(
+        "round-trip",
+        "Round trip",
+        "A message is published at its `origin`, published again by the other machine, and received at its"
+        " origin. In CRS, machine 1 publishes from a container (`origin=container`) or from the graph "
+        "outside of it (`origin=server`). `delay` is what the link adds in each direction, in "
+        "milliseconds; columns are sizes of the message in bytes.",
+        (
+            TableSpec("Round trip, median of a run (`round_trip`)", _quantities("round_trip"), "bytes"),
+            TableSpec(
+                "Round trip, 95th percentile of a run (`round_trip_p95`)",
+                _quantities("round_trip_p95"),
+                "bytes",
+            ),
+            TableSpec("Messages without an answer (`lost`)", _quantities("lost"), "bytes"),
+        ),
+    ),
+    Section(
+        "images",
+        "Images",
+        "Images go from one machine to the other, which echoes them on a console (`printed=yes`) or not. "
+        "`rate=carried` is a rate that the link can carry, `rate=above` is above it.",
+        (_DELIVERY, _TRAFFIC, _USE),
+    ),
+    Section(
+        "scaling",
+        "Number of robots",
+        "The same as laser scans, with more robots until something breaks. In CRS, all robots share a "
+        "container (`containers=one`) or have their own (`containers=each`). `start` is the time until the"
+        " topics of all robots arrive.",
+        (
+            _DELIVERY,
+            TableSpec("Round trip and start", _quantities("round_trip", "start")),
+            _TRAFFIC,
+            _USE,
+        ),
+    ),
+    Section(
+        "robustness",
+        "Faults",
+        "A core or a master is killed, or a machine is cut off. Shown is how long connected topics, "
+        "services and new topics were without an answer. What did not come back (`..._came_back` is 0) has"
+        " the time for which it was observed.",
+        (
+            TableSpec(
+                "Time without an answer",
+                _quantities("topics_stopped", "services_stopped", "new_topics_stopped"),
+            ),
+            TableSpec(
+                "Came back (1) or not (0), and messages lost",
+                _quantities(
+                    "topics_came_back", "services_came_back", "new_topics_came_back", "lost_messages"
+                ),
+            ),
+        ),
+    ),
+    Section(
+        "isolation",
+        "What a robot sees of others",
+        "Counted from one robot: topics, nodes and parameters of another robot that it sees, and whether "
+        "it can publish to it, call it and end its nodes (1) or not (0).",
+        (
+            TableSpec(
+                "Visible", _quantities("topics_visible", "topics_others", "nodes_others", "parameters_others")
+            ),
+            TableSpec("Possible", _quantities("can_publish", "can_call", "can_end_nodes")),
+        ),
+    ),
+    Section(
+        "configuration",
+        "What it takes to add a robot",
+        "Files and lines that are written to add a robot.",
+        (TableSpec("To add a robot", _quantities("files_to_add", "lines_to_add")),),
+    ),
+    Section(
+        "offload",
+        "Tasks on the robot or in the cloud",
+        "A robot's nodes on the robot, which has a netbook's share of a core (`place=robot`; nothing "
+        "crosses the link, so one link is enough), or in the cloud (`place=cloud`), over the link's `rate` "
+        "in Mbit/s and `delay` in milliseconds in each direction. `task=navigation` drives 1 m to a goal by "
+        "AMCL and `move_base`, `task=planning` asks for a plan across the floor, and `task=mapping` makes a "
+        "map of an arc of 2 s. `control_delay` is the time from a scan's stamp until a command or pose that "
+        "was made of it, or of a newer scan, is at the robot. A task that is not done within 8 s (4 s for "
+        "four plans) has failed: its time counts as that. Energy is computed by the robot's model.",
+        (
+            TableSpec("Task", _quantities("task_time", "control_delay", "energy", "success")),
+            TableSpec("Use", _quantities("robot.cpu", "server.cpu", "robot.network_in", "robot.network_out")),
+        ),
+    ),
+)
+LINK = TableSpec("The link as measured", _quantities("round_trip", "round_trip_p99", "rate", "lost"))
+
+READING = f"""\
+- *Median and interval.* `7.50 [7.41, 7.62]` is the median of the runs and its {100 * CONFIDENCE:.0f} %
+  confidence interval, by the percentile bootstrap with {RESAMPLES} samples. Fewer than {MIN_RUNS} runs have
+  no interval: `7.50 (2 runs)`. `-` was not measured.
+- *Which rows.* Each number comes from the rows of `results.csv` with the experiment of the section, the
+  system, software and factors of the table's row, and the metric of the table's column. A column such as
+  `server.network_in + server.network_out` is computed in each run. Warm-ups (run 0) do not count.
+- *Names.* SMS is `single_master`, MMS is `multi_master`, CRS is `cloud` in the raw data. Machine 1 is
+  `server`, machine 2 is `client`. Software `ros` is ROS 1 as Debian packages it, `rce` is the core and the
+  nodes of RCE. In CRS, the engine is RCE; the software is that of the robots. A verdict is about the
+  software of its row only.
+- *Verdicts.* A claim *holds* if it holds in all cases (combinations of factors), *does not hold* if it
+  holds in none, and otherwise *depends*. A system is *above* another one if their intervals do not overlap
+  and the medians differ by at least {100 * (MIN_RATIO - 1):.0f} %. *About the same* are medians of which
+  the largest is at most {SAME_RATIO:g} times the smallest.
+- *Effect size.* Cliff's delta of two systems: how much likelier a run of the first one is above a run of
+  the second one than below, from -1 to +1. Up to 0.147 it is negligible, up to 0.33 small, up to 0.474
+  medium, above that large.
+- *CPU* is in cores: 1.0 is one core. `link.cpu` is that of the emulated link, and is in no machine's CPU.
+"""
+
+LIMITS = f"""\
+- Machines are network namespaces of one computer and share its cores: where they need more than there is,
+  they slow each other down. Ratios carry over to other computers, absolute numbers do not.
+- The link is emulated: rate, delay and loss are those of a wireless LAN, but radio channels, roaming and
+  other senders are missing.
+- The robots are simulated, and the scans and images are made by programs.
+- The paper does not tell all of its set-up. A claim that does not hold here may have held there; the
+  verdict is about the versions above.
+- All runs were made on one computer in one session: the intervals say how well it repeats itself, not how
+  other computers differ. Of two identical full runs, only some {100 * EXPECTED:.0f} % of the second medians
+  lie in the first intervals.
+- Bootstrap intervals of ten runs are a little too narrow. Among so many comparisons, some differ by chance;
+  so a verdict needs a difference of {100 * (MIN_RATIO - 1):.0f} % and looks at all cases.
+- The original programs of fkie and the original Rapyuta are judged only where a row names them.
+"""

@@ -1,0 +1,242 @@
+"""A core or master is killed, or a machine cut off: what stops, for how long, and what is lost.
+
+Meanwhile the robot takes a topic of the server, calls a service of it, and looks for each topic that is newly
+made there. What was killed is started again after some seconds, as by a supervisor: a ROS core, and in MMS
+discovery and sync; the engine's master is started again by ``rce up`` itself. Programs are not restarted.
+New topics are declared beforehand where a system needs it: in MMS they are shared, in CRS they have bridges.
+
+A run takes up to a minute, so there are at most three of each set-up.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from dataclasses import dataclass, field
+from itertools import pairwise
+from math import ceil
+from typing import TYPE_CHECKING, NamedTuple
+
+from rce_fleet.experiments.bench import CLIENT, SERVER, Bench
+from rce_fleet.experiments.experiment import START_S, Experiment, Measured, Options, Trial
+from rce_fleet.experiments.measures import Value
+from rce_fleet.experiments.results import Condition
+from rce_fleet.experiments.systems.base import Flow, Workload
+from rce_fleet.experiments.systems.registry import system_of
+from rce_fleet.experiments.workloads.provider import (
+    NEW_S,
+    PERIOD_S,
+    SERVICE,
+    TEXT,
+    TOPIC,
+    TRIGGER,
+    new_topic,
+)
+from rce_fleet.experiments.workloads.telling import reports
+from rce_fleet.experiments.workloads.watcher import CALL, CALL_PERIOD_S, NEW, NUMBER
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from rce_fleet.experiments.systems.base import System
+
+CORE, MASTER, CUT = "core_killed", "master_killed", "machine_cut"
+RUNS = 3
+BEFORE_S = 15.0
+"""How long topics may be made before the fault."""
+STEADY_S = 1.5
+"""What answers for so long after the repair has come back."""
+SLACK_S = 1.0
+"""Something that answers comes that much late on a busy machine."""
+POLL_S = 0.3
+
+
+class Times(NamedTuple):
+    """How long parts of a run take, seconds.
+
+    Attributes:
+        down: From the fault to its end.
+        watch: From then to the end of the observation, at most.
+    """
+
+    down: float
+    watch: float
+
+
+TIMES = {CORE: Times(5.0, 10.0), MASTER: Times(5.0, 10.0), CUT: Times(20.0, 25.0)}
+QUICK_TIMES = {CORE: Times(2.0, 4.0), MASTER: Times(2.0, 4.0), CUT: Times(3.0, 8.0)}
+
+
+class Robustness(Experiment):
+    """Faults in the three systems."""
+
+    name = "robustness"
+    title = "core or master killed, machine cut off for 20 s: what stops, for how long, what is lost"
+
+    def setups(self, options: Options) -> list[Condition]:
+        """Return set-ups by fault and system, with the first software; quickly, one of each system."""
+        return [
+            Condition.of(self.name, setup.system, setup.software, fault=fault)
+            for setup in self.each(options, software=options.software[:1])
+            for fault in faults(setup.system, is_quick=options.quick)
+        ]
+
+    def seconds(self, setup: Condition, options: Options) -> float:
+        """Return about how long a run takes."""
+        return START_S + sum(times_of(setup, options))
+
+    def warm_up_seconds(self, setup: Condition, options: Options) -> float:
+        """Return about how long the run takes that does not count: there is none."""
+        del setup, options
+        return 0.0
+
+    def most_runs(self, setup: Condition) -> int:
+        """Return how many runs of a set-up count at most."""
+        del setup
+        return RUNS
+
+    async def measure(self, trial: Trial) -> list[Measured]:
+        """Run a set-up once."""
+        if trial.is_warm_up:
+            return []
+        fault = dict(trial.setup.factors)["fault"]
+        times = times_of(trial.setup, trial.options)
+        topics = ceil((BEFORE_S + sum(times)) / NEW_S)
+        async with Bench(seed=trial.seed) as bench:
+            system = trial.system(bench)
+            provider, watcher = await system.start(
+                flows(topics),
+                [
+                    Workload("provider", "provider", (str(topics),), SERVER),
+                    Workload("watcher", "watcher", (str(topics),), CLIENT),
+                ],
+            )
+            await watcher.wait_ready()
+            begin = time.time()
+            await _break(system, fault)
+            await asyncio.sleep(times.down)
+            await _repair(system, fault)
+            repaired = time.time()
+            seen = Seen()
+            while time.time() < repaired + times.watch:
+                await asyncio.sleep(POLL_S)
+                seen = Seen.of(reports(await watcher.lines()))
+                if seen.is_steady(repaired + STEADY_S):
+                    break
+            end = time.time()
+            sent = list(reports(await provider.lines()))
+        return trial.measured([*values_of(seen, begin, end), *lost(seen, sent, begin, end)])
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What a watcher told.
+
+    Attributes:
+        answers: When there was an answer, seconds since 1970, by what.
+        numbers: The numbers that arrived.
+    """
+
+    answers: Mapping[str, list[float]] = field(default_factory=dict)
+    numbers: frozenset[int] = frozenset()
+
+    @classmethod
+    def of(cls, told: Iterable[Mapping[str, object]]) -> Seen:
+        """Read reports."""
+        answers: dict[str, list[float]] = {NUMBER: [], CALL: [], NEW: []}
+        numbers = set()
+        for report in told:
+            if "what" in report:
+                answers[str(report["what"])].append(float(str(report["at"])))
+                if report["what"] == NUMBER:
+                    numbers.add(int(str(report["number"])))
+        return cls(answers, frozenset(numbers))
+
+    def is_steady(self, since: float) -> bool:
+        """Return whether there were answers of each after a time."""
+        return all(any(at > since for at in times) for times in self.answers.values())
+
+
+class Outage(NamedTuple):
+    """For how long something was without answer, seconds, and whether it came back."""
+
+    seconds: float
+    came_back: bool
+
+
+def outage(answers: Iterable[float], period: float, begin: float, end: float) -> Outage:
+    """Return the longest time without answer.
+
+    Args:
+        answers: When there was one.
+        period: Usual time from one answer to the next; it does not count.
+        begin: Begin of the observation.
+        end: Its end.
+    """
+    inside = sorted(at for at in answers if begin <= at <= end)
+    moments = [begin, *inside, end]
+    longest = max(after - before for before, after in pairwise(moments))
+    return Outage(max(0.0, longest - period), moments[-1] - moments[-2] <= period + SLACK_S and bool(inside))
+
+
+def values_of(seen: Seen, begin: float, end: float) -> list[Value]:
+    """Return how long topics, services and new topics stopped, and whether they came back."""
+    found = []
+    for name, what, period in (
+        ("topics", NUMBER, PERIOD_S),
+        ("services", CALL, CALL_PERIOD_S),
+        ("new_topics", NEW, NEW_S),
+    ):
+        one = outage(seen.answers.get(what, ()), period, begin, end)
+        found.append(Value(f"{name}_stopped", one.seconds, "s"))
+        found.append(Value(f"{name}_came_back", float(one.came_back), "count"))
+    return found
+
+
+def lost(seen: Seen, sent: Sequence[Mapping[str, object]], begin: float, end: float) -> list[Value]:
+    """Return how many numbers were sent during the observation and never arrived."""
+    counts = [(float(str(one["at"])), int(str(one["sent"]))) for one in sent if "sent" in one]
+    inside = [count for at, count in counts if begin <= at <= end - SLACK_S]
+    if not inside:
+        return []
+    missing = sum(number not in seen.numbers for number in range(inside[0], inside[-1]))
+    return [Value("lost_messages", float(missing), "count")]
+
+
+def flows(topics: int) -> list[Flow]:
+    """Return what the robot uses of the server."""
+    return [
+        Flow(TOPIC, TEXT, to=CLIENT),
+        Flow(SERVICE, TRIGGER, to=CLIENT, is_service=True),
+        *(Flow(new_topic(number), TEXT, to=CLIENT) for number in range(topics)),
+    ]
+
+
+def faults(system: str, *, is_quick: bool) -> tuple[str, ...]:
+    """Return the faults that are made in a system."""
+    if system_of(system).has_master:
+        return (MASTER,) if is_quick else (CORE, MASTER, CUT)
+    return (CORE,) if is_quick else (CORE, CUT)
+
+
+def times_of(setup: Condition, options: Options) -> Times:
+    """Return how long parts of a run take."""
+    return (QUICK_TIMES if options.quick else TIMES)[dict(setup.factors)["fault"]]
+
+
+async def _break(system: System, fault: str) -> None:
+    if fault == CORE:
+        await system.kill_core()
+    elif fault == MASTER:
+        await system.kill_master()
+    else:
+        await system.bench.cut(CLIENT, is_cut=True)
+
+
+async def _repair(system: System, fault: str) -> None:
+    if fault == CORE:
+        await system.restart_core()
+    elif fault == MASTER:
+        await system.restart_master()
+    else:
+        await system.bench.cut(CLIENT, is_cut=False)

@@ -1,0 +1,1 @@
+"""The systems that are compared: adapters that connect the machines of a bench."""

@@ -1,0 +1,359 @@
+"""The page of the experiments: each of its numbers is computed again from the rows."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from support.experiment_rows import CRS, SMS, example_rows, in_three_systems, rows_of
+
+from rce_fleet.exceptions import ExperimentError
+from rce_fleet.experiments.report import drawing, make_report
+from rce_fleet.experiments.report.measurements import Measurements
+from rce_fleet.experiments.report.page import page_text
+from rce_fleet.experiments.report.schematics import schematics
+from rce_fleet.experiments.report.sections import SECTIONS
+from rce_fleet.experiments.results import Condition, Row, write_rows
+from rce_fleet.experiments.statistics import effect_size, estimate
+
+SYSTEMS = {"SMS": "single_master", "MMS": "multi_master", "CRS": "cloud", "-": "-"}
+SOFTWARE = {"ROS": "ros", "RCE": "rce", "-": "-"}
+UNITS = {"µs": 1e-6, "ms": 1e-3, "%": 0.01, "kB": 1e3, "MB": 1e6, "GB": 1e9, "kbit/s": 1e3, "Mbit/s": 1e6}
+UNITS |= {f"{unit}/s": UNITS[unit] for unit in ("kB", "MB", "GB")}
+NUMBER = r"[-+]?\d+(?:\.\d+)?"
+CELL = re.compile(rf"({NUMBER}) (?:\[({NUMBER}), ({NUMBER})\]|\((\d+) runs?\))")
+_NAMES = re.compile(r"`[^`]*`|\w+=[\w.]+|[Mm]achine \d|within 25 %|by more than 5 %|of [\d.]+ Hz|for 1 s at")
+"""Numbers of a reason that are not measured: in names and in what a claim says."""
+WIDE = (0.9, 0.95, 1.0, 1.02, 1.1)
+
+
+@dataclass
+class Table:
+    """A table of the page, with the heading and the lines of text before it."""
+
+    heading: str
+    about: str
+    head: list[str]
+    rows: list[dict[str, str]]
+
+
+def tables_of(page: str) -> Iterator[Table]:
+    heading = about = ""
+    lines: list[str] = []
+    for line in [*page.splitlines(), ""]:
+        if line.startswith("|"):
+            lines.append(line)
+            continue
+        if lines:
+            cells = [[cell.strip() for cell in one.strip("|").split(" | ")] for one in lines]
+            yield Table(
+                heading, about, cells[0], [dict(zip(cells[0], one, strict=True)) for one in cells[2:]]
+            )
+            lines = []
+        heading = line if line.startswith("## ") else heading
+        about = line if line.strip() and not line.startswith("</") else about
+
+
+def values_of(rows: Sequence[Row], condition: Condition, formula: str) -> list[float]:
+    """Compute a column of the page from the rows, run by run."""
+    runs: dict[int, dict[str, float]] = defaultdict(dict)
+    for row in rows:
+        if row.condition == condition:
+            runs[row.run][row.metric] = row.value
+    first, operator, second = [*formula.split(), "", ""][:3]
+    if not operator:
+        return [metrics[first] for metrics in runs.values() if first in metrics]
+    both = [(one[first], one[second]) for one in runs.values() if {first, second} <= one.keys()]
+    return [a + b if operator == "+" else a / b for a, b in both]
+
+
+def check_cell(text: str, values: Sequence[float], unit: str) -> None:
+    """Compare a median and its interval, both with three digits, with the values."""
+    if text == "-":
+        assert not values
+        return
+    found = CELL.fullmatch(text)
+    assert found, text
+    again, factor = estimate(values), UNITS.get(unit, 1.0)
+    numbers = (again.median, again.low, again.high)
+    shown = [float(number) for number in found.groups()[:3] if number]
+    assert shown == [pytest.approx(number / factor, rel=0.006) for number in numbers[: len(shown)]]
+    assert found[4] is None or int(found[4]) == again.runs
+
+
+def unit_of(column: str) -> tuple[str, str]:
+    found = re.fullmatch(r"`([^`]+)`(?:, (.+))?", column)
+    assert found, column
+    return found[1], found[2] or ""
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[Row]:
+    extra = Condition.of("weather", CRS, "rce", sky="blue")
+    found = example_rows(spread=WIDE) + rows_of(extra, {"rain": (3.0, "mm")}, WIDE)
+    return found + rows_of(Condition.of("laser", SMS, "ros", printed="no"), {"surprise": (1.0, "Hz")}, WIDE)
+
+
+@pytest.fixture(scope="module")
+def page(rows: list[Row]) -> str:
+    return page_text(Measurements.of(rows), {"cores": 2}, {}, "images")
+
+
+def experiment_of(page: str, heading: str) -> str:
+    if heading == "## How it was measured":
+        return "link"
+    found = re.search(rf"^{re.escape(heading)}\n\nExperiment `([^`]+)`", page, re.MULTILINE)
+    assert found, heading
+    return found[1]
+
+
+def test_each_number_of_the_experiments_is_that_of_its_rows(page: str, rows: list[Row]) -> None:
+    cells = 0
+    for table in tables_of(page):
+        if table.head[:2] != ["system", "software"] or table.head[-1] != "runs":
+            continue
+        experiment = experiment_of(page, table.heading)
+        formula = found[1] if (found := re.search(r"\(`(\w+)`\)\*\*", table.about)) else ""
+        for line in table.rows:
+            factors = {name: line[name] for name in table.head[2:-1] if not name.startswith("`")}
+            factors = {name: value for name, value in factors.items() if value != "-"}
+            for column in (name for name in table.head if name.startswith("`")):
+                name, unit = unit_of(column)
+                one, _, place = name.partition("=")
+                more = {one: place} if place else {}
+                software = SOFTWARE[line["software"]]
+                condition = Condition.of(experiment, SYSTEMS[line["system"]], software, **factors, **more)
+                values = values_of(rows, condition, formula if place else name)
+                check_cell(line[column], values, unit)
+                assert not values or len(values) == int(line["runs"])
+                cells += 1
+    assert cells > 500
+
+
+def condition_of_case(experiment: str, software: str, case: str, system: str) -> Condition:
+    pairs = dict(part.split("=", 1) for part in case.split(", ")) if case != "-" else {}
+    pairs.pop("system", None)
+    if pairs.get("origin") == "server (CRS: container)":
+        pairs["origin"] = "container" if system == "CRS" else "server"
+    return Condition.of(experiment, SYSTEMS[system], SOFTWARE[software], **pairs)
+
+
+def check_effects(text: str, experiment: str, line: dict[str, str], case: str, rows: list[Row]) -> int:
+    """Compare each Cliff's delta with that of the rows, and return their number."""
+    found = re.findall(r"(?:`([^`]+)`: )?(\w+):(\w+) ([-+]\d\.\d\d)", text)
+    formula = line.get("quantity", "").strip("`") or re.findall(r"`([^`]+)`", line.get("figures", ""))[0]
+    for named, one, other, shown in found:
+        formula = named or formula
+        one_values, other_values = (
+            values_of(rows, condition_of_case(experiment, line["software"], case, system), formula)
+            for system in (one, other)
+        )
+        assert float(shown) == pytest.approx(effect_size(one_values, other_values), abs=0.006)
+    return len(found)
+
+
+def test_each_number_of_the_cases_is_that_of_its_rows(page: str, rows: list[Row]) -> None:
+    cells = effects = 0
+    for table in tables_of(page):
+        if "case" not in table.head:
+            continue
+        experiment = re.findall(r"experiment `([^`]+)`", table.about)[0]
+        for line in table.rows:
+            for system in ("SMS", "MMS", "CRS"):
+                condition = condition_of_case(experiment, line["software"], line["case"], system)
+                if f"system={system}" in line["case"] or "system=" not in line["case"]:
+                    check_cell(
+                        line[system], values_of(rows, condition, line["quantity"].strip("`")), line["unit"]
+                    )
+                    cells += 1
+            effects += check_effects(line["Cliff's delta"], experiment, line, line["case"], rows)
+    assert cells > 300
+    assert effects > 100
+
+
+def test_each_number_of_the_verdicts_is_that_of_its_rows(page: str, rows: list[Row]) -> None:
+    (table,) = (table for table in tables_of(page) if "verdict" in table.head)
+    experiments = dict(re.findall(r"\((\w)\) [^\n]*: experiment `([^`]+)`", page))
+    checked = 0
+    for line in table.rows:
+        experiment = experiments[line["claim"][1]]
+        figures, case = re.fullmatch(r"(.*) \(((?:[^()]|\([^()]*\))*)\)", line["figures"]).groups()  # type: ignore[union-attr]
+        for part in figures.split("; "):
+            formula, medians, unit = re.fullmatch(r"`([^`]+)`: (.*\])(?: (.*))?", part).groups()  # type: ignore[union-attr]
+            for system, text, *_ in re.findall(rf"(\w+) ({CELL.pattern})", medians):
+                condition = condition_of_case(experiment, line["software"], case, system)
+                check_cell(text, values_of(rows, condition, formula), unit or "")
+                checked += 1
+        check_effects(line["Cliff's delta"], experiment, line, case, rows)
+    assert checked > 50
+
+
+def test_each_number_of_the_reasons_is_in_the_cases(page: str) -> None:
+    """Medians, how many times one is the other, and how many cases there are; nothing else."""
+    medians: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    cases: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for table in tables_of(page):
+        if "case" in table.head:
+            letter = re.findall(r"\((\w)\)", table.about)[0]
+            for line in table.rows:
+                key = (letter, line["software"])
+                cases[key].add(line["case"])
+                texts = (line[system] for system in ("SMS", "MMS", "CRS") if line[system] != "-")
+                factor = UNITS.get(line["unit"], 1.0)
+                medians[key][line["quantity"]] += [float(text.split()[0]) * factor for text in texts]
+    (verdicts,) = (table for table in tables_of(page) if "verdict" in table.head)
+    for line in verdicts.rows:
+        key = (line["claim"][1], line["software"])
+        known = [one for found in medians[key].values() for one in found]
+        ratios = [a / b for found in medians[key].values() for a in found for b in found if b]
+        text = _NAMES.sub("", line["reason"])
+        for shown in map(float, re.findall(r"(?<![\w.])\d+(?:\.\d+)?", text)):
+            scaled = [one / factor for one in known for factor in (1.0, *UNITS.values())]
+            near = any(shown == pytest.approx(one, rel=0.012) for one in [*scaled, *ratios])
+            assert near or (shown.is_integer() and shown <= len(cases[key])), (shown, line["reason"])
+
+
+def test_unknown_experiments_and_metrics_are_listed(page: str) -> None:
+    assert "| weather | CRS | RCE | sky=blue | `rain` | 3.00 [2.70, 3.30] | mm | 5 |" in page
+    assert "| laser | SMS | ROS | printed=no | `surprise` | 1.00 [0.900, 1.10] | Hz | 5 |" in page
+
+
+def test_page_without_rows_says_so() -> None:
+    text = page_text(Measurements.of([]), {}, {}, "images")
+    for section in SECTIONS:
+        assert (
+            f"## {section.title}\n\nExperiment `{section.experiment}`. {section.text}\n\nNot measured.\n"
+            in text
+        )
+    assert text.count("| **not measured** |") == 18
+    assert "There is no `environment.json` beside the raw data." in text
+    assert "## Other data\n\nNone.\n\n## A second full run\n\nNot measured." in text
+
+
+def test_values_that_are_not_finite_are_told() -> None:
+    bad = in_three_systems("laser", "rate", "Hz", (float("inf"), 1.0, 1.0))
+    again = [Row(bad[0].condition, 1, "tries", 2.0, ""), Row(bad[0].condition, 1, "done", 60.0, "s")]
+    text = page_text(Measurements.of([*bad, *again]), {}, {}, "images")
+    assert "3 values are not finite and were left out: `rate` of `laser`." in text
+    assert "Runs that were tried more than once (`tries`): 1." in text
+    assert "`done`" not in text
+
+
+def test_break_even_is_the_lowest_rate_at_which_the_cloud_is_faster() -> None:
+    found = [
+        row
+        for place, times in (("robot", (4.0, 4.0, 4.0)), ("cloud", (9.0, 3.0, 1.0)))
+        for rate, seconds in zip((1, 2, 10), times, strict=True)
+        for row in rows_of(
+            Condition.of("offload", CRS, "rce", place=place, task="amcl", rate=rate, delay=5),
+            {"task_time": (seconds, "s")},
+        )
+    ]
+    assert "| CRS | RCE | amcl | 5 | 2 |" in page_text(Measurements.of(found), {}, {}, "images")
+    slow = [row for row in found if dict(row.condition.factors)["rate"] == "1"]
+    assert "| amcl | 5 | at none that was measured |" in page_text(Measurements.of(slow), {}, {}, "images")
+
+
+@pytest.mark.parametrize(
+    ("metrics", "expected"),
+    [
+        ({}, "| - | nothing up to 20 |"),
+        ({"rate": 20.0, "received": 20.0}, "| 20 | robots publish less (`rate`) |"),
+        (
+            {"received": 20.0},
+            "| 20 | messages arrive more slowly than they are published (`received`, `rate`) |",
+        ),
+        (
+            {"lost": 0.02, "delay_p95": 0.2},
+            "| 20 | messages are lost (`lost`); messages come late (`delay_p95`) |",
+        ),
+        ({"delay_p95": 0.05}, "| - | nothing up to 20 |"),
+    ],
+)
+def test_what_breaks_first_is_told(metrics: dict[str, float], expected: str) -> None:
+    works = {"rate": 30.0, "received": 30.0, "lost": 0.0, "delay_p95": 0.01}
+    units = {"rate": "Hz", "received": "Hz", "lost": "", "delay_p95": "s"}
+    found = [
+        row
+        for robots, values in ((1, works), (3, works), (20, {**works, **metrics}))
+        for row in rows_of(
+            Condition.of("scaling", CRS, "ros", robots=robots, containers="one"),
+            {metric: (value, units[metric]) for metric, value in values.items()},
+        )
+    ]
+    text = page_text(Measurements.of(found), {}, {}, "images")
+    assert f"| CRS | ROS | containers=one {expected}" in text
+
+
+def test_second_run_is_compared(rows: list[Row]) -> None:
+    changed = [
+        Row(one.condition, one.run, one.metric, one.value * 2, one.unit)
+        for one in rows
+        if one.metric == "rain"
+    ]
+    same = [row for row in rows if row.metric != "rain"]
+    text = page_text(Measurements.of(rows), {}, {}, "images", Measurements.of([*same, *changed]))
+    assert "| weather | 1 | 0 % | 0 % |" in text
+    assert "| weather | CRS | RCE | sky=blue | `rain` | 3.00 [2.70, 3.30] | 6.00 | mm | +100.0 % |" in text
+    assert "the goal of 90 % is reached" in text
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "raw"
+    folder.mkdir()
+    few = [row for row in example_rows(["ros"]) if row.condition.experiment in {"robustness", "link"}]
+    write_rows(folder / "results.csv", few)
+    about = {
+        "cores": 2,
+        "memory_bytes": 4_000_000_000,
+        "versions": {"rce": "0.1.0"},
+        "options": {"quick": False},
+    }
+    (folder / "environment.json").write_text(json.dumps(about))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fonts(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Matplotlib keeps the files of its fonts open: after this, a test opens none."""
+    pytest.importorskip("matplotlib", reason="figures need rce[figures]")
+    drawing.save(schematics()[0], tmp_path_factory.mktemp("fonts"))
+
+
+@pytest.mark.usefixtures("fonts")
+def test_report_is_page_figures_and_summary(folder: Path, tmp_path: Path) -> None:
+    page, figures = tmp_path / "docs" / "page.md", tmp_path / "docs" / "images" / "experiments"
+    make_report(folder, page=page, figures=figures, second=folder)
+    text = page.read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)]+)\)", text)
+    assert "images/experiments/robustness-ros.png" in links
+    assert len(links) == 1 + 2 * 4, "the summary, three set-ups and a figure, each as PNG and SVG"
+    assert all((page.parent / link).stat().st_size for link in links)
+    assert "| memory_bytes | 4.00 GB |" in text
+    assert "| options | quick no |" in text
+    make_report(folder, page=page, figures=figures, second=folder)
+    assert page.read_text(encoding="utf-8") == text
+
+
+def test_page_without_matplotlib_says_what_to_install(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drawing, "can_draw", lambda: False)
+    make_report(folder, page=tmp_path / "page.md", figures=tmp_path / "figures")
+    text = (tmp_path / "page.md").read_text(encoding="utf-8")
+    assert "Figures are missing: matplotlib is not installed: pip install 'rce[figures]'." in text
+    assert "| SMS | ROS | core_killed | 100 [99.0, 101] |" in text
+    assert [path.name for path in (tmp_path / "figures").iterdir()] == ["summary.csv"]
+
+
+@pytest.mark.parametrize("text", ["{", "[]"])
+def test_broken_environment_is_named(folder: Path, tmp_path: Path, text: str) -> None:
+    (folder / "environment.json").write_text(text)
+    with pytest.raises(ExperimentError, match=r"environment\.json"):
+        make_report(folder, page=tmp_path / "page.md", figures=tmp_path / "figures")

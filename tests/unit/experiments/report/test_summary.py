@@ -1,0 +1,139 @@
+"""Summaries of raw data, and the comparison of two full runs."""
+
+from __future__ import annotations
+
+from math import inf, isnan, nan
+from pathlib import Path
+
+import pytest
+
+from rce_fleet.exceptions import ExperimentError
+from rce_fleet.experiments.report.labels import natural, number, scale_for
+from rce_fleet.experiments.report.measurements import Measurements, Quantity
+from rce_fleet.experiments.report.repeat import compare
+from rce_fleet.experiments.report.summary import read_summary, summarize, write_summary
+from rce_fleet.experiments.results import Condition, Row
+
+SMS = Condition.of("laser", "single_master", "ros", printed="yes")
+MMS = Condition.of("laser", "multi_master", "ros", printed="yes")
+
+
+def rows(condition: Condition, metric: str, values: list[float], unit: str = "Hz") -> list[Row]:
+    return [Row(condition, run, metric, value, unit) for run, value in enumerate(values, 1)]
+
+
+def test_warm_ups_and_values_that_are_not_finite_are_left_out() -> None:
+    found = Measurements.of(
+        [Row(SMS, 0, "rate", 99.0, "Hz"), *rows(SMS, "rate", [7.0, 8.0, inf]), *rows(MMS, "rate", [nan])]
+    )
+    sample = found.sample(SMS, "rate")
+    assert sample is not None
+    assert sample.values == (7.0, 8.0)
+    assert found.sample(MMS, "rate") is None
+    assert len(found.left_out) == 2
+
+
+def test_last_value_of_a_repeated_run_counts() -> None:
+    sample = Measurements.of([*rows(SMS, "rate", [1.0, 2.0]), *rows(SMS, "rate", [3.0])]).sample(SMS, "rate")
+    assert sample is not None
+    assert sample.values == (3.0, 2.0)
+
+
+def test_quantities_are_computed_run_by_run() -> None:
+    found = Measurements.of([*rows(SMS, "a", [1.0, 2.0, 3.0]), *rows(SMS, "b", [10.0, 0.0])])
+    sums, shares = found.sample(SMS, Quantity("a", "+", "b")), found.sample(SMS, Quantity("a", "/", "b", "s"))
+    assert sums is not None
+    assert sums.values == (11.0, 2.0)
+    assert shares is not None
+    assert (shares.values, shares.unit, str(shares.quantity)) == ((0.1,), "s", "a / b")
+
+
+def test_summary_is_read_as_it_was_written(tmp_path: Path) -> None:
+    found = summarize(
+        Measurements.of([*rows(SMS, "rate", [7.1, 7.123456789, 7.3]), *rows(MMS, "rate", [4.0])])
+    )
+    write_summary(tmp_path / "summary.csv", found)
+    again = read_summary(tmp_path / "summary.csv")
+    assert [one.condition for one in again] == [SMS, MMS]
+    assert again[0] == found[0]
+    assert again[0].estimate.median == 7.12346
+    assert isnan(again[1].estimate.low)
+    assert again[1].estimate.runs == 1
+
+
+@pytest.mark.parametrize("text", ["", "a,b\n", "x\n"])
+def test_other_tables_are_not_summaries(tmp_path: Path, text: str) -> None:
+    (tmp_path / "summary.csv").write_text(text)
+    with pytest.raises(ExperimentError, match="not a summary"):
+        read_summary(tmp_path / "summary.csv")
+
+
+def test_bad_line_of_a_summary_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "summary.csv"
+    write_summary(path, [])
+    path.write_text(path.read_text() + "laser,cloud,ros,,rate,Hz,ten,1,1,1\n")
+    with pytest.raises(ExperimentError, match=r"summary.csv:2: .*ten"):
+        read_summary(path)
+
+
+def test_medians_of_a_second_run_are_counted() -> None:
+    """Of four: one in the interval, one outside by 2 %, one by 100 %, and one of which nothing is known."""
+    first = Measurements.of(
+        [
+            *rows(SMS, "rate", [7.0, 7.5, 8.0]),
+            *rows(SMS, "received", [100.0, 100.0, 100.0]),
+            *rows(SMS, "lost", [1.0, 1.0, 1.0]),
+            *rows(SMS, "server.network@0.5", [1.0, 1.0, 1.0]),
+            *rows(MMS, "rate", [4.0]),
+            *rows(MMS, "lost", [0.0]),
+        ]
+    )
+    second = Measurements.of(
+        [
+            *rows(SMS, "rate", [7.4]),
+            *rows(SMS, "received", [102.0]),
+            *rows(SMS, "lost", [2.0]),
+            *rows(SMS, "server.network@0.5", [9.0]),
+            *rows(MMS, "rate", [4.0]),
+            *rows(MMS, "delay_p50", [0.1]),
+        ]
+    )
+    found = compare(summarize(first), summarize(second))
+    assert found.inside == pytest.approx(1 / 3)
+    assert found.inside_or_near == pytest.approx(2 / 3)
+    assert not found.reaches_goal
+    assert [(pair.first.metric, pair.change) for pair in found.outside] == [
+        ("lost", 1.0),
+        ("received", pytest.approx(0.02)),
+    ]
+    assert found.without_interval == 1
+    assert [one.metric for one in found.only_first] == ["lost"]
+    assert [one.metric for one in found.only_second] == ["delay_p50"]
+    assert [name for name, _ in found.experiments()] == ["laser"]
+
+
+def test_the_same_run_twice_reaches_the_goal() -> None:
+    found = summarize(Measurements.of(rows(SMS, "rate", [7.1234567] * 3)))
+    assert compare(found, found).reaches_goal
+    assert not compare([], []).reaches_goal
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0, "0"), (1234.5, "1234"), (12.345, "12.3"), (1.0, "1.00"), (0.012345, "0.0123"), (-2.5, "-2.50")],
+)
+def test_numbers_have_three_digits(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+def test_units_fit_the_values() -> None:
+    assert scale_for("s", [0.002, 0.004, 3.0]) == ("ms", 1e-3)
+    assert scale_for("B/s", [2e6]) == ("MB/s", 1e6)
+    assert scale_for("share", [0.1]) == ("%", 0.01)
+    assert scale_for("s", [0.0]) == ("µs", 1e-6)
+    assert scale_for("Hz", [1e9]) == ("Hz", 1.0)
+
+
+def test_numbers_in_texts_are_sorted_by_value() -> None:
+    assert sorted(["1920x1080", "160x120", "640x480"], key=natural) == ["160x120", "640x480", "1920x1080"]
+    assert sorted(["full", "10", "9"], key=natural) == ["9", "10", "full"]

@@ -1,0 +1,46 @@
+"""Images for the camera, and which conditions are measured."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from rce_fleet.experiments.experiment import Options
+from rce_fleet.experiments.images import JPEG, PNG, RAW, parts, picture, shot_of, write_images
+
+
+def test_pictures_differ_and_compress_as_a_cameras() -> None:
+    first, second = picture(160, 120, 0), picture(160, 120, 1)
+    assert first.shape == (120, 160, 3)
+    assert not np.array_equal(first, second)
+    assert np.array_equal(first, picture(160, 120, 0))
+    raw, jpeg = shot_of(first, RAW), shot_of(first, JPEG)
+    assert len(raw.data) == 160 * 120 * 3
+    assert 0.02 < len(jpeg.data) / len(raw.data) < 0.3
+    assert Image.open(io.BytesIO(jpeg.data)).size == (160, 120)
+
+
+def test_the_list_names_each_image(tmp_path: Path) -> None:
+    write_images(tmp_path / "camera.jsonl", [JPEG, RAW], ["160x120"])
+    lines = [json.loads(line) for line in (tmp_path / "camera.jsonl").read_text().splitlines()]
+    assert {line["stream"] for line in lines} == {"jpeg 160x120", "raw 160x120"}
+    assert len({line["file"] for line in lines}) == len(lines) == 6
+    raw = next(line for line in lines if line["stream"] == "raw 160x120")
+    assert raw["fields"] == {"height": 120, "width": 160, "encoding": "rgb8", "step": 480}
+    assert len((tmp_path / raw["file"]).read_bytes()) == 120 * 480
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_only_an_engine_has_png(quick: bool) -> None:
+    options = Options(quick=quick)
+    encodings = {
+        system: {part.factors["encoding"] for part in parts(options, system)} for system in ("cloud", "x")
+    }
+    assert encodings == {"cloud": {RAW, JPEG, PNG}, "x": {RAW, JPEG}}
+    factors = [tuple(part.factors.items()) for part in parts(options, "cloud")]
+    assert len(set(factors)) == len(factors)

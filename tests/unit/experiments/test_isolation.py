@@ -1,0 +1,134 @@
+"""What robot 1's program sees and does, by a core and a graph that are driven by hand."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Thread
+from typing import Any
+from xmlrpc.server import SimpleXMLRPCServer
+
+import pytest
+
+from rce_fleet.experiments.isolation import reached, to_add
+from rce_fleet.experiments.systems.multi_master import MultiMaster
+from rce_fleet.experiments.workloads import reach as module
+from rce_fleet.experiments.workloads.core_api import CoreApi
+from rce_fleet.experiments.workloads.reach import Reach
+from rce_fleet.experiments.workloads.robot_base import RobotBase
+from rce_fleet.experiments.workloads.telling import reports
+
+STATE = [[["/Robot2/scan", ["/Robot2_base_1"]]], [["/map", ["/Robot1_base_1"]]], []]
+
+
+class Graph:
+    """Notes what is asked for."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def output(self, topic: str, kind: str) -> Graph:
+        del kind
+        self.asked.append(topic)
+        return self
+
+    def send(self, fields: object, stamp: object = None) -> None:
+        del stamp
+        self.asked.append(f"sent {fields}")
+
+    def call(self, service: str, kind: str, callback: Callable[[Any], None]) -> None:
+        del kind, callback
+        self.asked.append(service)
+
+    def take(self, *_: object) -> None: ...
+
+    def provide(self, *_: object) -> None: ...
+
+    def run(self, *_: object) -> None: ...
+
+
+@contextmanager
+def core() -> Iterator[tuple[str, list[str]]]:
+    """A core that is every node's slave API too; gives its URI, and who was told to end."""
+    told: list[str] = []
+
+    def look_up(_caller: str, name: str) -> str:
+        told.append(name)
+        return uri
+
+    with SimpleXMLRPCServer(("127.0.0.1", 0), logRequests=False) as server:
+        uri = f"http://127.0.0.1:{server.server_address[1]}/"
+        answers: dict[str, Callable[..., object]] = {
+            "getPublishedTopics": lambda *_: [["/Robot2/scan", "a/B"], ["/Robot20/scan", "a/B"]],
+            "getSystemState": lambda *_: STATE,
+            "getParamNames": lambda *_: ["/Robot2/max_speed", "/rosversion"],
+            "getPid": lambda *_: 1,
+            "lookupNode": look_up,
+            "shutdown": lambda *_: 0,
+        }
+        for name, answer in answers.items():
+            server.register_function(lambda *given, answer=answer: [1, "", answer(*given)], name)
+        server.register_function(lambda *_: [-1, "not allowed", 0], "setParam")
+        thread = Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        yield uri, told
+        server.shutdown()
+        thread.join()
+
+
+def test_a_program_looks_tries_and_ends_the_others_nodes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(module, "SECONDS", 0.2)
+    graph = Graph()
+    with core() as (uri, told):
+        reach = Reach(graph, CoreApi("/reach", uri), CoreApi("/reach", "http://127.0.0.1:1/"), 2)
+        reach.step()
+        assert graph.asked == ["/Robot2/cmd_vel"]
+        reach.step()
+        assert graph.asked[1:] == ["sent {}", "/Robot2/enable"]
+        time.sleep(0.2)
+        reach.step()
+        reach.step()
+    assert told == ["/Robot2_base_1"]
+    seen, end = reports(capsys.readouterr().out.splitlines())
+    assert seen == {
+        "topics_visible": 2,
+        "topics_others": 1,
+        "nodes_others": 1,
+        "parameters_others": 1,
+        "can_use_core": 0,
+    }
+    assert end == {"phase": "end"}
+
+
+def test_a_refusal_of_the_core_is_an_error() -> None:
+    with core() as (uri, _):
+        assert CoreApi("/reach", uri).answers()
+        with pytest.raises(OSError, match="setParam: not allowed"):
+            CoreApi("/reach", uri).set_parameter("/a", 1)
+
+
+def test_a_base_tells_once_what_was_done_to_it(capsys: pytest.CaptureFixture[str]) -> None:
+    base = RobotBase()
+    for _ in range(2):
+        base.move(None)
+        assert base.enable() == {"success": True}
+    assert list(reports(capsys.readouterr().out.splitlines())) == [{"moved": True}, {"called": True}]
+
+
+def test_deeds_are_known_by_what_the_other_robot_tells() -> None:
+    found = reached([{"topics_others": 2}, {"phase": "end"}], [{"moved": True}])
+    assert {name: value for name, value, _ in found} == {
+        "topics_others": 2.0,
+        "can_publish": 1.0,
+        "can_call": 0.0,
+        "can_end_nodes": 0.0,
+    }
+
+
+def test_files_and_lines_of_one_more_robot_are_counted() -> None:
+    files, lines = to_add(MultiMaster.wiring(2))
+    assert files.value == 1
+    assert lines.value == 10

@@ -1,0 +1,69 @@
+"""Figures from readings and stamps, computed by hand beside."""
+
+from __future__ import annotations
+
+import pytest
+
+from rce_fleet.experiments.bench import Reading
+from rce_fleet.experiments.machines import Traffic
+from rce_fleet.experiments.measures import Sample, by_topic, delivered, over_time, used
+from rce_fleet.experiments.usage import Usage
+
+MICRO = 1_000_000
+
+
+def reading(at: float, cpu_s: float, sent: int, received: int, packets: int = 0) -> Reading:
+    return Reading(at, Usage(cpu_s, 1000), Traffic(sent, received, packets, 2 * packets))
+
+
+def figures(values: object) -> dict[str, float]:
+    assert isinstance(values, list)
+    return {value.metric: value.value for value in values}
+
+
+def test_what_a_machine_used_is_per_second() -> None:
+    found = figures(used("server", reading(10.0, 1.0, 100, 1000), reading(14.0, 3.0, 500, 9000, 8)))
+    assert found == {
+        "server.cpu": 0.5,
+        "server.network_out": 100.0,
+        "server.network_in": 2000.0,
+        "server.packets_out": 2.0,
+        "server.packets_in": 4.0,
+        "server.memory": 1000.0,
+    }
+
+
+def test_the_network_over_time_counts_both_directions() -> None:
+    readings = [reading(10.0, 0, 0, 0), reading(10.5, 0, 100, 400), reading(11.5, 0, 300, 1200)]
+    assert figures(over_time(readings)) == {"server.network@0.5": 1000.0, "server.network@1.5": 1000.0}
+
+
+def test_only_what_is_inside_the_window_counts() -> None:
+    sent = {"/a": [9 * MICRO, 10 * MICRO, 11 * MICRO], "/b": [10 * MICRO, 13 * MICRO]}
+    received = {
+        "/a": [Sample(9 * MICRO, 10 * MICRO), Sample(10 * MICRO, 10 * MICRO + 200_000)],
+        "/b": [Sample(10 * MICRO, 10 * MICRO + 400_000), Sample(13 * MICRO, 13 * MICRO + 1)],
+    }
+    found = figures(delivered(sent, received, (10.0, 12.0), 6000.0))
+    assert found["rate"] == pytest.approx(3 / 2 / 2)
+    assert found["received"] == pytest.approx(3 / 2 / 2)
+    assert found["delay_p50"] == pytest.approx(0.4)
+    assert found["message_bytes"] == pytest.approx(2000.0)
+    assert found["lost"] == pytest.approx(1 / 3), "one of /a's two, none of /b's one"
+
+
+def test_messages_that_may_be_under_way_are_not_lost() -> None:
+    found = figures(delivered({"/a": [10 * MICRO, 11 * MICRO + 800_000]}, {}, (10.0, 12.0), 0.0))
+    assert found["lost"] == 1.0
+    assert "lost" not in figures(delivered({"/a": [11 * MICRO + 800_000]}, {}, (10.0, 12.0), 0.0))
+    assert "delay_p50" not in found, "nothing arrived"
+
+
+def test_samples_are_told_in_several_reports() -> None:
+    reports: list[dict[str, object]] = [
+        {"phase": "1", "topic": "/a", "samples": [[1, 2]]},
+        {"phase": "2", "topic": "/a", "samples": [[5, 6]]},
+        {"phase": "1", "topic": "/a", "samples": [[3, 4]]},
+        {"phase": "end"},
+    ]
+    assert by_topic(reports, "1") == {"/a": [(1, 2), (3, 4)]}

@@ -1,0 +1,117 @@
+"""The runner: what is done, tried again, resumed; with an experiment that measures without machines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rce_fleet.exceptions import ExperimentError
+from rce_fleet.experiments.experiment import NOT_ANY, Experiment, Measured, Options, Trial
+from rce_fleet.experiments.measures import Value
+from rce_fleet.experiments.results import Condition, Row, by_condition, read_rows, write_rows
+from rce_fleet.experiments.runner import DONE, LINK, LINK_DELAYS_S, TABLE, Plan, Runner
+
+OPTIONS = Options(systems=("single_master", "cloud"), software=("rce",))
+RUNS = 2
+
+
+class Dice(Experiment):
+    """Throws dice instead of starting machines."""
+
+    name = "dice"
+    title = "dice"
+
+    def __init__(self) -> None:
+        self.trials: list[Trial] = []
+        self.prepared = 0
+        self.fails = 0
+
+    def setups(self, options: Options) -> list[Condition]:
+        return self.each(options)
+
+    def seconds(self, setup: Condition, options: Options) -> float:
+        del setup, options
+        return 10.0
+
+    def preparation_seconds(self, options: Options) -> float:
+        del options
+        return 5.0
+
+    async def prepare(self, options: Options, seed: int) -> dict[str, float]:
+        del options, seed
+        self.prepared += 1
+        return {"sides": 6.0}
+
+    async def measure(self, trial: Trial) -> list[Measured]:
+        self.trials.append(trial)
+        if self.fails:
+            self.fails -= 1
+            raise ExperimentError("the dice fell off the table")
+        assert trial.prepared == {"sides": 6.0}
+        return trial.measured([Value("eyes", float(1 + trial.seed % 6), "")], colour="red")
+
+
+def runner(folder: Path, dice: Dice, said: list[str], *, runs: int = RUNS, seed: int = 1) -> Runner:
+    if not (folder / TABLE).exists():
+        conditions = [
+            Condition.of(LINK, NOT_ANY, NOT_ANY, delay=round(1000 * delay)) for delay in LINK_DELAYS_S
+        ]
+        write_rows(folder / TABLE, [Row(condition, 1, "rate", 1.0, "bit/s") for condition in conditions])
+    return Runner(Plan([dice], OPTIONS, runs, seed), folder, said.append)
+
+
+async def test_each_setup_is_warmed_up_and_run(tmp_path: Path) -> None:
+    dice, said = Dice(), list[str]()
+    await runner(tmp_path, dice, said).run()
+    assert [trial.is_warm_up for trial in dice.trials] == [True, True, False, False, False, False]
+    assert len({trial.seed for trial in dice.trials}) == len(dice.trials)
+    rows = read_rows(tmp_path / TABLE)
+    eyes = by_condition(rows, "eyes")
+    assert set(eyes) == {Condition.of("dice", one, "rce", colour="red") for one in OPTIONS.systems}
+    assert all(len(values) == RUNS for values in eyes.values()), "warm-ups do not count"
+    assert sum(row.metric == DONE for row in rows) == len(OPTIONS.systems) * RUNS
+    assert said[0] == "dice: preparing"
+    assert said[1].endswith("warm-up (1 of 6; about 1 min left)")
+
+
+async def test_only_what_is_missing_is_done_again(tmp_path: Path) -> None:
+    await runner(tmp_path, Dice(), [], runs=1).run()
+    done = read_rows(tmp_path / TABLE)
+    lost = next(row for row in reversed(done) if row.metric == DONE)
+    (tmp_path / TABLE).unlink()
+    write_rows(tmp_path / TABLE, [row for row in done if row != lost])
+
+    dice, said = Dice(), list[str]()
+    await runner(tmp_path, dice, said, runs=1).run()
+    assert [trial.setup for trial in dice.trials] == [lost.condition] * 2, "its warm-up, and the run"
+    assert dice.prepared == 0, "it is in the table"
+    again = read_rows(tmp_path / TABLE)
+    assert sorted(row.metric for row in again) == sorted(row.metric for row in done)
+    assert by_condition(again, "eyes") == by_condition(done, "eyes"), "a run has the same seed again"
+
+    await runner(tmp_path, dice, said, runs=1).run()
+    assert said[-1] == "dice: all runs are done"
+
+
+async def test_a_run_that_fails_is_tried_again_once(tmp_path: Path) -> None:
+    dice, said = Dice(), list[str]()
+    dice.fails = 1
+    await runner(tmp_path, dice, said).run()
+    assert any("is tried again: the dice fell off the table" in line for line in said)
+    dice.fails = 2
+    with pytest.raises(ExperimentError, match=r"dice: \w+ rce, warm-up: the dice fell off the table"):
+        await runner(tmp_path, dice, said, runs=RUNS + 1).run()
+    assert len(by_condition(read_rows(tmp_path / TABLE), "eyes")) == len(OPTIONS.systems), (
+        "what is done stays"
+    )
+
+
+async def test_other_seeds_make_another_order(tmp_path: Path) -> None:
+    orders = []
+    for seed in range(6):
+        dice, folder = Dice(), tmp_path / str(seed)
+        folder.mkdir()
+        await runner(folder, dice, [], runs=1, seed=seed).run()
+        orders.append(tuple(trial.setup.system for trial in dice.trials))
+    assert len(set(orders)) > 1
