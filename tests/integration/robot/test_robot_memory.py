@@ -147,7 +147,8 @@ async def test_latched_over_limit_are_dropped_oldest_first() -> None:
 
         def have_arrived(count: int) -> bool:
             usage = cloud.master.usage
-            found = {} if usage is None else usage.endpoints["testUser/testRobot"].interfaces
+            endpoint = usage.endpoints.get("testUser/testRobot") if usage else None
+            found = endpoint.interfaces if endpoint else {}
             return sum(interface.messages_in for interface in found.values()) >= count
 
         for count in range(10, 61, 10):

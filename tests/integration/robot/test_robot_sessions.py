@@ -373,7 +373,8 @@ async def test_a_robot_that_stops_reading_harms_itself_only(dial: Dial, robot_of
 
         def dropped() -> bool:
             usage = cloud.master.usage
-            found = usage.endpoints["testUser/stalled"].interfaces.get("image") if usage else None
+            endpoint = usage.endpoints.get("testUser/stalled") if usage else None
+            found = endpoint.interfaces.get("image") if endpoint else None
             return found is not None and found.dropped > 10
 
         await cloud.master.changed.until(dropped)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import time
 from collections.abc import Callable, Mapping
 from types import SimpleNamespace
@@ -125,6 +126,12 @@ def test_a_watcher_is_ready_when_all_have_answered(capsys: pytest.CaptureFixture
 
 
 def test_a_process_has_a_family_and_a_command_line() -> None:
-    assert os.getpid() in family(os.getppid())
-    assert "pytest" in command_line(os.getpid())
+    with subprocess.Popen(["cat", "-"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdin is not None
+        assert child.stdout is not None
+        child.stdin.write(b"\n")
+        child.stdin.flush()
+        assert child.stdout.readline() == b"\n"  # its command line is empty until it runs
+        assert {os.getpid(), child.pid} <= set(family(os.getppid()))
+        assert command_line(child.pid).split() == ["cat", "-"]
     assert command_line(2**22 + 1) == ""
