@@ -1,105 +1,26 @@
-"""``rce experiment`` from outside: all experiments quickly, interrupted and killed runs, bad input."""
+"""``rce experiment`` from outside: a killed run, a system of one's own, the plan, bad input."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 import time
 import tomllib
-from collections import Counter
 from pathlib import Path
 
 import pytest
+from support.experiments import TIMEOUT_S, command, left_behind, run, started
 
 from rce_fleet.experiments.catalogue import EXPERIMENTS
-from rce_fleet.experiments.experiment import PAPER_SYSTEMS
 from rce_fleet.experiments.results import read_rows
-from rce_fleet.experiments.runner import DONE
 
 pytestmark = pytest.mark.e2e
 
 ROOT = Path(__file__).parents[2]
-TIMEOUT_S = 550.0
-COMPARED = ("laser", "round-trip", "images")
 needs_machines = pytest.mark.needs("netns")
-needs_ros = pytest.mark.needs("rospy")
-
-
-def command(*words: str | Path) -> list[str]:
-    return [str(Path(sys.executable).with_name("rce")), "experiment", *map(str, words)]
-
-
-def run(*words: str | Path, timeout: float = TIMEOUT_S) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(*words), check=False, capture_output=True, text=True, timeout=timeout)
-
-
-def left_behind(pid: int) -> list[str]:
-    """Return what an experiment left on the system."""
-    tag = f"rcx{pid}."
-    namespaces = subprocess.run(["ip", "netns"], check=True, capture_output=True, text=True).stdout
-    interfaces = subprocess.run(["ip", "link"], check=True, capture_output=True, text=True).stdout
-    folders = [*Path("/tmp").glob(f"{tag}*"), *Path("/sys/fs/cgroup").glob(f"*/{tag}*")]
-    found = [line for line in (namespaces + interfaces).splitlines() if tag in line]
-    return [*found, *map(str, folders)]
-
-
-def started(folder: Path, *words: str) -> subprocess.Popen[str]:
-    """Start an experiment, and wait until its first run is under way."""
-    process = subprocess.Popen(command(*words, "--output", folder), stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if ", run 1 " in line:
-            return process
-    raise AssertionError(f"no run was begun: {process.wait()}")
-
-
-@needs_machines
-@needs_ros
-@pytest.mark.needs("pymunk")
-@pytest.mark.timeout(TIMEOUT_S)
-def test_all_experiments_quickly_with_an_interruption(tmp_path: Path) -> None:
-    folder = tmp_path / "data"
-    process = started(folder, "all", "--quick")
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert left_behind(process.pid) == []
-
-    done = run("all", "--quick", "--resume", folder)
-    assert done.returncode == 0, done.stdout + done.stderr
-    rows = read_rows(folder / "results.csv")
-    finished = Counter(row.condition.experiment for row in rows if row.metric == DONE)
-    assert finished.keys() == EXPERIMENTS.keys()
-    for experiment in COMPARED:
-        values = {
-            (row.condition.system, row.metric) for row in rows if row.condition.experiment == experiment
-        }
-        for system in PAPER_SYSTEMS:
-            for metric in (
-                ("round_trip",) if experiment == "round-trip" else ("rate", "server.cpu", "delay_p50")
-            ):
-                assert (system, metric) in values, f"{experiment} has no {metric} of {system}"
-    assert all(
-        row.value < 0.5 for row in rows if row.metric == "lost" and row.condition.experiment != "robustness"
-    )
-    assert {row.metric for row in rows if row.condition.experiment == "link"} >= {"round_trip", "rate"}
-    described = json.loads((folder / "environment.json").read_text())
-    assert described["cores"] == len(os.sched_getaffinity(0))
-    assert described["options"]["quick"] is True
-
-    page = (folder / "experiments.md").read_text()
-    assert "## The paper's claims" in page
-    for figure in re.findall(r"]\((experiments/[^)]*)\)", page):
-        assert (folder / figure).stat().st_size > 0
-
-    again = run("all", "--quick", "--resume", folder)
-    assert again.returncode == 0
-    assert again.stdout.count("all runs are done") == len(EXPERIMENTS)
-    assert read_rows(folder / "results.csv") == rows
 
 
 @needs_machines
