@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -192,8 +193,6 @@ class Runner:
 
 def hash_of(seed: int, run: Run) -> int:
     """Return the seed of a run: the same for the same run of the same plan, and different for others."""
-    import zlib
-
     return zlib.crc32(f"{seed} {run}".encode())
 
 

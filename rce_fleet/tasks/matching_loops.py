@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from rce_fleet.compiled import helper, kernel
 
@@ -32,6 +31,8 @@ _DENSE_FROM = 4
 
 
 def _match_numpy(costs: Floats) -> Ints:
+    from scipy.optimize import linear_sum_assignment  # long to load, needed only where nothing is compiled
+
     rows, columns = linear_sum_assignment(costs)
     found = np.empty(len(costs), np.int64)
     found[rows] = columns

@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 
 from rce_fleet.compiled import helper, kernel
 
@@ -21,6 +19,9 @@ LANES = 16
 
 
 def _measure_scipy(indptr: Ints, neighbours: Ints, costs: Floats, goals: Ints) -> NDArray[np.float32]:
+    from scipy.sparse import csr_array  # long to load, needed only where nothing is compiled
+    from scipy.sparse.csgraph import dijkstra
+
     graph: Any = csr_array((costs, neighbours, indptr), shape=(len(indptr) - 1, len(indptr) - 1))
     return np.asarray(dijkstra(graph, indices=goals), np.float32).reshape(len(goals), -1)
 
