@@ -50,7 +50,7 @@ def test_boxes_on_one_lane_leave_robots_room_to_pass(seed: int) -> None:
 
 
 def test_robots_that_can_never_pass_are_not_drawn() -> None:
-    scenario = make_scenario(GridMap(1, 12), 3, seed=1)
+    scenario = make_scenario(GridMap(1, 9), 3, seed=1)
     order = sorted(range(3), key=lambda robot: scenario.starts[robot])
     assert [scenario.goals[robot] for robot in order] == sorted(scenario.goals)
 
