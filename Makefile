@@ -3,13 +3,14 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+LOOPS  := $(VENV)/.compiled
 
 PARALLEL := -n auto --dist loadgroup --durations=25
 
 # Tests start thousands of programs; without bytecode each of them compiles all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help install demo test test-all test-quick fuzz lint format docs reference bench lock clean
+.PHONY: help packages install demo test test-all test-quick fuzz lint format docs reference bench lock clean
 
 help:
 	@echo "make demo    engine, containers and a simulated fleet, with its web page"
@@ -22,13 +23,18 @@ help:
 	@echo "make reference  the pages of settings, options and life cycles"
 	@echo "make install only the set-up      make clean    remove what make made"
 
-install: $(STAMP)
+install: $(STAMP) $(LOOPS)
+
+packages: $(STAMP)
 
 $(STAMP): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and "RCE needs Python 3.11 or newer; this is %d.%d (set PYTHON=...)" % v[:2])'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+$(LOOPS): $(STAMP)
 	$(BIN)/rce compile
 	@touch $@
 
@@ -48,20 +54,20 @@ fuzz: install
 test-quick: install
 	$(BIN)/python -m pytest -n logical --hypothesis-profile=quick --durations=5 tests/unit $(ARGS)
 
-lint: install
+lint: packages
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m tools.audit
 
-format: install
+format: packages
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-docs: install
+docs: packages
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-reference: install
+reference: packages
 	$(BIN)/python -m tools.reference
 
 bench: install

@@ -31,13 +31,13 @@ def test_uses_it(made, number):
 """
 
 
-def run_ci(folder: Path, lint: int, docs: int, tests: int) -> subprocess.CompletedProcess[str]:
+def run_ci(folder: Path, lint: int, docs: int, loops: int, tests: int) -> subprocess.CompletedProcess[str]:
     """Run ``.ci/run`` where ``make`` only notes what it is asked for."""
     (folder / ".ci").mkdir()
     shutil.copy(ROOT / ".ci" / "run", folder / ".ci" / "run")
     (folder / ".ci" / "packages.txt").write_text("# none\n\ndpkg  # is everywhere\n")
     rules = "{0}:\n\t@echo {0} >> asked; exit {1}\n"
-    ends = {"install": 0, "lint": lint, "docs": docs, "test-all": tests}
+    ends = {"packages": 0, "lint": lint, "docs": docs, "install": loops, "test-all": tests}
     (folder / "Makefile").write_text("".join(rules.format(name, code) for name, code in ends.items()))
     environ = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
     return subprocess.run(
@@ -46,14 +46,17 @@ def run_ci(folder: Path, lint: int, docs: int, tests: int) -> subprocess.Complet
 
 
 @pytest.mark.skipif(shutil.which("dpkg-query") is None, reason=".ci/run is for Debian")
-@pytest.mark.parametrize(("lint", "docs", "tests"), [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)])
+@pytest.mark.parametrize(
+    ("lint", "docs", "loops", "tests"),
+    [(0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1), (1, 1, 1, 1)],
+)
 def test_any_failure_fails_the_run_and_nothing_runs_twice(
-    tmp_path: Path, lint: int, docs: int, tests: int
+    tmp_path: Path, lint: int, docs: int, loops: int, tests: int
 ) -> None:
-    done = run_ci(tmp_path, lint, docs, tests)
-    assert (done.returncode == 0) == (lint == docs == tests == 0), done
+    done = run_ci(tmp_path, lint, docs, loops, tests)
+    assert (done.returncode == 0) == (lint == docs == loops == tests == 0), done
     first, *checks, last = (tmp_path / "asked").read_text().split()
-    assert (first, sorted(checks), last) == ("install", ["docs", "lint"], "test-all")
+    assert (first, sorted(checks), last) == ("packages", ["docs", "install", "lint"], "test-all")
 
 
 def test_workers_have_ports_of_their_own() -> None:
