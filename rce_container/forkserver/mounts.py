@@ -34,6 +34,7 @@ _HIDDEN = (
     "/proc/keys",
     "/proc/kmsg",
     "/proc/latency_stats",
+    "/proc/locks",
     "/proc/mdstat",
     "/proc/modules",
     "/proc/mtrr",

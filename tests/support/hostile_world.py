@@ -151,15 +151,22 @@ async def attack(
 
 
 class Bait:
-    """Sockets of the machine that nobody inside should reach."""
+    """Sockets of the machine that nobody inside should reach, and a locked file.
+
+    Its lock belongs to an open file, not to a process: the kernel tells of it in all namespaces.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.abstract = f"\0rce-hostile-{os.getpid()}"
         self.path = str(folder / "bait.sock")
         self._sockets = [socket.socket(family) for family in (socket.AF_UNIX, socket.AF_UNIX, socket.AF_INET)]
+        self._locked = (folder / "locked").open("wb")
         self.port = 0
 
     def __enter__(self) -> Self:
+        fcntl.fcntl(
+            self._locked, fcntl.F_OFD_SETLK, struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
+        )
         addresses: tuple[str | tuple[str, int], ...] = (self.abstract, self.path, ("127.0.0.1", 0))
         for sock, address in zip(self._sockets, addresses, strict=True):
             sock.bind(address)
@@ -168,6 +175,7 @@ class Bait:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._locked.close()
         for sock in self._sockets:
             sock.close()
 
