@@ -49,6 +49,57 @@ FREE, PLANNED, KEPT = -1, -2, -3
 
 
 @helper
+def _may_move(robot: int, lengths: Ints, slots: Ints, turns: Ints) -> bool:
+    """Return whether a robot has a path that may be taken from it."""
+    slot = slots[robot]
+    return bool(slot < 0 or (lengths[slot] != FREE and turns[slot] < _TURNS))
+
+
+@helper
+def _note_once(robot: int, size: int, found: Ints) -> int:
+    """Add a robot to a list of ``size`` robots unless it is in it; return the new size."""
+    for index in range(size):
+        if found[index] == robot:
+            return size
+    found[size] = robot
+    return size + 1
+
+
+@helper
+def _find_standing(
+    robot: int,
+    start: int,
+    indptr: Ints,
+    neighbours: Ints,
+    field: Ints,
+    counts: Ints,
+    times: Floats,
+    tags: Ints,
+    lengths: Ints,
+    slots: Ints,
+    turns: Ints,
+    found: Ints,
+) -> int:
+    """Write the robots that stay on a robot's shortest path for good into ``found``; return how many.
+
+    Such a visit need not be the last one of its node: others are due there once the robot has another goal.
+    """
+    here, size, moved = start, 0, True
+    while moved and size < _ASIDE:
+        for place in range(counts[here]):
+            other = tags[here, place, ROBOT]
+            is_standing = times[here, place, LEAVE] == np.inf and other >= 0 and other != robot
+            if is_standing and size < _ASIDE and _may_move(other, lengths, slots, turns):
+                size = _note_once(other, size, found)
+        there, moved = here, False
+        for edge in range(indptr[here], indptr[here + 1]):
+            if field[neighbours[edge]] < field[there]:
+                there, moved = neighbours[edge], True
+        here = there
+    return size
+
+
+@helper
 def _take_aside(
     robot: int,
     start: int,
@@ -66,8 +117,18 @@ def _take_aside(
     found: Ints,
     random: NDArray[np.int64],
 ) -> int:
-    """Write the first robots in the way of a robot on its shortest path into ``found``; return how many."""
-    here, step, size, moved = start, begin, 0, True
+    """Write robots in the way of a robot on its shortest path into ``found``; return how many.
+
+    Robots that stay in a node of it for good come first. Without these there may be no path at all: then each
+    search is as long as it can be, and taking others aside does not help. Otherwise it is the first robots
+    that it meets.
+    """
+    size = _find_standing(
+        robot, start, indptr, neighbours, field, counts, times, tags, lengths, slots, turns, found
+    )
+    if size:
+        return size
+    here, step, moved = start, begin, True
     most = min(_ASIDE, 1 + turns[slots[robot]] // _GROWS)
     while moved and size < most:
         for place in range(counts[here]):
@@ -76,14 +137,8 @@ def _take_aside(
             is_near = enter <= step + 2.0 or here == goal
             if other < 0 or other == robot or not is_near or leave < step - 1.0:
                 continue
-            has_path = slots[other] < 0 or lengths[slots[other]] >= 0 or lengths[slots[other]] == KEPT
-            if size < most and has_path and (slots[other] < 0 or turns[slots[other]] < _TURNS):
-                is_new = True
-                for index in range(size):
-                    is_new = is_new and found[index] != other
-                if is_new:
-                    found[size] = other
-                    size += 1
+            if size < most and _may_move(other, lengths, slots, turns):
+                size = _note_once(other, size, found)
         first, degree = indptr[here], indptr[here + 1] - indptr[here]
         turn = draw(random) % degree if degree else 0
         there, moved = here, False

@@ -128,6 +128,39 @@ def test_most_blocked_cells_need_no_plan_for_all() -> None:
     assert len(found) > len(results) / 2
 
 
+def aisle_with_a_standing_robot() -> tuple[GridMap, list[int], list[int], list[Route]]:
+    """Return an aisle that Robot0 has to go through.
+
+    Robot1 stands in it, in its goal, beside a bay. Robot2 is due in its cell much later. All others cross the
+    aisle, each just when Robot0 could be there.
+    """
+    columns, crossings = 30, range(2, 24, 2)
+    free = {columns + column for column in range(columns)} | {26, 2 * columns + 27, 2 * columns + 28}
+    free |= {side + column for column in crossings for side in (0, 2 * columns)}
+    grid = GridMap(3, columns, blocked=frozenset(range(3 * columns)) - free)
+    starts = [columns, columns + 27, 2 * columns + 27, *crossings]
+    goals = [2 * columns - 1, columns + 27, 2 * columns + 28, *(2 * columns + column for column in crossings)]
+    due = [(columns + 27, 150.0), (columns + 28, 151.0), (2 * columns + 28, 152.0)]
+    crossed: list[Route] = [
+        [(columns + column, float(column)), (2 * columns + column, column + 1.0)] for column in crossings
+    ]
+    return grid, starts, goals, [[], [], due, *crossed]
+
+
+def test_standing_robot_in_an_aisle_makes_way_first() -> None:
+    """The robot without which there is a path makes way; those that only cross keep their paths."""
+    grid, starts, goals, routes = aisle_with_a_standing_robot()
+    graph = PlanningGraph.from_grid(grid)
+    found = reroute(graph, routed(starts, goals, routes), [0], effort=20_000, seed=1)
+    assert found is not None
+    assert found.paths.keys() == {0, 1}
+    for robot, (cells, steps) in found.paths.items():
+        assert cells[-1] == goals[robot]
+        routes[robot] = list(zip(cells.tolist(), steps.tolist(), strict=True))
+    ledger = drive(starts, routes, 1)
+    assert [ledger.route(name(robot)) for robot in (0, 1)] == [[goals[0]], [goals[1]]]
+
+
 def test_compiled_and_plain_loops_find_the_same_paths() -> None:
     """Both forms of the loops find the same paths."""
     if not is_available():
