@@ -29,6 +29,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable
+from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
 from types import FunctionType
@@ -115,14 +116,13 @@ def helper(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def is_available() -> bool:
-    """Return whether numba is installed and the variable ``RCE_COMPILED`` does not turn it off."""
+    """Return whether numba is installed and the variable ``RCE_COMPILED`` does not turn it off.
+
+    numba is not imported for that: it takes tens of megabytes, and most of a second.
+    """
     if os.environ.get(COMPILED, "").lower() in _OFF:
         return False
-    try:
-        import numba  # noqa: F401  # only whether it is there
-    except ImportError:
-        return False
-    return True
+    return find_spec("numba") is not None
 
 
 def compile_kernels(kernels: Iterable[Kernel[..., Any]] | None = None) -> bool:
