@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
+from copy import copy
 from typing import TYPE_CHECKING, NamedTuple
 
 from aiohttp import web
@@ -23,7 +25,7 @@ from rce_master.state.lifecycle import ContainerPhase, RobotSession
 from rce_master.state.records import Container, Endpoint
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
 
     from prometheus_client.metrics_core import Metric
 
@@ -37,24 +39,39 @@ MAX_SERIES = 50_000
 """Series of containers, nodes and interfaces in one answer; further ones are counted, not listed."""
 
 
+PIECE = 250
+"""Series that are made or written between two turns of the event loop."""
+
+
 def make_answer(
     tables: Tables, book: UsageBook, password_checks: Callable[[], int]
-) -> Callable[[], web.Response]:
+) -> Callable[[], Awaitable[web.Response]]:
     """Return the function that answers a scrape."""
     registry = make_registry(tables, book)
     registry.register(_LoginCollector(password_checks))
+    consumption = Consumption(tables, book)
     headers = {"Content-Type": CONTENT_TYPE_LATEST}
-    return lambda: web.Response(body=generate_latest(registry), headers=headers)
+
+    async def answer() -> web.Response:
+        parts = [generate_latest(registry)]
+        async for part in consumption.parts():
+            parts.append(part)
+            await asyncio.sleep(0)
+        return web.Response(body=b"".join(parts), headers=headers)
+
+    return answer
 
 
 def make_registry(tables: Tables, book: UsageBook) -> CollectorRegistry:
-    """Make a separate registry; the library's global one belongs to the embedding program."""
+    """Make a separate registry; the library's global one belongs to the embedding program.
+
+    :class:`Consumption` is not in it: it has too many series for one step.
+    """
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
     PlatformCollector(registry=registry)
     GCCollector(registry=registry)
     registry.register(EngineCollector(tables, book.newest))
-    registry.register(ConsumptionCollector(tables, book))
     return registry
 
 
@@ -144,8 +161,30 @@ class EngineCollector(Collector):
         yield from (connected, endpoints, cpu, memory, held, shed, turned_away)
 
 
-class ConsumptionCollector(Collector):
+class _Piece(NamedTuple):
+    """A part of a metric, in place of a registry."""
+
+    metric: Metric
+
+    def collect(self) -> tuple[Metric]:
+        """Return the part."""
+        return (self.metric,)
+
+
+def write_pieces(metric: Metric) -> Iterator[bytes]:
+    """Write a metric, at most :data:`PIECE` series at a time, with its description before the first ones."""
+    for begin in range(0, max(len(metric.samples), 1), PIECE):
+        part = copy(metric)
+        part.samples = metric.samples[begin : begin + PIECE]
+        text = generate_latest(_Piece(part))
+        lines = text.splitlines(keepends=True)
+        yield text if begin == 0 else b"".join(line for line in lines if not line.startswith(b"#"))
+
+
+class Consumption:
     """Metrics of the traffic of interfaces, the usage of containers and nodes, and the promises of machines.
+
+    There are many: they are made and written in pieces, and other tasks run in between.
 
     The labels are only names in the present desired state, so that reports of task sets cannot add labels,
     and a counter ends with the object that it counts.
@@ -155,10 +194,17 @@ class ConsumptionCollector(Collector):
         self._tables = tables
         self._book = book
 
-    def collect(self) -> Iterator[Metric]:
-        """Make all metrics."""
+    async def parts(self) -> AsyncIterator[bytes]:
+        """Write all metrics, in parts of at most :data:`PIECE` series."""
         families = _Families(MAX_SERIES)
-        for endpoint in self._tables.endpoints:
+        made = 0
+        for id_ in [endpoint.id for endpoint in self._tables.endpoints]:
+            if families.count - made >= PIECE:
+                made = families.count
+                await asyncio.sleep(0)
+            endpoint = self._tables.endpoints.get(id_)
+            if endpoint is None:
+                continue  # It was removed meanwhile.
             usage = self._usage_of(endpoint)
             if isinstance(endpoint, Container):
                 self._container(families, endpoint, usage)
@@ -167,10 +213,12 @@ class ConsumptionCollector(Collector):
                 _interface(families, endpoint.id, tag, usage.interfaces.get(tag))
         for room in self._tables.rooms:
             _machine(families, room)
-        yield from families
-        yield GaugeMetricFamily(
+        omitted = GaugeMetricFamily(
             "rce_metrics_omitted", "Series that found no room in this answer.", value=families.omitted
         )
+        for metric in (*families, omitted):
+            for piece in write_pieces(metric):
+                yield piece
 
     def _usage_of(self, endpoint: Endpoint) -> EndpointUsage:
         told = self._book.newest.get(endpoint.task_set)
@@ -202,11 +250,16 @@ class _Families:
 
     def __init__(self, most: int) -> None:
         self.omitted = 0
-        self._room = most
+        self._most = self._room = most
         self._found: dict[str, GaugeMetricFamily | CounterMetricFamily] = {}
 
     def __iter__(self) -> Iterator[Metric]:
         return iter(self._found.values())
+
+    @property
+    def count(self) -> int:
+        """Series so far, with those that found no room."""
+        return self._most - self._room + self.omitted
 
     def gauge(self, name: str, help_: str, labels: dict[str, str], value: float) -> None:
         """Add a gauge."""

@@ -73,7 +73,7 @@ def _at_entry(entry: Entry) -> Handler:
 
 def _metrics(services: Services) -> Handler:
     @cache
-    def scraped() -> Callable[[], web.Response]:
+    def scraped() -> Callable[[], Awaitable[web.Response]]:
         from rce_master.http.metrics import make_answer  # only scraped masters spend this memory
 
         checks = services.authenticator
@@ -81,7 +81,7 @@ def _metrics(services: Services) -> Handler:
 
     async def handle(request: web.Request) -> web.Response:
         check_metrics(request, services)
-        return scraped()()
+        return await scraped()()
 
     return handle
 

@@ -77,7 +77,8 @@ def test_a_process_with_its_own_folder_compiles_nothing(tmp_path: Path) -> None:
 
 def test_looking_for_numba_does_not_import_it() -> None:
     """A program that only asks whether loops can be compiled does not spend numba's memory."""
-    look = "import sys; from rce_fleet.compiled import is_available as told; print(told(), 'numba' in sys.modules)"
+    look = "import sys; from rce_fleet.compiled import is_available as is_it; "
+    look += "print(is_it(), 'numba' in sys.modules)"
     command = [sys.executable, "-c", look]
     told = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
     assert told.stdout.split() == [str(find_spec("numba") is not None), "False"]
