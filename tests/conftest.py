@@ -110,6 +110,13 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         lambda: _runs("pkg-config", "--exists", "roscpp") and shutil.which("g++") is not None,
         "roscpp cannot be compiled against (Debian: g++ pkg-config libroscpp-dev libstd-srvs-dev)",
     ),
+    "roscpp_sensor_msgs": (
+        lambda: (
+            _runs("pkg-config", "--exists", "roscpp", "sensor_msgs", "std_msgs")
+            and shutil.which("g++") is not None
+        ),
+        "roscpp's sensor_msgs cannot be compiled against (Debian: g++ pkg-config libsensor-msgs-dev)",
+    ),
     "roscpp_actionlib": (
         lambda: _runs("pkg-config", "--exists", "actionlib", "roscpp") and shutil.which("g++") is not None,
         "roscpp's actionlib cannot be compiled against (Debian: g++ pkg-config libactionlib-dev)",

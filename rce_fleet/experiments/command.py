@@ -20,7 +20,7 @@ from rce_fleet.experiments.ownership import sweep
 from rce_fleet.experiments.report import make_report
 from rce_fleet.experiments.runner import TABLE, Plan, Runner
 from rce_fleet.experiments.systems.registry import system_of
-from rce_fleet.experiments.systems.software import SOFTWARES, software_of
+from rce_fleet.experiments.systems.software import SOFTWARES, USUAL, software_of
 
 RUNS = 10
 PAGE = "experiments.md"
@@ -58,7 +58,7 @@ def experiment(
         typer.Option(
             metavar="NAME,...",
             help="Software of the robots; the first one has all conditions.",
-            show_default="those that are installed of ros,rce",
+            show_default="those that are installed of ros,rce; roscpp if it is named",
         ),
     ] = None,
     page: Annotated[
@@ -82,6 +82,8 @@ def experiment(
     try:
         options = _options(systems, software, robots, quick=quick)
         planned = Plan(experiments_of(name), options, 1 if quick else runs, seed)
+        for line in planned.left_out():
+            typer.echo(line)
         if plan:
             _show(planned, resume)
             return
@@ -125,7 +127,7 @@ def _options(systems: str, software: str | None, robots: int, *, quick: bool) ->
     for name in chosen:
         system_of(name)
     if software is None:
-        names = tuple(name for name, one in SOFTWARES.items() if not one.missing())
+        names = tuple(name for name in USUAL if not SOFTWARES[name].missing())
     else:
         names = _names(software, "--software")
         for name in names:
@@ -192,7 +194,7 @@ def _show(planned: Plan, resume: Path | None) -> None:
         seconds = planned.seconds(one, rows)
         total += seconds
         works = planned.works(one, rows)
-        setups = len(one.setups(planned.options))
+        setups = len(one.setups(planned.options_of(one)))
         typer.echo(
             f"{one.name:12} {setups:3} set-ups {len(works):4} runs {seconds / 60:6.1f} min  {one.title}"
         )

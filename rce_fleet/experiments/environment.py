@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import rce
 from rce_fleet.experiments.ownership import new_tag
+from rce_fleet.experiments.systems.software import ROSCPP
 from rce_fleet.experiments.usage import make_meter
 
 if TYPE_CHECKING:
@@ -22,7 +23,12 @@ if TYPE_CHECKING:
 
 FILE = "environment.json"
 PACKAGES = ("numpy", "uvloop", "websockets", "aiohttp", "msgspec")
-PROGRAMS = {"roscore": ("rosversion", "roslaunch"), "bwrap": ("bwrap", "--version")}
+PROGRAMS = {
+    "roscore": ("rosversion", "roslaunch"),
+    "roscpp": ("pkg-config", "--modversion", "roscpp"),
+    "g++": ("g++", "-dumpfullversion"),
+    "bwrap": ("bwrap", "--version"),
+}
 """Programs that take part, and what prints their versions."""
 
 
@@ -89,7 +95,7 @@ def _versions() -> dict[str, str]:
     for name in PACKAGES:
         found[name] = metadata.version(name)
     for name, argv in PROGRAMS.items():
-        if shutil.which(argv[0]) is not None:
+        if shutil.which(name) is not None or (name == "roscpp" and not ROSCPP.missing()):
             done = subprocess.run(argv, check=False, capture_output=True, text=True, timeout=30)  # noqa: S603
             found[name] = done.stdout.strip().removeprefix("bubblewrap ") or "unknown"
     return found

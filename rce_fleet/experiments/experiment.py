@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from rce_fleet.experiments.results import Condition
 from rce_fleet.experiments.systems.base import Layout, System
 from rce_fleet.experiments.systems.registry import system_of
-from rce_fleet.experiments.systems.software import software_of
+from rce_fleet.experiments.systems.software import SOFTWARES, USUAL, software_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -40,7 +40,7 @@ class Options:
     """
 
     systems: tuple[str, ...] = PAPER_SYSTEMS
-    software: tuple[str, ...] = ("ros", "rce")
+    software: tuple[str, ...] = USUAL
     robots: int = 5
     seconds: float = 3.0
     quick: bool = False
@@ -93,6 +93,16 @@ class Experiment(ABC):
     name: ClassVar[str]
     title: ClassVar[str]
     """What it measures, in a line."""
+    programs: ClassVar[tuple[str, ...]] = ()
+    """Programs of the experiments that the software of robots must have."""
+
+    def possible(self, options: Options) -> Options:
+        """Return the options with only the software that has all of the experiment's programs."""
+        return replace(options, software=tuple(one for one in options.software if not self.lacking(one)))
+
+    def lacking(self, software: str) -> list[str]:
+        """Return the programs of the experiment that a software does not have."""
+        return SOFTWARES[software].lacking(self.programs) if software in SOFTWARES else []
 
     @abstractmethod
     def setups(self, options: Options) -> list[Condition]:

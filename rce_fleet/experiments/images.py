@@ -44,6 +44,7 @@ class Images(Experiment):
 
     name = "images"
     title = "camera images, shown on a console of machine 1 (the paper's experiment 2)"
+    programs = ("camera", "listener")
 
     def setups(self, options: Options) -> list[Condition]:
         """Return a set-up for each system, with the first software."""

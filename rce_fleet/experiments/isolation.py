@@ -38,6 +38,7 @@ class Isolation(Experiment):
 
     name = "isolation"
     title = "what a robot's program sees of another robot and can do to it; files and lines to add a robot"
+    programs = ("listener", "reach", "robot_base")
 
     def setups(self, options: Options) -> list[Condition]:
         """Return a set-up for each system and software; quickly, with the first software only."""

@@ -34,6 +34,7 @@ class Laser(Experiment):
 
     name = "laser"
     title = "laser scans of five robots, printed on machine 1 (the paper's experiment 1)"
+    programs = ("listener", "robots")
 
     def setups(self, options: Options) -> list[Condition]:
         """Return a set-up for each system and software."""

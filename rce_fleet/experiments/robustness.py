@@ -72,6 +72,7 @@ class Robustness(Experiment):
 
     name = "robustness"
     title = "core or master killed, machine cut off for 20 s: what stops, for how long, what is lost"
+    programs = ("provider", "watcher")
 
     def setups(self, options: Options) -> list[Condition]:
         """Return set-ups by fault and system, with the first software; quickly, one of each system."""

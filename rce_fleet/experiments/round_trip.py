@@ -39,6 +39,7 @@ class RoundTrip(Experiment):
 
     name = "round-trip"
     title = "round trip of messages of 7 B to 10 MB, from both machines, over links with more and less delay"
+    programs = ("asker", "echo")
 
     def setups(self, options: Options) -> list[Condition]:
         """Return set-ups by system and software; where there are containers, with and without them."""

@@ -17,6 +17,7 @@ from rce_fleet.experiments.bench import CLIENT, SERVER, Bench
 from rce_fleet.experiments.experiment import NOT_ANY, Experiment, Options, Trial
 from rce_fleet.experiments.results import Condition, Row, read_rows, write_rows
 from rce_fleet.experiments.schedule import WARM_UP, Run, remaining, schedule
+from rce_fleet.experiments.systems.software import software_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -57,11 +58,30 @@ class Plan:
     runs: int
     seed: int
 
+    def options_of(self, experiment: Experiment) -> Options:
+        """Return how an experiment is done: with the software that has its programs."""
+        return experiment.possible(self.options)
+
+    def left_out(self) -> list[str]:
+        """Return a line for each experiment that is done without some software, and why.
+
+        Raises:
+            ExperimentError: No experiment can be done with the software.
+        """
+        lines = [
+            f"{one.name} is not done with the software {software}: it has no program {', '.join(lacking)}"
+            for one in self.experiments
+            for software in self.options.software
+            if (lacking := one.lacking(software))
+        ]
+        if lines and not any(self.options_of(one).software for one in self.experiments):
+            raise ExperimentError("; ".join(lines))
+        return lines
+
     def works(self, experiment: Experiment, rows: list[Row]) -> list[Work]:
         """Return the runs of an experiment that are still to be done."""
-        planned = schedule(
-            experiment.setups(self.options), self.runs, self.seed, warm_up=not self.options.quick
-        )
+        setups = experiment.setups(self.options_of(experiment))
+        planned = schedule(setups, self.runs, self.seed, warm_up=not self.options.quick)
         most = {condition: experiment.most_runs(condition) for condition in dict(planned)}
         planned = [run for run in planned if run.number <= (most[run.condition] or run.number)]
         done = {Run(row.condition, row.run) for row in rows if row.metric == DONE}
@@ -73,13 +93,13 @@ class Plan:
         if not works:
             return 0.0
         runs = sum(self._run_seconds(work) for work in works)
-        return runs + experiment.preparation_seconds(self.options)
+        return runs + experiment.preparation_seconds(self.options_of(experiment))
 
     def _run_seconds(self, work: Work) -> float:
         seconds = work.experiment.seconds
         if work.run.number == WARM_UP:
             seconds = work.experiment.warm_up_seconds
-        return seconds(work.run.condition, self.options)
+        return seconds(work.run.condition, self.options_of(work.experiment))
 
 
 class Runner:
@@ -114,6 +134,7 @@ class Runner:
             ExperimentError: Something cannot be done; what is done stays.
         """
         self._drop_unfinished()
+        await self._prepare_software()
         await self._measure_link()
         total = sum(self._plan.seconds(one, self.rows()) for one in self._plan.experiments)
         began = time.monotonic()
@@ -131,7 +152,8 @@ class Runner:
     async def _do(self, work: Work, prepared: dict[str, float]) -> None:
         run = work.run
         seed = hash_of(self._plan.seed, run)
-        trial = Trial(run.condition, self._plan.options, seed, run.number == WARM_UP, prepared)
+        options = self._plan.options_of(work.experiment)
+        trial = Trial(run.condition, options, seed, run.number == WARM_UP, prepared)
         began = time.monotonic()
         for attempt in range(1, TRIES + 1):
             try:
@@ -148,12 +170,18 @@ class Runner:
         attempts = Row(run.condition, run.number, "tries", float(attempt), "")
         await asyncio.to_thread(write_rows, self._table, [*rows, attempts, took])
 
+    async def _prepare_software(self) -> None:
+        """Have the software make what it needs, before anything is measured."""
+        for name in self._plan.options.software:
+            await asyncio.to_thread(software_of(name).prepare, self._say)
+
     async def _prepare(self, experiment: Experiment) -> dict[str, float]:
         condition = Condition.of(experiment.name, NOT_ANY, NOT_ANY, part=PREPARED)
         found = {row.metric: row.value for row in self.rows() if row.condition == condition}
-        if not found and experiment.preparation_seconds(self._plan.options):
+        options = self._plan.options_of(experiment)
+        if not found and experiment.preparation_seconds(options):
             self._say(f"{experiment.name}: preparing")
-            found = await experiment.prepare(self._plan.options, self._plan.seed)
+            found = await experiment.prepare(options, self._plan.seed)
             write_rows(self._table, [Row(condition, 1, name, value, "") for name, value in found.items()])
         return found
 

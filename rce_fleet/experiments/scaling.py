@@ -47,6 +47,7 @@ class Scaling(Experiment):
 
     name = "scaling"
     title = "1 to 50 robots with laser scans; one container for all against one for each"
+    programs = ("asker", "echo", "listener", "robots")
 
     def setups(self, options: Options) -> list[Condition]:
         """Return set-ups by number of robots and system, with the first software."""

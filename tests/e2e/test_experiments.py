@@ -90,7 +90,7 @@ def test_a_plan_says_what_would_run_and_runs_nothing(tmp_path: Path) -> None:
     [
         (["lasers"], "there is no experiment lasers; there is laser, round-trip, images"),
         (["laser", "--systems", "cloud,peer"], "there is no system peer; there is cloud, multi_master"),
-        (["laser", "--software", "ros2"], "there is no software ros2; there is ros, rce"),
+        (["laser", "--software", "ros2"], "there is no software ros2; there is ros, roscpp, rce"),
         (["laser", "--systems", ","], "--systems needs at least one name"),
         (["laser", "--resume", "absent"], "--resume absent: "),
         (["laser", "--output", "there"], "there exists already; go on in it with --resume there"),

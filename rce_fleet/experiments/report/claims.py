@@ -23,7 +23,7 @@ from rce_fleet.experiments.report.judging import (
     reason_of,
     verdict_of,
 )
-from rce_fleet.experiments.report.labels import SOFTWARE, SYSTEMS, natural, system_label
+from rce_fleet.experiments.report.labels import SOFTWARE, SYSTEMS, USUAL, natural, system_label
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -159,12 +159,13 @@ def judge(claim: Claim, measurements: Measurements, software: str) -> Judgement:
 
 
 def judge_all(measurements: Measurements) -> list[Judgement]:
-    """Judge all claims for the known software, and for other software that was measured in two systems."""
+    """Judge all claims for the usual software, and for other software that was measured in two systems."""
     systems: dict[str, set[str]] = defaultdict(set)
     for condition in measurements.runs:
         systems[condition.software].add(condition.system)
-    compared = sorted(software for software, found in systems.items() if len(found & SYSTEMS.keys()) > 1)
-    known = [*SOFTWARE, *(software for software in compared if software not in SOFTWARE)]
+    compared = {software for software, found in systems.items() if len(found & SYSTEMS.keys()) > 1}
+    known = [software for software in SOFTWARE if software in compared.union(USUAL)]
+    known += sorted(compared.difference(SOFTWARE))
     return [judge(claim, measurements, software) for claim in CLAIMS for software in known]
 
 

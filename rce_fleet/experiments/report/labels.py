@@ -14,7 +14,9 @@ if TYPE_CHECKING:
 
 SYSTEMS = {"single_master": "SMS", "multi_master": "MMS", "cloud": "CRS"}
 """The paper's abbreviations of the systems, in the order of tables and figures."""
-SOFTWARE = {"ros": "ROS", "rce": "RCE"}
+SOFTWARE = {"ros": "ROS", "roscpp": "ROS C++", "rce": "RCE"}
+USUAL = frozenset({"ros", "rce"})
+"""Software that the page judges even if it was not measured."""
 COUNTS = frozenset({"count", ""})
 """Units of values that are counted, not measured."""
 DIGITS = 3

@@ -160,8 +160,9 @@ READING = f"""\
   system, software and factors of the table's row, and the metric of the table's column. A column such as
   `server.network_in + server.network_out` is computed in each run. Warm-ups (run 0) do not count.
 - *Names.* SMS is `single_master`, MMS is `multi_master`, CRS is `cloud` in the raw data. Machine 1 is
-  `server`, machine 2 is `client`. Software `ros` is ROS 1 as Debian packages it, `rce` is the core and the
-  nodes of RCE. In CRS, the engine is RCE; the software is that of the robots. A verdict is about the
+  `server`, machine 2 is `client`. Software `ros` is ROS 1 as Debian packages it, with programs in Python
+  (rospy); `roscpp` is the same with programs in C++; `rce` is the core and the nodes of RCE. In CRS, the
+  engine and the nodes in containers are RCE; the software is that of the robots. A verdict is about the
   software of its row only.
 - *Verdicts.* A claim *holds* if it holds in all cases (combinations of factors), *does not hold* if it
   holds in none, and otherwise *depends*. A system is *above* another one if their intervals do not overlap

@@ -1,6 +1,6 @@
 """The paper's Multi Master System: a ROS core on each machine, ``master_discovery`` and ``master_sync``.
 
-Discovery and sync are ours with either software: Debian has no package of fkie's. An adapter for fkie's own
+Discovery and sync are ours with any software: Debian has no package of fkie's. An adapter for fkie's own
 programs has other values of ``discovery`` and ``sync``.
 """
 

@@ -53,5 +53,5 @@ def test_the_papers_systems_are_there() -> None:
 def test_what_is_not_there_is_named() -> None:
     with pytest.raises(ExperimentError, match="there is no system peer; there is cloud"):
         system_of("peer")
-    with pytest.raises(ExperimentError, match="there is no software ros2; there is ros, rce"):
+    with pytest.raises(ExperimentError, match="there is no software ros2; there is ros, roscpp, rce"):
         software_of("ros2")

@@ -123,6 +123,13 @@ def test_software_is_judged_apart() -> None:
     assert len(found) == 2 * len(CLAIMS) == 18
 
 
+def test_roscpp_is_judged_where_it_was_measured() -> None:
+    rows = [*network(FALLING, PAPER), *network(EQUAL, PAPER, software="roscpp")]
+    found = {(one.claim.letter, one.software): one.verdict for one in judge_all(Measurements.of(rows))}
+    assert (found["a", "ros"], found["a", "roscpp"]) == (HOLDS, FAILS)
+    assert [software for letter, software in found if letter == "a"] == ["ros", "roscpp", "rce"]
+
+
 def test_further_software_with_two_systems_is_judged() -> None:
     rows = [*network(FALLING, PAPER, software="rapyuta"), *rows_of(Condition.of("link", "-", "-"), {})]
     assert {one.software for one in judge_all(Measurements.of(rows))} == {"ros", "rce", "rapyuta"}
