@@ -15,7 +15,7 @@ from rce.own_process import end_signals
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments import environment
 from rce_fleet.experiments.catalogue import experiments_of
-from rce_fleet.experiments.experiment import PAPER_SYSTEMS, Options
+from rce_fleet.experiments.experiment import PAPER_SYSTEMS, Experiment, Options
 from rce_fleet.experiments.ownership import sweep
 from rce_fleet.experiments.report import make_report
 from rce_fleet.experiments.runner import TABLE, Plan, Runner
@@ -24,6 +24,8 @@ from rce_fleet.experiments.systems.software import SOFTWARES, USUAL, software_of
 
 RUNS = 10
 PAGE = "experiments.md"
+MAKE_PAGE = "page"
+"""Name by which only the page is made."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 QUICK_SECONDS = 1.0
@@ -32,7 +34,18 @@ QUICK_ROBOTS = 2
 
 
 def experiment(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The experiment, or all.", show_default=False)],
+    name: Annotated[
+        str,
+        typer.Argument(metavar="NAME", help="The experiment, or all; page: run nothing.", show_default=False),
+    ],
+    folders: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[DIR]...",
+            help="For page: folders of raw data that the page is made of.",
+            show_default=False,
+        ),
+    ] = None,
     runs: Annotated[int, typer.Option(min=1, help="Runs of each set-up that count.")] = RUNS,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the order of runs and of random choices.")] = 1,
     *,
@@ -66,12 +79,12 @@ def experiment(
         typer.Option(
             metavar="FILE",
             help="Page that is made of the raw data; its figures are in a folder of its name beside it.",
-            show_default="experiments.md in the folder",
+            show_default="experiments.md in the first folder",
         ),
     ] = None,
     second: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Raw data of a second run: the page compares both."),
+        list[Path] | None,
+        typer.Option(metavar="DIR", help="Raw data of a second run: the page compares both. Repeatable."),
     ] = None,
 ) -> None:
     """Compare Single Master, Multi Master and Cloud Robotics System by experiments.
@@ -80,8 +93,11 @@ def experiment(
     what they depend on to environment.json. A page of tables, figures and claims is made of them.
     """
     try:
+        if name == MAKE_PAGE:
+            _report(folders or [], page, second or [])
+            return
         options = _options(systems, software, robots, quick=quick)
-        planned = Plan(experiments_of(name), options, 1 if quick else runs, seed)
+        planned = Plan(_experiments(name, folders), options, 1 if quick else runs, seed)
         for line in planned.left_out():
             typer.echo(line)
         if plan:
@@ -92,15 +108,28 @@ def experiment(
             typer.echo(f"removed what an experiment left that was killed: {left}")
         asyncio.run(_run(Runner(planned, folder, typer.echo)))
         typer.echo(f"raw data: {folder / TABLE}")
-        page = page or folder / PAGE
-        make_report(folder, page=page, figures=page.with_suffix(""), second=second)
-        typer.echo(f"page: {page}")
+        _report([folder], page, second or [])
     except (ExperimentError, OSError) as error:
         typer.echo(f"rce experiment: {error}", err=True)
         raise typer.Exit(1) from error
     except asyncio.CancelledError:
         typer.echo(f"interrupted; go on with --resume {folder}", err=True)
         raise typer.Exit(INTERRUPTED) from None
+
+
+def _experiments(name: str, folders: list[Path] | None) -> list[Experiment]:
+    if folders:
+        raise ExperimentError(f"only {MAKE_PAGE} takes folders; {name} writes to --output DIR")
+    return experiments_of(name)
+
+
+def _report(folders: list[Path], page: Path | None, second: list[Path]) -> None:
+    """Make the page of folders with raw data."""
+    if not folders:
+        raise ExperimentError(f"{MAKE_PAGE} needs at least one folder of raw data")
+    page = page or folders[0] / PAGE
+    make_report(folders, page=page, figures=page.with_suffix(""), second=second)
+    typer.echo(f"page: {page}")
 
 
 async def _run(runner: Runner) -> None:

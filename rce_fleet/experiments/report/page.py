@@ -1,28 +1,25 @@
-"""Makes the page of the experiments, its figures and the summary, from a folder of raw data."""
+"""Makes the page of the experiments, its figures and the summary, from folders of raw data."""
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.report import drawing
 from rce_fleet.experiments.report.break_even import break_even_table
 from rce_fleet.experiments.report.breaking import breaking_table
 from rce_fleet.experiments.report.claims import judge_all
 from rce_fleet.experiments.report.claims_part import cases, verdicts
 from rce_fleet.experiments.report.figures import figures_of
-from rce_fleet.experiments.report.labels import number
 from rce_fleet.experiments.report.measurements import Measurements
+from rce_fleet.experiments.report.parts import environment_table, environments_of, read_parts, rows_of
 from rce_fleet.experiments.report.repeat import compare
 from rce_fleet.experiments.report.repeat_part import comparison_text
 from rce_fleet.experiments.report.schematics import schematics
 from rce_fleet.experiments.report.sections import LIMITS, LINK, READING, SECTIONS
 from rce_fleet.experiments.report.summary import summarize, write_summary
-from rce_fleet.experiments.report.tables import folded, markdown, metric_table, table_of, unlisted
-from rce_fleet.experiments.results import read_rows
+from rce_fleet.experiments.report.tables import folded, metric_table, table_of, unlisted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -30,8 +27,6 @@ if TYPE_CHECKING:
 
     from rce_fleet.experiments.report.drawing import Drawing
 
-TABLE = "results.csv"
-ENVIRONMENT = "environment.json"
 SUMMARY = "summary.csv"
 NOT_MEASURED = "Not measured."
 _LINK = "link"
@@ -39,22 +34,24 @@ _ANALYSES = {"scaling": breaking_table, "offload": break_even_table}
 """Tables that say what follows from an experiment's medians."""
 
 
-def make_report(folder: Path, *, page: Path, figures: Path, second: Path | None = None) -> None:
+def make_report(folders: Sequence[Path], *, page: Path, figures: Path, second: Sequence[Path] = ()) -> None:
     """Make the page of the experiments, its figures and the summary of the raw data.
 
     Args:
-        folder: Has the raw data, ``results.csv``, and what they depend on, ``environment.json``.
+        folders: Have the raw data, ``results.csv``, and what they depend on, ``environment.json``. Each
+            experiment is in one of them.
         page: The page that is written.
         figures: Folder for figures and ``summary.csv``; made if it does not exist.
-        second: Folder with the raw data of a second full run, which is compared with the first one.
+        second: Folders with the raw data of a second full run, which is compared with the first one.
 
     Raises:
         OSError: A file cannot be read or written.
-        ExperimentError: A file is not what it must be; the text names it.
+        ExperimentError: A file is not what it must be, or two folders have the same experiment; the text
+            names them.
     """
-    measurements = Measurements.of(read_rows(folder / TABLE))
-    again = Measurements.of(read_rows(second / TABLE)) if second else None
-    environment = _environment(folder / ENVIRONMENT)
+    parts = read_parts(folders)
+    measurements = Measurements.of(rows_of(parts))
+    again = Measurements.of(rows_of(read_parts(second))) if second else None
     figures.mkdir(parents=True, exist_ok=True)
     write_summary(figures / SUMMARY, summarize(measurements))
     drawings = figures_of(measurements)
@@ -63,12 +60,12 @@ def make_report(folder: Path, *, page: Path, figures: Path, second: Path | None 
             drawing.save(one, figures)
     where = PurePath(os.path.relpath(figures, page.parent)).as_posix()
     page.parent.mkdir(parents=True, exist_ok=True)
-    page.write_text(page_text(measurements, environment, drawings, where, again), encoding="utf-8")
+    page.write_text(page_text(measurements, environments_of(parts), drawings, where, again), encoding="utf-8")
 
 
 def page_text(
     measurements: Measurements,
-    environment: Mapping[str, Any],
+    environments: Mapping[str, Mapping[str, Any]],
     drawings: Mapping[str, Sequence[Drawing]],
     figures: str,
     again: Measurements | None = None,
@@ -77,7 +74,7 @@ def page_text(
 
     Args:
         measurements: The raw data.
-        environment: What they depend on.
+        environments: What they depend on, by the heads of the table's columns.
         drawings: Figures by experiment.
         figures: Folder of the figures as the page links to it.
         again: The raw data of a second full run.
@@ -88,7 +85,7 @@ def page_text(
         "## How this page is read",
         READING,
         "## How it was measured",
-        _measured(measurements, environment),
+        _measured(measurements, environments),
         "## The three set-ups",
         _pictures(schematics(), figures),
         "## The paper's claims",
@@ -115,9 +112,8 @@ Robotics Platform" (Singhal et al., 2017) hold. `rce experiment` made this page 
 it. All medians are in [{SUMMARY}]({figures}/{SUMMARY})."""
 
 
-def _measured(measurements: Measurements, environment: Mapping[str, Any]) -> str:
-    table = markdown(("what", "value"), ([name, _value(name, value)] for name, value in environment.items()))
-    parts = [table if environment else f"There is no `{ENVIRONMENT}` beside the raw data."]
+def _measured(measurements: Measurements, environments: Mapping[str, Mapping[str, Any]]) -> str:
+    parts = [environment_table(environments)]
     parts.append(table_of(measurements, _LINK, LINK) or f"The link (experiment `{_LINK}`): not measured.")
     if measurements.retried:
         parts.append(f"Runs that were tried more than once (`tries`): {measurements.retried}.")
@@ -174,29 +170,3 @@ def _repeated(measurements: Measurements, again: Measurements | None) -> str:
     if again is None:
         return NOT_MEASURED
     return comparison_text(compare(summarize(measurements), summarize(again)))
-
-
-def _environment(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return {}
-    except ValueError as error:
-        raise ExperimentError(f"{path} is not JSON: {error}") from error
-    if not isinstance(found, dict):
-        raise ExperimentError(f"{path} must have a JSON object, not {type(found).__name__}")
-    return found
-
-
-def _value(name: str, value: object) -> str:
-    match value:
-        case dict():
-            return ", ".join(f"{key} {_value(key, one)}" for key, one in value.items())
-        case list():
-            return ", ".join(_value("", one) for one in value)
-        case bool():
-            return "yes" if value else "no"
-        case int() if name == "memory_bytes":
-            return f"{number(value / 1e9)} GB"
-        case _:
-            return str(value)

@@ -182,9 +182,9 @@ LIMITS = f"""\
 - The robots are simulated, and the scans and images are made by programs.
 - The paper does not tell all of its set-up. A claim that does not hold here may have held there; the
   verdict is about the versions above.
-- All runs were made on one computer in one session: the intervals say how well it repeats itself, not how
-  other computers differ. Of two identical full runs, only some {100 * EXPECTED:.0f} % of the second medians
-  lie in the first intervals.
+- All runs of an experiment were made on one computer in one session: the intervals say how well it repeats
+  itself, not how other computers differ. Of two identical full runs, only some {100 * EXPECTED:.0f} % of the
+  second medians lie in the first intervals.
 - Bootstrap intervals of ten runs are a little too narrow. Among so many comparisons, some differ by chance;
   so a verdict needs a difference of {100 * (MIN_RATIO - 1):.0f} % and looks at all cases.
 - The original programs of fkie and the original Rapyuta are judged only where a row names them.

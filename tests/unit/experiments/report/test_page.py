@@ -101,7 +101,7 @@ def rows() -> list[Row]:
 
 @pytest.fixture(scope="module")
 def page(rows: list[Row]) -> str:
-    return page_text(Measurements.of(rows), {"cores": 2}, {}, "images")
+    return page_text(Measurements.of(rows), {"value": {"cores": 2}}, {}, "images")
 
 
 def experiment_of(page: str, heading: str) -> str:
@@ -329,7 +329,7 @@ def fonts(tmp_path_factory: pytest.TempPathFactory) -> None:
 @pytest.mark.usefixtures("fonts")
 def test_report_is_page_figures_and_summary(folder: Path, tmp_path: Path) -> None:
     page, figures = tmp_path / "docs" / "page.md", tmp_path / "docs" / "images" / "experiments"
-    make_report(folder, page=page, figures=figures, second=folder)
+    make_report([folder], page=page, figures=figures, second=[folder])
     text = page.read_text(encoding="utf-8")
     links = re.findall(r"\]\(([^)]+)\)", text)
     assert "images/experiments/robustness-ros.png" in links
@@ -337,7 +337,7 @@ def test_report_is_page_figures_and_summary(folder: Path, tmp_path: Path) -> Non
     assert all((page.parent / link).stat().st_size for link in links)
     assert "| memory_bytes | 4.00 GB |" in text
     assert "| options | quick no |" in text
-    make_report(folder, page=page, figures=figures, second=folder)
+    make_report([folder], page=page, figures=figures, second=[folder])
     assert page.read_text(encoding="utf-8") == text
 
 
@@ -345,7 +345,7 @@ def test_page_without_matplotlib_says_what_to_install(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(drawing, "can_draw", lambda: False)
-    make_report(folder, page=tmp_path / "page.md", figures=tmp_path / "figures")
+    make_report([folder], page=tmp_path / "page.md", figures=tmp_path / "figures")
     text = (tmp_path / "page.md").read_text(encoding="utf-8")
     assert "Figures are missing: matplotlib is not installed: pip install 'rce[figures]'." in text
     assert "| SMS | ROS | core_killed | 100 [99.0, 101] |" in text
@@ -356,4 +356,36 @@ def test_page_without_matplotlib_says_what_to_install(
 def test_broken_environment_is_named(folder: Path, tmp_path: Path, text: str) -> None:
     (folder / "environment.json").write_text(text)
     with pytest.raises(ExperimentError, match=r"environment\.json"):
-        make_report(folder, page=tmp_path / "page.md", figures=tmp_path / "figures")
+        make_report([folder], page=tmp_path / "page.md", figures=tmp_path / "figures")
+
+
+def test_page_of_several_folders_has_each_experiment_with_its_circumstances(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drawing, "can_draw", lambda: False)
+    other = tmp_path / "other"
+    other.mkdir()
+    kept = {"laser", "images", "link"}
+    write_rows(
+        other / "results.csv", [one for one in example_rows(["ros"]) if one.condition.experiment in kept]
+    )
+    (other / "environment.json").write_text(json.dumps({"cores": 8, "commit": "abc"}))
+    page = tmp_path / "page.md"
+    make_report([folder, other], page=page, figures=tmp_path / "page", second=[other])
+    text = page.read_text(encoding="utf-8")
+    tables = list(tables_of(text))
+    (about,) = (one for one in tables if "what" in one.head)
+    assert about.head == ["what", "robustness", "laser, images"]
+    assert {"what": "cores", "robustness": "2", "laser, images": "8"} in about.rows
+    assert {"what": "commit", "robustness": "-", "laser, images": "abc"} in about.rows
+    for section in SECTIONS:
+        measured = section.experiment in {"robustness", "laser", "images"}
+        assert (f"{section.text}\n\nNot measured." in text) is not measured
+    (link,) = (one for one in tables if one.about == "**The link as measured**")
+    assert link.rows[0]["runs"] == "6", "three of each folder"
+
+
+def test_folders_with_the_same_experiment_are_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(ExperimentError, match=r"the experiment robustness is in .*raw and in .*raw; "):
+        make_report([folder, folder], page=tmp_path / "page.md", figures=tmp_path / "figures")
+    assert not (tmp_path / "page.md").exists()

@@ -1,0 +1,132 @@
+"""The folders of raw data that a page is made of: each experiment is in one of them."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from rce_fleet.exceptions import ExperimentError
+from rce_fleet.experiments.report.labels import number
+from rce_fleet.experiments.report.tables import markdown
+from rce_fleet.experiments.results import Row, read_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+TABLE = "results.csv"
+ENVIRONMENT = "environment.json"
+LINK = "link"
+"""What each folder has measured first, beside its experiments."""
+MISSING = "-"
+
+
+@dataclass(frozen=True)
+class Part:
+    """A folder of raw data.
+
+    Attributes:
+        folder: The folder.
+        rows: Its rows.
+        environment: What they depend on; empty if the folder does not say.
+    """
+
+    folder: Path
+    rows: Sequence[Row]
+    environment: Mapping[str, Any]
+
+    @classmethod
+    def read(cls, folder: Path) -> Part:
+        """Read a folder.
+
+        Raises:
+            OSError: A file cannot be read.
+            ExperimentError: A file is not what it must be; the text names it.
+        """
+        return cls(folder, read_rows(folder / TABLE), _environment(folder / ENVIRONMENT))
+
+    @property
+    def experiments(self) -> list[str]:
+        """Its experiments, in the order in which they were done."""
+        return list(dict.fromkeys(name for row in self.rows if (name := row.condition.experiment) != LINK))
+
+
+def read_parts(folders: Sequence[Path]) -> list[Part]:
+    """Read folders that have different experiments.
+
+    Raises:
+        OSError: A file cannot be read.
+        ExperimentError: A file is not what it must be, or two folders have the same experiment.
+    """
+    found: dict[str, Path] = {}
+    parts = [Part.read(folder) for folder in folders]
+    for part in parts:
+        for experiment in part.experiments:
+            if experiment in found:
+                raise ExperimentError(
+                    f"the experiment {experiment} is in {found[experiment]} and in {part.folder}; a page is "
+                    "made of one of them, and --second compares two runs of it"
+                )
+            found[experiment] = part.folder
+    return parts
+
+
+def rows_of(parts: Sequence[Part]) -> list[Row]:
+    """Return the rows of all parts; their measurements of the same link count as runs, one for each part."""
+    rows = []
+    runs: Counter[tuple[object, str]] = Counter()
+    for row in (row for part in parts for row in part.rows):
+        if row.condition.experiment == LINK:
+            key = (row.condition, row.metric)
+            runs[key] += 1
+            rows.append(replace(row, run=runs[key]))
+        else:
+            rows.append(row)
+    return rows
+
+
+def environments_of(parts: Sequence[Part]) -> dict[str, Mapping[str, Any]]:
+    """Return what rows depend on, by the experiments of each part; ``value`` if there is one part only."""
+    if len(parts) == 1:
+        return {"value": parts[0].environment} if parts[0].environment else {}
+    return {", ".join(part.experiments) or str(part.folder): part.environment for part in parts}
+
+
+def environment_table(environments: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the table of what rows depend on: a column for each part."""
+    if not environments:
+        return f"There is no `{ENVIRONMENT}` beside the raw data."
+    names = dict.fromkeys(name for environment in environments.values() for name in environment)
+    rows = [
+        [name, *(_value(name, environment.get(name, MISSING)) for environment in environments.values())]
+        for name in names
+    ]
+    return markdown(("what", *environments), rows)
+
+
+def _environment(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except ValueError as error:
+        raise ExperimentError(f"{path} is not JSON: {error}") from error
+    if not isinstance(found, dict):
+        raise ExperimentError(f"{path} must have a JSON object, not {type(found).__name__}")
+    return found
+
+
+def _value(name: str, value: object) -> str:
+    match value:
+        case dict():
+            return ", ".join(f"{key} {_value(key, one)}" for key, one in value.items())
+        case list():
+            return ", ".join(_value("", one) for one in value)
+        case bool():
+            return "yes" if value else "no"
+        case int() if name == "memory_bytes":
+            return f"{number(value / 1e9)} GB"
+        case _:
+            return str(value)
