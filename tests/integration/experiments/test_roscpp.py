@@ -56,7 +56,9 @@ class Started:
         return by_topic(reports(self.lines()), "0")
 
     def messages(self) -> list[str]:
-        printed = [line for line in self.lines() if line != READY and not line.startswith(REPORT)]
+        """What was printed, without sequence numbers: a listener's begin when it was connected."""
+        left_out = (READY, REPORT, "  seq: ")
+        printed = [line for line in self.lines() if not line.startswith(left_out)]
         return sorted("\n".join(printed).split("---"))
 
 
