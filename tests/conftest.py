@@ -156,9 +156,9 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         lambda: shutil.which("systemd-analyze") is not None,
         "systemd-analyze is missing (Debian: systemd)",
     ),
-    "mmdebstrap": (
-        lambda: shutil.which("mmdebstrap") is not None,
-        "mmdebstrap is missing (Debian: mmdebstrap)",
+    "debootstrap": (
+        lambda: shutil.which("debootstrap", path=f"{os.environ['PATH']}:/usr/sbin") is not None,
+        "debootstrap is missing (Debian: debootstrap)",
     ),
     "root": (lambda: os.geteuid() == 0, "needs root"),
     "cgroups": (_can_limit, "no cgroup can be made here (needs root, or a delegated subtree)"),

@@ -26,13 +26,10 @@ _STDLIB_LEFT_OUT = (
 
 @contextlib.contextmanager
 def image_of(rootfs: Path) -> Iterator[str]:
-    """Have a root file system, a folder or a tar file, as an image in podman's store; gives its name."""
+    """Have a root file system as an image in podman's store; gives its name."""
     name = f"localhost/rce-test-{os.getpid()}-{secrets.token_hex(4)}:1"
-    source, tar = str(rootfs), b""
-    if rootfs.is_dir():
-        source = "-"
-        tar = subprocess.run(["tar", "-C", str(rootfs), "-c", "."], capture_output=True, check=True).stdout
-    subprocess.run(["podman", "import", "-q", source, name], input=tar, capture_output=True, check=True)
+    tar = subprocess.run(["tar", "-C", str(rootfs), "-c", "."], capture_output=True, check=True).stdout
+    subprocess.run(["podman", "import", "-q", "-", name], input=tar, capture_output=True, check=True)
     try:
         yield name
     finally:
