@@ -29,8 +29,9 @@ from rce import __version__
 from rce_master.exceptions import StoreError
 from rce_master.state.records import UserPackage
 from rce_master.state.tables import Tables
+from rce_master.store.base import SCHEMA_VERSION
 from rce_master.store.lock import FolderLock
-from rce_master.store.sqlite import FILE_NAME, SCHEMA_VERSION
+from rce_master.store.sqlite import FILE_NAME
 
 FORMAT = 1
 MASTER, CERTIFICATES, BUNDLES = "master", "certificates", "bundles"

@@ -19,7 +19,8 @@
     +-- TransitionError            an event that a life cycle does not allow in the present state
     +-- StoreError                 the store cannot be read or written
     |   +-- StoreBusyError         another process owns the state folder
-    |   +-- StaleTermError         another master has begun a newer term
+    |   +-- FencedError            this master leads no more, and must not write
+    |       +-- StaleTermError     another master has begun a newer term
     +-- TaskSetAwayError           the task set that is to be asked is not there
 """
 
@@ -156,8 +157,15 @@ class StoreBusyError(StoreError):
     """Another process owns the state folder."""
 
 
-class StaleTermError(StoreError):
-    """Another master has begun a newer term: this one must not write any more.
+class FencedError(StoreError):
+    """This master does not lead any more: it must not write, nor answer from what it knows.
+
+    What it wrote last may have been stored or not; only the next leader knows.
+    """
+
+
+class StaleTermError(FencedError):
+    """Another master has begun a newer term; nothing was written.
 
     Args:
         term: The term of the refused write.

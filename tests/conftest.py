@@ -150,6 +150,7 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         lambda: data_folder() is not None,
         "the folder of public maps and logs is absent (set RCE_DATA)",
     ),
+    "etcd": (lambda: shutil.which("etcd") is not None, "etcd is missing (Debian: etcd-server)"),
     "curl": (lambda: shutil.which("curl") is not None, "curl is missing (Debian: curl)"),
     "openssl": (lambda: shutil.which("openssl") is not None, "openssl is missing (Debian: openssl)"),
     "systemd": (

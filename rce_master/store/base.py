@@ -1,7 +1,7 @@
 """The interface of a store.
 
-A store does not know robots or users: it keeps bytes under a table's name and a key. A replicated store would
-need only the same functions.
+A store does not know robots or users: it keeps bytes under a table's name and a key. SQLite keeps them on one
+machine, etcd on several.
 """
 
 from __future__ import annotations
@@ -9,6 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
+
+SCHEMA_VERSION = 2
+"""Of what the rows hold. 1: interfaces were stored in their endpoints and connections in their links; these
+are converted when they are read (:mod:`rce_master.state.migration`)."""
 
 Snapshot = Mapping[str, Mapping[str, bytes]]
 """The contents of a store: table name to key to encoded record."""
@@ -53,6 +57,7 @@ class Store(Protocol):
 
         Raises:
             StaleTermError: A newer term was begun; nothing was written.
+            FencedError: The term has ended, and it may have been written or not.
             StoreError: Nothing was written.
         """
 

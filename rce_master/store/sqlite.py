@@ -10,6 +10,7 @@ import aiosqlite
 
 from rce.config import STORE_FILE
 from rce_master.exceptions import StaleTermError, StoreError
+from rce_master.store.base import SCHEMA_VERSION
 from rce_master.store.lock import FolderLock
 
 if TYPE_CHECKING:
@@ -18,9 +19,6 @@ if TYPE_CHECKING:
 
     from rce_master.store.base import Row, Snapshot
 
-SCHEMA_VERSION = 2
-"""1: interfaces were stored in their endpoints and connections in their links. The form of the table is the
-same: what the rows hold is converted by who reads them (:mod:`rce_master.state.migration`)."""
 _CONVERTIBLE = 1
 FILE_NAME = STORE_FILE
 

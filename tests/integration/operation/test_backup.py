@@ -22,7 +22,7 @@ from support.forked_commands import run_command
 from support.ports import free_ports
 
 from rce_master.backup import MANIFEST
-from rce_master.store.sqlite import SCHEMA_VERSION
+from rce_master.store.base import SCHEMA_VERSION
 
 pytestmark = pytest.mark.timeout(300)
 

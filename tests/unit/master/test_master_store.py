@@ -5,30 +5,13 @@ import stat
 from typing import TYPE_CHECKING
 
 import pytest
+from support.store_laws import check_round_trip, check_snapshot, check_terms
 
-from rce_master.exceptions import StaleTermError, StoreBusyError, StoreError
-from rce_master.store import MemoryStore, Row, SqliteStore, Store
+from rce_master.exceptions import StoreBusyError, StoreError
+from rce_master.store import MemoryStore, Row, SqliteStore
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-
-async def check_round_trip(store: Store) -> None:
-    await store.save([Row("users", "a", b"1"), Row("users", "b", b"2"), Row("links", "a", b"3")])
-    await store.save([Row("users", "a", None), Row("users", "b", b"4"), Row("users", "none", None)])
-    assert await store.load() == {"users": {"b": b"4"}, "links": {"a": b"3"}}
-
-
-async def check_terms(store: Store) -> None:
-    await store.save([Row("users", "a", b"1")])
-    first = await store.begin_term()
-    await store.save([Row("users", "a", b"2")], first)
-    second = await store.begin_term()
-    assert second > first
-    with pytest.raises(StaleTermError, match="another master has taken over"):
-        await store.save([Row("users", "a", b"3")], first)
-    await store.save([Row("users", "b", b"4")], second)
-    assert await store.load() == {"users": {"a": b"2", "b": b"4"}}
 
 
 async def test_who_has_an_older_term_writes_nothing(tmp_path: Path) -> None:
@@ -43,6 +26,13 @@ async def test_who_has_an_older_term_writes_nothing(tmp_path: Path) -> None:
 
 async def test_memory_store_keeps_rows() -> None:
     await check_round_trip(MemoryStore())
+    await check_snapshot(MemoryStore())
+
+
+async def test_sqlite_store_keeps_all_kinds_of_rows(tmp_path: Path) -> None:
+    store = await SqliteStore.open(tmp_path / "state")
+    await check_snapshot(store)
+    await store.close()
 
 
 async def test_sqlite_store_keeps_rows_over_a_restart(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ from rce_master.state.core import State
 from rce_master.state.migration import conversion, converted
 from rce_master.state_service import StateService
 from rce_master.store import MemoryStore, SqliteStore
-from rce_master.store.sqlite import FILE_NAME, SCHEMA_VERSION
+from rce_master.store.base import SCHEMA_VERSION
+from rce_master.store.sqlite import FILE_NAME
 
 if TYPE_CHECKING:
     from pathlib import Path

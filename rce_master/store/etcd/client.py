@@ -1,0 +1,294 @@
+"""A client of etcd's JSON gateway with several endpoints, which are asked in turn."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import logging
+import os
+from typing import TYPE_CHECKING, Self, TypeVar
+
+import aiohttp
+
+from rce.tls import explain_to_client
+from rce_master.exceptions import StoreError
+from rce_master.store.etcd import wire
+from rce_master.store.etcd.exceptions import EtcdAwayError, EtcdRefusedError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from types import TracebackType
+
+    from rce.tls import Context
+
+T = TypeVar("T")
+
+_log = logging.getLogger(__name__)
+
+ATTEMPT_S = 1.0
+"""How long one member may take for a small request before the next one is asked."""
+LOAD_S = 20.0
+"""The same for a page of records."""
+MIN_VERSION = (3, 4)
+"""The first release whose gateway is below ``/v3``."""
+_OK = 200
+_CANCELLED, _UNKNOWN, _DEADLINE, _EXHAUSTED, _INTERNAL, _UNAVAILABLE = 1, 2, 4, 8, 13, 14
+_UNCERTAIN = frozenset((_CANCELLED, _UNKNOWN, _DEADLINE, _INTERNAL, _UNAVAILABLE))
+"""gRPC's codes after which a request may have been done."""
+_BUSY = "too many requests"
+_ERROR = b'"error"'
+"""What answers hold that tell of a fault; keys and values of records are in base64."""
+
+
+class _FailedError(Exception):
+    """One endpoint did not do a request; another one may."""
+
+    def __init__(self, reason: str, *, maybe_done: bool) -> None:
+        super().__init__(reason)
+        self.maybe_done = maybe_done
+
+
+class EtcdClient:
+    """Speaks with the members of one etcd cluster. An async context manager.
+
+    A member that fails is passed over, and the next one stays in use. Cancelling a call leaves open whether
+    it is done.
+
+    Args:
+        endpoints: Addresses ``HOST:PORT`` of members; the nearest one first.
+        tls: Gives the TLS context of each connection, with this master's certificate; None speaks plainly.
+        attempt: Seconds that one member may take for a small request.
+
+    Example:
+        ```python
+        async with EtcdClient(["10.0.0.1:2379", "10.0.0.2:2379"]) as etcd:
+            await etcd.check_members()
+            page = await etcd.range("/rce/")
+        ```
+    """
+
+    def __init__(
+        self, endpoints: Sequence[str], *, tls: Context | None = None, attempt: float = ATTEMPT_S
+    ) -> None:
+        if not endpoints:
+            raise ValueError("give the address of at least one member of etcd")
+        self._endpoints = tuple(endpoints)
+        self._tls = tls
+        self._attempt = attempt
+        self._current = 0
+        self._session: aiohttp.ClientSession | None = None
+
+    def __str__(self) -> str:
+        return ",".join(self._endpoints)
+
+    async def __aenter__(self) -> Self:
+        # The members are named by the operator; a proxy of the environment is for other addresses.
+        connector = aiohttp.TCPConnector(limit=0, keepalive_timeout=60.0)
+        self._session = aiohttp.ClientSession(connector=connector, trust_env=False)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._session is not None:
+            await self._session.close()
+            self._session = None
+
+    async def check_members(self) -> None:
+        """Check that etcd is there, new enough, and has a quorum.
+
+        Raises:
+            StoreError: It is not; the text says what is wrong and what to do.
+        """
+        reasons = []
+        for endpoint in self._endpoints:
+            try:
+                await self._check_version(endpoint)
+            except _FailedError as error:
+                reasons.append(f"{endpoint}: {error}")
+        if len(reasons) == len(self._endpoints):
+            raise EtcdAwayError(reasons, maybe_done=False)
+        for reason in reasons:
+            _log.warning("a member of etcd cannot be used: %s", reason)
+        try:
+            await self.get("/")
+        except EtcdAwayError as error:
+            raise StoreError(
+                f"etcd has no quorum: more than half of its members must run and reach each other ({error})."
+                " If they are lost for good, restore a snapshot: etcdctl snapshot restore"
+            ) from error
+
+    async def _check_version(self, endpoint: str) -> None:
+        body = await self._exchange(endpoint, "version", None, self._attempt)
+        try:
+            version = wire.read_version(body)
+        except wire.WireError:
+            raise _FailedError(
+                "this is not etcd; expected its address for clients, as a rule port 2379", maybe_done=False
+            ) from None
+        if version < MIN_VERSION:
+            found, needed = (".".join(map(str, one)) for one in (version, MIN_VERSION))
+            raise StoreError(f"etcd at {endpoint} is version {found}; version {needed} or later is needed")
+
+    # Keys
+
+    async def get(self, key: str) -> wire.Record | None:
+        """Read a key, as a majority knows it; None if it does not exist.
+
+        Raises:
+            EtcdRefusedError: etcd refused.
+            EtcdAwayError: No member answered.
+        """
+        page = await self._call("v3/kv/range", wire.get_request(key), wire.read_page)
+        return page.records[0] if page.records else None
+
+    async def range(
+        self, prefix: str, *, after: str = "", limit: int = 0, revision: int = 0, keys_only: bool = False
+    ) -> wire.Page:
+        """Read keys with a prefix, in their order; the arguments are those of :func:`wire.range_request`.
+
+        Raises:
+            EtcdRefusedError: etcd refused; with the code ``OUT_OF_RANGE`` the revision was compacted away.
+            EtcdAwayError: No member answered.
+        """
+        request = wire.range_request(prefix, after=after, limit=limit, revision=revision, keys_only=keys_only)
+        return await self._call("v3/kv/range", request, wire.read_page, LOAD_S)
+
+    async def transact(
+        self,
+        conditions: Sequence[wire.Condition],
+        operations: Sequence[wire.Put | wire.Delete],
+        otherwise: Sequence[str] = (),
+    ) -> wire.Outcome:
+        """Do a transaction, or read keys if its conditions do not hold.
+
+        After an :class:`EtcdAwayError` with ``maybe_done`` it may have been done, also some time later.
+
+        Raises:
+            EtcdRefusedError: etcd refused, and did nothing.
+            EtcdAwayError: No member answered.
+        """
+        request = wire.txn_request(conditions, operations, otherwise)
+        return await self._call("v3/kv/txn", request, wire.read_outcome)
+
+    # Leases
+
+    async def grant(self, ttl: int) -> tuple[int, int]:
+        """Make a lease.
+
+        Args:
+            ttl: Seconds; etcd may make it longer.
+
+        Returns:
+            Its number and its seconds.
+
+        Raises:
+            EtcdRefusedError: etcd refused.
+            EtcdAwayError: No member answered; a lease that was made nevertheless ends by itself.
+        """
+        return await self._call("v3/lease/grant", wire.grant_request(ttl), wire.read_lease)
+
+    async def renew(self, lease: int) -> int:
+        """Renew a lease.
+
+        Returns:
+            The seconds that it lasts from now; 0 if it has ended.
+
+        Raises:
+            EtcdRefusedError: etcd refused.
+            EtcdAwayError: No member answered.
+        """
+        return (await self._call("v3/lease/keepalive", wire.lease_request(lease), wire.read_lease))[1]
+
+    async def revoke(self, lease: int) -> None:
+        """End a lease, and with it its keys.
+
+        Raises:
+            EtcdRefusedError: etcd refused; the code ``NOT_FOUND`` says that the lease has ended.
+            EtcdAwayError: No member answered.
+        """
+        await self._call("v3/lease/revoke", wire.lease_request(lease), wire.as_it_is)
+
+    # Requests
+
+    async def _call(
+        self,
+        path: str,
+        message: wire.Message,
+        read: Callable[[wire.Message], T],
+        timeout: float | None = None,
+    ) -> T:
+        """Ask the endpoints in turn, each once."""
+        reasons: list[str] = []
+        maybe_done = False
+        body = json.dumps(message).encode()
+        for _ in self._endpoints:
+            used = self._current
+            endpoint = self._endpoints[used]
+            try:
+                answer = await self._exchange(endpoint, path, body, timeout or self._attempt)
+                return read(json.loads(answer))
+            except (wire.WireError, ValueError) as error:
+                reasons.append(f"{endpoint}: {error}")
+                maybe_done = True
+            except _FailedError as error:
+                reasons.append(f"{endpoint}: {error}")
+                maybe_done = maybe_done or error.maybe_done
+            except EtcdRefusedError as error:
+                # A member that was asked before may have passed the same request on.
+                if not maybe_done:
+                    raise
+                raise EtcdAwayError([*reasons, str(error)], maybe_done=True) from error
+            if used == self._current:  # another call may have passed it over meanwhile
+                self._current = (used + 1) % len(self._endpoints)
+        raise EtcdAwayError(reasons, maybe_done=maybe_done)
+
+    async def _exchange(self, endpoint: str, path: str, body: bytes | None, timeout: float) -> bytes:
+        assert self._session is not None
+        scheme = "http" if self._tls is None else "https"
+        try:
+            async with (
+                asyncio.timeout(timeout),
+                self._session.request(
+                    "GET" if body is None else "POST",
+                    f"{scheme}://{endpoint}/{path}",
+                    data=None if body is None else io.BytesIO(body),  # aiohttp sends it in pieces
+                    ssl=True if self._tls is None else self._tls(),
+                    allow_redirects=False,
+                ) as response,
+            ):
+                status, answer = response.status, await response.read()
+        except aiohttp.ClientConnectorError as error:
+            raise _FailedError(_connect_text(error), maybe_done=False) from error
+        except TimeoutError:
+            raise _FailedError(f"no answer within {timeout:g} s", maybe_done=True) from None
+        except (aiohttp.ClientError, OSError) as error:
+            text = str(error) or type(error).__name__
+            if self._tls is None and isinstance(error, aiohttp.ServerDisconnectedError):
+                text += " (if this etcd uses TLS, name it etcds://)"
+            raise _FailedError(text, maybe_done=True) from error
+        if status == _OK and _ERROR not in answer:
+            return answer
+        fault = wire.read_fault(answer)
+        if fault is None:
+            raise _FailedError(_not_etcd(status, answer, tls=self._tls is not None), maybe_done=False)
+        if fault.code in _UNCERTAIN:
+            raise _FailedError(fault.text, maybe_done=True)
+        if fault.code == _EXHAUSTED and _BUSY in fault.text:
+            raise _FailedError(fault.text, maybe_done=False)
+        raise EtcdRefusedError(endpoint, fault)
+
+
+def _connect_text(error: aiohttp.ClientConnectorError) -> str:
+    if (explained := explain_to_client(error)) is not None:
+        return explained
+    number = error.os_error.errno or 0
+    # asyncio's own text leaves out why; numbers of failed look-ups are negative.
+    return os.strerror(number) if number > 0 else error.os_error.strerror or str(error.os_error)
+
+
+def _not_etcd(status: int, answer: bytes, *, tls: bool) -> str:
+    if not tls and b"HTTPS" in answer:
+        return "it uses TLS; name it etcds://"
+    return f"this is not etcd's gateway: it answered {status}"

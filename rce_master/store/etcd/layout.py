@@ -1,0 +1,129 @@
+"""The keys below a prefix of etcd, and what they hold.
+
+::
+
+schema                  version of what the rows hold
+leadership/leader       name and term of the leading master; removed when its lease ends
+leadership/term         the newest term, and a mark of the store that began it
+leadership/last         TERM:NUMBER of the last save
+tables/TABLE/KEY        a row
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rce_master.exceptions import StoreError
+from rce_master.store.base import SCHEMA_VERSION
+from rce_master.store.etcd.wire import Condition, Put, Record, Subject
+
+if TYPE_CHECKING:
+    from rce_master.store.etcd.client import EtcdClient
+
+MAX_OPERATIONS = 4096
+"""Operations of a transaction that etcd must allow; its default is 128."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leader:
+    """The leading master, as the store knows it."""
+
+    name: str
+    term: int
+
+
+class Keys:
+    """The keys below a prefix."""
+
+    def __init__(self, prefix: str) -> None:
+        self.root = prefix.rstrip("/") + "/"
+        self.schema = self.root + "schema"
+        self.leadership = self.root + "leadership/"
+        self.leader = self.leadership + "leader"
+        self.term = self.leadership + "term"
+        self.last = self.leadership + "last"
+        self.tables = self.root + "tables/"
+
+    def row(self, table: str, key: str) -> str:
+        """Return the key of a row."""
+        return f"{self.tables}{table}/{key}"
+
+    def read_row(self, key: str) -> tuple[str, str]:
+        """Return the table and the key of a row."""
+        table, _, rest = key.removeprefix(self.tables).partition("/")
+        return table, rest
+
+
+async def prepare(client: EtcdClient, prefix: str) -> None:
+    """Check that a prefix of an etcd can hold the state; mark an empty one as an engine's.
+
+    Raises:
+        StoreError: etcd cannot be used as it is, the prefix has keys of another program, or a newer release
+            wrote it. Nothing was overwritten.
+    """
+    await client.check_members()
+    keys = Keys(prefix)
+    schema = await client.get(keys.schema)
+    if schema is None:
+        there = (await client.range(keys.root, limit=1, keys_only=True)).records
+        if there:
+            raise StoreError(
+                f"etcd has keys of another program below {keys.root}, such as {there[0].key!r};"
+                " choose another prefix: etcd://HOST:2379/PREFIX"
+            )
+        mark = Put(keys.schema, str(SCHEMA_VERSION).encode())
+        absent = Condition(keys.schema, Subject.CREATED, 0)
+        found = (await client.transact([absent], [mark], [keys.schema])).found
+        schema = found[0] if found else None
+    if schema is not None and schema.value != str(SCHEMA_VERSION).encode():
+        version = schema.value.decode(errors="replace")
+        raise StoreError(
+            f"the store in etcd below {keys.root} has version {version}, this program reads version"
+            f" {SCHEMA_VERSION}"
+        )
+    # Without a condition these reads are never done, but etcd counts them.
+    await client.transact([], [], [keys.schema] * MAX_OPERATIONS)
+
+
+def write_number(term: int, number: int) -> bytes:
+    """Return what the key of the last save holds."""
+    return f"{term}:{number}".encode()
+
+
+def read_leader(record: Record) -> Leader:
+    """Read the leader key.
+
+    Raises:
+        StoreError: It was overwritten by another program.
+    """
+    try:
+        value = json.loads(record.value)
+        return Leader(str(value["name"]), int(value["term"]))
+    except (ValueError, KeyError, TypeError) as error:
+        raise StoreError(f"the key {record.key} of etcd was overwritten") from error
+
+
+def read_term(record: Record) -> int:
+    """Read the newest term.
+
+    Raises:
+        StoreError: Its key was overwritten by another program.
+    """
+    try:
+        return int(json.loads(record.value)["term"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise StoreError(f"the key {record.key} of etcd was overwritten") from error
+
+
+def read_mark(record: Record) -> str:
+    """Read the mark of the store that began the newest term.
+
+    Raises:
+        StoreError: Its key was overwritten by another program.
+    """
+    try:
+        return str(json.loads(record.value).get("mark", ""))
+    except (ValueError, AttributeError) as error:
+        raise StoreError(f"the key {record.key} of etcd was overwritten") from error

@@ -1,0 +1,293 @@
+"""Messages of etcd's JSON gateway: keys and values in base64, 64-bit numbers as texts. Pure.
+
+The layout is that of ``etcdserverpb.KV`` and ``Lease`` in protobuf's JSON form, which etcd 3.4 and later have
+below ``/v3``. A number of 0 and an empty text are left out of answers.
+"""
+
+from __future__ import annotations
+
+import binascii
+import json
+from base64 import b64decode, b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, TypeAlias
+
+Message: TypeAlias = "dict[str, Any]"
+"""A JSON object."""
+
+
+class WireError(Exception):
+    """An answer is not of etcd's gateway."""
+
+
+class Subject(Enum):
+    """What of a key a condition compares."""
+
+    CREATED = "create_revision"
+    """The revision at which it was created; 0 while it does not exist."""
+    MODIFIED = "mod_revision"
+    """The revision at which it was last written; 0 while it does not exist."""
+    VALUE = "value"
+
+
+_TARGETS = {Subject.CREATED: "CREATE", Subject.MODIFIED: "MOD", Subject.VALUE: "VALUE"}
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """A transaction is done if all its conditions hold."""
+
+    key: str
+    subject: Subject
+    equals: int | bytes
+    """A value is bytes, a revision a number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Put:
+    """Write a key."""
+
+    key: str
+    value: bytes
+    lease: int = 0
+    """The key is removed when this lease ends; 0: never."""
+
+
+@dataclass(frozen=True, slots=True)
+class Delete:
+    """Remove a key, if it exists."""
+
+    key: str
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """A key as etcd keeps it."""
+
+    key: str
+    value: bytes
+    created: int
+    """Revision."""
+    modified: int
+    """Revision."""
+    lease: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """Records of a range of keys, in their order."""
+
+    records: tuple[Record, ...]
+    revision: int
+    """The revision of the whole store at which they were read."""
+    more: bool
+    """Whether the range has further keys."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """The answer to a transaction."""
+
+    done: bool
+    """Whether its conditions held, and it was written."""
+    revision: int
+    found: tuple[Record, ...] = ()
+    """The keys that were asked for if it was not done."""
+
+
+@dataclass(frozen=True, slots=True)
+class GatewayFault:
+    """An error of etcd: gRPC's code and etcd's text."""
+
+    code: int
+    text: str
+
+
+def end_of(prefix: str) -> bytes:
+    """Return the end of the range of all keys that begin with a prefix."""
+    key = bytearray(prefix.encode())
+    while key and key[-1] == 0xFF:  # noqa: PLR2004 - the greatest byte
+        key.pop()
+    if not key:
+        return b"\0"
+    key[-1] += 1
+    return bytes(key)
+
+
+def range_request(
+    prefix: str, *, after: str = "", limit: int = 0, revision: int = 0, keys_only: bool = False
+) -> Message:
+    """Ask for keys with a prefix.
+
+    Args:
+        prefix: How they begin.
+        after: Only those behind this key.
+        limit: At most so many; 0: all.
+        revision: The state to read; 0: the newest, agreed on by a majority.
+        keys_only: Leave the values out.
+    """
+    begin = after.encode() + b"\0" if after else prefix.encode()
+    message: Message = {"key": _base64(begin), "range_end": _base64(end_of(prefix))}
+    if limit:
+        message["limit"] = str(limit)
+    if revision:
+        message["revision"] = str(revision)
+    if keys_only:
+        message["keys_only"] = True
+    return message
+
+
+def get_request(key: str) -> Message:
+    """Ask for one key."""
+    return {"key": _base64(key.encode())}
+
+
+def txn_request(
+    conditions: Sequence[Condition], operations: Sequence[Put | Delete], otherwise: Sequence[str] = ()
+) -> Message:
+    """Ask for a transaction.
+
+    Args:
+        conditions: It is done if all of them hold.
+        operations: What to write; no key twice.
+        otherwise: Keys to read if it is not done.
+    """
+    return {
+        "compare": [_condition(one) for one in conditions],
+        "success": [_operation(one) for one in operations],
+        "failure": [{"request_range": get_request(key)} for key in otherwise],
+    }
+
+
+def grant_request(ttl: int) -> Message:
+    """Ask for a lease of so many seconds."""
+    return {"TTL": str(ttl)}
+
+
+def lease_request(lease: int) -> Message:
+    """Ask for a lease to be renewed or revoked."""
+    return {"ID": str(lease)}
+
+
+def read_page(answer: Message) -> Page:
+    """Read the answer to a range request.
+
+    Raises:
+        WireError: It is not one.
+    """
+    try:
+        return Page(_records(answer), _revision(answer), bool(answer.get("more", False)))
+    except _BROKEN as error:
+        raise WireError(f"not an answer to a range request: {error!r}") from error
+
+
+def read_outcome(answer: Message) -> Outcome:
+    """Read the answer to a transaction.
+
+    Raises:
+        WireError: It is not one.
+    """
+    try:
+        done = bool(answer.get("succeeded", False))
+        parts = [] if done else answer.get("responses", [])
+        found = [record for part in parts for record in _records(part["response_range"])]
+        return Outcome(done, _revision(answer), tuple(found))
+    except _BROKEN as error:
+        raise WireError(f"not an answer to a transaction: {error!r}") from error
+
+
+def read_lease(answer: Message) -> tuple[int, int]:
+    """Read a granted or renewed lease.
+
+    Returns:
+        Its number, and how many seconds it lasts from now; 0 if it has ended.
+
+    Raises:
+        WireError: It is not a lease.
+    """
+    try:
+        lease = answer.get("result", answer)
+        return int(lease["ID"]), int(lease.get("TTL", 0))
+    except _BROKEN as error:
+        raise WireError(f"not a lease: {error!r}") from error
+
+
+def as_it_is(answer: Message) -> Message:
+    """Read an answer of which nothing is needed."""
+    return answer
+
+
+def read_fault(body: bytes) -> GatewayFault | None:
+    """Read an error, from the answer to a request or from a stream of answers.
+
+    Returns:
+        None if the answer is not an error of etcd.
+    """
+    try:
+        answer = json.loads(body)
+        inner = answer.get("error")
+        fault = inner if isinstance(inner, dict) else answer
+        code = fault.get("code", fault.get("grpc_code"))
+        text = fault.get("message") or fault.get("error")
+        return GatewayFault(int(code), str(text)) if code is not None and text else None
+    except (ValueError, AttributeError, TypeError):
+        return None
+
+
+def read_version(body: bytes) -> tuple[int, int]:
+    """Read the major and minor version of a server.
+
+    Raises:
+        WireError: It is not etcd's answer.
+    """
+    try:
+        major, minor, *_ = json.loads(body)["etcdserver"].split(".")
+        return int(major), int(minor)
+    except _BROKEN as error:
+        raise WireError("not an answer of etcd") from error
+
+
+_BROKEN = (KeyError, ValueError, TypeError, AttributeError, binascii.Error)
+"""What reading a message of another form raises."""
+
+
+def _base64(value: bytes) -> str:
+    return b64encode(value).decode()
+
+
+def _condition(condition: Condition) -> Message:
+    equals = condition.equals
+    return {
+        "key": _base64(condition.key.encode()),
+        "target": _TARGETS[condition.subject],
+        "result": "EQUAL",
+        condition.subject.value: _base64(equals) if isinstance(equals, bytes) else str(equals),
+    }
+
+
+def _operation(operation: Put | Delete) -> Message:
+    if isinstance(operation, Delete):
+        return {"request_delete_range": get_request(operation.key)}
+    put = {"key": _base64(operation.key.encode()), "value": _base64(operation.value)}
+    if operation.lease:
+        put["lease"] = str(operation.lease)
+    return {"request_put": put}
+
+
+def _records(answer: Message) -> tuple[Record, ...]:
+    return tuple(
+        Record(
+            key=b64decode(each["key"]).decode(),
+            value=b64decode(each.get("value", "")),
+            created=int(each["create_revision"]),
+            modified=int(each["mod_revision"]),
+            lease=int(each.get("lease", 0)),
+        )
+        for each in answer.get("kvs", [])
+    )
+
+
+def _revision(answer: Message) -> int:
+    return int(answer["header"]["revision"])

@@ -1,0 +1,132 @@
+"""The client of etcd and what it says of an etcd that cannot be used."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from aiohttp import web
+from support.etcd import LOOPBACK, cluster
+from support.ports import free_port
+
+from rce.tls.folder import CertificateFolder
+from rce.tls.identity import TlsFiles, TlsIdentity
+from rce_master.exceptions import StoreError
+from rce_master.store import Row
+from rce_master.store.etcd import EtcdClient, EtcdStore
+from rce_master.store.etcd.exceptions import EtcdAwayError
+from rce_master.store.etcd.layout import Keys, prepare
+from rce_master.store.etcd.wire import Put
+
+PATIENT_S = 20.0
+
+
+@contextlib.asynccontextmanager
+async def other_server(answers: dict[str, object]) -> AsyncIterator[str]:
+    """Serve JSON at some paths, as programs do that are not etcd, or an old one."""
+
+    async def answer(request: web.Request) -> web.Response:
+        if request.path not in answers:
+            return web.Response(status=404, text="Not Found\n")
+        return web.json_response(answers[request.path])
+
+    app = web.Application()
+    app.router.add_route("*", "/{path:.*}", answer)
+    runner = web.AppRunner(app)
+    await runner.setup()
+    port = free_port()
+    await web.TCPSite(runner, LOOPBACK, port).start()
+    try:
+        yield f"{LOOPBACK}:{port}"
+    finally:
+        await runner.cleanup()
+
+
+async def refusal(endpoint: str, prefix: str = "/rce", *, attempt: float = PATIENT_S) -> str:
+    """Return what :func:`prepare` says."""
+    async with EtcdClient([endpoint], attempt=attempt) as client:
+        with pytest.raises(StoreError) as caught:
+            await prepare(client, prefix)
+    return str(caught.value)
+
+
+async def test_a_port_without_a_server_is_named() -> None:
+    endpoint = f"{LOOPBACK}:{free_port()}"
+    text = await refusal(endpoint)
+    assert endpoint in text
+    assert "refused" in text.lower()
+
+
+async def test_a_server_that_is_not_etcd_is_named() -> None:
+    async with other_server({"/version": {"rce": "0.1"}}) as endpoint:
+        assert f"{endpoint}: this is not etcd" in await refusal(endpoint)
+    async with other_server({}) as endpoint:
+        assert f"{endpoint}: this is not etcd" in await refusal(endpoint)
+
+
+async def test_an_etcd_before_the_gateway_is_refused() -> None:
+    async with other_server({"/version": {"etcdserver": "3.3.27", "etcdcluster": "3.3.0"}}) as endpoint:
+        assert "is version 3.3; version 3.4 or later is needed" in await refusal(endpoint)
+
+
+@pytest.mark.needs("etcd")
+async def test_a_prefix_of_another_program_or_release_is_left_alone(tmp_path: Path) -> None:
+    async with cluster(tmp_path / "etcd") as etcd, EtcdClient(etcd.endpoints, attempt=PATIENT_S) as client:
+        await client.transact([], [Put("/other/key", b"1"), Put(Keys("/newer").schema, b"99")])
+        text = await refusal(etcd.endpoints[0], "/other")
+        assert "keys of another program below /other/, such as '/other/key'" in text
+        assert "has version 99, this program reads version 2" in await refusal(etcd.endpoints[0], "/newer")
+        await prepare(client, "/rce")
+        await prepare(client, "/rce")
+        keys = [record.key for record in (await client.range("/")).records]
+        assert keys == ["/newer/schema", "/other/key", "/rce/schema"]
+
+
+@pytest.mark.needs("etcd")
+async def test_an_etcd_with_its_default_limits_is_refused(tmp_path: Path) -> None:
+    async with cluster(tmp_path / "etcd", 1, "--max-txn-ops", "128") as etcd:
+        assert "start etcd with --max-txn-ops 4096" in await refusal(etcd.endpoints[0])
+
+
+@pytest.mark.needs("etcd")
+async def test_members_that_fail_are_passed_over(tmp_path: Path) -> None:
+    """One is killed, one is stopped: the third alone has no quorum, and says so; with two all is well."""
+    async with cluster(tmp_path / "etcd", 3) as etcd, EtcdClient(etcd.endpoints, attempt=1.0) as client:
+        await prepare(client, "/rce")
+        store = EtcdStore(client, "/rce")
+        first = await etcd.leader()
+        first.send(signal.SIGKILL)
+        await store.save([Row("users", "a", b"1")])
+        second = await etcd.leader_of([member for member in etcd.members if member is not first])
+        second.send(signal.SIGSTOP)
+        (third,) = [member for member in etcd.members if member not in (first, second)]
+        assert "etcd has no quorum" in await refusal(third.endpoint, attempt=0.5)
+        second.send(signal.SIGCONT)
+        await store.save([Row("users", "b", b"2")])
+        assert await store.load() == {"users": {"a": b"1", "b": b"2"}}
+
+
+@pytest.mark.needs("etcd")
+async def test_etcd_with_client_certificates(tmp_path: Path) -> None:
+    folder = CertificateFolder(tmp_path / "certificates")
+    folder.make_authority()
+    folder.issue("engine", hosts=[LOOPBACK])
+    certificate, key = folder.certificate("engine"), folder.key("engine")
+    files = TlsFiles(certificate, key, folder.authority)
+    options = [
+        *("--cert-file", str(certificate), "--key-file", str(key)),
+        *("--client-cert-auth", "--trusted-ca-file", str(folder.authority)),
+    ]
+    async with cluster(tmp_path / "etcd", 1, *options, tls=TlsIdentity(files).client) as etcd:
+        async with EtcdClient(etcd.endpoints, tls=TlsIdentity(files).client, attempt=PATIENT_S) as client:
+            await prepare(client, "/rce")
+            await EtcdStore(client, "/rce").save([Row("users", "a", b"1")])
+            assert await EtcdStore(client, "/rce").load() == {"users": {"a": b"1"}}
+        without = TlsIdentity(TlsFiles(authority=folder.authority)).client
+        async with EtcdClient(etcd.endpoints, tls=without, attempt=PATIENT_S) as client:
+            with pytest.raises(EtcdAwayError):
+                await client.check_members()
+        assert "etcds://" in await refusal(etcd.endpoints[0])

@@ -1,0 +1,196 @@
+"""Real etcd: one member or several as processes, and a proxy that cuts connections at chosen moments."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import AsyncIterator, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+
+import aiohttp
+
+from rce.tls import Context
+from rce_master.exceptions import StoreError
+from rce_master.store.etcd import EtcdClient
+from rce_master.store.etcd.layout import MAX_OPERATIONS
+from support.engine import until
+from support.ports import free_ports
+from support.processes import finish
+
+LOOPBACK = "127.0.0.1"
+START_S = 120.0
+
+
+class Member:
+    """One member of a cluster."""
+
+    def __init__(self, folder: Path, name: str, ports: tuple[int, int]) -> None:
+        self.folder = folder
+        self.name = name
+        self.endpoint = f"{LOOPBACK}:{ports[0]}"
+        self.peer = f"http://{LOOPBACK}:{ports[1]}"
+        self.process: asyncio.subprocess.Process | None = None
+
+    async def start(self, members: Sequence[Member], *options: str, scheme: str = "http") -> None:
+        url = f"{scheme}://{self.endpoint}"
+        with (self.folder / f"{self.name}.log").open("ab") as log:
+            self.process = await asyncio.create_subprocess_exec(
+                "etcd",
+                *("--name", self.name, "--data-dir", str(self.folder / self.name)),
+                *("--listen-client-urls", url, "--advertise-client-urls", url),
+                *("--listen-peer-urls", self.peer, "--initial-advertise-peer-urls", self.peer),
+                *("--initial-cluster", ",".join(f"{each.name}={each.peer}" for each in members)),
+                *("--max-txn-ops", str(MAX_OPERATIONS), "--log-level", "error", *options),
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+
+    def send(self, number: signal.Signals) -> None:
+        assert self.process is not None
+        self.process.send_signal(number)
+
+    async def end(self) -> None:
+        if self.process is not None:
+            await finish(self.process)
+            self.process = None
+
+
+class Cluster:
+    """Members that run, the first of them first."""
+
+    def __init__(self, members: Sequence[Member]) -> None:
+        self.members = members
+
+    @property
+    def endpoints(self) -> list[str]:
+        return [member.endpoint for member in self.members]
+
+    @property
+    def store(self) -> str:
+        """The value of ``--store``."""
+        return f"etcd://{','.join(self.endpoints)}"
+
+    async def leader(self) -> Member:
+        """Return the member that leads."""
+        return await self.leader_of(self.members)
+
+    async def leader_of(self, members: Sequence[Member]) -> Member:
+        """Return the member that leads; those asked must run."""
+        return await until(lambda: _leader_of(members), timeout=START_S, what="a member of etcd leads")
+
+
+@asynccontextmanager
+async def cluster(
+    folder: Path, count: int = 1, *options: str, tls: Context | None = None
+) -> AsyncIterator[Cluster]:
+    """Run a cluster until it is left; give it once it has a quorum."""
+    folder.mkdir(exist_ok=True)
+    ports = free_ports(2 * count)
+    members = [Member(folder, f"m{i}", (ports[2 * i], ports[2 * i + 1])) for i in range(count)]
+    made = Cluster(members)
+    async with AsyncExitStack() as stack:
+        for member in members:
+            stack.push_async_callback(member.end)
+            await member.start(members, *options, scheme="http" if tls is None else "https")
+        async with EtcdClient(made.endpoints, tls=tls, attempt=5.0) as client:
+            await until(lambda: _works(client), timeout=START_S, what="etcd has a quorum")
+        yield made
+
+
+async def _leader_of(members: Sequence[Member]) -> Member | None:
+    async with aiohttp.ClientSession() as session:
+        for member in members:
+            url = f"http://{member.endpoint}/v3/maintenance/status"
+            async with session.post(url, json={}) as reply:
+                status = await reply.json()
+            if status.get("leader") == status["header"]["member_id"]:
+                return member
+    return None
+
+
+async def _works(client: EtcdClient) -> bool:
+    with contextlib.suppress(StoreError):
+        await client.get("/")
+        return True
+    return False
+
+
+class CuttingProxy:
+    """Passes requests on to a server; after :meth:`cut` it drops connections in place of answers.
+
+    Attributes:
+        cuts: How many answers were cut off.
+    """
+
+    def __init__(self, target: str) -> None:
+        host, _, port = target.rpartition(":")
+        self._target = host, int(port)
+        self._path, self._left = b"", 0
+        self.cuts = 0
+        self.endpoint = ""
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def cut(self, path: str, count: int) -> None:
+        """Let the server do the next requests for a path, and their clients get no answer."""
+        self._path, self._left = path.encode(), count
+
+    @asynccontextmanager
+    async def running(self) -> AsyncIterator[CuttingProxy]:
+        server = await asyncio.start_server(self._serve, LOOPBACK, 0)
+        self.endpoint = f"{LOOPBACK}:{server.sockets[0].getsockname()[1]}"
+        try:
+            yield self
+        finally:
+            server.close()
+            for task in tuple(self._tasks):
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+            await server.wait_closed()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._tasks.add(task)
+        try:
+            await self._pass_on(reader, writer)
+        except (OSError, asyncio.IncompleteReadError):
+            pass  # one of the two ended the connection
+        finally:
+            self._tasks.discard(task)
+            writer.transport.abort()
+
+    async def _pass_on(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while request := await _message(reader):
+            server_reader, server_writer = await asyncio.open_connection(*self._target)
+            try:
+                server_writer.write(request)
+                answer = await _message(server_reader)
+            finally:
+                server_writer.transport.abort()
+            if self._left and self._path in request:
+                self._left -= 1
+                self.cuts += 1
+                return
+            writer.write(answer)
+            await writer.drain()
+
+
+async def _message(reader: asyncio.StreamReader) -> bytes:
+    """Read one HTTP message with a length or in chunks; empty at the end."""
+    try:
+        head = await reader.readuntil(b"\r\n\r\n")
+    except asyncio.IncompleteReadError as error:
+        if error.partial:
+            raise
+        return b""
+    lowered = head.lower()
+    if b"transfer-encoding: chunked" in lowered:
+        body = b""
+        while not body.endswith(b"0\r\n\r\n"):
+            body += await reader.readline()
+        return head + body
+    _, _, rest = lowered.partition(b"content-length:")
+    return head + await reader.readexactly(int(rest.split(b"\r\n")[0] or 0))
