@@ -20,6 +20,7 @@ import rce_fleet.coordination.move_client
 import rce_fleet.coordination.robot
 import rce_fleet.navigation.move_base.core
 import rce_fleet.tasks.task
+import rce_master.leadership.core
 import rce_master.state.lifecycle
 from rce.lifecycle import LifeCycle
 from tools.state_diagram import draw, word
@@ -67,6 +68,13 @@ CYCLES = (
         "node",
         "A node of a container, as its environment sees it.",
         rce_container.environment.nodes.life.NODE_LIFE,
+    ),
+    Cycle(
+        "Master among several",
+        "leadership",
+        "What `GET /healthz` of a master shows as its role, with a store in etcd"
+        " ([three masters](../how-to/three-masters.md)).",
+        rce_master.leadership.core.LEADERSHIP_LIFE,
     ),
     Cycle(
         "Robot session",

@@ -68,11 +68,13 @@ async def prepare(client: EtcdClient, prefix: str) -> None:
     schema = await client.get(keys.schema)
     if schema is None:
         there = (await client.range(keys.root, limit=1, keys_only=True)).records
-        if there:
+        schema = await client.get(keys.schema) if there else None  # another master may have begun just now
+        if there and schema is None:
             raise StoreError(
                 f"etcd has keys of another program below {keys.root}, such as {there[0].key!r};"
                 " choose another prefix: etcd://HOST:2379/PREFIX"
             )
+    if schema is None:
         mark = Put(keys.schema, str(SCHEMA_VERSION).encode())
         absent = Condition(keys.schema, Subject.CREATED, 0)
         found = (await client.transact([absent], [mark], [keys.schema])).found

@@ -1,0 +1,173 @@
+"""Waits for the lead, keeps it by renewing a lease at etcd, and gives it back."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import time
+from typing import TYPE_CHECKING
+
+from rce_master.exceptions import FencedError, StoreBusyError, StoreError
+from rce_master.leadership.core import Fence, LeadershipCore, LeaseSettings, Role
+from rce_master.store.etcd.store import Candidacy, EtcdStore
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rce_master.store.etcd.client import EtcdClient
+    from rce_master.store.etcd.layout import Leader
+
+_log = logging.getLogger(__name__)
+
+_PAUSE_S = 0.1
+"""Between two attempts of a renewal."""
+
+
+def boot_time() -> float:
+    """Return seconds since the start of the machine, also those in which it was suspended."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+class LeadershipKeeper:
+    """The leadership of one master: :meth:`acquire`, then :meth:`keep`, then :meth:`step_down`, and again.
+
+    Args:
+        client: Connected to etcd.
+        prefix: Of the state's keys.
+        name: This master's name, for the others.
+        settings: Times.
+        clock: Seconds that also pass while the machine is suspended.
+
+    Attributes:
+        core: The role, the term and the deadline.
+        leader: The leading master, as far as this one knows.
+        fault: Why etcd cannot be asked; empty if it can.
+        lease: The number of the lease by which this master leads; 0: it has none.
+    """
+
+    def __init__(
+        self,
+        client: EtcdClient,
+        prefix: str,
+        name: str,
+        settings: LeaseSettings | None = None,
+        clock: Callable[[], float] = boot_time,
+    ) -> None:
+        self._client = client
+        self._prefix = prefix
+        self._name = name
+        self._clock = clock
+        self._watched = EtcdStore(client, prefix)
+        self._store: EtcdStore | None = None
+        self.lease = 0
+        self.core = LeadershipCore(settings or LeaseSettings())
+        self.leader: Leader | None = None
+        self.fault = ""
+
+    async def acquire(self) -> tuple[EtcdStore, Fence]:
+        """Wait until no other master leads, and take the lead.
+
+        Cancelling gives a lease back that was taken meanwhile.
+
+        Returns:
+            The store of the new term, and what tells whether it still lasts.
+        """
+        while True:
+            if await self._is_free() and await self._campaign():
+                assert self._store is not None
+                return self._store, Fence(self.core, self._clock, self._name)
+            await asyncio.sleep(self.core.settings.poll)
+
+    async def _is_free(self) -> bool:
+        try:
+            self.leader = await self._watched.leader()
+        except StoreError as error:
+            self._note(str(error))
+            return False
+        self._note("")
+        return self.leader is None
+
+    async def _campaign(self) -> bool:
+        sent = self._clock()
+        try:
+            self.lease, ttl = await self._client.grant(math.ceil(self.core.settings.ttl))
+        except StoreError as error:
+            self._note(str(error))
+            return False
+        self.core.granted(sent, ttl)
+        store = EtcdStore(self._client, self._prefix, Candidacy(self.lease, self._name, self._remaining))
+        try:
+            async with asyncio.timeout(max(0.0, self._remaining())):
+                term = await store.begin_term()
+            self.core.elected(term, self._clock())
+        except StoreBusyError:
+            _log.info("another master was faster to take the lead")
+        except (StoreError, TimeoutError) as error:
+            _log.warning("the lead could not be taken: %s", str(error) or "etcd does not answer")
+        finally:
+            if self.core.role is not Role.LEADING:
+                await self._give_up()
+        self._store = store
+        return self.core.role is Role.LEADING
+
+    async def _give_up(self) -> None:
+        if self.core.role is Role.CANDIDATE:
+            self.core.refused()
+        await self._revoke()
+
+    async def keep(self) -> None:
+        """Renew the lease until it is lost.
+
+        Raises:
+            FencedError: It is lost.
+        """
+        while self.core.look(self._clock()):
+            await asyncio.sleep(self.core.until_renewal(self._clock()))
+            if self.core.look(self._clock()) and not await self._renew():
+                await asyncio.sleep(_PAUSE_S)
+        raise FencedError("the lease was lost, or could not be renewed in time")
+
+    async def _renew(self) -> bool:
+        """Renew the lease once; return False if etcd did not answer."""
+        assert self._store is not None
+        sent = self._clock()
+        try:
+            async with asyncio.timeout(max(0.0, self._remaining())):
+                ttl = await self._client.renew(self.lease)
+                # A renewal alone is no proof: etcd's releases before 3.4.27 may renew a lease that has ended.
+                holds = await self._store.holds_lead()
+        except TimeoutError:
+            return False
+        except StoreError as error:
+            _log.warning("the lease was not renewed: %s", error)
+            return False
+        if holds:
+            self.core.renewed(sent, ttl)
+        else:
+            self.core.lost()
+        return True
+
+    async def step_down(self) -> None:
+        """End the lease, so that another master leads at once; nothing of the term may be left."""
+        self.core.resigned()
+        await self._revoke()
+        self.core.released()
+        self._store = None
+
+    async def _revoke(self) -> None:
+        lease, self.lease = self.lease, 0
+        if not lease:
+            return
+        try:
+            await self._client.revoke(lease)
+        except StoreError as error:
+            _log.info("the lease is left to end by itself: %s", error)
+
+    def _remaining(self) -> float:
+        return self.core.remaining(self._clock())
+
+    def _note(self, fault: str) -> None:
+        if fault and not self.fault:
+            _log.warning("%s", fault)
+        self.fault = fault
