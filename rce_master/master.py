@@ -24,7 +24,7 @@ from rce_master.control_handler import ControlHandler
 from rce_master.events import EventLog
 from rce_master.exceptions import MasterError
 from rce_master.executions import Executions
-from rce_master.http.entry import Entry
+from rce_master.http.entry import Entry, refusal
 from rce_master.http.routes import Services
 from rce_master.packages.contents import ContentStore
 from rce_master.packages.service import PackageService
@@ -36,12 +36,14 @@ from rce_master.state_service import StateService
 from rce_master.tokens import Tokens
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable
 
     from aiohttp import web
     from argon2 import PasswordHasher
 
     from rce.config import Secret
+    from rce.web.entry import EntryAnswer
+    from rce_master.leadership import Fence
     from rce_master.settings import MasterSettings
     from rce_master.state.changes import Changes
     from rce_master.store import Store
@@ -52,6 +54,7 @@ TICK_S = 0.5
 _ACCESS = ("users", "tokens")
 """Tables that determine permissions to follow events."""
 DEV_USER = "testUser"
+FENCED = "This master leads no more; ask again.\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +75,7 @@ class Master:
         secret: The secret by which task sets authenticate.
         store: Keeps the desired state; the caller closes it.
         hasher: How passwords are hashed.
+        fence: Tells whether this master leads, if there may be others; the store is one of its term.
     """
 
     def __init__(
@@ -81,29 +85,39 @@ class Master:
         store: Store,
         *,
         hasher: PasswordHasher | None = None,
+        fence: Fence | None = None,
     ) -> None:
+        self._fence = fence
         self._settings = settings
         self._secret = secret
         self._store = store
         self._hasher = hasher
 
-    async def run(self, on_ready: Callable[[RunningMaster], None]) -> None:
+    async def run(
+        self,
+        on_ready: Callable[[RunningMaster], None],
+        before_listening: Callable[[], Awaitable[None]] | None = None,
+    ) -> None:
         """Run until cancelled.
 
         Args:
             on_ready: Called once everything listens.
+            before_listening: Awaited after the state was loaded; frees the ports.
 
         Raises:
+            FencedError: This master leads no more.
             StoreError: The store cannot be read.
             MasterError: A port cannot be used.
             CertificateError: A certificate cannot be used.
         """
-        state_service = await StateService.open(self._store, self._settings.state)
+        state_service = await StateService.open(self._store, self._settings.state, fence=self._fence)
+        if before_listening is not None:
+            await before_listening()
         if not self._settings.dev and not len(state_service.tables.users):
             _log.warning(
                 "there are no users, so no one can log in: stop this program and run"
-                " `rce user add NAME --admin --state-dir %s`",
-                self._settings.state_dir,
+                " `rce user add NAME --admin %s`",
+                f"--state-dir {self._settings.state_dir}" if self._fence is None else "--store etcd://...",
             )
         events = EventLog(time.time())
         state_service.listeners.append(lambda changes: _log_events(events, changes))
@@ -135,6 +149,7 @@ class Master:
             quotas=quotas,
             dev=self._settings.dev,
             audit=audit,
+            fence=self._fence,
         )
         try:
             async with asyncio.TaskGroup() as group:
@@ -173,7 +188,8 @@ class Master:
 
             return partial(make_app, services, entry, allowed_origins=settings.allowed_origins, names=names)
 
-        app = LateApplication(load, entry.answer)
+        fence = self._fence
+        app = LateApplication(load, entry.answer if fence is None else partial(_answer_fenced, fence, entry))
         control = ControlServer(
             self._secret,
             on_hello=control_handler.on_hello,
@@ -187,6 +203,7 @@ class Master:
             is_revoked=for_task_sets.is_revoked if for_task_sets else None,
             on_execution=services.executions.arrived,
             features=(PATCHES, TYPED_REQUESTS),
+            is_fenced=None if fence is None else lambda: fence.is_closed,
         )
         http = HttpServer(app, settings.bind, settings.http_port, for_clients.server if for_clients else None)
         if for_clients is None or for_task_sets is None:
@@ -216,6 +233,10 @@ async def make_dev_user(services: Services) -> None:
         created=services.clock(),
     )
     await services.state_service.submit(commands.AddUser(user=user))
+
+
+def _answer_fenced(fence: Fence, entry: Entry, query: str) -> EntryAnswer:
+    return refusal(FENCED) if fence.is_closed else entry.answer(query)
 
 
 async def _tick(state_service: StateService, audit: AuditLog) -> None:

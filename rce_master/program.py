@@ -5,11 +5,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import socket
 import sys
 
 import uvloop
 
-from rce.config import EngineSettings, LogFileError, RunDirError, Secret, SecretError, load_secret, log_as
+from rce.config import (
+    EngineSettings,
+    EtcdAddress,
+    LogFileError,
+    RunDirError,
+    Secret,
+    SecretError,
+    load_secret,
+    log_as,
+    read_store_address,
+)
 from rce.own_process import end_signals, raise_file_limit
 from rce.tls import CertificateError
 from rce.tls.choice import TlsChoice
@@ -47,11 +58,16 @@ def run(engine: EngineSettings, *, verbose: bool = False) -> int:
 def _settings(engine: EngineSettings) -> MasterSettings:
     """Derive the master's settings from the engine's."""
     own = engine.master
+    address = read_store_address(own.store)
+    machine = engine.machine or socket.gethostname()
     return MasterSettings(
         bind=own.bind,
         http_port=own.http_port,
         control_port=own.control_port,
         state_dir=engine.master_state,
+        etcd=address if isinstance(address, EtcdAddress) else None,
+        lease=own.lease,
+        name=f"{machine}:{own.http_port}",
         dev=engine.dev,
         tls=TlsChoice.of(engine),
         allowed_origins=own.origins,
@@ -73,12 +89,21 @@ async def _run(settings: MasterSettings, secret: Secret) -> None:
     task = asyncio.current_task()
     assert task is not None
 
+    is_stopping = asyncio.Event()
+
     def stop() -> None:
+        is_stopping.set()
         if not task.cancelling():  # a second cancellation would interrupt the shutdown
             task.cancel()
 
     for number in end_signals():
         asyncio.get_running_loop().add_signal_handler(number, stop)
+    if settings.etcd is not None:
+        from rce_master.replicated import ReplicatedMaster  # loads aiohttp's client
+
+        with contextlib.suppress(asyncio.CancelledError):
+            await ReplicatedMaster(settings, secret).run(_announce, _announce_standby, is_stopping.is_set)
+        return
     store = await SqliteStore.open(settings.state_dir)
     try:
         with contextlib.suppress(asyncio.CancelledError):
@@ -92,3 +117,7 @@ def _announce(master: RunningMaster) -> None:
     gc.collect()
     gc.freeze()
     print(f"rce-master ready: {master.url}", flush=True)  # noqa: T201 - read by other programs
+
+
+def _announce_standby(url: str) -> None:
+    print(f"rce-master stand-by: {url}", flush=True)  # noqa: T201 - read by other programs

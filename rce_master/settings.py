@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rce.config import ANYWHERE, EngineSettings, default_state_dir
+from rce.config import ANYWHERE, EngineSettings, EtcdAddress, default_state_dir
 from rce.tls.choice import TlsChoice
 from rce_master.quotas import QuotaSettings
 from rce_master.state.settings import StateSettings
@@ -27,6 +27,12 @@ class MasterSettings:
     http_port: int = HTTP_PORT
     control_port: int = CONTROL_PORT
     state_dir: Path = field(default_factory=lambda: default_state_dir() / "master")
+    etcd: EtcdAddress | None = None
+    """Where the state is; None: in an SQLite file in the state folder."""
+    lease: float = 3.0
+    """Seconds that the lead lasts without a renewal."""
+    name: str = ""
+    """This master's name among several, such as ``machine1:9000``."""
     dev: bool = False
     """Make the user testUser with the password testUser, an administrator."""
     tls: TlsChoice = field(default_factory=TlsChoice)

@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rce_master.exceptions import MasterError, RefusedError, StoreError
+from rce_master.exceptions import FencedError, MasterError, RefusedError, StoreError
 from rce_master.state.changes import Changes, Touched, make_row
 from rce_master.state.commands import Continue
 from rce_master.state.core import State
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from rce.control import EndpointSpec, SpecPatch
+    from rce_master.leadership import Fence
     from rce_master.state.commands import Command
     from rce_master.state.settings import StateSettings
     from rce_master.state.tables import Tables
@@ -67,15 +68,22 @@ class StateService:
         store: Keeps what must survive.
         clock: Seconds that never go back.
         term: The term of the store in which this writes.
+        fence: Tells whether this master leads; None if there is no other one.
 
     Attributes:
         listeners: Called with the changes of each command after they were stored; must not block or raise.
     """
 
     def __init__(
-        self, state: State, store: Store, clock: Callable[[], float] = time.monotonic, term: int = 0
+        self,
+        state: State,
+        store: Store,
+        clock: Callable[[], float] = time.monotonic,
+        term: int = 0,
+        fence: Fence | None = None,
     ) -> None:
         self.state = state
+        self._fence = fence
         self._term = term
         self.listeners: list[Callable[[Changes], None]] = []
         self._store = store
@@ -84,6 +92,8 @@ class StateService:
         self._store_fault = ""
         self._is_unfinished = False
         """Whether a command left work that is continued after the commands that wait."""
+        self._end: FencedError | None = None
+        """Why nothing is done any more."""
 
     @classmethod
     async def open(
@@ -92,23 +102,25 @@ class StateService:
         settings: StateSettings | None = None,
         clock: Callable[[], float] = time.monotonic,
         revision: int | None = None,
+        fence: Fence | None = None,
     ) -> StateService:
-        """Go on from what a store holds, in a new term of it.
+        """Go on from what a store holds, in a new term of it, or in that of a fence.
 
         Args:
             store: The store.
             settings: Limits and times.
             clock: Seconds; never goes back.
             revision: As :meth:`State.load` takes it; None is the time of day.
+            fence: Of the leadership in which the store was opened, if there may be other masters.
 
         Raises:
             StoreError: It cannot be read.
         """
         if revision is None:
             revision = time.time_ns() // 1_000_000
-        term = await store.begin_term()
+        term = await store.begin_term() if fence is None else fence.term
         state = State.load(await load_converted(store, term), clock(), settings, revision=revision)
-        return cls(state, store, clock, term)
+        return cls(state, store, clock, term, fence)
 
     @property
     def tables(self) -> Tables:
@@ -172,17 +184,29 @@ class StateService:
         """
         job = _Job(commands, asyncio.get_running_loop().create_future())
         await self._jobs.put(job)
+        if self._end is not None:
+            self._refuse([], self._end)
         return job.done
 
     async def run(self) -> None:
-        """Work until cancelled."""
+        """Work until cancelled.
+
+        Raises:
+            FencedError: This master leads no more; what it did last may have been stored or not. From then on
+                commands fail with this error.
+        """
         while True:
             continues = self._is_unfinished
             if continues:
                 # Without this, work that writes nothing would leave the event loop to no other task.
                 await asyncio.sleep(0)
             jobs = [] if continues else [await self._jobs.get()]
-            await self._work(jobs, takes_more=True, continues=continues)
+            try:
+                await self._work(jobs, takes_more=True, continues=continues)
+            except FencedError as error:
+                self._end = error
+                self._refuse(jobs, error)
+                raise
 
     async def _work(self, jobs: list[_Job], *, takes_more: bool = False, continues: bool = False) -> None:
         """Do jobs in one transaction of the store.
@@ -195,8 +219,12 @@ class StateService:
         done: list[Changes] = []
         try:
             await self._apply_all(jobs, done, takes_more=takes_more, continues=continues)
+            self._check_fence()
             await self._save(done)
+            self._check_fence()
         except StoreError as error:
+            if self._fence is not None and isinstance(error, FencedError):
+                raise  # the state ends with the leadership; nobody is answered from it
             _revert(done)
             # The next tick does what was left over: a store that fails is not asked again at once.
             self._is_unfinished = False
@@ -213,6 +241,10 @@ class StateService:
                 listener(changes)
             await turn.end_if_over()
         self._answer(jobs, None)
+
+    def _check_fence(self) -> None:
+        if self._fence is not None:
+            self._fence.check()
 
     async def _apply_all(
         self, jobs: list[_Job], done: list[Changes], *, takes_more: bool, continues: bool
@@ -268,6 +300,14 @@ class StateService:
             _log.exception("could not apply %r", command)
             return MasterError(f"internal error: {error!r}")
         return None
+
+    def _refuse(self, jobs: list[_Job], error: FencedError) -> None:
+        """Let commands fail, and those that wait: the servers wait for them while they close."""
+        while not self._jobs.empty():
+            jobs.append(self._jobs.get_nowait())
+        for job in jobs:
+            job.outcomes = [error for _ in job.commands]
+        self._answer(jobs, error)
 
     @staticmethod
     def _answer(jobs: list[_Job], error: StoreError | None) -> None:

@@ -336,7 +336,7 @@ def _leaks(fds: dict[int, str], children: set[int], threads: set[threading.Threa
 @pytest.fixture(autouse=True)
 def _no_leaks(request: pytest.FixtureRequest) -> Iterator[None]:
     """Fail a test that leaves a descriptor, a process or a thread behind."""
-    if {"shared_engine", "shared_demo"} & set(request.fixturenames):
+    if {"shared_engine", "shared_demo", "shared_masters"} & set(request.fixturenames):
         yield
         return
     fds, threads = _descriptors(), set(threading.enumerate())

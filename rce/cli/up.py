@@ -11,7 +11,15 @@ import typer
 from msgspec.structs import replace
 
 from rce.cli.settings import SettingsOptions
-from rce.config import EngineSettings, MasterSettings, SettingError, as_document, fields_of
+from rce.config import (
+    EngineSettings,
+    EtcdAddress,
+    MasterSettings,
+    SettingError,
+    as_document,
+    fields_of,
+    read_store_address,
+)
 from rce.supervision.plan import Plan, Program
 from rce.tls.choice import WARNED_VARIABLE, plain_warning
 
@@ -44,6 +52,11 @@ def up(
     ] = None,
 ) -> None:
     """Run an engine: master, robot and container task sets."""
+    if isinstance(read_store_address(settings.master.store), EtcdAddress):
+        raise typer.BadParameter(
+            "rce up keeps the state on this machine; for a state in etcd start rce-master, rce-robot and"
+            " rce-container by themselves (docs/how-to/three-masters.md)"
+        )
     try:
         plan(settings if bind is None else bound_to(bind, settings)).hand_over()
     except OSError as error:

@@ -21,6 +21,7 @@ from rce.config.secret import (
     rotate_secret,
 )
 from rce.config.settings import ANYWHERE, LOOPBACK, EngineSettings, MasterSettings, Runtime
+from rce.config.store_address import EtcdAddress, SqliteAddress, StoreAddress, read_store_address
 
 __all__ = [
     "ANYWHERE",
@@ -29,6 +30,7 @@ __all__ = [
     "STORE_FILE",
     "ConfigError",
     "EngineSettings",
+    "EtcdAddress",
     "Fault",
     "Field",
     "LogFileError",
@@ -39,6 +41,8 @@ __all__ = [
     "SecretError",
     "SettingError",
     "ShippedFileError",
+    "SqliteAddress",
+    "StoreAddress",
     "as_document",
     "configs_dir",
     "default_secret_file",
@@ -51,6 +55,7 @@ __all__ = [
     "log_as",
     "new_secret",
     "read_document",
+    "read_store_address",
     "redact",
     "retire_secrets",
     "rotate_secret",

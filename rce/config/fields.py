@@ -27,6 +27,7 @@ from msgspec.structs import fields as struct_fields
 
 from rce.config.documents import join
 from rce.config.exceptions import Fault
+from rce.config.store_address import read_store_address
 from rce.masters import split_addresses
 from rce.model import read_cores, read_memory, write_memory
 
@@ -313,6 +314,13 @@ def choice(kind: type[Enum]) -> Reader:
     return Reader(read, _plain, "|".join(str(item.value) for item in kind))
 
 
+def _read_store(value: Any) -> Any:
+    if not isinstance(value, str):
+        raise ValueError(f"must be sqlite:FOLDER or etcd://HOST:PORT,..., found {value!r:.60}")  # noqa: TRY004
+    read_store_address(value)
+    return value
+
+
 def _same(value: Any) -> Any:
     return value
 
@@ -321,6 +329,8 @@ Host = Annotated[str, Reader(_read_host, _same, "HOST")]
 """A host name or an IP address; empty for none."""
 Hosts = Annotated[str, Reader(_read_hosts, _same, "HOST")]
 """As :data:`Host`, or several, separated by commas."""
+Store = Annotated[str, Reader(_read_store, _same, "STORE")]
+"""Where the master's state is, as :func:`rce.config.store_address.read_store_address` reads it."""
 Networks = Annotated[tuple[str, ...], Reader(_read_network, _same, "ADDRESS")]
 """IP addresses or networks."""
 Port = Annotated[int, Meta(ge=0, le=65535)]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from rce.config.fields import Cores, Host, Memory, Networks, Port, Seconds, Section, Setting
+from rce.config.fields import Cores, Finite, Host, Memory, Networks, Port, Seconds, Section, Setting, Store
 
 ANYWHERE = "0.0.0.0"  # noqa: S104 - an engine serves other machines unless in development mode
 
@@ -22,6 +22,19 @@ class MasterSettings(Section, frozen=True, kw_only=True):
         Path | None,
         Setting("Folder of users and desired state.", unset="folder `master` in the engine's state folder"),
     ] = None
+    store: Annotated[
+        Store,
+        Setting(
+            "Where users and desired state are: `sqlite:FOLDER`, or for several masters"
+            " `etcd://HOST:2379,HOST:2379,...[/PREFIX]` (`etcds://` with TLS).",
+            unset="SQLite in `state_dir`",
+        ),
+    ] = ""
+    lease: Annotated[
+        Finite,
+        Meta(ge=2, le=60),
+        Setting("Seconds; with etcd: how long a leading master that fell silent keeps the lead."),
+    ] = 3.0
     origins: Annotated[
         tuple[str, ...],
         Setting("Origins whose web pages may use the server.", option="allow-origin"),

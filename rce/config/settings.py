@@ -18,6 +18,7 @@ from msgspec import Meta, field
 from rce.config.fields import Hosts, Memory, Section, Setting, choice
 from rce.config.folders import MASTER_FOLDER, default_state_dir, master_folder
 from rce.config.master_settings import ANYWHERE, MasterSettings
+from rce.config.store_address import SqliteAddress, read_store_address
 from rce.config.task_set_settings import ContainerSettings, RobotSettings, Runtime
 from rce.masters import split_addresses
 
@@ -148,7 +149,10 @@ class EngineSettings(Section, frozen=True, kw_only=True):
 
     @property
     def master_state(self) -> Path:
-        """The folder of the master's state."""
+        """The folder of the master's state; with etcd, of what remains on its machine."""
+        address = read_store_address(self.master.store)
+        if isinstance(address, SqliteAddress) and address.folder is not None:
+            return address.folder
         if self.master.state_dir is not None:
             return master_folder(self.master.state_dir)
         return self.state_dir / MASTER_FOLDER

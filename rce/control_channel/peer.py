@@ -21,6 +21,8 @@ from rce.control import (
 from rce.control_channel.timeouts import MAX_QUEUED, ControlTimeouts
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from websockets.asyncio.server import ServerConnection
 
 
@@ -30,8 +32,15 @@ _log = logging.getLogger(__name__)
 class Peer:
     """A task set that is connected."""
 
-    def __init__(self, hello: Hello, socket: ServerConnection, timeouts: ControlTimeouts) -> None:
+    def __init__(
+        self,
+        hello: Hello,
+        socket: ServerConnection,
+        timeouts: ControlTimeouts,
+        is_fenced: Callable[[], bool] | None = None,
+    ) -> None:
         self.hello = hello
+        self._is_fenced = is_fenced
         self._socket = socket
         self._timeouts = timeouts
         self._outbox: asyncio.Queue[str] = asyncio.Queue(MAX_QUEUED)
@@ -116,7 +125,11 @@ class Peer:
             ConnectionClosed: The connection ended.
         """
         while True:
-            await self._socket.send(await self._outbox.get())
+            message = await self._outbox.get()
+            if self._is_fenced is not None and self._is_fenced():
+                self.abort()
+                return
+            await self._socket.send(message)
 
     def answer(self, chunk: LogChunk) -> None:
         """Take an answer to :meth:`read_log` (for the server)."""

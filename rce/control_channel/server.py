@@ -89,6 +89,7 @@ class ControlServer:
         is_revoked: Tells by its serial number whether a task set's certificate was revoked.
         on_execution: Takes a connection that a task set dialed for a run (:mod:`rce.control.execution`), and
             returns when it is done with it.
+        is_fenced: Tells that another master may lead by now. Then nothing is sent to task sets any more.
     """
 
     def __init__(
@@ -107,7 +108,9 @@ class ControlServer:
         is_revoked: Callable[[int], bool] | None = None,
         on_execution: Callable[[str, ServerConnection], Awaitable[None]] | None = None,
         features: tuple[str, ...] = (),
+        is_fenced: Callable[[], bool] | None = None,
     ) -> None:
+        self._is_fenced = is_fenced
         self._features = features
         self._secret = secret
         self._tls = tls
@@ -192,6 +195,8 @@ class ControlServer:
 
     async def _admit(self, socket: ServerConnection, request: Request) -> Response | None:
         refusal = self._authenticate(socket, request)
+        if refusal is None and self._is_fenced is not None and self._is_fenced():
+            return socket.respond(HTTPStatus.SERVICE_UNAVAILABLE, "This master leads no more.\n")
         if refusal is None and self._contents is not None and is_for_contents(request.path):
             return await answer(request, self._contents)
         return refusal
@@ -215,7 +220,7 @@ class ControlServer:
         try:
             hello = await self._greet(socket)
             if hello is not None:
-                await self._serve_peer(Peer(hello, socket, self._timeouts), socket)
+                await self._serve_peer(Peer(hello, socket, self._timeouts, self._is_fenced), socket)
         except ConnectionClosed as error:
             _log.debug("a task set's connection ended: %s", error)
 

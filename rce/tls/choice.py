@@ -79,6 +79,16 @@ class TlsChoice:
         identity.mutual_server()
         return identity
 
+    def own_identity(self) -> TlsIdentity:
+        """Return this machine's identity by the engine's authority, also where TLS is not used elsewhere.
+
+        Raises:
+            CertificateError: The files cannot be used.
+        """
+        identity = TlsIdentity(self._own())
+        identity.client()
+        return identity
+
     def _own(self) -> TlsFiles:
         certificate, key = self.folder / f"{self.name}.pem", self.folder / f"{self.name}.key"
         return TlsFiles(certificate, key, self.folder / "authority.pem", self.folder / "revoked.pem")

@@ -17,6 +17,7 @@ from rce.web.client import session_connector
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.events import Event
 from rce_master.exceptions import MasterError
+from rce_master.leadership.core import STANDBY_HEADER
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine
@@ -95,6 +96,9 @@ class ApiClient:
                 async with self._session.request(
                     method, self._base + path, json=body, params=query, allow_redirects=False
                 ) as reply:
+                    if number > 1 and STANDBY_HEADER in reply.headers:
+                        self._masters.failed(url)
+                        continue
                     return await _result(reply)
             except (aiohttp.ClientError, TimeoutError, ValueError) as error:
                 # Only without a connection it is certain that the request had no effect.

@@ -1,4 +1,4 @@
-"""Work on a master's state folder while no master runs on it.
+"""Work on a master's state folder, or on its etcd, while no master runs on it.
 
 Changes are in the audit log, as changes over the API: the user is that of the operating system, and the
 address is ``offline``.
@@ -9,13 +9,23 @@ from __future__ import annotations
 import os
 import pwd
 import time
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rce.config import MASTER_FOLDER, STORE_FILE, ConfigError, default_state_dir, load_settings
+from rce.config import (
+    MASTER_FOLDER,
+    STORE_FILE,
+    ConfigError,
+    EtcdAddress,
+    default_state_dir,
+    load_settings,
+    read_store_address,
+)
+from rce.tls import CertificateError
+from rce.tls.choice import TlsChoice
 from rce_master.audit import AuditLog
 from rce_master.cli import credentials
 from rce_master.cli.exceptions import CliError, NotLoggedInError
@@ -24,6 +34,8 @@ from rce_master.settings import state_settings
 from rce_master.state.core import State
 from rce_master.state_service import load_converted
 from rce_master.store import SqliteStore, Store
+from rce_master.store.etcd import EtcdClient, EtcdStore
+from rce_master.store.etcd.layout import prepare
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -31,6 +43,8 @@ if TYPE_CHECKING:
     from rce_master.cli.credentials import Credentials
     from rce_master.state.commands import Command
 
+_ETCD_S = 5.0
+"""How long one member of etcd may take for an answer."""
 OFFLINE = "offline"
 """The address in the audit log for changes made on this machine."""
 
@@ -38,6 +52,28 @@ StateDir = Annotated[
     Path | None,
     typer.Option(help="Work on this state folder while no master runs on it, instead of over the API."),
 ]
+StoreOption = Annotated[
+    str,
+    typer.Option(
+        metavar="etcd://HOST:2379,...",
+        help="Work on the state in this etcd while no master leads, instead of over the API.",
+    ),
+]
+
+
+def read_etcd(store: str) -> EtcdAddress:
+    """Read the value of ``--store``.
+
+    Raises:
+        CliError: It is not the address of an etcd.
+    """
+    try:
+        address = read_store_address(store)
+    except ValueError as error:
+        raise CliError(f"--store {error}") from None
+    if not isinstance(address, EtcdAddress):
+        raise CliError("--store must be etcd://HOST:2379,...; for a folder use --state-dir")
+    return address
 
 
 def choose(state_dir: Path | None) -> Path | Credentials:
@@ -75,12 +111,12 @@ class OfflineState:
 
     Attributes:
         state: The state of the store, with the changes since.
-        folder: Where it is.
+        place: Where it is, for messages.
     """
 
-    def __init__(self, state: State, store: Store, term: int, audit: AuditLog, folder: Path) -> None:
+    def __init__(self, state: State, store: Store, term: int, audit: AuditLog, place: str) -> None:
         self.state = state
-        self.folder = folder
+        self.place = place
         self._store = store
         self._term = term
         self._audit = audit
@@ -102,29 +138,45 @@ class OfflineState:
 
 
 @asynccontextmanager
-async def open_state(state_dir: Path) -> AsyncIterator[OfflineState]:
-    """Open the state in a folder: the master's own, or the engine's, which contains the master's.
+async def open_state(place: Path | EtcdAddress) -> AsyncIterator[OfflineState]:
+    """Open the state in a folder, the master's own or the engine's, which contains the master's, or in etcd.
 
     Raises:
         CliError: A master runs on it, there are two states, or the settings cannot be read.
+        StoreError: The store cannot be used.
     """
-    folder = find_state(state_dir)
     try:
-        settings = state_settings(load_settings(None))
+        settings = load_settings(None)
     except ConfigError as error:
         raise CliError(str(error)) from error
+    folder = find_state(place) if isinstance(place, Path) else settings.master_state
+    async with AsyncExitStack() as stack:
+        try:
+            if isinstance(place, Path):
+                store: Store = await SqliteStore.open(folder)
+                stack.push_async_callback(store.close)
+            else:
+                store = await stack.enter_async_context(_etcd_store(place, TlsChoice.of(settings)))
+            term = await store.begin_term()
+        except StoreBusyError as error:
+            raise CliError(f"{error}; to work over its API, log in there: rce login") from error
+        audit = AuditLog(folder / "audit", time.time)
+        stack.callback(audit.close)
+        limits = state_settings(settings)
+        state = State.load(await load_converted(store, term), time.monotonic(), settings=limits)
+        yield OfflineState(state, store, term, audit, str(folder if isinstance(place, Path) else place))
+
+
+@asynccontextmanager
+async def _etcd_store(address: EtcdAddress, tls: TlsChoice) -> AsyncIterator[Store]:
     try:
-        store = await SqliteStore.open(folder)
-    except StoreBusyError as error:
-        raise CliError(f"{error}; to work over its API, log in there: rce login") from error
-    audit = AuditLog(folder / "audit", time.time)
-    try:
-        term = await store.begin_term()
-        state = State.load(await load_converted(store, term), time.monotonic(), settings=settings)
-        yield OfflineState(state, store, term, audit, folder)
-    finally:
-        audit.close()
-        await store.close()
+        identity = tls.own_identity() if address.tls else None
+    except CertificateError as error:
+        raise CliError(str(error)) from error
+    contexts = None if identity is None else identity.client
+    async with EtcdClient(address.endpoints, tls=contexts, attempt=_ETCD_S) as client:
+        await prepare(client, address.prefix)
+        yield EtcdStore(client, address.prefix)
 
 
 def _caller() -> str:

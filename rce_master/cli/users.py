@@ -11,11 +11,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from rce.config import EtcdAddress
 from rce_master.auth import Authenticator, client_digest
 from rce_master.cli import credentials, limits
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import CliError
-from rce_master.cli.offline import OfflineState, StateDir, choose, open_state
+from rce_master.cli.offline import OfflineState, StateDir, StoreOption, choose, open_state, read_etcd
 from rce_master.cli.session import read_password
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
@@ -38,6 +39,7 @@ def add(
     admin: Annotated[bool, typer.Option("--admin", help="The same as --role admin.")] = False,
     password_stdin: PasswordStdin = False,
     state_dir: StateDir = None,
+    store: StoreOption = "",
 ) -> None:
     """Add a user."""
     run(
@@ -46,12 +48,13 @@ def add(
             "admin" if admin else role.value,
             read_password(from_stdin=password_stdin, confirm=True),
             state_dir,
+            store,
         )
     )
 
 
-async def _add(name: str, role: str, password: str, state_dir: Path | None) -> None:
-    async with _directory(state_dir) as users:
+async def _add(name: str, role: str, password: str, state_dir: Path | None, store: str) -> None:
+    async with _directory(state_dir, store) as users:
         await users.add(name, role, password)
     typer.echo(f"added {name} {users.place}")
 
@@ -160,7 +163,7 @@ class _StoreDirectory:
     """Users directly in the store, which is locked meanwhile."""
 
     def __init__(self, offline: OfflineState) -> None:
-        self.place = f"in {offline.folder}"
+        self.place = f"in {offline.place}"
         self._offline = offline
         self._authenticator = Authenticator(offline.state.tables)
 
@@ -192,10 +195,10 @@ class _StoreDirectory:
 
 
 @asynccontextmanager
-async def _directory(state_dir: Path | None) -> AsyncIterator[_Directory]:
-    """Choose the named folder, else the master of the login, else the default folder."""
-    place = choose(state_dir)
-    if not isinstance(place, Path):
+async def _directory(state_dir: Path | None, store: str = "") -> AsyncIterator[_Directory]:
+    """Choose the named etcd or folder, else the master of the login, else the default folder."""
+    place = read_etcd(store) if store else choose(state_dir)
+    if not isinstance(place, Path | EtcdAddress):
         async with ApiClient.of(place) as client:
             yield _ApiDirectory(client, place.url)
         return

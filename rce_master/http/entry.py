@@ -52,7 +52,7 @@ class Entry:
             return _plain(error.status, f"{error.reason}\n")
         task_set = self.choose()
         if task_set is None:
-            return _plain(503, "No robot process is free; try again later.\n", {"Retry-After": "1"})
+            return refusal("No robot process is free; try again later.\n")
         body = master_reply(wanted, task_set.url, header=task_set.bearer)
         return EntryAnswer(200, body, "application/json; charset=utf-8")
 
@@ -76,6 +76,11 @@ class Entry:
 
     def _load(self, task_set: TaskSet) -> int:
         return self._tables.endpoints.count("task_set", task_set.process)
+
+
+def refusal(text: str) -> EntryAnswer:
+    """Return an answer to a client that may ask again, or another master."""
+    return _plain(503, text, {"Retry-After": "1"})
 
 
 def _plain(status: int, text: str, headers: Mapping[str, str] | None = None) -> EntryAnswer:

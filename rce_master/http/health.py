@@ -10,6 +10,7 @@ from aiohttp import web
 from rce_master.exceptions import StoreError
 
 if TYPE_CHECKING:
+    from rce_master.leadership import Fence
     from rce_master.state_service import StateService
 
 
@@ -18,10 +19,12 @@ class Health:
 
     Args:
         state_service: The owner of the store.
+        fence: Of this master's leadership, if there may be other masters; then the answer says that it leads.
     """
 
-    def __init__(self, state_service: StateService) -> None:
+    def __init__(self, state_service: StateService, fence: Fence | None = None) -> None:
         self._state_service = state_service
+        self._fence = fence
         self._look: asyncio.Task[str] | None = None
         """The running check; concurrent requests wait for its result."""
 
@@ -32,7 +35,10 @@ class Health:
         fault = await asyncio.shield(self._look)
         tables = self._state_service.tables
         connected = sum(tables.is_connected(task_set.process) for task_set in tables.task_sets)
-        body = {"status": fault or "ok", "task_sets": connected}
+        body: dict[str, object] = {"status": fault or "ok", "task_sets": connected}
+        if self._fence is not None:
+            self._fence.check()
+            body |= describe_role("leader", self._fence.term, self._fence.name, ready=not fault)
         return web.json_response(body, status=503 if fault else 200)
 
     async def _check(self) -> str:
@@ -43,3 +49,15 @@ class Health:
         finally:
             self._look = None
         return ""
+
+
+def describe_role(role: str, term: int, leader: str, *, ready: bool) -> dict[str, object]:
+    """Return the part of an answer that tells which master leads.
+
+    Args:
+        role: ``leader`` or ``standby``.
+        term: The newest term that this master knows; 0: none.
+        leader: The name of the leading master; empty: none, or unknown.
+        ready: Whether this master serves clients.
+    """
+    return {"live": True, "ready": ready, "role": role, "term": term, "leader": leader}

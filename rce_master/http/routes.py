@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rce_master.auth import Authenticator
     from rce_master.events import EventLog
     from rce_master.executions import Executions
+    from rce_master.leadership import Fence
     from rce_master.packages.service import PackageService
     from rce_master.quotas import Quotas
     from rce_master.reconciler import Reconciler
@@ -59,6 +60,8 @@ class Services:
     dev: bool
     """Whether this is development mode."""
     proxies: TrustedProxies = field(default_factory=TrustedProxies)
+    fence: Fence | None = None
+    """Tells whether this master leads; None if there is no other one."""
 
 
 @dataclass(frozen=True, slots=True)

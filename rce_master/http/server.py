@@ -13,6 +13,7 @@ from rce.web.openapi import PREFIX
 from rce.web.origin import ServerNames, is_foreign
 from rce_master.exceptions import (
     AuthError,
+    FencedError,
     MasterError,
     RefusedError,
     StoreError,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
     from rce_master.http.entry import Entry
     from rce_master.http.routes import Services
+    from rce_master.leadership import Fence
 
     Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -51,9 +53,10 @@ def make_app(
         names: The allowed host names of the server.
     """
     guard = _origin_guard(frozenset(allowed_origins), names or ServerNames())
-    app = web.Application(middlewares=[guard, _errors], client_max_size=MAX_BODY)
+    inner = [] if services.fence is None else [_fencing(services.fence)]
+    app = web.Application(middlewares=[guard, _errors, *inner], client_max_size=MAX_BODY)
     app.router.add_get("/", _at_entry(entry))
-    app.router.add_get("/healthz", Health(services.state_service).handle)
+    app.router.add_get("/healthz", Health(services.state_service, services.fence).handle)
     app.router.add_get("/metrics", _metrics(services))
     app.router.add_route("*", PREFIX + "/{rest:.*}", LateApi(services).handle)
     return app
@@ -118,6 +121,23 @@ async def _errors(request: web.Request, handler: Handler) -> web.StreamResponse:
         return _error(error.status, error.reason, {k: v for k, v in error.headers.items() if k == hdrs.ALLOW})
 
 
+def _fencing(fence: Fence) -> Any:
+    @web.middleware
+    async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Answer nothing from a state that another master may have changed."""
+        fence.check()
+        try:
+            response = await handler(request)
+        except MasterError:
+            fence.check()
+            raise
+        if not response.prepared:
+            fence.check()
+        return response
+
+    return check
+
+
 def _status(error: MasterError) -> int:
     match error:
         case RefusedError():
@@ -136,7 +156,7 @@ def _headers(error: MasterError) -> dict[str, str]:
     match error:
         case TooManyFailuresError() | TooMuchError():
             return {hdrs.RETRY_AFTER: str(math.ceil(error.retry_after))}
-        case TooManyLoginsError():
+        case TooManyLoginsError() | FencedError():
             return {hdrs.RETRY_AFTER: "1"}
         case AuthError():
             return {hdrs.WWW_AUTHENTICATE: "Bearer"}

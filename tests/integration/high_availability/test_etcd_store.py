@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections.abc import AsyncIterator
+from pathlib import Path
 
 import aiohttp
 import pytest
 import pytest_asyncio
 from support.etcd import Cluster, CuttingProxy, cluster
+from support.master_program import rce
 from support.store_laws import check_round_trip, check_snapshot, check_terms
 
 from rce_master.exceptions import FencedError, StaleTermError, StoreBusyError, StoreError
@@ -186,3 +188,18 @@ async def test_the_state_is_read_anew_if_it_is_compacted_meanwhile(
     monkeypatch.setattr(client, "range", read_and_compact)
     assert await store.load() == {"users": rows | {"0000": b"2"}}
     assert next(reads) == 4
+
+
+async def test_the_first_user_is_added_before_a_master_leads(
+    etcd: Cluster, client: EtcdClient, prefix: str, tmp_path: Path
+) -> None:
+    store = f"{etcd.store}{prefix}"
+    add = ("add", "anna", "--admin", "--password-stdin", "--store", store)
+    assert f"added anna in {store}" in await rce(tmp_path, "user", *add, text="secret\nsecret\n")
+    assert list((await EtcdStore(client, prefix).load())["users"]) == ["anna"]
+    _, _, lease = await lead(client, prefix)
+    told = await rce(tmp_path, "user", *add, text="secret\nsecret\n", code=1)
+    assert "another master leads: one:9000; to work over its API, log in there" in told
+    await client.revoke(lease)
+    told = await rce(tmp_path, "user", *add[:-1], "etcd://", text="secret\nsecret\n", code=1)
+    assert "--store must name members of etcd" in told

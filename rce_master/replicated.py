@@ -1,0 +1,136 @@
+"""One of several masters on one etcd: a stand-by until it takes the lead, the leader until it loses it."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+from contextlib import AsyncExitStack
+from typing import TYPE_CHECKING
+
+from rce.own_process import listening
+from rce.web.origin import ServerNames
+from rce.web.server import HttpServer
+from rce_master.exceptions import FencedError, MasterError
+from rce_master.leadership import LeaseSettings
+from rce_master.leadership.keeper import LeadershipKeeper
+from rce_master.master import Master
+from rce_master.store.etcd import EtcdClient
+from rce_master.store.etcd.layout import prepare
+from rce_master.store.lock import FolderLock
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from argon2 import PasswordHasher
+
+    from rce.config import Secret
+    from rce_master.master import RunningMaster
+    from rce_master.settings import MasterSettings
+
+_log = logging.getLogger(__name__)
+
+START_S = 5.0
+"""How long a member of etcd may take for an answer when this program starts."""
+_ATTEMPTS = 4
+"""Requests to members of etcd, one after the other, in the time of a lease."""
+
+
+class ReplicatedMaster:
+    """Runs a master whose state is in etcd, beside others.
+
+    Args:
+        settings: Its settings, with the address of etcd.
+        secret: The secret by which task sets authenticate.
+        hasher: How passwords are hashed.
+    """
+
+    def __init__(
+        self, settings: MasterSettings, secret: Secret, *, hasher: PasswordHasher | None = None
+    ) -> None:
+        self._settings = settings
+        self._secret = secret
+        self._hasher = hasher
+
+    async def run(
+        self,
+        on_ready: Callable[[RunningMaster], None],
+        on_standby: Callable[[str], None],
+        is_stopping: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Run until cancelled; then the lead is given back, so that another master takes it at once.
+
+        Args:
+            on_ready: Called each time that this master leads and listens.
+            on_standby: Called with the URL of the stand-by's server each time that it listens.
+            is_stopping: Asked when this master has lost the lead: whether to end instead of standing by. A
+                cancellation at that moment would interrupt the closing of what belonged to the term.
+
+        Raises:
+            StoreError: etcd cannot be used as it is; the text says why.
+            StoreBusyError: Another master uses the state folder.
+            MasterError: A port cannot be used.
+            CertificateError: A certificate cannot be used.
+        """
+        settings = self._settings
+        address = settings.etcd
+        assert address is not None
+        identity = settings.tls.own_identity() if address.tls else None
+        lock = FolderLock(settings.state_dir)
+        try:
+            tls = None if identity is None else identity.client
+            async with EtcdClient(address.endpoints, tls=tls, attempt=START_S) as client:
+                await prepare(client, address.prefix)
+            attempt = settings.lease / _ATTEMPTS
+            async with EtcdClient(address.endpoints, tls=tls, attempt=attempt) as client:
+                lease = LeaseSettings(ttl=settings.lease)
+                keeper = LeadershipKeeper(client, address.prefix, settings.name, lease)
+                while not is_stopping():
+                    await self._stand_by_and_lead(keeper, on_ready, on_standby)
+        finally:
+            lock.close()
+
+    async def _stand_by_and_lead(
+        self,
+        keeper: LeadershipKeeper,
+        on_ready: Callable[[RunningMaster], None],
+        on_standby: Callable[[str], None],
+    ) -> None:
+        from rce_master.http.standby import make_standby_app  # loads aiohttp's server
+
+        settings = self._settings
+        for_clients = settings.tls.for_clients()
+        names = ServerNames(settings.bind, settings.public_names)
+        async with AsyncExitStack() as waiting:
+            server = HttpServer(
+                make_standby_app(keeper, names),
+                settings.bind,
+                settings.http_port,
+                for_clients.server if for_clients else None,
+            )
+            try:
+                with listening(settings.bind, settings.http_port, "--http-port"):
+                    await waiting.enter_async_context(server)
+            except OSError as error:
+                raise MasterError(str(error)) from error
+            on_standby(server.url)
+            store, fence = await keeper.acquire()
+            _log.info("this master leads in term %d", fence.term)
+            try:
+                master = Master(settings, self._secret, store, hasher=self._hasher, fence=fence)
+                async with asyncio.TaskGroup() as group:
+                    keeping = group.create_task(keeper.keep())
+                    await master.run(on_ready, waiting.aclose)
+                    keeping.cancel()
+            except* FencedError as errors:
+                _log.warning("this master leads no more: %s", _first_of(errors))
+            finally:
+                await keeper.step_down()
+                gc.unfreeze()
+
+
+def _first_of(errors: BaseExceptionGroup[FencedError]) -> BaseException:
+    first: BaseException = errors
+    while isinstance(first, BaseExceptionGroup):
+        first = first.exceptions[0]
+    return first

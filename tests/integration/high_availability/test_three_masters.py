@@ -1,0 +1,172 @@
+"""Three masters on an etcd of three members, and what they do when one of them or of etcd fails."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import AsyncIterator
+from typing import Any
+
+import aiohttp
+import pytest
+import pytest_asyncio
+from support.engine import until
+from support.etcd import Cluster, cluster
+from support.masters import MasterProcess, Masters, masters
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+
+from rce.control import decode_to_task_set, encode
+from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, Sync, TaskSetKind
+
+pytestmark = [pytest.mark.needs("etcd"), pytest.mark.asyncio(loop_scope="module")]
+
+LEASE_S = 4.0
+SECRET = {"Authorization": "Bearer a secret for the tests"}
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def etcd(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Cluster]:
+    async with cluster(tmp_path_factory.mktemp("etcd"), 3) as made:
+        yield made
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def shared_masters(etcd: Cluster, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Masters]:
+    async with masters(tmp_path_factory.mktemp("masters"), etcd.store, lease=LEASE_S) as made:
+        yield made
+
+
+async def restart(master: MasterProcess) -> None:
+    await master.start(ready="rce-master stand-by: ")
+
+
+async def test_one_leads_and_the_others_say_who(shared_masters: Masters) -> None:
+    found = await until(lambda: agreed(shared_masters), timeout=120, what="all masters agree who leads")
+    leader = await shared_masters.leader()
+    assert found["leader"] == f"{leader.name}:{leader.http_port}"
+    async with shared_masters.session(20.0) as session:
+        for other in (master for master in shared_masters.all if master is not leader):
+            async with session.get(f"{other.url}api/v1/users") as reply:
+                assert (reply.status, reply.headers["Retry-After"]) == (503, "1")
+                assert f"stand-by; {found['leader']} leads" in (await reply.json())["error"]
+            with pytest.raises(OSError, match=r"Connect call failed|refused"):
+                await asyncio.open_connection("127.0.0.1", other.control_port)
+
+
+async def agreed(shared_masters: Masters) -> dict[str, Any] | None:
+    """Return the answer of the leader if it leads, and the others say so."""
+    leading, *others = sorted(
+        [await master.health() for master in shared_masters.all], key=lambda told: told.get("role", "")
+    )
+    if leading.get("role") != "leader" or any(told.get("role") != "standby" for told in others):
+        return None
+    assert (leading["code"], leading["live"], leading["ready"]) == (200, True, True)
+    assert leading["term"] > 0
+    for told in others:
+        assert (told["code"], told["live"], told["ready"]) == (503, True, False)
+    who = (leading["leader"], leading["term"])
+    return leading if all((told["leader"], told["term"]) == who for told in others) else None
+
+
+async def test_nothing_acknowledged_is_lost_when_the_leader_is_killed(shared_masters: Masters) -> None:
+    leader = await shared_masters.leader()
+    term = (await leader.health())["term"]
+    async with shared_masters.under_load():
+        await shared_masters.wait_for_writes()
+        await leader.kill()
+        new = await shared_masters.leader(but=leader)
+        assert (await new.health())["term"] > term
+        await shared_masters.wait_for_writes()
+    await restart(leader)
+    await shared_masters.check_nothing_is_lost()
+
+
+async def test_sigterm_hands_over_before_the_lease_ends(shared_masters: Masters) -> None:
+    leader = await shared_masters.leader()
+    term = (await leader.health())["term"]
+    async with shared_masters.under_load():
+        await shared_masters.wait_for_writes()
+        assert await leader.stop() == 0
+        new = await shared_masters.leader(but=leader)
+        assert (await new.health())["term"] > term
+        await shared_masters.wait_for_writes()
+    assert "left to end by itself" not in leader.output()
+    await restart(leader)
+    await shared_masters.check_nothing_is_lost()
+
+
+async def test_a_stopped_leader_says_and_does_nothing_when_it_wakes(shared_masters: Masters) -> None:
+    """Requests that wait in its sockets, and a task set that is connected, get nothing of the old term."""
+    leader = await shared_masters.leader()
+    control = f"ws://127.0.0.1:{leader.control_port}/"
+    async with (
+        shared_masters.session(60.0) as session,
+        connect(control, additional_headers=SECRET) as task_set,
+    ):
+        async with session.get(f"{leader.url}api/v1/users") as reply:
+            assert reply.status == 200  # the next request finds an open connection
+        await task_set.send(encode(hello()))
+        async for frame in task_set:
+            if isinstance(decode_to_task_set(frame), Sync):
+                break
+        async with shared_masters.under_load():
+            await shared_masters.wait_for_writes()
+            leader.send(signal.SIGSTOP)
+            reads = [
+                asyncio.create_task(status(session, "GET", f"{leader.url}api/v1/users")) for _ in range(4)
+            ]
+            body = {"robot": "of_the_old_term"}
+            write = asyncio.create_task(status(session, "POST", f"{leader.url}api/v1/robot-tokens", body))
+            dial = asyncio.create_task(handshake(control))
+            new = await shared_masters.leader(but=leader)
+            await shared_masters.wait_for_writes()
+        leader.send(signal.SIGCONT)
+        assert await dial is False
+        assert {*await asyncio.gather(*reads), await write} <= {503, 0}
+        with pytest.raises(ConnectionClosed):
+            pytest.fail(f"the old leader sent {await task_set.recv()!r}")
+    await until(
+        lambda: leader.output().count("rce-master stand-by: ") > 1, what="the old leader is a stand-by"
+    )
+    assert "leads no more" in leader.output()
+    assert (await new.health())["role"] == "leader"
+    assert "of_the_old_term" not in await shared_masters.stored()
+    await shared_masters.check_nothing_is_lost()
+
+
+async def test_nothing_acknowledged_is_lost_when_a_member_of_etcd_is_killed(
+    shared_masters: Masters, etcd: Cluster
+) -> None:
+    async with shared_masters.under_load():
+        await shared_masters.wait_for_writes()
+        member = await etcd.leader()
+        member.send(signal.SIGKILL)
+        await shared_masters.wait_for_writes(20)
+        await member.start(etcd.members)
+        await shared_masters.wait_for_writes(20)
+    await shared_masters.check_nothing_is_lost()
+
+
+def hello() -> Hello:
+    return Hello(
+        version=CONTROL_VERSION, kind=TaskSetKind.CONTAINER, process="c1", machine=MachineInfo(name="machine")
+    )
+
+
+async def status(session: aiohttp.ClientSession, method: str, url: str, body: object = None) -> int:
+    """Return the status of an answer; 0 if there is none."""
+    try:
+        async with session.request(method, url, json=body) as reply:
+            return reply.status
+    except aiohttp.ClientError:
+        return 0
+
+
+async def handshake(url: str) -> bool:
+    """Dial as a task set; return whether the master took it."""
+    try:
+        async with connect(url, additional_headers=SECRET, open_timeout=60):
+            return True
+    except (InvalidHandshake, OSError, TimeoutError):
+        return False

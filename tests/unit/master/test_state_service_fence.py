@@ -1,0 +1,69 @@
+"""What becomes of commands when the leadership of their master ends."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+from support.master_cloud import FragileStore
+
+from rce_master.exceptions import FencedError
+from rce_master.leadership.core import Fence, LeadershipCore, LeaseSettings
+from rce_master.state import commands
+from rce_master.state.records import User, UserRole
+from rce_master.state_service import StateService
+
+
+class Leading:
+    """A state service of a master that leads by a clock of the test."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        core = LeadershipCore(LeaseSettings(ttl=3.0))
+        core.granted(self.now, 3.0)
+        core.elected(0, self.now)
+        self.fence = Fence(core, lambda: self.now, "one:9000")
+        self.store = FragileStore()
+
+    async def open(self) -> StateService:
+        return await StateService.open(self.store, fence=self.fence)
+
+
+def new_user(name: str) -> commands.AddUser:
+    return commands.AddUser(user=User(name=name, role=UserRole.USER, password="x", created=0.0))
+
+
+async def test_nothing_is_written_or_answered_after_the_deadline() -> None:
+    leading = Leading()
+    service = await leading.open()
+    running = asyncio.create_task(service.run())
+    await service.submit(new_user("anna"))
+    leading.now += 3.0
+    waiting = [asyncio.create_task(service.submit(new_user(name))) for name in ("bert", "carl")]
+    for task in waiting:
+        with pytest.raises(FencedError):
+            await task
+    with pytest.raises(FencedError):
+        await running
+    with pytest.raises(FencedError):
+        await service.submit(new_user("dora"))
+    assert list((await leading.store.load())["users"]) == ["anna"]
+
+
+async def test_a_deadline_that_passes_during_a_save_is_not_answered_as_done() -> None:
+    leading = Leading()
+    service = await leading.open()
+    running = asyncio.create_task(service.run())
+    heard: list[object] = []
+    service.listeners.append(heard.append)
+    leading.store.free.clear()
+    adding = asyncio.create_task(service.submit(new_user("anna")))
+    later = asyncio.create_task(service.submit(new_user("bert")))
+    while leading.store.free.is_set() or service.tables.users.get("anna") is None:
+        await asyncio.sleep(0)
+    leading.now += 3.0
+    leading.store.free.set()
+    for task in (adding, later, running):
+        with pytest.raises(FencedError):
+            await task
+    assert heard == []
