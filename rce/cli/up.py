@@ -52,11 +52,6 @@ def up(
     ] = None,
 ) -> None:
     """Run an engine: master, robot and container task sets."""
-    if isinstance(read_store_address(settings.master.store), EtcdAddress):
-        raise typer.BadParameter(
-            "rce up keeps the state on this machine; for a state in etcd start rce-master, rce-robot and"
-            " rce-container by themselves (docs/how-to/three-masters.md)"
-        )
     try:
         plan(settings if bind is None else bound_to(bind, settings)).hand_over()
     except OSError as error:
@@ -83,7 +78,16 @@ def bound_to(bind: str, settings: EngineSettings) -> EngineSettings:
 
 
 def plan(settings: EngineSettings) -> Plan:
-    """Return the programs to run and the lines to print."""
+    """Return the programs to run and the lines to print.
+
+    Raises:
+        typer.BadParameter: The state is to be in etcd.
+    """
+    if isinstance(read_store_address(settings.master.store), EtcdAddress):
+        raise typer.BadParameter(
+            "rce up keeps the state on this machine; for a state in etcd start rce-master, rce-robot and"
+            " rce-container by themselves (docs/how-to/three-masters.md)"
+        )
     ready = [f"RCE ready: {settings.http_url}"]
     certified = {}
     if settings.tls.enabled:

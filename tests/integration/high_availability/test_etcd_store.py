@@ -159,9 +159,7 @@ async def test_a_cancelled_save_ends_the_term(client: EtcdClient, prefix: str) -
         await store.save([Row("users", "a", b"2")], term)
 
 
-async def test_a_save_that_is_too_large_is_refused_and_the_next_is_done(
-    client: EtcdClient, prefix: str
-) -> None:
+async def test_a_save_that_is_too_large_is_refused(client: EtcdClient, prefix: str) -> None:
     store, term, _ = await lead(client, prefix)
     with pytest.raises(StoreError, match="start etcd with --max-request-bytes") as caught:
         await store.save([Row("users", "a", b"1" * (2 << 20))], term)

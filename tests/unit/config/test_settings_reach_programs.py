@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+import typer
 import typer.main
 from msgspec.structs import replace
 from typer import Typer
 
-from rce.cli.up import bound_to, programs, warning
+from rce.cli.up import bound_to, plan, programs, warning
 from rce.config.fields import fields_of, sections_of
 from rce.config.settings import (
     ContainerSettings,
@@ -107,6 +108,12 @@ def test_task_sets_dial_the_address_at_which_the_master_listens(host: str, maste
     found = received(bound_to(host, EngineSettings()))
     assert {one.master_host for one in found.values()} == {master}
     assert received(bound_to(host, SETTINGS))["robot1"].master_host == "127.0.0.2", "as it is set"
+
+
+def test_one_command_for_all_programs_takes_no_store_in_etcd() -> None:
+    settings = EngineSettings(master=MasterSettings(store="etcd://10.0.0.1"))
+    with pytest.raises(typer.BadParameter, match="start rce-master, rce-robot and rce-container"):
+        plan(settings)
 
 
 @pytest.mark.parametrize("host", ["10.0.0.7", "0.0.0.0"])

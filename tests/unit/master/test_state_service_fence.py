@@ -50,7 +50,7 @@ async def test_nothing_is_written_or_answered_after_the_deadline() -> None:
     assert list((await leading.store.load())["users"]) == ["anna"]
 
 
-async def test_a_deadline_that_passes_during_a_save_is_not_answered_as_done() -> None:
+async def test_a_save_that_outlives_the_lease_is_not_answered() -> None:
     leading = Leading()
     service = await leading.open()
     running = asyncio.create_task(service.run())
