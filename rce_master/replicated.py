@@ -16,6 +16,7 @@ from rce_master.leadership import LeaseSettings
 from rce_master.leadership.keeper import LeadershipKeeper
 from rce_master.master import Master
 from rce_master.store.etcd import EtcdClient
+from rce_master.store.etcd.exceptions import EtcdAwayError
 from rce_master.store.etcd.layout import prepare
 from rce_master.store.lock import FolderLock
 
@@ -122,14 +123,14 @@ class ReplicatedMaster:
                     keeping = group.create_task(keeper.keep())
                     await master.run(on_ready, waiting.aclose)
                     keeping.cancel()
-            except* FencedError as errors:
+            except* (FencedError, EtcdAwayError) as errors:
                 _log.warning("this master leads no more: %s", _first_of(errors))
             finally:
                 await keeper.step_down()
                 gc.unfreeze()
 
 
-def _first_of(errors: BaseExceptionGroup[FencedError]) -> BaseException:
+def _first_of(errors: BaseExceptionGroup[BaseException]) -> BaseException:
     first: BaseException = errors
     while isinstance(first, BaseExceptionGroup):
         first = first.exceptions[0]

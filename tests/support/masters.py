@@ -19,6 +19,8 @@ from support.ports import free_ports
 
 LOOPBACK = "127.0.0.1"
 DEV_USER = "testUser"
+MAX_WRITES = 120
+"""Of one writer in one test: a user may have 2000 tokens."""
 _FAILURES = (aiohttp.ClientError, TimeoutError, ConnectionError)
 
 
@@ -113,9 +115,9 @@ class Masters:
         )
 
     async def _write(self, writer: int) -> None:
-        used = writer
+        used, made = writer, 0
         async with self.session() as session:
-            while True:
+            while made < MAX_WRITES:
                 self._next += 1
                 robot = f"robot_{writer}_{self._next}"
                 url = self.all[used % len(self.all)].url
@@ -123,12 +125,13 @@ class Masters:
                     async with session.post(f"{url}api/v1/robot-tokens", json={"robot": robot}) as reply:
                         if reply.status == 201:
                             self.acknowledged.append(robot)
+                            made += 1
                         else:
                             assert reply.status == 503, (reply.status, await reply.text())
                             used += 1
                 except _FAILURES:
                     used += 1
-                await asyncio.sleep(0.02)
+                await asyncio.sleep(0.05)
 
     async def stored(self) -> set[str]:
         """Return the robots that have tokens."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import socket
 from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
 from aiohttp import web
 from support.etcd import LOOPBACK, cluster
+from support.masters import MasterProcess
 from support.ports import free_port
 
 from rce.tls.folder import CertificateFolder
@@ -89,6 +91,20 @@ async def test_a_prefix_of_another_program_or_release_is_left_alone(tmp_path: Pa
 async def test_an_etcd_with_its_default_limits_is_refused(tmp_path: Path) -> None:
     async with cluster(tmp_path / "etcd", 1, "--max-txn-ops", "128") as etcd:
         assert "start etcd with --max-txn-ops 4096" in await refusal(etcd.endpoints[0])
+
+
+@pytest.mark.needs("etcd")
+async def test_a_master_without_its_control_port_ends(tmp_path: Path) -> None:
+    """It is refused once it leads; it gives the lead back, so that another master takes it at once."""
+    async with cluster(tmp_path / "etcd") as etcd:
+        master = MasterProcess(tmp_path, "one", etcd.store, 5.0)
+        with socket.create_server((LOOPBACK, master.control_port)):
+            await master.start(ready="rce-master stand-by: ")
+            assert master.process is not None
+            assert await master.process.wait() == 1
+        assert "--control-port" in master.output().splitlines()[-1]
+        async with EtcdClient(etcd.endpoints, attempt=PATIENT_S) as client:
+            assert await EtcdStore(client, "/rce").leader() is None
 
 
 @pytest.mark.needs("etcd")
