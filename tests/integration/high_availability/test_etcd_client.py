@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from aiohttp import web
+from support.engine import until
 from support.etcd import LOOPBACK, cluster
 from support.masters import MasterProcess
 from support.ports import free_port
@@ -146,3 +147,13 @@ async def test_etcd_with_client_certificates(tmp_path: Path) -> None:
             with pytest.raises(EtcdAwayError):
                 await client.check_members()
         assert "etcds://" in await refusal(etcd.endpoints[0])
+        await check_master(tmp_path, f"etcds://{etcd.endpoints[0]}/own", "--certificates", str(folder.path))
+
+
+async def check_master(folder: Path, store: str, *options: str) -> None:
+    """Let a master take the lead, and give it back."""
+    master = MasterProcess(folder, "one", store, 5.0)
+    master.argv += options
+    await master.start(ready="rce-master ready: ")
+    assert (await until(master.health, what="it answers"))["role"] == "leader"
+    assert await master.stop() == 0
