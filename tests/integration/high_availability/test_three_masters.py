@@ -16,14 +16,17 @@ from support.masters import DEV_USER, MasterProcess, Masters, masters
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
+from rce.config import Secret
 from rce.control import decode_to_task_set, encode
-from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, Sync, TaskSetKind
+from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, Sync, TaskSetKind, ToTaskSet
+from rce.control_channel.channel import TaskSetChannel
 from rce_master.cli.client import ApiClient
 
 pytestmark = [pytest.mark.needs("etcd"), pytest.mark.asyncio(loop_scope="module")]
 
 LEASE_S = 4.0
-SECRET = {"Authorization": "Bearer a secret for the tests"}
+SECRET = "a secret for the tests"
+AUTHORIZATION = {"Authorization": f"Bearer {SECRET}"}
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
@@ -70,6 +73,27 @@ async def test_clients_with_all_addresses_find_the_leader(shared_masters: Master
         url = f"{leader.url}api/v1/packages/pkg/1.0.0"
         async with session.put(url, params=query, data=b"x") as reply:
             assert (reply.status, "takes none yet" in await reply.text()) == (409, True)
+
+
+async def test_a_task_set_finds_the_new_leader(shared_masters: Masters) -> None:
+    """It knows all masters, of which only the leader listens for task sets."""
+    syncs: asyncio.Queue[Sync] = asyncio.Queue()
+
+    async def take(message: ToTaskSet) -> None:
+        if isinstance(message, Sync):
+            syncs.put_nowait(message)
+
+    urls = ",".join(f"ws://127.0.0.1:{master.control_port}/" for master in shared_masters.all)
+    running = asyncio.create_task(TaskSetChannel(urls, Secret(SECRET), hello, take).run())
+    try:
+        await asyncio.wait_for(syncs.get(), 120)
+        leader = await shared_masters.leader()
+        assert await leader.stop() == 0
+        await asyncio.wait_for(syncs.get(), 120)
+        await restart(leader)
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
 
 
 async def agreed(shared_masters: Masters) -> dict[str, Any] | None:
@@ -120,7 +144,7 @@ async def test_a_stopped_leader_says_and_does_nothing_when_it_wakes(shared_maste
     control = f"ws://127.0.0.1:{leader.control_port}/"
     async with (
         shared_masters.session(60.0) as session,
-        connect(control, additional_headers=SECRET) as task_set,
+        connect(control, additional_headers=AUTHORIZATION) as task_set,
     ):
         async with session.get(f"{leader.url}api/v1/users") as reply:
             assert reply.status == 200  # the next request finds an open connection
@@ -185,7 +209,7 @@ async def status(session: aiohttp.ClientSession, method: str, url: str, body: ob
 async def handshake(url: str) -> bool:
     """Dial as a task set; return whether the master took it."""
     try:
-        async with connect(url, additional_headers=SECRET, open_timeout=60):
+        async with connect(url, additional_headers=AUTHORIZATION, open_timeout=60):
             return True
     except (InvalidHandshake, OSError, TimeoutError):
         return False
