@@ -9,6 +9,7 @@ from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING
 
 from rce.own_process import listening
+from rce.tls.choice import is_loopback
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_master.exceptions import FencedError, MasterError
@@ -77,6 +78,9 @@ class ReplicatedMaster:
         address = settings.etcd
         assert address is not None
         identity = settings.tls.own_identity() if address.tls else None
+        remote = [host for host in address.hosts if not is_loopback(host)]
+        if remote and identity is None:
+            _log.warning("the state travels in clear to etcd on %s: use etcds://", ", ".join(remote))
         lock = FolderLock(settings.state_dir)
         try:
             tls = None if identity is None else identity.client

@@ -35,6 +35,11 @@ class EtcdAddress:
     tls: bool = False
     """Whether to use TLS, with the certificate of this machine."""
 
+    @property
+    def hosts(self) -> tuple[str, ...]:
+        """The endpoints without their ports."""
+        return tuple(endpoint.rpartition(":")[0].strip("[]") for endpoint in self.endpoints)
+
     def __str__(self) -> str:
         return f"{'etcds' if self.tls else 'etcd'}://{','.join(self.endpoints)}{self.prefix}"
 

@@ -12,6 +12,7 @@ def test_an_address_of_etcd_has_endpoints_prefix_and_tls() -> None:
     found = read_store_address("etcds://a:1, b-c.example:2,[::1]:3/fleet/two/")
     assert found == EtcdAddress(("a:1", "b-c.example:2", "[::1]:3"), "/fleet/two", tls=True)
     assert read_store_address(str(found)) == found
+    assert found.hosts == ("a", "b-c.example", "::1")
 
 
 def test_an_address_of_sqlite_is_a_folder() -> None:
