@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
-from copy import copy
 from typing import TYPE_CHECKING, NamedTuple
 
 from aiohttp import web
@@ -19,13 +17,14 @@ from prometheus_client import (
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from rce.control import EndpointUsage, InterfaceUsage, NodeUsage, Usage
-from rce_master.http.views import Views
-from rce_master.state.lifecycle import ContainerPhase, RobotSession
+from rce.control import EndpointUsage, InterfaceUsage, NodeUsage
+from rce_master.http import metrics_pieces
+from rce_master.http.engine_metrics import EngineMetrics
+from rce_master.http.metrics_pieces import in_pieces, write_pieces
 from rce_master.state.records import Container, Endpoint
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 
     from prometheus_client.metrics_core import Metric
 
@@ -39,39 +38,35 @@ MAX_SERIES = 50_000
 """Series of containers, nodes and interfaces in one answer; further ones are counted, not listed."""
 
 
-PIECE = 250
-"""Series that are made or written between two turns of the event loop."""
-
-
 def make_answer(
     tables: Tables, book: UsageBook, password_checks: Callable[[], int]
 ) -> Callable[[], Awaitable[web.Response]]:
     """Return the function that answers a scrape."""
-    registry = make_registry(tables, book)
-    registry.register(_LoginCollector(password_checks))
-    consumption = Consumption(tables, book)
+    registry = make_registry(password_checks)
+    sources = (EngineMetrics(tables, book.newest), Consumption(tables, book))
     headers = {"Content-Type": CONTENT_TYPE_LATEST}
 
     async def answer() -> web.Response:
         parts = [generate_latest(registry)]
-        async for part in consumption.parts():
-            parts.append(part)
-            await asyncio.sleep(0)
+        for source in sources:
+            async for part in source.parts():
+                parts.append(part)
+                await asyncio.sleep(0)
         return web.Response(body=b"".join(parts), headers=headers)
 
     return answer
 
 
-def make_registry(tables: Tables, book: UsageBook) -> CollectorRegistry:
+def make_registry(password_checks: Callable[[], int]) -> CollectorRegistry:
     """Make a separate registry; the library's global one belongs to the embedding program.
 
-    :class:`Consumption` is not in it: it has too many series for one step.
+    What grows with the engine is not in it: a registry is written in one step.
     """
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
     PlatformCollector(registry=registry)
     GCCollector(registry=registry)
-    registry.register(EngineCollector(tables, book.newest))
+    registry.register(_LoginCollector(password_checks))
     return registry
 
 
@@ -85,100 +80,6 @@ class _LoginCollector(Collector):
         """Make all metrics."""
         text = "Unknown passwords that were hashed to check them."
         yield CounterMetricFamily("rce_password_checks", text, value=self._password_checks())
-
-
-class EngineCollector(Collector):
-    """Robots, containers, nodes, connections and task sets."""
-
-    def __init__(self, tables: Tables, usage: Mapping[str, Usage]) -> None:
-        self._tables = tables
-        self._usage = usage
-        self._views = Views(tables, usage)
-
-    def collect(self) -> Iterator[Metric]:
-        """Make all metrics."""
-        yield from self._states()
-        yield from self._connections()
-        yield from self._task_sets()
-
-    def _states(self) -> Iterator[Metric]:
-        tables = self._tables
-        sessions = Counter(tables.robot_live(robot.id).session for robot in tables.robots())
-        yield _gauge(
-            "rce_robots",
-            "Robots by session.",
-            "session",
-            {s.value: sessions[s] for s in RobotSession if s is not RobotSession.OFFLINE},
-        )
-        phases = Counter(tables.container_live(container.id).phase for container in tables.containers())
-        yield _gauge(
-            "rce_containers", "Containers by state.", "state", {p.value: phases[p] for p in ContainerPhase}
-        )
-        nodes = Counter(state for c in tables.containers() for state in self._views.node_states(c))
-        yield _gauge("rce_nodes", "Nodes by state.", "state", nodes)
-        yield GaugeMetricFamily("rce_users", "Users.", value=len(tables.users))
-        counted = {counter.name: counter.value for counter in tables.counters}
-        yield CounterMetricFamily(
-            "rce_revisions",
-            "Changes of desired state since the start.",
-            value=counted.get("revision", 0) - tables.first_revision,
-        )
-
-    def _connections(self) -> Iterator[Metric]:
-        connections = self._tables.connections
-        established = sum(map(self._views.is_established, connections))
-        values = {"established": established, "waiting": len(connections) - established}
-        yield _gauge("rce_connections", "Connections by state.", "state", values)
-
-    def _task_sets(self) -> Iterator[Metric]:
-        labels = ["process", "kind"]
-        connected = GaugeMetricFamily("rce_task_set_connected", "1 while connected.", labels=labels)
-        endpoints = GaugeMetricFamily("rce_task_set_endpoints", "Robots or containers there.", labels=labels)
-        cpu = CounterMetricFamily("rce_task_set_cpu_seconds", "CPU time.", labels=labels)
-        memory = GaugeMetricFamily("rce_task_set_memory_bytes", "Resident memory.", labels=labels)
-        held = GaugeMetricFamily(
-            "rce_task_set_held_bytes", "Of messages that wait or are incomplete.", labels=labels
-        )
-        shed = CounterMetricFamily(
-            "rce_task_set_shed", "Times that a user held too much and lost the oldest of it.", labels=labels
-        )
-        turned_away = CounterMetricFamily(
-            "rce_task_set_turned_away",
-            "Connections closed because too many did not say who they are.",
-            labels=labels,
-        )
-        for task_set in self._tables.task_sets:
-            shown = self._views.machine(task_set)
-            key = [shown.process, shown.kind]
-            connected.add_metric(key, shown.connected)
-            endpoints.add_metric(key, shown.endpoints)
-            cpu.add_metric(key, shown.cpu_s)
-            memory.add_metric(key, shown.memory_used)
-            if (usage := self._usage.get(task_set.process)) is not None:
-                held.add_metric(key, usage.held)
-                shed.add_metric(key, usage.shed)
-                turned_away.add_metric(key, usage.turned_away)
-        yield from (connected, endpoints, cpu, memory, held, shed, turned_away)
-
-
-class _Piece(NamedTuple):
-    """A part of a metric, in place of a registry."""
-
-    metric: Metric
-
-    def collect(self) -> tuple[Metric]:
-        """Return the part."""
-        return (self.metric,)
-
-
-def write_pieces(metric: Metric) -> Iterator[bytes]:
-    """Write a metric, at most :data:`PIECE` series at a time, with its description before the first ones."""
-    for begin in range(0, max(len(metric.samples), 1), PIECE):
-        part = copy(metric)
-        part.samples = metric.samples[begin : begin + PIECE]
-        text = generate_latest(_Piece(part))
-        lines = text.splitlines(keepends=True)
-        yield text if begin == 0 else b"".join(line for line in lines if not line.startswith(b"#"))
 
 
 class Consumption:
@@ -195,16 +96,13 @@ class Consumption:
         self._book = book
 
     async def parts(self) -> AsyncIterator[bytes]:
-        """Write all metrics, in parts of at most :data:`PIECE` series."""
+        """Write all metrics, in parts of at most :data:`~rce_master.http.metrics_pieces.PIECE` series."""
         families = _Families(MAX_SERIES)
         made = 0
-        for id_ in [endpoint.id for endpoint in self._tables.endpoints]:
-            if families.count - made >= PIECE:
+        async for endpoint in in_pieces(self._tables.endpoints):
+            if families.count - made >= metrics_pieces.PIECE:
                 made = families.count
                 await asyncio.sleep(0)
-            endpoint = self._tables.endpoints.get(id_)
-            if endpoint is None:
-                continue  # It was removed meanwhile.
             usage = self._usage_of(endpoint)
             if isinstance(endpoint, Container):
                 self._container(families, endpoint, usage)
@@ -340,10 +238,3 @@ def _machine(families: _Families, room: Room) -> None:
         text = f"What its containers are promised of {name}."
         families.gauge(f"rce_machine_promised_{name}", text, labels, promised)
     families.gauge("rce_machine_draining", "1 while it is being emptied.", labels, room.draining)
-
-
-def _gauge(name: str, help_: str, label: str, values: Mapping[str, int]) -> GaugeMetricFamily:
-    family = GaugeMetricFamily(name, help_, labels=[label])
-    for key, value in values.items():
-        family.add_metric([key], value)
-    return family
