@@ -125,6 +125,10 @@ class UnknownTaskError(TaskError):
     """There is no task, robot or other thing of this name."""
 
 
+class PlannerSilentError(TaskError):
+    """The planner has told nothing since the fleet manager began: try again."""
+
+
 class RevisionError(TaskError):
     """The task was changed after the requester read it; read it again."""
 

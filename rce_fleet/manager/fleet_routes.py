@@ -15,7 +15,7 @@ from rce_fleet.api.fleet import (
     RobotList,
 )
 from rce_fleet.api.tasks import HoldRequest
-from rce_fleet.exceptions import TaskRefusedError, UnknownTaskError
+from rce_fleet.exceptions import PlannerSilentError, TaskRefusedError, UnknownTaskError
 from rce_fleet.journal.journal import EventQuery
 from rce_fleet.manager.convert import read_profile, show_profile
 from rce_fleet.manager.goals import NO_ANSWER
@@ -93,10 +93,12 @@ async def set_goal(call: Call) -> FleetAnswer:
 
 
 def _robot(call: Call) -> str:
-    name = call.names[0]
-    if name not in call.manager.facts.robots and name not in call.manager.book.robots:
-        raise UnknownTaskError(f"there is no robot {name!r}")
-    return name
+    name, manager = call.names[0], call.manager
+    if name in manager.facts.robots or name in manager.book.robots:
+        return name
+    if manager.facts.grid is None:
+        raise PlannerSilentError("the planner has not told its robots yet; try again later")
+    raise UnknownTaskError(f"there is no robot {name!r}")
 
 
 def _entry(call: Call) -> tuple[str, RobotEntry]:

@@ -15,6 +15,7 @@ from rce_fleet.exceptions import (
     FleetError,
     JournalError,
     KeyReusedError,
+    PlannerSilentError,
     RevisionError,
     TaskRefusedError,
     TransitionError,
@@ -34,6 +35,7 @@ class BadRequestError(Exception):
 
 _STATUS: dict[type[Exception], int] = {
     UnknownTaskError: 404,
+    PlannerSilentError: 503,
     TaskRefusedError: 409,
     TransitionError: 409,
     KeyReusedError: 409,

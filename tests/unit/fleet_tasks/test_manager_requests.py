@@ -108,6 +108,20 @@ async def test_a_viewer_changes_nothing(client: ManagerClient) -> None:
     assert (await client.ask("GET", "/tasks", role="viewer"))[:2] == (200, {"tasks": [], "next": None})
 
 
+@pytest.mark.parametrize("path", ["/robots/Robot1", "/robots/Robot1/take-out", "/robots/Robot1/goal"])
+async def test_no_robot_is_denied_before_the_planner_has_told_its_robots(
+    client: ManagerClient, path: str
+) -> None:
+    """A fleet manager that was killed does not know yet which robots there are."""
+    grid, client.manager.facts.grid = client.manager.facts.grid, None
+    method = {"Robot1": "GET", "take-out": "POST", "goal": "PUT"}[path.rpartition("/")[2]]
+    body = {"cell": 3} if method == "PUT" else None
+    status, said, _ = await client.ask(method, path, body)
+    assert (status, said["error"]) == (503, "the planner has not told its robots yet; try again later")
+    client.manager.facts.grid = grid
+    assert (await client.ask(method, path, body))[0] == 404
+
+
 @pytest.mark.parametrize(
     ("method", "path", "body", "status"),
     [
