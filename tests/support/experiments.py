@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-TIMEOUT_S = 550.0
+TIMEOUT_S = 1500.0
 
 
 def command(*words: str | Path) -> list[str]:
