@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import re
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
@@ -27,6 +29,8 @@ pytestmark = pytest.mark.needs("roscpp_sensor_msgs", "rospy", "roslaunch")
 
 TIMEOUT_S = 120.0
 FEW = 4
+STAMP = re.compile(r"secs: *(\d+)")
+FIELD = re.compile(r"^\w+:", re.MULTILINE)
 """Messages of each topic that are printed."""
 
 
@@ -55,11 +59,15 @@ class Started:
     def samples(self) -> dict[str, list[tuple[int, ...]]]:
         return by_topic(reports(self.lines()), "0")
 
-    def messages(self) -> list[str]:
-        """What was printed, without sequence numbers: a listener's begin when it was connected."""
+    def messages(self) -> dict[tuple[str, ...], str]:
+        """What was printed of each message, by its fields and stamp.
+
+        Sequence numbers are left out: a listener's begin when it was connected.
+        """
         left_out = (READY, REPORT, "  seq: ")
         printed = [line for line in self.lines() if not line.startswith(left_out)]
-        return sorted("\n".join(printed).split("---"))
+        *texts, _ = "\n".join(printed).split("---")
+        return {(*STAMP.findall(text), *FIELD.findall(text)): text for text in texts}
 
 
 @contextlib.asynccontextmanager
@@ -120,10 +128,16 @@ async def test_programs_print_and_tell_as_those_in_python(tmp_path: Path) -> Non
         )
         sent = robots.samples() | camera.samples()
         assert sent.keys() == kinds.keys()
-        assert listener.messages() == reference.messages()
+        ours, theirs = listener.messages(), reference.messages()
+        both = ours.keys() & theirs.keys()  # a queue that is full on a busy machine loses some
+        by_kind = Counter(key[2:] for key in both)
+        assert len(by_kind) == len(kinds)
+        assert {key: ours[key] for key in both} == {key: theirs[key] for key in both}
         for found in (listener.samples(), reference.samples()):
-            assert {topic: [one[:1] for one in samples] for topic, samples in found.items()} == sent
-            assert all(stamp <= arrival for samples in found.values() for stamp, arrival in samples)
+            assert found.keys() == kinds.keys()
+            for topic, samples in found.items():
+                assert {one[:1] for one in samples} <= set(sent[topic])
+                assert all(stamp <= arrival for stamp, arrival in samples)
 
 
 async def measured(experiment: Experiment, options: Options) -> dict[str, list[float]]:
