@@ -224,7 +224,7 @@ class StateService:
             self._check_fence()
         except StoreError as error:
             if self._fence is not None and isinstance(error, FencedError):
-                raise  # the state ends with the leadership; nobody is answered from it
+                raise  # the state ends with the leadership; no request is answered from it
             _revert(done)
             # The next tick does what was left over: a store that fails is not asked again at once.
             self._is_unfinished = False

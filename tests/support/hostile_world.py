@@ -151,7 +151,7 @@ async def attack(
 
 
 class Bait:
-    """Sockets of the machine that nobody inside should reach, and a locked file.
+    """Sockets of the machine that an attacker inside must not reach, and a locked file.
 
     Its lock belongs to an open file, not to a process: the kernel tells of it in all namespaces.
     """
