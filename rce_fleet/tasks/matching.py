@@ -58,7 +58,7 @@ def cheapest_pairs(costs: NDArray[np.float64]) -> tuple[Ints, Ints]:
 def _forbidding(costs: NDArray[np.float64], pairs: int) -> float:
     """Return a cost so large that no allowed pair is given up to save other costs.
 
-    It is at most that, so that sums with it keep as many digits as possible.
+    It is not larger than needed, so that sums with it keep as many digits as possible.
     """
     least, greatest = float(costs.min()), float(costs.max())
     return greatest + (greatest - least + 1.0) * pairs
