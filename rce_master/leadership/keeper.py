@@ -135,7 +135,7 @@ class LeadershipKeeper:
         try:
             async with asyncio.timeout(max(0.0, self._remaining())):
                 ttl = await self._client.renew(self.lease)
-                # A renewal does not prove it: releases of etcd before 3.4.27 may renew a lease that has ended.
+                # A renewal does not prove it: etcd before 3.4.27 may renew a lease that has ended.
                 holds = await self._store.holds_lead()
         except TimeoutError:
             return False
