@@ -28,7 +28,10 @@ def test_what_a_killed_experiment_leaves_is_removed_by_the_next_one(tmp_path: Pa
     process = started(
         tmp_path / "one", "round-trip", "--quick", "--systems", "single_master", "--software", "rce"
     )
-    time.sleep(1.0)
+    deadline = time.monotonic() + TIMEOUT_S
+    while not left_behind(process.pid):
+        assert time.monotonic() < deadline, "it makes no machines"
+        time.sleep(0.05)
     process.kill()
     process.communicate()
     assert left_behind(process.pid) != []
