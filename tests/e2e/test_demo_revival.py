@@ -18,15 +18,22 @@ pytestmark = [pytest.mark.e2e]
 
 async def reaches(station: StationClient, robot: str, cell: int) -> None:
     """Send a robot to a cell, again until the planner knows of it, and wait until it stands there."""
-    async with asyncio.timeout(240):
-        while True:
-            with contextlib.suppress(StationError):
-                for one in (await station.fleet()).robots:
-                    if one.id == robot and one.goal != cell:
-                        await station.set_goal(robot, cell)
-                    if one.id == robot and one.cell == cell and one.state == "arrived":
-                        return
-            await asyncio.sleep(0.5)
+    seen: dict[str, object] = {}
+    try:
+        async with asyncio.timeout(240):
+            while True:
+                try:
+                    for one in (await station.fleet()).robots:
+                        seen[one.id] = one
+                        if one.id == robot and one.goal != cell:
+                            await station.set_goal(robot, cell)
+                        if one.id == robot and one.cell == cell and one.state == "arrived":
+                            return
+                except StationError as error:
+                    seen["refusal"] = error
+                await asyncio.sleep(0.5)
+    except TimeoutError:
+        raise AssertionError(f"{robot} does not reach cell {cell}: {seen}") from None
 
 
 async def knows_robots(station: StationClient, count: int) -> bool:
