@@ -66,7 +66,7 @@ class Started:
         """
         left_out = (READY, REPORT, "  seq: ")
         printed = [line for line in self.lines() if not line.startswith(left_out)]
-        *texts, _ = "\n".join(printed).split("---")
+        *texts, _ = ("\n" + "\n".join(printed)).split("---")
         return {(*STAMP.findall(text), *FIELD.findall(text)): text for text in texts}
 
 
