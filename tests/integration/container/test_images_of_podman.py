@@ -102,13 +102,17 @@ def vanish(before: set[str]) -> None:
 
 
 def traces() -> set[str]:
-    """What podman keeps of containers, and what is mounted but its store, which it mounts when it looks."""
+    """What podman keeps of containers, and what is mounted but its store, which it mounts when it looks.
+
+    Network namespaces count if podman named them: other tests make their own meanwhile.
+    """
     listing = ["podman", "ps", "--all", "--external", "--format", "{{.Names}}"]
     found = subprocess.run(listing, capture_output=True, text=True, check=True).stdout.split()
     mounts = Path("/proc/mounts").read_text().splitlines()
-    found += [line for line in mounts if not line.split()[1].endswith("/containers/storage/overlay")]
-    for folder in ("/run/crun", "/run/containers/storage/overlay-containers", "/run/netns"):
-        found += map(str, Path(folder).glob("*"))
+    others = ("/containers/storage/overlay", "/run/netns")
+    found += [line for line in mounts if not line.split()[1].endswith(others) and "/netns/rc" not in line]
+    for names in ("crun/*", "containers/storage/overlay-containers/*", "netns/netns-*"):
+        found += map(str, Path("/run").glob(names))
     return set(found)
 
 
