@@ -84,7 +84,10 @@ def experiment(
     ] = None,
     second: Annotated[
         list[Path] | None,
-        typer.Option(metavar="DIR", help="Raw data of a second run: the page compares both. Repeatable."),
+        typer.Option(
+            metavar="DIR|FILE",
+            help="Raw data of another run, or its summary.csv: the page compares both. Repeatable.",
+        ),
     ] = None,
 ) -> None:
     """Compare Single Master, Multi Master and Cloud Robotics System by experiments.

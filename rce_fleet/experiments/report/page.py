@@ -18,7 +18,7 @@ from rce_fleet.experiments.report.repeat import compare
 from rce_fleet.experiments.report.repeat_part import comparison_text
 from rce_fleet.experiments.report.schematics import schematics
 from rce_fleet.experiments.report.sections import LIMITS, LINK, READING, SECTIONS
-from rce_fleet.experiments.report.summary import summarize, write_summary
+from rce_fleet.experiments.report.summary import Summary, read_summary, summarize, write_summary
 from rce_fleet.experiments.report.tables import folded, metric_table, table_of, unlisted
 
 if TYPE_CHECKING:
@@ -42,7 +42,8 @@ def make_report(folders: Sequence[Path], *, page: Path, figures: Path, second: S
             experiment is in one of them.
         page: The page that is written.
         figures: Folder for figures and ``summary.csv``; made if it does not exist.
-        second: Folders with the raw data of a second full run, which is compared with the first one.
+        second: Folders with the raw data of another full run, or its ``summary.csv``, which is compared with
+            this one.
 
     Raises:
         OSError: A file cannot be read or written.
@@ -51,7 +52,7 @@ def make_report(folders: Sequence[Path], *, page: Path, figures: Path, second: S
     """
     parts = read_parts(folders)
     measurements = Measurements.of(rows_of(parts))
-    again = Measurements.of(rows_of(read_parts(second))) if second else None
+    again = _summaries(second) if second else None
     figures.mkdir(parents=True, exist_ok=True)
     write_summary(figures / SUMMARY, summarize(measurements))
     drawings = figures_of(measurements)
@@ -68,7 +69,7 @@ def page_text(
     environments: Mapping[str, Mapping[str, Any]],
     drawings: Mapping[str, Sequence[Drawing]],
     figures: str,
-    again: Measurements | None = None,
+    again: Sequence[Summary] | None = None,
 ) -> str:
     """Return the page.
 
@@ -77,7 +78,7 @@ def page_text(
         environments: What they depend on, by the heads of the table's columns.
         drawings: Figures by experiment.
         figures: Folder of the figures as the page links to it.
-        again: The raw data of a second full run.
+        again: The summary of another full run.
     """
     judgements = judge_all(measurements)
     parts = [
@@ -97,7 +98,7 @@ def page_text(
         parts += [f"## {section.title}", f"Experiment `{section.experiment}`. {section.text}"]
         parts += _section(measurements, section.experiment, drawings.get(section.experiment, ()), figures)
     parts += ["## Other data", _other(measurements)]
-    parts += ["## A second full run", _repeated(measurements, again)]
+    parts += ["## Another full run", _repeated(measurements, again)]
     parts += ["## Limits", LIMITS]
     return "\n\n".join(part.strip("\n") for part in parts if part) + "\n"
 
@@ -166,7 +167,15 @@ def _other(measurements: Measurements) -> str:
     return "\n\n".join(filter(None, parts)) or "None."
 
 
-def _repeated(measurements: Measurements, again: Measurements | None) -> str:
+def _repeated(measurements: Measurements, again: Sequence[Summary] | None) -> str:
     if again is None:
         return NOT_MEASURED
-    return comparison_text(compare(summarize(measurements), summarize(again)))
+    return comparison_text(compare(summarize(measurements), again))
+
+
+def _summaries(paths: Sequence[Path]) -> list[Summary]:
+    """Return the summary of another run, of folders with its raw data or of files that were kept of it."""
+    files = [path for path in paths if path.is_file()]
+    kept = [one for path in files for one in read_summary(path)]
+    parts = read_parts([path for path in paths if path not in files])
+    return kept + summarize(Measurements.of(rows_of(parts)))

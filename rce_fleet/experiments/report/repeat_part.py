@@ -1,4 +1,4 @@
-"""The part of the page that compares a second full run with the first one."""
+"""The part of the page that compares another full run with the first one."""
 
 from __future__ import annotations
 
