@@ -13,6 +13,7 @@ from rce_master.state.changes import Changes, Touched, make_row
 from rce_master.state.commands import Continue
 from rce_master.state.core import State
 from rce_master.state.migration import conversion
+from rce_master.store.copying import check_finished
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -329,9 +330,10 @@ async def load_converted(store: Store, term: int) -> Snapshot:
         term: The term of it in which the caller writes.
 
     Raises:
-        StoreError: It cannot be read or written.
+        StoreError: It cannot be read or written, or holds a part of a state only.
     """
     snapshot = await store.load()
+    check_finished(snapshot)
     rows = conversion(snapshot)
     if not rows:
         return snapshot

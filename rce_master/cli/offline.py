@@ -152,11 +152,9 @@ async def open_state(place: Path | EtcdAddress) -> AsyncIterator[OfflineState]:
     folder = find_state(place) if isinstance(place, Path) else settings.master_state
     async with AsyncExitStack() as stack:
         try:
-            if isinstance(place, Path):
-                store: Store = await SqliteStore.open(folder)
-                stack.push_async_callback(store.close)
-            else:
-                store = await stack.enter_async_context(_etcd_store(place, TlsChoice.of(settings)))
+            store = await stack.enter_async_context(
+                open_store(folder if isinstance(place, Path) else place, TlsChoice.of(settings))
+            )
             term = await store.begin_term()
         except StoreBusyError as error:
             raise CliError(f"{error}; to work over its API, log in there: rce login") from error
@@ -165,6 +163,26 @@ async def open_state(place: Path | EtcdAddress) -> AsyncIterator[OfflineState]:
         limits = state_settings(settings)
         state = State.load(await load_converted(store, term), time.monotonic(), settings=limits)
         yield OfflineState(state, store, term, audit, str(folder if isinstance(place, Path) else place))
+
+
+@asynccontextmanager
+async def open_store(place: Path | EtcdAddress, tls: TlsChoice) -> AsyncIterator[Store]:
+    """Open the store in a folder or in etcd.
+
+    Raises:
+        CliError: A certificate cannot be used.
+        StoreBusyError: A master runs on the folder.
+        StoreError: The store cannot be used.
+    """
+    if isinstance(place, Path):
+        store = await SqliteStore.open(place)
+        try:
+            yield store
+        finally:
+            await store.close()
+        return
+    async with _etcd_store(place, tls) as in_etcd:
+        yield in_etcd
 
 
 @asynccontextmanager

@@ -38,11 +38,14 @@ class Store(Protocol):
             StoreError: It cannot be read.
         """
 
-    async def begin_term(self) -> int:
+    async def begin_term(self, *, above: int = 0) -> int:
         """Take over: begin a new term, and end the term of the former writer.
 
+        Args:
+            above: A term of another store, whose rows are copied to this one.
+
         Returns:
-            The term, greater than all before; it survives a crash.
+            The term, greater than all before and than that; it survives a crash.
 
         Raises:
             StoreError: None was begun.

@@ -23,9 +23,9 @@ class MemoryStore:
         """Read everything."""
         return {name: dict(rows) for name, rows in self.tables.items()}
 
-    async def begin_term(self) -> int:
-        """Begin a new term."""
-        self._term += 1
+    async def begin_term(self, *, above: int = 0) -> int:
+        """Begin a new term, greater than another one too."""
+        self._term = max(self._term, above) + 1
         return self._term
 
     async def save(self, rows: Sequence[Row], term: int = 0) -> None:

@@ -30,7 +30,9 @@ CREATE TABLE record (
 _LEASE = """
 CREATE TABLE IF NOT EXISTS lease (one INTEGER PRIMARY KEY CHECK (one = 1), term INTEGER NOT NULL)
 """
-_NEXT_TERM = "INSERT INTO lease VALUES (1, 1) ON CONFLICT DO UPDATE SET term = term + 1"
+_NEXT_TERM = """
+INSERT INTO lease VALUES (1, 1 + :above) ON CONFLICT DO UPDATE SET term = max(term, :above) + 1
+"""
 _PUT = "INSERT INTO record (kind, key, body) VALUES (?, ?, ?) ON CONFLICT DO UPDATE SET body = excluded.body"
 _DELETE = "DELETE FROM record WHERE kind = ? AND key = ?"
 
@@ -78,15 +80,15 @@ class SqliteStore:
             raise StoreError(f"cannot read the store: {error}") from error
         return snapshot
 
-    async def begin_term(self) -> int:
-        """Begin a new term.
+    async def begin_term(self, *, above: int = 0) -> int:
+        """Begin a new term, greater than another one too.
 
         Raises:
             StoreError: None was begun.
         """
         self._check_that_it_is_there()
         try:
-            await self._database.execute(_NEXT_TERM)
+            await self._database.execute(_NEXT_TERM, {"above": above})
             await self._database.commit()
             return await self._newest_term()
         except sqlite3.Error as error:

@@ -17,7 +17,8 @@ async def check_round_trip(store: Store) -> None:
     assert await store.load() == {"users": {"b": b"4"}, "links": {"a": b"3"}}
 
 
-async def check_terms(store: Store) -> None:
+async def check_terms(store: Store) -> int:
+    """Check what a term allows; return the last one."""
     await store.save([Row("users", "a", b"1")])
     first = await store.begin_term()
     await store.save([Row("users", "a", b"2")], first)
@@ -27,6 +28,11 @@ async def check_terms(store: Store) -> None:
         await store.save([Row("users", "a", b"3")], first)
     await store.save([Row("users", "b", b"4")], second)
     assert await store.load() == {"users": {"a": b"2", "b": b"4"}}
+    third = await store.begin_term(above=second + 100)
+    assert third > second + 100
+    last = await store.begin_term(above=1)
+    assert last > third
+    return last
 
 
 async def check_snapshot(store: Store) -> None:

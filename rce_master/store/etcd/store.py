@@ -121,8 +121,8 @@ class EtcdStore:
         found = await self._client.get(self._keys.leader)
         return found is not None and found.created == self._led
 
-    async def begin_term(self) -> int:
-        """Begin a new term, and with a candidacy take the lead.
+    async def begin_term(self, *, above: int = 0) -> int:
+        """Begin a new term, greater than another one too, and with a candidacy take the lead.
 
         Raises:
             StoreBusyError: Another master leads.
@@ -137,7 +137,7 @@ class EtcdStore:
             if leader is not None and leader.created != self._led:
                 raise StoreBusyError(f"another master leads: {read_leader(leader).name}")
             try:
-                await self._try_term(mark, newest)
+                await self._try_term(mark, newest, above)
             except EtcdAwayError as error:
                 if not error.maybe_done:
                     raise
@@ -146,8 +146,8 @@ class EtcdStore:
     async def _read_leadership(self) -> Sequence[Record]:
         return (await self._client.range(self._keys.leadership)).records
 
-    async def _try_term(self, mark: str, newest: Record | None) -> None:
-        term = 1 if newest is None else read_term(newest) + 1
+    async def _try_term(self, mark: str, newest: Record | None, above: int) -> None:
+        term = max(above, 0 if newest is None else read_term(newest)) + 1
         conditions = [
             Condition(self._keys.term, Subject.MODIFIED, 0 if newest is None else newest.modified),
             Condition(self._keys.leader, Subject.CREATED, self._led),

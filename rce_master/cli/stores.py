@@ -1,0 +1,97 @@
+"""``rce master``: the state of masters that do not run, moved from one store to another."""
+
+from __future__ import annotations
+
+from contextlib import AsyncExitStack
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rce.config import (
+    STORE_FILE,
+    ConfigError,
+    EtcdAddress,
+    default_state_dir,
+    load_settings,
+    read_store_address,
+)
+from rce.tls.choice import TlsChoice
+from rce_master.cli.client import run
+from rce_master.cli.exceptions import CliError
+from rce_master.cli.offline import find_state, open_store
+from rce_master.exceptions import StoreBusyError
+from rce_master.state.tables import Tables
+from rce_master.state_service import load_converted
+from rce_master.store.copying import copy_rows
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rce_master.store import Snapshot
+
+_ADDRESS = "sqlite:FOLDER|etcd://HOST:2379,..."
+
+_SHOWN = 5
+"""Packages that a message names."""
+
+app = typer.Typer(no_args_is_help=True, help="Move the state of the master to another store.")
+
+
+@app.callback()
+def _root() -> None:
+    """Make typer ask for a command, though there is only one."""
+
+
+@app.command("copy")
+def copy(
+    source: Annotated[str, typer.Option("--from", metavar=_ADDRESS, help="The store that is copied.")],
+    target: Annotated[str, typer.Option("--to", metavar=_ADDRESS, help="The store that is filled.")],
+) -> None:
+    """Copy the state of a master to an empty store, while no master runs on either."""
+    run(_copy(source, target))
+
+
+async def _copy(source: str, target: str) -> None:
+    here, there = _read(source, "--from"), _read(target, "--to")
+    if here == there:
+        raise CliError("--from and --to name the same store")
+    if not isinstance(here, EtcdAddress) and not (here / STORE_FILE).exists():
+        raise CliError(f"--from names {here}, which holds no state: it has no {STORE_FILE}")
+    try:
+        tls = TlsChoice.of(load_settings(None))
+    except ConfigError as error:
+        raise CliError(str(error)) from error
+    async with AsyncExitStack() as stack:
+        try:
+            old = await stack.enter_async_context(open_store(here, tls))
+            term = await old.begin_term()
+            new = await stack.enter_async_context(open_store(there, tls))
+            snapshot = await load_converted(old, term)
+            if isinstance(there, EtcdAddress):
+                _check_packages(snapshot)
+            count = await copy_rows(snapshot, new, above=term)
+        except StoreBusyError as error:
+            raise CliError(f"{error}; the state is copied while no master runs") from error
+    typer.echo(f"copied {count} records to {there}; start no master on {here} any more")
+
+
+def _read(text: str, option: str) -> Path | EtcdAddress:
+    """Read the address of a store; return its folder, or that of etcd."""
+    try:
+        address = read_store_address(text)
+    except ValueError as error:
+        raise CliError(f"{option} {error}") from None
+    if isinstance(address, EtcdAddress):
+        return address
+    return find_state((address.folder or default_state_dir()).absolute())
+
+
+def _check_packages(snapshot: Snapshot) -> None:
+    """Refuse users' packages, which are files of one machine."""
+    names = sorted(snapshot.get(Tables().packages.name, {}))
+    if names:
+        shown = ", ".join([*names[:_SHOWN], *(["..."] if len(names) > _SHOWN else [])])
+        raise CliError(
+            f"users have packages ({shown}), which a master with a store in etcd cannot keep: remove them"
+            " first, with rce package remove"
+        )

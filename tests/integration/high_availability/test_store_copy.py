@@ -1,0 +1,82 @@
+"""``rce master copy``: a state moves from SQLite to a real etcd and back."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from support.etcd import cluster
+from support.master_program import rce
+
+from rce_master.state.tables import Tables
+from rce_master.store import Row, SqliteStore
+from rce_master.store.copying import UNFINISHED
+from rce_master.store.etcd import EtcdClient, EtcdStore
+from rce_master.store.etcd.layout import prepare
+from rce_master.store.etcd.store import Candidacy
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = [pytest.mark.needs("etcd")]
+
+MANY = 3000
+
+
+async def make_state(folder: Path) -> None:
+    """Make a state with a user, as rce user does it, and many rows more."""
+    await rce(
+        folder, "user", "add", "anna", "--password-stdin", "--state-dir", "state", text="secret\nsecret\n"
+    )
+    store = await SqliteStore.open(folder / "state" / "master")
+    rows = [Row("many", f"a b/{number}", b"x" * (number % 500)) for number in range(MANY)]
+    await store.save(rows, await store.begin_term())
+    await store.close()
+
+
+async def test_a_state_is_copied_to_etcd_and_back(tmp_path: Path) -> None:
+    await make_state(tmp_path)
+    async with cluster(tmp_path / "etcd") as etcd, EtcdClient(etcd.endpoints, attempt=20.0) as client:
+        there = f"{etcd.store}/one"
+        told = await rce(tmp_path, "master", "copy", "--from", "sqlite:state", "--to", there)
+        assert f"copied {MANY + 1} records to {there}; start no master on {tmp_path}/state" in told
+        in_etcd = EtcdStore(client, "/one")
+        copied = await in_etcd.load()
+        assert list(copied["users"]) == ["anna"]
+        assert len(copied["many"]) == MANY
+
+        told = await rce(tmp_path, "master", "copy", "--from", "sqlite:state", "--to", there, code=1)
+        assert "the target holds a state already (3000 many, 1 users)" in told
+        told = await rce(tmp_path, "master", "copy", "--from", "sqlite:nothing", "--to", there, code=1)
+        assert "nothing/master, which holds no state" in told
+        assert not (tmp_path / "nothing").exists()
+        told = await rce(tmp_path, "master", "copy", "--from", there, "--to", there, code=1)
+        assert "name the same store" in told
+        told = await rce(tmp_path, "master", "copy", "--from", "mysql://x", "--to", there, code=1)
+        assert "--from must be sqlite:FOLDER or etcd://" in told
+
+        await rce(tmp_path, "master", "copy", "--from", there, "--to", "sqlite:back")
+        back = await SqliteStore.open(tmp_path / "back" / "master")
+        assert {table: rows for table, rows in (await back.load()).items() if rows} == copied
+        assert await back.begin_term() > await in_etcd.begin_term()
+        await back.close()
+
+        lease, _ = await client.grant(60)
+        await EtcdStore(client, "/one", Candidacy(lease, "one:9000", lambda: 60.0)).begin_term()
+        told = await rce(tmp_path, "master", "copy", "--from", there, "--to", "sqlite:again", code=1)
+        assert "another master leads: one:9000; the state is copied while no master runs" in told
+
+
+async def test_packages_and_parts_of_a_state_are_refused(tmp_path: Path) -> None:
+    await make_state(tmp_path)
+    store = await SqliteStore.open(tmp_path / "state" / "master")
+    await store.save([Row(Tables().packages.name, "anna/tools", b"{}")], await store.begin_term())
+    await store.close()
+    async with cluster(tmp_path / "etcd") as etcd, EtcdClient(etcd.endpoints, attempt=20.0) as client:
+        told = await rce(tmp_path, "master", "copy", "--from", "sqlite:state", "--to", etcd.store, code=1)
+        assert "users have packages (anna/tools)" in told
+        await prepare(client, "/part")
+        await EtcdStore(client, "/part").save([Row(UNFINISHED, "mark", b"{}")])
+        there = f"{etcd.store}/part"
+        told = await rce(tmp_path, "master", "copy", "--from", there, "--to", "sqlite:part", code=1)
+        assert "a copy into this store was not finished" in told
