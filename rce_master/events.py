@@ -14,6 +14,11 @@ if TYPE_CHECKING:
     from rce_master.state.changes import StateEvent
 
 CAPACITY = 10_000
+IDS_OF_TERM = 10**10
+_FIRST_TERM = 1000
+"""So many terms are counted before the first one: its ids are greater than milliseconds since 1970."""
+GAP = "gap"
+"""Kind of an event that stands for those that a follower missed."""
 AT_ONCE = 100
 """Events that a follower gets at a time."""
 _COMPACT_AFTER = 64
@@ -43,6 +48,8 @@ class _UserLog:
     def __init__(self) -> None:
         self._events: list[Event] = []
         self._begin = 0
+        self.forgotten = -1
+        """Id of the newest event that was dropped."""
 
     def __len__(self) -> int:
         return len(self._events) - self._begin
@@ -53,6 +60,7 @@ class _UserLog:
 
     def forget_oldest(self) -> None:
         """Drop the oldest event."""
+        self.forgotten = self._events[self._begin].id
         self._begin += 1
         if self._begin > max(_COMPACT_AFTER, len(self)):
             del self._events[: self._begin]
@@ -71,14 +79,17 @@ class EventLog:
         start: Seconds since 1970. Event ids start at its milliseconds: so they increase across a restart, as
             long as fewer than a thousand events a second happen on average.
         capacity: How many events are kept.
+        term: Of the leadership, if other masters may lead: event ids start at a number of their own for each
+            term, since the clocks of machines differ. 0: there are no others.
     """
 
-    def __init__(self, start: float, capacity: int = CAPACITY) -> None:
+    def __init__(self, start: float, capacity: int = CAPACITY, *, term: int = 0) -> None:
         self._events: dict[str, _UserLog] = {}
         """By user."""
         self._count = 0
         self._capacity = capacity
-        self._next_id = int(start * 1000)
+        self._first_id = (_FIRST_TERM + term) * IDS_OF_TERM if term else int(start * 1000)
+        self._next_id = self._first_id
         self._news = asyncio.Event()
 
     @property
@@ -108,6 +119,18 @@ class EventLog:
         user = max(self._events, key=lambda user: len(self._events[user]))
         self._events[user].forget_oldest()
         self._count -= 1
+
+    def missed(self, id_: int, user: str | None = None) -> int | None:
+        """Return where a follower who resumes after an event goes on; None if no event is missing.
+
+        Args:
+            id_: The event, which may be one of the time before this master started or led.
+            user: Of this user only; None: of all.
+        """
+        logs = self._events.values() if user is None else filter(None, [self._events.get(user)])
+        start = self._first_id - 1
+        forgotten = max((log.forgotten for log in logs), default=start)
+        return max(id_, start) if id_ < max(start, forgotten) else None
 
     def wake(self) -> None:
         """Wake all followers, so that they check whether they may still follow."""

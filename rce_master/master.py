@@ -119,7 +119,7 @@ class Master:
                 " `rce user add NAME --admin %s`",
                 f"--state-dir {self._settings.state_dir}" if self._fence is None else "--store etcd://...",
             )
-        events = EventLog(time.time())
+        events = EventLog(time.time(), term=0 if self._fence is None else self._fence.term)
         state_service.listeners.append(lambda changes: _log_events(events, changes))
         reconciler = Reconciler(state_service)
         authenticator = Authenticator(

@@ -14,7 +14,7 @@ from msgspec.structs import asdict
 
 from rce.control import LogLevel, LogQuery, LogStream
 from rce.web.openapi import Query
-from rce_master.events import AT_ONCE, Event
+from rce_master.events import AT_ONCE, GAP, Event
 from rce_master.exceptions import InvalidRequestError
 from rce_master.http import models
 from rce_master.http.paging import MAX_ITEMS, PAGE
@@ -25,6 +25,7 @@ routes = route_table("stream")
 MAX_LOG = 1 << 20
 HEARTBEAT_S = 15.0
 E = TypeVar("E", bound=Enum)
+_GAP = "earlier events are not kept; read the present state"
 _EVENT_ID = re.compile(r"[0-9]{1,18}")
 
 
@@ -137,6 +138,8 @@ def _page(call: Call, scope: str | None) -> models.EventsOut:
     found = log.since(since, limit + 1, scope)
     has_more, found = len(found) > limit, found[:limit]
     shown = [event for event in found if event.time >= born and _concerns(call, event)]
+    if (gap := _gap(call, scope, since)) is not None:
+        shown.insert(0, gap)
     return models.EventsOut(
         events=[models.EventOut(**asdict(event)) for event in shown],
         newest=max(since, log.last_id),
@@ -156,8 +159,10 @@ async def _stream(call: Call, scope: str | None, last: int) -> web.StreamRespons
         headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     )
     await response.prepare(call.request)
-    await response.write(b": hello\n\n")
     events = call.services.events
+    gap = _gap(call, scope, last)
+    await response.write(b": hello\n\n" + (b"" if gap is None else _frame(gap)))
+    last = last if gap is None else gap.id
     clock = asyncio.get_running_loop().time
     written = clock()
     try:
@@ -184,6 +189,15 @@ def _start(call: Call) -> int:
     if _EVENT_ID.fullmatch(resumed):
         return int(resumed)
     return call.number("since", call.services.events.last_id)
+
+
+def _gap(call: Call, scope: str | None, last: int) -> Event | None:
+    """Return what stands for the events that a follower missed after an event; None if none are missing."""
+    missed = call.services.events.missed(last, scope) if last > 0 else None
+    if missed is None:
+        return None
+    user = scope or call.caller.name
+    return Event(id=missed, time=call.services.clock(), kind=GAP, user=user, subject=user, text=_GAP)
 
 
 def _concerns(call: Call, event: Event) -> bool:

@@ -21,6 +21,7 @@ from rce.control import EndpointUsage, InterfaceUsage, NodeUsage
 from rce_master.http import metrics_pieces
 from rce_master.http.engine_metrics import EngineMetrics
 from rce_master.http.metrics_pieces import in_pieces, write_pieces
+from rce_master.http.role_metrics import RoleCollector
 from rce_master.state.records import Container, Endpoint
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
     from prometheus_client.metrics_core import Metric
 
+    from rce_master.leadership import Fence
     from rce_master.state.placement import Room
     from rce_master.state.tables import Tables
     from rce_master.usage import UsageBook
@@ -39,10 +41,19 @@ MAX_SERIES = 50_000
 
 
 def make_answer(
-    tables: Tables, book: UsageBook, password_checks: Callable[[], int]
+    tables: Tables, book: UsageBook, password_checks: Callable[[], int], fence: Fence | None = None
 ) -> Callable[[], Awaitable[web.Response]]:
-    """Return the function that answers a scrape."""
+    """Return the function that answers a scrape.
+
+    Args:
+        tables: The state's tables.
+        book: What task sets told of consumption.
+        password_checks: Returns how many passwords were checked.
+        fence: Of this master's leadership, if there may be other masters.
+    """
     registry = make_registry(password_checks)
+    if fence is not None:
+        registry.register(RoleCollector(lambda: fence.term, leads=True))
     sources = (EngineMetrics(tables, book.newest), Consumption(tables, book))
     headers = {"Content-Type": CONTENT_TYPE_LATEST}
 

@@ -79,8 +79,8 @@ def _metrics(services: Services) -> Handler:
     def scraped() -> Callable[[], Awaitable[web.Response]]:
         from rce_master.http.metrics import make_answer  # only scraped masters spend this memory
 
-        checks = services.authenticator
-        return make_answer(services.state_service.tables, services.reconciler.book, lambda: checks.checks)
+        checks, tables = services.authenticator, services.state_service.tables
+        return make_answer(tables, services.reconciler.book, lambda: checks.checks, services.fence)
 
     async def handle(request: web.Request) -> web.Response:
         check_metrics(request, services)

@@ -54,8 +54,16 @@ async def test_one_leads_and_the_others_say_who(shared_masters: Masters) -> None
             async with session.get(f"{other.url}api/v1/users") as reply:
                 assert (reply.status, reply.headers["Retry-After"]) == (503, "1")
                 assert f"stand-by; {found['leader']} leads" in (await reply.json())["error"]
+            async with session.get(f"{other.url}metrics") as reply:
+                told = await reply.text()
+            assert "rce_master_leading 0.0" in told
+            assert f"rce_master_term {float(found['term'])}" in told
             with pytest.raises(OSError, match=r"Connect call failed|refused"):
                 await asyncio.open_connection("127.0.0.1", other.control_port)
+        async with session.get(f"{leader.url}metrics") as reply:
+            told = await reply.text()
+        assert "rce_master_leading 1.0" in told
+        assert f"rce_master_term {float(found['term'])}" in told
 
 
 async def test_clients_with_all_addresses_find_the_leader(shared_masters: Masters) -> None:

@@ -216,6 +216,10 @@ async def test_events_are_followed_and_resumed(site: Site) -> None:
     waiting = asyncio.ensure_future(read_events(site, 1, site.token, last=resumed[0]["id"]))
     await site.api("DELETE", "/containers/first", status=204)
     assert [e["kind"] for e in await waiting] == ["container_destroyed"]
+    late = await read_events(site, 4, site.token, last=5)
+    assert [e["kind"] for e in late[:2]] == ["gap", "user_added"]
+    assert 5 < late[0]["id"] < late[1]["id"] == everything[0]["id"]
+    assert late[1:] == everything
 
 
 async def test_user_does_not_see_a_predecessors_records(site: Site) -> None:

@@ -17,6 +17,30 @@ def test_ids_grow_over_a_restart() -> None:
     assert EventLog(1000.5).last_id > old.last_id
 
 
+def test_ids_grow_over_terms_whatever_the_clocks_say() -> None:
+    alone = EventLog(1.8e9)
+    first, second = EventLog(1.8e9, term=1), EventLog(1.7e9, term=2)
+    first.add(state_event("x"), 1.8e9)
+    assert alone.last_id < first.last_id < second.last_id < 2**53, "JSON numbers are exact up to there"
+    second.add(state_event("y"), 1.7e9)
+    assert [event.text for event in second.since(first.last_id)] == ["y"]
+
+
+def test_what_a_follower_missed_is_known() -> None:
+    log = EventLog(1.0, capacity=3)
+    assert log.missed(999) is None
+    assert log.missed(5) == 999, "it is an id of the time before"
+    log.add(StateEvent("kind", "bert", "bert/c", "first"), 1.0)
+    for number in range(4):
+        log.add(state_event(str(number)), 1.0)
+    assert [event.text for event in log.since(999)] == ["first", "2", "3"]
+    assert log.missed(1001) == log.missed(1001, "anna") == 1001
+    assert log.missed(5, "anna") == 999
+    assert log.missed(1002, "anna") is None
+    assert log.missed(999, "bert") is None
+    assert log.missed(999, "carl") is None
+
+
 def test_the_ring_keeps_the_newest() -> None:
     log = EventLog(0.0, capacity=3)
     for number in range(5):
