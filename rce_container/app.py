@@ -17,6 +17,7 @@ from rce.control import MachineInfo, VolumeLimit
 from rce.control_channel.channel import TaskSetChannel
 from rce.control_channel.contents import ContentClient
 from rce.control_channel.dialing import RunDialer
+from rce.control_channel.terms import Terms
 from rce.link import LinkAcceptor, in_url, is_any, listen_on, own_address
 from rce.masters import Masters, split_addresses
 from rce.model import MEMORY_PER_SLOT
@@ -157,7 +158,10 @@ class App:
                     library=library,
                     dialer=RunDialer(masters, self.secret, tls=tls),
                 )
-                channel = TaskSetChannel(masters, self.secret, manager.hello, manager.handle, tls=tls)
+                terms = Terms(state.term, state.keep_term)
+                channel = TaskSetChannel(
+                    masters, self.secret, manager.hello, manager.handle, tls=tls, terms=terms
+                )
                 await _manage(manager, channel, quitting.of(manager), lambda: ready(name, runtime.name))
 
     def _masters(self, tls: Context | None) -> Masters:

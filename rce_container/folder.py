@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import logging
 import os
 import re
 import secrets
@@ -25,6 +26,8 @@ from rce_container.archive import LOG_DAYS, LOG_SPACE, LogArchive
 from rce_container.environment import proc
 from rce_container.exceptions import StateBusyError, StateError
 from rce_container.files import remove, write_whole
+
+_log = logging.getLogger(__name__)
 
 _INCARNATION_ID = re.compile(r"[0-9a-f]{12}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}")
@@ -241,6 +244,25 @@ class StateFolder:
                 )
             self._keep(self._state / "name", requested)
         return self._word("name", f"container-{secrets.token_hex(4)}")
+
+    @property
+    def term(self) -> int:
+        """The newest term of leadership that a task set saw with this state directory; 0: none.
+
+        Raises:
+            StateError: The file cannot be read, or holds no number.
+        """
+        text = self._word("term", "0")
+        if not text.isdecimal():
+            raise StateError(f"{self._state / 'term'} must hold a number, found {text!r:.40}; remove it")
+        return int(text)
+
+    def keep_term(self, term: int) -> None:
+        """Keep the newest term of leadership, if that can be written."""
+        try:
+            self._keep(self._state / "term", str(term))
+        except StateError as error:
+            _log.warning("the term %d is forgotten when this program ends: %s", term, error)
 
     @property
     def token(self) -> str:

@@ -18,6 +18,7 @@ from rce.control import (
     Login,
     LoginReply,
     PatchStatus,
+    PeerRefusedError,
     RequestFault,
     SpecWanted,
     Status,
@@ -28,6 +29,7 @@ from rce.control import (
 from rce_master import requests
 from rce_master.audit import AuditLog, describe
 from rce_master.exceptions import (
+    FencedError,
     ForbiddenError,
     MasterError,
     RefusedError,
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine
 
     from rce_master.auth import Authenticator
+    from rce_master.leadership import Fence
     from rce_master.reconciler import Peer, Reconciler
     from rce_master.state_service import Outcome, StateService
 
@@ -55,6 +58,9 @@ MAX_TOGETHER = 200
 """Commands of one request that are done in one batch; other requests run between the batches."""
 MAX_LOGINS = 4096
 """Concurrent logins; beyond it robots are told to try later. A delayed login blocks no other work."""
+
+MAX_TERMS_AHEAD = 1_000_000
+"""A task set that has seen a term so far ahead is not believed: terms must not run out."""
 
 _UNAUTHORIZED, _FORBIDDEN, _CONFLICT, _TOO_MANY, _UNAVAILABLE = 401, 403, 409, 429, 503
 
@@ -84,8 +90,10 @@ class ControlHandler:
         tokens: Tokens | None = None,
         quotas: Quotas | None = None,
         audit: AuditLog | None = None,
+        fence: Fence | None = None,
     ) -> None:
         self._audit = audit
+        self._fence = fence
         self._tokens = Tokens(state_service.tables) if tokens is None else tokens
         self._state_service = state_service
         self._reconciler = reconciler
@@ -101,7 +109,13 @@ class ControlHandler:
             await asyncio.Event().wait()
 
     async def on_hello(self, peer: Peer, hello: Hello) -> None:
-        """Handle a task set that connected."""
+        """Handle a task set that connected.
+
+        Raises:
+            PeerRefusedError: It has seen a newer term of leadership.
+        """
+        if self._fence is not None:
+            _check_term(self._fence, hello.term)
         await self._reconciler.on_hello(peer, hello)
 
     async def on_gone(self, peer: Peer) -> None:
@@ -277,3 +291,20 @@ class ControlHandler:
 def _fault_of(command: commands.Request, error: MasterError) -> RequestFault:
     code = error.code.value if isinstance(error, RefusedError) else ""
     return RequestFault(code=code, ids=requests.ids_of(command))
+
+
+def _check_term(fence: Fence, term: int) -> None:
+    """Refuse a task set that has seen a newer term; this master steps down then.
+
+    Raises:
+        PeerRefusedError: It has.
+    """
+    if term > fence.term + MAX_TERMS_AHEAD:
+        raise PeerRefusedError(
+            f"this task set says that term {term} has begun, which is not believed in term {fence.term};"
+            " remove the file term from its state folder"
+        )
+    try:
+        fence.heed(term)
+    except FencedError as error:
+        raise PeerRefusedError(str(error)) from error

@@ -131,7 +131,9 @@ class Master:
         tokens = Tokens(state_service.tables)
         quotas = Quotas(self._settings.quotas)
         audit = AuditLog(self._settings.state_dir / "audit", time.time)
-        control_handler = ControlHandler(state_service, reconciler, authenticator, tokens, quotas, audit)
+        control_handler = ControlHandler(
+            state_service, reconciler, authenticator, tokens, quotas, audit, self._fence
+        )
         lifetime = self._settings.token_lifetime
         self._contents = ContentStore(self._settings.state_dir / "bundles")
         packages = PackageService(state_service, self._contents)
@@ -204,6 +206,7 @@ class Master:
             on_execution=services.executions.arrived,
             features=(PATCHES, TYPED_REQUESTS),
             is_fenced=None if fence is None else lambda: fence.is_closed,
+            term=0 if fence is None else fence.term,
         )
         http = HttpServer(app, settings.bind, settings.http_port, for_clients.server if for_clients else None)
         if for_clients is None or for_task_sets is None:

@@ -116,6 +116,8 @@ class Hello(_Message, frozen=True, kw_only=True, omit_defaults=True):
     features: tuple[str, ...] = ()
     """What this task set can do that one of an earlier release could not, such as
     :data:`rce.control.execution.FEATURE`."""
+    term: int = 0
+    """The newest term of leadership that it has seen; 0: none."""
 
 
 class Status(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -237,6 +239,9 @@ class Welcome(_Message, frozen=True, kw_only=True, omit_defaults=True):
     master: str
     features: tuple[str, ...] = ()
     """What this master can do that one of an earlier release could not."""
+    term: int = 0
+    """The term of leadership in which everything on this connection is said; 0: there are no other masters. A
+    task set that has seen a greater one does not take it."""
 
 
 class Refused(_Message, frozen=True, kw_only=True, omit_defaults=True):

@@ -14,6 +14,7 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, TypeVar, assert_never
 
 import msgspec
+from msgspec.structs import replace
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
@@ -43,6 +44,7 @@ from rce.control import (
     decode_to_task_set,
     encode,
 )
+from rce.control_channel.terms import Terms
 from rce.control_channel.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, MAX_TEXT, ControlTimeouts
 from rce.dialing import open_url_socket
 from rce.masters import Masters
@@ -69,6 +71,10 @@ class _RefusedError(Exception):
     """The master refused the connection."""
 
 
+class _OldTermError(Exception):
+    """The master leads no more, and does not know it."""
+
+
 class _Pending:
     """A request that waits for its answer."""
 
@@ -89,6 +95,7 @@ class TaskSetChannel:
             while the master is dialed again so that it says everything again.
         timeouts: Times of this end.
         tls: Gives the TLS context for each connection to a ``wss://`` URL.
+        terms: Remembers the newest term of leadership, so that no master of an older one is listened to.
     """
 
     def __init__(
@@ -100,7 +107,9 @@ class TaskSetChannel:
         *,
         timeouts: ControlTimeouts = DEFAULT_TIMEOUTS,
         tls: Context | None = None,
+        terms: Terms | None = None,
     ) -> None:
+        self._terms = terms or Terms()
         self._masters = url if isinstance(url, Masters) else Masters(url)
         self._url = self._masters.current
         self._tls = tls
@@ -276,6 +285,8 @@ class TaskSetChannel:
         except _RefusedError as error:
             _log.error("the master at %s refuses this task set: %s", self._url, error)
             return self._timeouts.backoff_refused
+        except _OldTermError as error:
+            _log.warning("the master at %s leads no more: %s", self._url, error)
         except (OSError, TimeoutError, WebSocketException, CertificateError) as error:
             self._tell(error)
         if self._handler_failed:  # it may fail again, so not at once
@@ -303,7 +314,7 @@ class TaskSetChannel:
                 writer = tasks.create_task(self._write(socket, outbox))
                 await self._read(socket)
                 writer.cancel()
-        except* (ConnectionClosed, _RefusedError) as group:
+        except* (ConnectionClosed, _RefusedError, _OldTermError) as group:
             failure = group.exceptions[0]
         finally:
             self._socket = self._outbox = None
@@ -315,7 +326,8 @@ class TaskSetChannel:
 
     async def _write(self, socket: ClientConnection, outbox: asyncio.Queue[str]) -> None:
         # Hello is made in the same step in which sending begins to count, so no change falls between the two.
-        first = [encode(self._hello()), *(pending.text for pending in self._pending.values())]
+        hello = replace(self._hello(), term=self._terms.newest)
+        first = [encode(hello), *(pending.text for pending in self._pending.values())]
         while not outbox.empty():
             outbox.get_nowait()
         for text in first:
@@ -338,6 +350,8 @@ class TaskSetChannel:
             case Unknown(name=name):
                 _log.info("the master sent a %s, which this release does not know", name)
             case Welcome():
+                if not self._terms.accept(message.term):
+                    raise _OldTermError(f"its term is {message.term}, and {self._terms.newest} has begun")
                 _log.info("connected to master %s at %s", message.master, self._url)
                 self._pauses.reset()
                 self._told = ""

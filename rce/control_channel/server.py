@@ -90,6 +90,7 @@ class ControlServer:
         on_execution: Takes a connection that a task set dialed for a run (:mod:`rce.control.execution`), and
             returns when it is done with it.
         is_fenced: Tells that another master may lead by now. Then nothing is sent to task sets any more.
+        term: The term of leadership in which this master talks; 0: there are no other masters.
     """
 
     def __init__(
@@ -109,8 +110,10 @@ class ControlServer:
         on_execution: Callable[[str, ServerConnection], Awaitable[None]] | None = None,
         features: tuple[str, ...] = (),
         is_fenced: Callable[[], bool] | None = None,
+        term: int = 0,
     ) -> None:
         self._is_fenced = is_fenced
+        self._term = term
         self._features = features
         self._secret = secret
         self._tls = tls
@@ -276,7 +279,10 @@ class ControlServer:
             peer.finished.set()
 
     async def _introduce(self, peer: Peer, socket: ServerConnection) -> None:
-        peer.send(Welcome(version=CONTROL_VERSION, master=self._master, features=self._features))
+        welcome = Welcome(
+            version=CONTROL_VERSION, master=self._master, features=self._features, term=self._term
+        )
+        peer.send(welcome)
         try:
             await self._on_hello(peer, peer.hello)
         except PeerRefusedError as error:

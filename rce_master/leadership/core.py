@@ -97,6 +97,7 @@ class LeadershipCore:
         role: The present role.
         term: The term in which it leads, or led last; 0: none.
         deadline: Time until which it may act as the leader; of use while it leads only.
+        heard: The newest term that a task set has seen; the next term must be greater.
     """
 
     def __init__(self, settings: LeaseSettings) -> None:
@@ -104,6 +105,7 @@ class LeadershipCore:
         self._machine = LEADERSHIP_LIFE.start(Role.STANDBY)
         self.term = 0
         self.deadline = 0.0
+        self.heard = 0
         self._renew_at = 0.0
 
     @property
@@ -155,6 +157,11 @@ class LeadershipCore:
         """Lead no more, for a reason other than the deadline: a newer term, a key that was removed."""
         if self.role is Role.LEADING:
             self._machine.advance(LeadershipEvent.LOST)
+
+    def overtaken(self, term: int) -> None:
+        """Hear of a newer term: another master leads, or etcd was restored from an older copy."""
+        self.heard = max(self.heard, term)
+        self.lost()
 
     def resigned(self) -> None:
         """Begin to hand over, unless the lead was lost already."""
@@ -217,3 +224,13 @@ class Fence:
         """
         if self.is_closed:
             raise FencedError("this master leads no more; ask the one that leads now")
+
+    def heed(self, term: int) -> None:
+        """Step down if a task set has seen a newer term.
+
+        Raises:
+            FencedError: It has.
+        """
+        if term > self.term:
+            self._core.overtaken(term)
+            raise FencedError(f"this master leads in term {self.term}, and term {term} has begun")

@@ -99,7 +99,7 @@ class LeadershipKeeper:
         store = EtcdStore(self._client, self._prefix, Candidacy(self.lease, self._name, self._remaining))
         try:
             async with asyncio.timeout(max(0.0, self._remaining())):
-                term = await store.begin_term()
+                term = await store.begin_term(above=self.core.heard)
             self.core.elected(term, self._clock())
         except StoreBusyError:
             _log.info("another master was faster to take the lead")

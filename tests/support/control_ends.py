@@ -48,7 +48,7 @@ QUICK = ControlTimeouts(
 class Master:
     """A master that answers and remembers."""
 
-    def __init__(self, port: int = 0, timeouts: ControlTimeouts = QUICK) -> None:
+    def __init__(self, port: int = 0, timeouts: ControlTimeouts = QUICK, *, term: int = 0) -> None:
         self.hellos: asyncio.Queue[tuple[Peer, Hello]] = asyncio.Queue()
         self.messages: asyncio.Queue[ToMaster] = asyncio.Queue()
         self.gone: asyncio.Queue[Peer] = asyncio.Queue()
@@ -63,6 +63,7 @@ class Master:
             on_gone=self.on_gone,
             port=port,
             timeouts=timeouts,
+            term=term,
         )
 
     async def on_hello(self, peer: Peer, hello: Hello) -> None:

@@ -32,6 +32,7 @@ from rce.control.messages import (
     encode,
 )
 from rce.control_channel.channel import TaskSetChannel
+from rce.control_channel.terms import Terms
 from rce.control_channel.timeouts import ControlTimeouts
 from rce.masters import Masters
 
@@ -164,6 +165,32 @@ async def test_of_several_masters_the_next_is_dialed_when_one_is_away() -> None:
             assert second.hellos.empty()
             await stack.aclose()
             await second.hellos.get()
+
+
+async def test_a_master_of_an_older_term_is_not_listened_to(caplog: pytest.LogCaptureFixture) -> None:
+    """It leads no more, and says things that are not so any more."""
+    old, new = Master(term=4), Master(term=5)
+    kept: list[int] = []
+    async with old.server, contextlib.AsyncExitStack() as stack:
+        await stack.enter_async_context(new.server)
+        urls = [f"ws://127.0.0.1:{master.server.port}" for master in (new, old)]
+        robots = TaskSet(new.server.port)
+        robots.channel = TaskSetChannel(
+            Masters(urls), SECRET, hello, robots.handle, timeouts=QUICK, terms=Terms(3, kept.append)
+        )
+        async with robots.running(), asyncio.timeout(30):
+            _, first = await new.hellos.get()
+            assert first.term == 3
+            while not isinstance(await robots.told.get(), Sync):
+                pass
+            await stack.aclose()
+            _, second = await old.hellos.get()
+            assert second.term == 5
+            while "leads no more: its term is 4, and 5 has begun" not in caplog.text:
+                await asyncio.sleep(0.01)
+            assert not robots.channel.connected
+            assert robots.told.empty()
+    assert kept == [5]
 
 
 async def test_same_name_again_replaces_the_older_connection() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import aiohttp
 import pytest
 import pytest_asyncio
+from msgspec.structs import replace
 from support.engine import until
 from support.etcd import Cluster, cluster
 from support.masters import DEV_USER, MasterProcess, Masters, masters
@@ -18,8 +19,18 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from rce.config import Secret
 from rce.control import decode_to_task_set, encode
-from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, Sync, TaskSetKind, ToTaskSet
+from rce.control.messages import (
+    CONTROL_VERSION,
+    Hello,
+    MachineInfo,
+    Refused,
+    Sync,
+    TaskSetKind,
+    ToTaskSet,
+    Welcome,
+)
 from rce.control_channel.channel import TaskSetChannel
+from rce.control_channel.terms import Terms
 from rce_master.cli.client import ApiClient
 
 pytestmark = [pytest.mark.needs("etcd"), pytest.mark.asyncio(loop_scope="module")]
@@ -197,6 +208,38 @@ async def test_nothing_acknowledged_is_lost_when_etcds_leader_is_killed(
         await member.start(etcd.members)
         await shared_masters.wait_for_writes(20)
     await shared_masters.check_nothing_is_lost()
+
+
+async def test_the_term_grows_above_what_a_task_set_has_seen(shared_masters: Masters) -> None:
+    """As after etcd was restored from an older copy: else the task set would listen to no master."""
+    term = (await (await shared_masters.leader()).health())["term"]
+    seen = asyncio.Queue[int]()
+
+    async def take(message: ToTaskSet) -> None:
+        if isinstance(message, Welcome):
+            seen.put_nowait(message.term)
+
+    urls = ",".join(f"ws://127.0.0.1:{master.control_port}/" for master in shared_masters.all)
+    terms = Terms(term + 100)
+    running = asyncio.create_task(TaskSetChannel(urls, Secret(SECRET), hello, take, terms=terms).run())
+    try:
+        new = await asyncio.wait_for(seen.get(), 120)
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+    assert new > term + 100
+    assert terms.newest == new
+
+
+async def test_a_term_far_ahead_is_not_believed(shared_masters: Masters) -> None:
+    leader = await shared_masters.leader()
+    control = f"ws://127.0.0.1:{leader.control_port}/"
+    async with connect(control, additional_headers=AUTHORIZATION) as task_set:
+        await task_set.send(encode(replace(hello(), term=10**12)))
+        refusal = decode_to_task_set(await task_set.recv())
+    assert isinstance(refusal, Refused)
+    assert "which is not believed" in refusal.reason
+    assert (await leader.health())["role"] == "leader"
 
 
 def hello() -> Hello:

@@ -22,6 +22,17 @@ def test_the_name_is_kept(tmp_path: Path) -> None:
             state.name("a b")
 
 
+def test_the_newest_term_is_kept(tmp_path: Path) -> None:
+    with StateFolder(tmp_path / "state", tmp_path / "run") as state:
+        assert state.term == 0
+        state.keep_term(12)
+    with StateFolder(tmp_path / "state", tmp_path / "run") as state:
+        assert state.term == 12
+        (tmp_path / "state" / "term").write_text("newest")
+        with pytest.raises(StateError, match="term must hold a number, found 'newest'"):
+            _ = state.term
+
+
 def test_one_task_set_at_a_time(tmp_path: Path) -> None:
     with (
         StateFolder(tmp_path / "state", tmp_path / "run"),

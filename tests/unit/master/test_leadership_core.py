@@ -114,6 +114,18 @@ def test_a_fence_is_of_one_term_only() -> None:
         fence.check()
 
 
+def test_a_leader_that_hears_of_a_newer_term_steps_down() -> None:
+    core = leading(at=100.0, term=4)
+    fence = Fence(core, lambda: 100.2, "one:9000")
+    for term in (0, 3, 4):
+        fence.heed(term)
+    fence.check()
+    with pytest.raises(FencedError, match="leads in term 4, and term 9 has begun"):
+        fence.heed(9)
+    assert fence.is_closed
+    assert core.heard == 9, "the next term is greater"
+
+
 @given(st.lists(st.tuples(st.sampled_from(["renew", "late", "look"]), st.floats(0, 5)), max_size=30))
 def test_no_order_of_events_extends_a_lease_beyond_etcds(events: list[tuple[str, float]]) -> None:
     """Etcd keeps the lease for its whole time from when it got the request, which is after it was sent."""
