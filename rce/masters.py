@@ -8,9 +8,39 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 
+_MAX_PORT = 65535
+
+
 def split_addresses(text: str) -> tuple[str, ...]:
     """Return the addresses in a text that separates them by commas."""
     return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def split_port(address: str, default: int) -> tuple[str, int]:
+    """Return host and port of ``HOST``, ``HOST:PORT``, ``ADDRESS`` or ``[ADDRESS]:PORT``.
+
+    Args:
+        address: The text; an IPv6 address with a port is in brackets.
+        default: The port, if the text names none.
+
+    Raises:
+        ValueError: What should be a port is none.
+
+    Example:
+        >>> split_port("[::1]:8081", 8080)
+        ('::1', 8081)
+    """
+    host, separator, port = address.rpartition(":")
+    if address.startswith("["):
+        host, _, rest = address[1:].partition("]")
+        separator, port = rest[:1], rest[1:]
+    elif ":" in host or not separator:  # an IPv6 address, or a host alone
+        return address, default
+    if not separator and not port:
+        return host, default
+    if separator != ":" or not port.isascii() or not port.isdecimal() or not 0 < int(port) <= _MAX_PORT:
+        raise ValueError(f"must be HOST or HOST:PORT, found {address!r:.60}")
+    return host, int(port)
 
 
 class Masters:

@@ -19,7 +19,7 @@ from rce.control_channel.contents import ContentClient
 from rce.control_channel.dialing import RunDialer
 from rce.control_channel.terms import Terms
 from rce.link import LinkAcceptor, in_url, is_any, listen_on, own_address
-from rce.masters import Masters, split_addresses
+from rce.masters import Masters, split_addresses, split_port
 from rce.model import MEMORY_PER_SLOT
 from rce.own_process import end_signals, listening, machine_memory
 from rce.ros.packages import PackageIndex, installed_shares
@@ -142,9 +142,8 @@ class App:
                 library = await asyncio.to_thread(self._library, state, masters, tls)
                 reach = self.host
                 if is_any(reach):
-                    reach = await own_address(
-                        split_addresses(self.master)[0], self.control_port, quitting.told
-                    )
+                    first = split_port(split_addresses(self.master)[0], self.control_port)
+                    reach = await own_address(*first, quitting.told)
                 manager = Manager(
                     name=name,
                     info=_machine(self.settings, offers, limiter, detail, limit),
@@ -166,8 +165,8 @@ class App:
 
     def _masters(self, tls: Context | None) -> Masters:
         scheme = "ws" if tls is None else "wss"
-        hosts = split_addresses(self.master)
-        return Masters(f"{scheme}://{in_url(host)}:{self.control_port}" for host in hosts)
+        places = (split_port(address, self.control_port) for address in split_addresses(self.master))
+        return Masters(f"{scheme}://{in_url(host)}:{port}" for host, port in places)
 
     def _library(self, state: StateFolder, masters: Masters, tls: Context | None) -> Library:
         """Return the source of the packages that users bring. Blocks."""

@@ -17,7 +17,7 @@ from rce_master.leadership import LeaseSettings
 from rce_master.leadership.keeper import LeadershipKeeper
 from rce_master.master import Master
 from rce_master.store.etcd import EtcdClient
-from rce_master.store.etcd.exceptions import EtcdAwayError
+from rce_master.store.etcd.exceptions import EtcdAwayError, NoQuorumError
 from rce_master.store.etcd.layout import prepare
 from rce_master.store.lock import FolderLock
 
@@ -34,6 +34,9 @@ _log = logging.getLogger(__name__)
 
 START_S = 5.0
 """How long a member of etcd may take for an answer when this program starts."""
+START_TIMEOUT_S = 20.0
+"""How long this program waits at its start until enough members of etcd answer."""
+_PAUSE_S = 0.5
 _ATTEMPTS = 4
 """Requests to members of etcd, one after the other, in the time of a lease."""
 
@@ -85,7 +88,7 @@ class ReplicatedMaster:
         try:
             tls = None if identity is None else identity.client
             async with EtcdClient(address.endpoints, tls=tls, attempt=START_S) as client:
-                await prepare(client, address.prefix)
+                await _prepare(client, address.prefix)
             attempt = settings.lease / _ATTEMPTS
             async with EtcdClient(address.endpoints, tls=tls, attempt=attempt) as client:
                 lease = LeaseSettings(ttl=settings.lease)
@@ -132,6 +135,24 @@ class ReplicatedMaster:
             finally:
                 await keeper.step_down()
                 gc.unfreeze()
+
+
+async def _prepare(client: EtcdClient, prefix: str) -> None:
+    """Prepare etcd, which may be starting at the same time as this program."""
+    clock = asyncio.get_running_loop().time
+    end = clock() + START_TIMEOUT_S
+    level = logging.WARNING
+    while True:
+        try:
+            await prepare(client, prefix)
+        except (EtcdAwayError, NoQuorumError) as error:
+            if clock() >= end:
+                raise
+            _log.log(level, "%s; trying again for %.0f s", error, end - clock())
+            level = logging.DEBUG
+        else:
+            return
+        await asyncio.sleep(_PAUSE_S)
 
 
 def _first_of(errors: BaseExceptionGroup[BaseException]) -> BaseException:

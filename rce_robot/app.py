@@ -18,7 +18,7 @@ from rce.control_channel.channel import TaskSetChannel
 from rce.guard import Lobby
 from rce.link import LinkHub, in_url, is_any, listen_on, own_address, remove_stale_sockets, socket_name
 from rce.lookups import LOOKUPS
-from rce.masters import Masters, split_addresses
+from rce.masters import Masters, split_addresses, split_port
 from rce.own_process import end_signals, listening, machine_memory
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
@@ -44,7 +44,7 @@ class App:
     """A robot task set that is to be run."""
 
     master: str
-    """Host of the master; several are separated by commas."""
+    """Host of the master, or ``HOST:PORT``; several are separated by commas."""
     control_port: int
     secret: Secret
     packages: Sequence[Path]
@@ -71,6 +71,11 @@ class App:
             gc.freeze()
             await stop.wait()
 
+    @property
+    def _places(self) -> list[tuple[str, int]]:
+        """Host and control port of each master."""
+        return [split_port(address, self.control_port) for address in split_addresses(self.master)]
+
     @contextlib.asynccontextmanager
     async def started(
         self, ready: Callable[[str], None], stop: asyncio.Event | None = None
@@ -86,7 +91,7 @@ class App:
         machine = settings.machine or socket.gethostname()
         reach = settings.public_host or settings.host
         if is_any(reach):
-            reach = await own_address(split_addresses(self.master)[0], self.control_port, stop)
+            reach = await own_address(*self._places[0], stop)
         name = f"robot_{secrets.token_hex(4)}"
         packages = _package_index(self.packages)
         types = TypeRegistry(packages)
@@ -119,9 +124,8 @@ class App:
                 pool=pool,
             )
             scheme = "wss" if for_task_sets else "ws"
-            hosts = split_addresses(self.master)
             channel = TaskSetChannel(
-                Masters(f"{scheme}://{in_url(host)}:{self.control_port}" for host in hosts),
+                Masters(f"{scheme}://{in_url(host)}:{port}" for host, port in self._places),
                 self.secret,
                 task_set.hello,
                 task_set.handle,

@@ -28,7 +28,7 @@ from msgspec.structs import fields as struct_fields
 from rce.config.documents import join
 from rce.config.exceptions import Fault
 from rce.config.store_address import read_store_address
-from rce.masters import split_addresses
+from rce.masters import split_addresses, split_port
 from rce.model import read_cores, read_memory, write_memory
 
 _WORDS = {
@@ -278,7 +278,7 @@ def _read_host(value: Any) -> Any:
 
 def _read_hosts(value: Any) -> Any:
     for host in split_addresses(value) if isinstance(value, str) else [value]:
-        _read_host(host)
+        _read_host(split_port(host, 1)[0] if isinstance(host, str) else host)
     return value
 
 
@@ -327,7 +327,7 @@ def _same(value: Any) -> Any:
 
 Host = Annotated[str, Reader(_read_host, _same, "HOST")]
 """A host name or an IP address; empty for none."""
-Hosts = Annotated[str, Reader(_read_hosts, _same, "HOST")]
+Hosts = Annotated[str, Reader(_read_hosts, _same, "HOST[:PORT],...")]
 """As :data:`Host`, or several, separated by commas."""
 Store = Annotated[str, Reader(_read_store, _same, "STORE")]
 """Where the master's state is, as :func:`rce.config.store_address.read_store_address` reads it."""

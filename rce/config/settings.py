@@ -20,7 +20,7 @@ from rce.config.folders import MASTER_FOLDER, default_state_dir, master_folder
 from rce.config.master_settings import ANYWHERE, MasterSettings
 from rce.config.store_address import SqliteAddress, read_store_address
 from rce.config.task_set_settings import ContainerSettings, RobotSettings, Runtime
-from rce.masters import split_addresses
+from rce.masters import split_addresses, split_port
 
 __all__ = [
     "ANYWHERE",
@@ -117,7 +117,8 @@ class EngineSettings(Section, frozen=True, kw_only=True):
     master_host: Annotated[
         Hosts,
         Setting(
-            "Where robot and container task sets find the master; several by commas, used in turn.",
+            "Where robot and container task sets find the master; several by commas, used in turn; with"
+            " their control ports, or with `control_port` of the section `master`.",
             option="",
             unset="the argument MASTER_IP; 127.0.0.1 with `rce up`",
             example="10.0.0.1",
@@ -170,9 +171,10 @@ class EngineSettings(Section, frozen=True, kw_only=True):
     @property
     def control_url(self) -> str:
         """The URL at which task sets dial the master, the first of several."""
-        host = (*split_addresses(self.master_host), LOOPBACK)[0]
+        first = (*split_addresses(self.master_host), LOOPBACK)[0]
+        host, port = split_port(first, self.master.control_port)
         scheme = "wss" if self.tls.enabled else "ws"
-        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.master.control_port}"
+        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
 
     @property
     def near_host(self) -> str:

@@ -9,7 +9,7 @@ import socket
 from typing import TYPE_CHECKING
 
 from rce.lookups import LOOKUPS
-from rce.masters import split_addresses
+from rce.masters import split_addresses, split_port
 from rce.tls.faults import CertificateError
 
 if TYPE_CHECKING:
@@ -65,7 +65,8 @@ def ensure(settings: EngineSettings, full_name: str) -> str:
     from rce.tls.folder import CertificateFolder  # takes 10 MB, which only engines with TLS spend
 
     binds = (settings.master.bind, settings.robot.bind, settings.container.bind)
-    named = (*split_addresses(settings.master_host), settings.robot.public_host or "", *binds)
+    masters = [split_port(address, 0)[0] for address in split_addresses(settings.master_host)]
+    named = (*masters, settings.robot.public_host or "", *binds)
     folder = CertificateFolder(settings.certificates.absolute())
     return folder.ensure(settings.tls.name, own_hosts((full_name, *named)))
 

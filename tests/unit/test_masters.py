@@ -7,7 +7,7 @@ import pytest
 from rce.config.client import ClientConfig
 from rce.config.exceptions import ConfigError
 from rce.config.loading import read_document
-from rce.masters import Masters, split_addresses
+from rce.masters import Masters, split_addresses, split_port
 
 
 def test_one_address_is_used_for_good() -> None:
@@ -41,6 +41,27 @@ def test_no_address_is_refused(nothing: str | tuple[str, ...]) -> None:
     assert split_addresses(" , ") == ()
 
 
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("one", ("one", 8080)),
+        ("one:81", ("one", 81)),
+        ("10.0.0.1:65535", ("10.0.0.1", 65535)),
+        ("::1", ("::1", 8080)),
+        ("[::1]", ("::1", 8080)),
+        ("[fe80::1]:81", ("fe80::1", 81)),
+    ],
+)
+def test_an_address_may_have_a_port(text: str, expected: tuple[str, int]) -> None:
+    assert split_port(text, 8080) == expected
+
+
+@pytest.mark.parametrize("text", ["one:", "one:x", "one:0", "one:65536", "[::1]8", "[::1]:", "one:\u0661"])
+def test_a_port_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="must be HOST or HOST:PORT"):
+        split_port(text, 8080)
+
+
 def config(url: object) -> ClientConfig:
     return ClientConfig.model_validate({"url": url, "userID": "u", "robotID": "r"})
 
@@ -56,5 +77,8 @@ def test_a_clients_file_names_one_or_several_masters() -> None:
 
 def test_task_sets_settings_name_one_or_several_masters() -> None:
     assert read_document({"master_host": "one,10.0.0.2"}, "file")["master_host"] == "one,10.0.0.2"
+    assert read_document({"master_host": "one:81,[::1]:82"}, "file")["master_host"] == "one:81,[::1]:82"
+    with pytest.raises(ConfigError, match="must be HOST or HOST:PORT"):
+        read_document({"master_host": "one:port"}, "file")
     with pytest.raises(ConfigError, match="must be a host name"):
         read_document({"master_host": "one,t!wo"}, "file")

@@ -14,7 +14,7 @@ import aiohttp
 from rce.tls import explain_to_client
 from rce_master.exceptions import StoreError
 from rce_master.store.etcd import wire
-from rce_master.store.etcd.exceptions import EtcdAwayError, EtcdRefusedError
+from rce_master.store.etcd.exceptions import EtcdAwayError, EtcdRefusedError, NoQuorumError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -114,7 +114,7 @@ class EtcdClient:
         try:
             await self.get("/")
         except EtcdAwayError as error:
-            raise StoreError(
+            raise NoQuorumError(
                 f"etcd has no quorum: more than half of its members must run and reach each other ({error})."
                 " If they are lost for good, restore a snapshot: etcdctl snapshot restore"
             ) from error

@@ -6,6 +6,7 @@
     +-- EtcdError
         +-- EtcdRefusedError     etcd refused a request and did nothing
         +-- EtcdAwayError        no member of etcd answered
+        +-- NoQuorumError        members answer, but too few for a majority
 """
 
 from __future__ import annotations
@@ -52,6 +53,10 @@ class EtcdRefusedError(EtcdError):
         if not hint and self.fault.code in (_DENIED, _NOT_AUTHENTICATED):
             hint = _CERTIFICATE_HINT
         return f"etcd at {self.endpoint} refused: {text}" + (f"; {hint}" if hint else "")
+
+
+class NoQuorumError(EtcdError):
+    """Members of etcd answer, but too few for a majority."""
 
 
 class EtcdAwayError(EtcdError):
