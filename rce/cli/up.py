@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 from msgspec.structs import replace
 
+from rce.cli.replicas import Replicas, ReplicasError
 from rce.cli.settings import SettingsOptions
 from rce.config import (
     EngineSettings,
@@ -50,10 +51,16 @@ def up(
     bind: Annotated[
         str | None, typer.Option(metavar="HOST", help="Address that all programs listen on.")
     ] = None,
+    replicas: Annotated[
+        int,
+        typer.Option(metavar="N", help="Run 3 or 5 masters and their etcd, to try how one fails."),
+    ] = 1,
 ) -> None:
     """Run an engine: master, robot and container task sets."""
     try:
-        plan(settings if bind is None else bound_to(bind, settings)).hand_over()
+        plan(settings if bind is None else bound_to(bind, settings), replicas).hand_over()
+    except ReplicasError as error:
+        raise typer.BadParameter(str(error)) from None
     except OSError as error:
         typer.echo(f"rce up: {error}", err=True)
         raise typer.Exit(1) from error
@@ -77,10 +84,15 @@ def bound_to(bind: str, settings: EngineSettings) -> EngineSettings:
     )
 
 
-def plan(settings: EngineSettings) -> Plan:
+def plan(settings: EngineSettings, replicas: int = 1) -> Plan:
     """Return the programs to run and the lines to print.
 
+    Args:
+        settings: The engine's settings.
+        replicas: How many masters; several keep the state in an etcd, which is run too.
+
     Raises:
+        ReplicasError: So many masters cannot be run.
         typer.BadParameter: The state is to be in etcd.
     """
     if isinstance(read_store_address(settings.master.store), EtcdAddress):
@@ -88,19 +100,20 @@ def plan(settings: EngineSettings) -> Plan:
             "rce up keeps the state on this machine; for a state in etcd start rce-master, rce-robot and"
             " rce-container by themselves (docs/how-to/three-masters.md)"
         )
-    ready = [f"RCE ready: {settings.http_url}"]
+    masters = None if replicas == 1 else Replicas(settings, replicas)
+    ready = [f"RCE ready: {settings.http_url if masters is None else masters.http_urls}"]
     certified = {}
     if settings.tls.enabled:
         ready.append(
             f"RCE authority (clients need this file): {settings.certificates.absolute()}/authority.pem"
         )
         certified = _document(settings)
-    text = warning(settings)
+    texts = (warning(settings), None if masters is None else masters.warning)
     return Plan(
-        programs=tuple(programs(settings)),
+        programs=tuple(programs(settings, masters)),
         shared=SHARED,
         ready=tuple(ready),
-        warnings=(f"[up] {text}",) if text else (),
+        warnings=tuple(f"[up] {text}" for text in texts if text),
         certified=certified,
     )
 
@@ -114,10 +127,19 @@ def warning(settings: EngineSettings) -> str | None:
     )
 
 
-def programs(settings: EngineSettings) -> Iterable[Program]:
-    """Return the engine's programs in start order; each gets all settings as one document."""
+def programs(settings: EngineSettings, masters: Replicas | None = None) -> Iterable[Program]:
+    """Return the engine's programs in start order; each gets all settings as one document.
+
+    Args:
+        settings: The engine's settings.
+        masters: Several masters in place of one.
+    """
     document = _document(settings)
-    yield _program("master", "rce_master", document)
+    if masters is None:
+        yield _program("master", "rce_master", document)
+    else:
+        document["master_host"] = masters.master_host
+        yield from masters.programs(document)
     robot = settings.robot
     link_port = ROBOT_LINK_PORT if robot.link_port is None else robot.link_port
     for index in range(robot.count):

@@ -17,7 +17,7 @@ from rce.supervision.title import set_title
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A program to keep running. It prints a line holding ``ready:`` once it can be used."""
+    """A program to keep running."""
 
     name: str
     argv: Sequence[str]
@@ -28,11 +28,16 @@ class Program:
     module: str = ""
     """The Python package that :attr:`argv` runs, if the program may be a fork of its supervisor: its
     ``__main__`` has a function ``main`` that takes no arguments, and reads ``sys.argv``."""
+    ready: str = " ready: "
+    """Part of the line that it prints once it can be used."""
 
     @classmethod
-    def of(cls, name: str, module: str, *arguments: str, env: Mapping[str, str]) -> Program:
+    def of(
+        cls, name: str, module: str, *arguments: str, env: Mapping[str, str], ready: str = " ready: "
+    ) -> Program:
         """Return a program that is a Python package of the engine."""
-        return cls(name, [sys.executable, "-P", "-m", module, *arguments], env, module=module)
+        argv = [sys.executable, "-P", "-m", module, *arguments]
+        return cls(name, argv, env, module=module, ready=ready)
 
     @property
     def arguments(self) -> Sequence[str]:

@@ -106,7 +106,7 @@ class Supervisor:
     async def _keep(self, program: Program, ready: asyncio.Event) -> None:
         def take_line(line: str) -> None:
             self._show(f"[{program.name}] {line}")
-            if " ready: " in line:
+            if program.ready in line:
                 ready.set()
 
         def on_end(code: int, pause: float | None) -> bool:
