@@ -25,6 +25,7 @@ from rce_master.events import EventLog
 from rce_master.exceptions import MasterError
 from rce_master.executions import Executions
 from rce_master.http.entry import Entry, refusal
+from rce_master.http.forwarded import PURPOSE, ForwardingKey
 from rce_master.http.routes import Services
 from rce_master.packages.contents import ContentStore
 from rce_master.packages.service import PackageService
@@ -152,6 +153,7 @@ class Master:
             dev=self._settings.dev,
             audit=audit,
             fence=self._fence,
+            forwarding=ForwardingKey(self._secret.derive(PURPOSE)),
         )
         try:
             async with asyncio.TaskGroup() as group:
@@ -182,7 +184,7 @@ class Master:
         if settings.dev:
             await make_dev_user(services)
         for_clients, for_task_sets = settings.tls.for_clients(), settings.tls.for_task_sets()
-        names = ServerNames(settings.bind, settings.public_names)
+        names = ServerNames(settings.bind, settings.names)
         entry = Entry(services.state_service.tables, asyncio.get_running_loop().time)
 
         def load() -> Callable[[], web.Application]:

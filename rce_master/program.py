@@ -76,6 +76,7 @@ def _settings(engine: EngineSettings) -> MasterSettings:
         state_dir=engine.master_state,
         etcd=address if isinstance(address, EtcdAddress) else None,
         lease=own.lease,
+        advertise=own.advertise,
         name=f"{machine}:{own.http_port}",
         dev=engine.dev,
         tls=TlsChoice.of(engine),

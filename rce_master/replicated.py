@@ -8,11 +8,15 @@ import logging
 from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING
 
+from rce.config.store_address import ETCD_PORT
+from rce.guard import TrustedProxies
+from rce.link.address import in_url, is_any, own_address
 from rce.own_process import listening
 from rce.tls.choice import is_loopback
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_master.exceptions import FencedError, MasterError
+from rce_master.http.forwarded import PURPOSE, ForwardingKey
 from rce_master.leadership import LeaseSettings
 from rce_master.leadership.keeper import LeadershipKeeper
 from rce_master.master import Master
@@ -27,6 +31,7 @@ if TYPE_CHECKING:
     from argon2 import PasswordHasher
 
     from rce.config import Secret
+    from rce_master.http.forward import Forwarder
     from rce_master.master import RunningMaster
     from rce_master.settings import MasterSettings
 
@@ -108,10 +113,11 @@ class ReplicatedMaster:
 
         settings = self._settings
         for_clients = settings.tls.for_clients()
-        names = ServerNames(settings.bind, settings.public_names)
+        names = ServerNames(settings.bind, settings.names)
         async with AsyncExitStack() as waiting:
+            forwarder = await waiting.enter_async_context(self._forwarder())
             server = HttpServer(
-                make_standby_app(keeper, names),
+                make_standby_app(keeper, forwarder, names, settings.allowed_origins),
                 settings.bind,
                 settings.http_port,
                 for_clients.server if for_clients else None,
@@ -121,6 +127,7 @@ class ReplicatedMaster:
                     await waiting.enter_async_context(server)
             except OSError as error:
                 raise MasterError(str(error)) from error
+            keeper.url = await self._own_url(server.url)
             on_standby(server.url)
             store, fence = await keeper.acquire()
             _log.info("this master leads in term %d", fence.term)
@@ -135,6 +142,29 @@ class ReplicatedMaster:
             finally:
                 await keeper.step_down()
                 gc.unfreeze()
+
+    def _forwarder(self) -> Forwarder:
+        from rce_master.http.forward import Forwarder  # loads aiohttp
+
+        tls = self._settings.tls
+        context = tls.own_identity().client if tls.enabled and tls.certificate is None else None
+        key = ForwardingKey(self._secret.derive(PURPOSE))
+        return Forwarder(key, TrustedProxies(self._settings.trusted_proxies), context)
+
+    async def _own_url(self, url: str) -> str:
+        """Return the URL of this machine's HTTP server for the other masters.
+
+        Args:
+            url: The same for programs on this machine.
+        """
+        settings = self._settings
+        assert settings.etcd is not None
+        host = settings.advertise or settings.bind
+        if is_any(host):
+            others = [one for one in settings.etcd.hosts if not is_loopback(one)]
+            host = await own_address((*others, *settings.etcd.hosts)[0], ETCD_PORT)
+        scheme, port = url.partition("://")[0], url.rstrip("/").rpartition(":")[2]
+        return f"{scheme}://{in_url(host)}:{port}/"
 
 
 async def _prepare(client: EtcdClient, prefix: str) -> None:

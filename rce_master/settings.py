@@ -31,6 +31,8 @@ class MasterSettings:
     """Where the state is; None: in an SQLite file in the state folder."""
     lease: float = 3.0
     """Seconds that the lead lasts without a renewal."""
+    advertise: str = ""
+    """Host by which other masters reach this one; empty: the address on the way to etcd, or ``bind``."""
     name: str = ""
     """This master's name among several, such as ``machine1:9000``."""
     dev: bool = False
@@ -46,6 +48,11 @@ class MasterSettings:
     quotas: QuotaSettings = field(default_factory=QuotaSettings)
     """The quotas of one user."""
     state: StateSettings = field(default_factory=StateSettings)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All host names of the server that are allowed beside its own."""
+        return (*self.public_names, *((self.advertise,) if self.advertise else ()))
 
 
 def state_settings(engine: EngineSettings) -> StateSettings:

@@ -35,6 +35,14 @@ class MasterSettings(Section, frozen=True, kw_only=True):
         Meta(ge=2, le=60),
         Setting("Seconds; with etcd: how long a leading master that fell silent keeps the lead."),
     ] = 3.0
+    advertise: Annotated[
+        Host,
+        Setting(
+            "With etcd: host name or address by which the other masters reach this one, to forward requests.",
+            unset="`bind`, or the address on the way to etcd",
+            example="10.0.0.1",
+        ),
+    ] = ""
     origins: Annotated[
         tuple[str, ...],
         Setting("Origins whose web pages may use the server.", option="allow-origin"),

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 from aiohttp import hdrs, web
 
 from rce_master.exceptions import ForbiddenError, WrongCredentialsError
+from rce_master.http.forwarded import HEADER
 from rce_master.state.records import FLEET_SCOPE, METRICS_SCOPE, Token, User, UserRole
 
 if TYPE_CHECKING:
     from rce_master.http.routes import Route, Services
 
 
+_FORWARDED = ("X-Forwarded-For", "X-Real-IP", "Forwarded", "Via", HEADER)
 _GOOD_FOR = {FLEET_SCOPE: "operator stations"}
 
 
@@ -90,7 +92,7 @@ def _token(request: web.Request) -> str:
 
 
 def _is_local(request: web.Request) -> bool:
-    if any(name in request.headers for name in ("X-Forwarded-For", "X-Real-IP", "Forwarded", "Via")):
+    if any(name in request.headers for name in _FORWARDED):
         return False
     peer = request.transport.get_extra_info("peername") if request.transport else None
     return peer is not None and ipaddress.ip_address(peer[0].partition("%")[0]).is_loopback

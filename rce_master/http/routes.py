@@ -12,6 +12,7 @@ from rce.guard import TrustedProxies
 from rce.web import routes
 from rce.web.openapi import Query
 from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError, WrongCredentialsError
+from rce_master.http.forwarded import HEADER, ForwardingKey
 from rce_master.state.records import User, UserRole
 
 if TYPE_CHECKING:
@@ -62,6 +63,8 @@ class Services:
     proxies: TrustedProxies = field(default_factory=TrustedProxies)
     fence: Fence | None = None
     """Tells whether this master leads; None if there is no other one."""
+    forwarding: ForwardingKey | None = None
+    """Of the stand-bys that forward requests to this master; None if there are none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +82,12 @@ class Call:
 
     @property
     def address(self) -> str:
-        """The address of the request, as reported by trusted proxies."""
+        """The address of the request, as reported by a stand-by or by trusted proxies."""
+        services = self.services
+        if services.fence is not None and services.forwarding is not None:
+            told = services.forwarding.read(self.request.headers.get(HEADER, ""), services.fence.term)
+            if told is not None:
+                return told
         transport = self.request.transport
         peer = None if transport is None else transport.get_extra_info("peername")
         return self.services.proxies.origin(peer, self.request.headers.getall("X-Forwarded-For", ()))

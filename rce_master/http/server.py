@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from aiohttp import hdrs, web
 
 from rce.web.openapi import PREFIX
-from rce.web.origin import ServerNames, is_foreign
+from rce.web.origin import ServerNames
 from rce_master.exceptions import (
     AuthError,
     FencedError,
@@ -25,6 +25,7 @@ from rce_master.exceptions import (
 from rce_master.http.access import check_metrics
 from rce_master.http.health import Health
 from rce_master.http.late import LateApi
+from rce_master.http.origin_guard import origin_guard
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
@@ -52,7 +53,7 @@ def make_app(
             ``https://fleet.example.org``; pages of the server itself always may.
         names: The allowed host names of the server.
     """
-    guard = _origin_guard(frozenset(allowed_origins), names or ServerNames())
+    guard = origin_guard(frozenset(allowed_origins), names or ServerNames())
     inner = [] if services.fence is None else [_fencing(services.fence)]
     app = web.Application(middlewares=[guard, _errors, *inner], client_max_size=MAX_BODY)
     app.router.add_get("/", _at_entry(entry))
@@ -90,25 +91,6 @@ def _metrics(services: Services) -> Handler:
 
 
 # Middleware of all routes
-
-
-def _origin_guard(allowed: frozenset[str], names: ServerNames) -> Any:
-    @web.middleware
-    async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse requests of other sites' pages, which a browser would send from the user's network."""
-        origin, host = request.headers.get(hdrs.ORIGIN), request.headers.get(hdrs.HOST, "")
-        # Robots ask for their endpoint by any name of this server: the answer is not secret.
-        refusal = None if origin is None and request.path == "/" else names.refusal(host)
-        if refusal is not None and origin not in allowed:
-            return _error(421, refusal)
-        if is_foreign(origin, host, allowed):
-            return _error(403, f"origin {origin} may not use this server")
-        response = await handler(request)
-        if origin in allowed and not response.prepared:
-            response.headers[hdrs.ACCESS_CONTROL_ALLOW_ORIGIN] = str(origin)
-        return response
-
-    return guard
 
 
 @web.middleware

@@ -43,6 +43,7 @@ class LeadershipKeeper:
         core: The role, the term and the deadline.
         leader: The leading master, as far as this one knows.
         fault: Why etcd cannot be asked; empty if it can.
+        url: Where other masters reach this one while it leads.
         lease: The number of the lease by which this master leads; 0: it has none.
     """
 
@@ -60,6 +61,7 @@ class LeadershipKeeper:
         self._clock = clock
         self._watched = EtcdStore(client, prefix)
         self._store: EtcdStore | None = None
+        self.url = ""
         self.lease = 0
         self.core = LeadershipCore(settings or LeaseSettings())
         self.leader: Leader | None = None
@@ -96,7 +98,8 @@ class LeadershipKeeper:
             self._note(str(error))
             return False
         self.core.granted(sent, ttl)
-        store = EtcdStore(self._client, self._prefix, Candidacy(self.lease, self._name, self._remaining))
+        candidacy = Candidacy(self.lease, self._name, self._remaining, self.url)
+        store = EtcdStore(self._client, self._prefix, candidacy)
         try:
             async with asyncio.timeout(max(0.0, self._remaining())):
                 term = await store.begin_term(above=self.core.heard)

@@ -127,7 +127,8 @@ class Masters:
                             self.acknowledged.append(robot)
                             made += 1
                         else:
-                            assert reply.status == 503, (reply.status, await reply.text())
+                            # 502: a stand-by does not know whether the leader has done it.
+                            assert reply.status in {502, 503}, (reply.status, await reply.text())
                             used += 1
                 except _FAILURES:
                     used += 1

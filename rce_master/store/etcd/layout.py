@@ -32,6 +32,8 @@ class Leader:
 
     name: str
     term: int
+    url: str = ""
+    """Where other masters reach its HTTP server; empty: it does not say."""
 
 
 class Keys:
@@ -102,8 +104,8 @@ def read_leader(record: Record) -> Leader:
     """
     try:
         value = json.loads(record.value)
-        return Leader(str(value["name"]), int(value["term"]))
-    except (ValueError, KeyError, TypeError) as error:
+        return Leader(str(value["name"]), int(value["term"]), str(value.get("url", "")))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise StoreError(f"the key {record.key} of etcd was overwritten") from error
 
 

@@ -47,6 +47,8 @@ class Candidacy:
     lease: int
     name: str
     remaining: Callable[[], float]
+    url: str = ""
+    """Where other masters reach this one."""
 
 
 class EtcdStore:
@@ -157,7 +159,8 @@ class EtcdStore:
             Put(self._keys.last, write_number(term, 0)),
         ]
         if self._candidacy is not None and not self._led:
-            value = json.dumps({"name": self._candidacy.name, "term": term}).encode()
+            own = self._candidacy
+            value = json.dumps({"name": own.name, "term": term, "url": own.url}).encode()
             operations.append(Put(self._keys.leader, value, self._candidacy.lease))
         await self._client.transact(conditions, operations)
 

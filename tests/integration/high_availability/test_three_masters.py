@@ -62,9 +62,6 @@ async def test_one_leads_and_the_others_say_who(shared_masters: Masters) -> None
     assert found["leader"] == f"{leader.name}:{leader.http_port}"
     async with shared_masters.session(20.0) as session:
         for other in (master for master in shared_masters.all if master is not leader):
-            async with session.get(f"{other.url}api/v1/users") as reply:
-                assert (reply.status, reply.headers["Retry-After"]) == (503, "1")
-                assert f"stand-by; {found['leader']} leads" in (await reply.json())["error"]
             async with session.get(f"{other.url}metrics") as reply:
                 told = await reply.text()
             assert "rce_master_leading 0.0" in told
@@ -85,13 +82,67 @@ async def test_clients_with_all_addresses_find_the_leader(shared_masters: Master
     )
     async with client:
         assert [user["name"] for user in await client.items("/users")] == [DEV_USER]
+
+
+async def test_a_stand_by_forwards_what_it_is_asked(shared_masters: Masters) -> None:
+    leader = await shared_masters.leader()
+    standby = next(master for master in shared_masters.all if master is not leader)
+    api = f"{standby.url}api/v1"
     async with shared_masters.session(20.0) as session:
-        async with session.get(f"{standby.url}?userID={DEV_USER}&version=0.1.0") as reply:
-            assert (reply.status, reply.headers["RCE-Standby"]) == (503, "yes")
+        async with session.get(f"{api}/users") as reply:
+            assert [user["name"] for user in (await reply.json())["users"]] == [DEV_USER]
+        async with session.post(f"{api}/robot-tokens", json={"robot": "through_another"}) as reply:
+            assert reply.status == 201
+        async with session.get(f"{api}/nothing", params={"a": "b/c d"}) as reply:
+            assert (reply.status, "error" in await reply.json()) == (404, True)
+        async with session.get(f"{standby.url}?userID={DEV_USER}&version=20130902") as reply:
+            assert (reply.status, "No robot process is free" in await reply.text()) == (503, True)
         query = {"key": "0" * 64, "signature": "0" * 128}
-        url = f"{leader.url}api/v1/packages/pkg/1.0.0"
-        async with session.put(url, params=query, data=b"x") as reply:
+        body = b"x" * 500_000
+        async with session.put(f"{api}/packages/pkg/1.0.0", params=query, data=body) as reply:
             assert (reply.status, "takes none yet" in await reply.text()) == (409, True)
+        async with session.get(f"{api}/events", params={"since": 0}) as reply:
+            assert reply.headers["Content-Type"] == "text/event-stream"
+            lines = [await reply.content.readline() for _ in range(4)]
+            assert lines[:2] == [b": hello\n", b"\n"]
+            assert lines[2].startswith(b"id: ")
+    assert "through_another" in await shared_masters.stored()
+
+
+async def test_what_a_stand_by_does_not_forward(shared_masters: Masters) -> None:
+    leader = await shared_masters.leader()
+    standby = next(master for master in shared_masters.all if master is not leader)
+    users = f"{standby.url}api/v1/users"
+    async with shared_masters.session(20.0) as session:
+        async with session.get(users, headers={"Host": "evil.example"}) as reply:
+            assert reply.status == 421
+        async with session.get(users, headers={"Origin": "http://evil.example"}) as reply:
+            assert reply.status == 403
+        async with session.get(users, headers={"Origin": standby.url.rstrip("/")}) as reply:
+            assert reply.status == 200, "of a page of the stand-by itself"
+        async with session.get(users, headers={"RCE-Forwarded": "10.0.0.1 1 00"}) as reply:
+            assert (reply.status, "asked by another stand-by" in await reply.text()) == (503, True)
+        with pytest.raises(aiohttp.WSServerHandshakeError, match="503"):
+            await session.ws_connect(f"{standby.url}api/v1/containers/c/exec")
+
+
+async def test_the_leader_knows_who_asked_a_stand_by(shared_masters: Masters) -> None:
+    """By a word that only masters can give: a client that claims to be another one is not believed."""
+    leader = await shared_masters.leader()
+    standby = next(master for master in shared_masters.all if master is not leader)
+    claim = {"RCE-Forwarded": "10.0.0.1 1 00"}
+    for own, url, headers in (("127.0.0.8", standby.url, {}), ("127.0.0.9", leader.url, claim)):
+        connector = aiohttp.TCPConnector(local_addr=(own, 0))
+        body = {"userID": DEV_USER, "password": "wrong"}
+        async with (
+            aiohttp.ClientSession(connector=connector) as session,
+            session.post(f"{url}api/v1/login", json=body, headers=headers) as reply,
+        ):
+            assert reply.status == 401
+    async with shared_masters.session(20.0) as session, session.get(f"{leader.url}api/v1/audit") as reply:
+        records = (await reply.json())["records"]
+    refused = [record["address"] for record in records if record["outcome"] == "refused"]
+    assert refused == ["127.0.0.8", "127.0.0.9"]
 
 
 async def test_a_task_set_finds_the_new_leader(shared_masters: Masters) -> None:

@@ -1,0 +1,150 @@
+"""Forwards requests from a stand-by to the leading master, so that clients may know any master."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import aiohttp
+from aiohttp import hdrs, web
+from multidict import CIMultiDict
+from yarl import URL
+
+from rce.web.origin import is_foreign
+from rce_master.http.forwarded import HEADER
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from multidict import CIMultiDictProxy
+
+    from rce.guard import TrustedProxies
+    from rce.tls import Context
+    from rce_master.http.forwarded import ForwardingKey
+    from rce_master.store.etcd.layout import Leader
+
+_log = logging.getLogger(__name__)
+
+CONNECT_S = 2.0
+SILENCE_S = 60.0
+"""A leader that says nothing for so long in an answer is given up; streams say something more often."""
+_OF_CONNECTION = frozenset(
+    name.lower()
+    for name in (
+        *(hdrs.CONNECTION, hdrs.KEEP_ALIVE, hdrs.PROXY_AUTHENTICATE, hdrs.PROXY_AUTHORIZATION, hdrs.TE),
+        *(hdrs.TRAILER, hdrs.TRANSFER_ENCODING, hdrs.UPGRADE, hdrs.EXPECT, hdrs.HOST, HEADER),
+        *("X-Forwarded-For", "X-Real-IP", "Forwarded", "Via"),
+    )
+)
+"""Headers that are about one connection (RFC 9110, 7.6.1), or tell who sent a request."""
+_ADDED = (hdrs.USER_AGENT, hdrs.ACCEPT, hdrs.ACCEPT_ENCODING, hdrs.CONTENT_TYPE)
+"""Headers that the library would add."""
+
+
+class NotForwardedError(Exception):
+    """A request was not sent to the leading master; another master may do it."""
+
+
+class Forwarder:
+    """Sends requests on to the leading master. Use it as an asynchronous context manager.
+
+    Args:
+        key: Tells the leader the client's address.
+        proxies: Whose word about that address is taken.
+        tls: Gives the TLS context of each connection to a leader that uses TLS.
+    """
+
+    def __init__(self, key: ForwardingKey, proxies: TrustedProxies, tls: Context | None = None) -> None:
+        self._key = key
+        self._proxies = proxies
+        self._tls = tls
+        self._session: aiohttp.ClientSession
+
+    async def __aenter__(self) -> Self:
+        timeout = aiohttp.ClientTimeout(total=None, sock_connect=CONNECT_S, sock_read=SILENCE_S)
+        self._session = aiohttp.ClientSession(
+            connector=aiohttp.TCPConnector(limit=0),
+            cookie_jar=aiohttp.DummyCookieJar(),
+            timeout=timeout,
+            auto_decompress=False,
+            skip_auto_headers=_ADDED,
+            trust_env=False,
+        )
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._session.close()
+
+    async def forward(self, request: web.Request, leader: Leader | None) -> web.StreamResponse:
+        """Send a request on, and return the leader's answer.
+
+        Args:
+            request: The request; its ``Host`` and ``Origin`` were accepted here.
+            leader: The leading master.
+
+        Raises:
+            NotForwardedError: The leader did not get it; the text says why.
+        """
+        if leader is None or not leader.url:
+            raise NotForwardedError("no master leads now" if leader is None else f"{leader.name} leads")
+        if HEADER in request.headers:
+            raise NotForwardedError(f"{leader.name} leads; it is asked by another stand-by")
+        if request.headers.get(hdrs.UPGRADE):
+            raise NotForwardedError(f"{leader.name} leads; ask it for WebSockets, at {leader.url}")
+        response: web.StreamResponse | None = None
+        try:
+            async with self._session.request(
+                request.method,
+                URL(leader.url.rstrip("/") + request.rel_url.raw_path_qs, encoded=True),
+                headers=self._headers(request, leader),
+                data=request.content if request.body_exists else None,
+                allow_redirects=False,
+                ssl=self._tls() if self._tls is not None else True,
+            ) as reply:
+                response = web.StreamResponse(
+                    status=reply.status, reason=reply.reason, headers=_without(reply.headers)
+                )
+                await response.prepare(request)
+                async for piece in reply.content.iter_any():
+                    await response.write(piece)
+                await response.write_eof()
+        except (aiohttp.ClientError, TimeoutError, ConnectionError) as error:
+            return _broken(request, leader, response, error)
+        return response
+
+    def _headers(self, request: web.Request, leader: Leader) -> CIMultiDict[str]:
+        headers = _without(request.headers)
+        if not is_foreign(headers.get(hdrs.ORIGIN), request.headers.get(hdrs.HOST, "")):
+            headers.popall(hdrs.ORIGIN, None)  # a page of this server: the leader has another name
+        transport = request.transport
+        peer = None if transport is None else transport.get_extra_info("peername")
+        address = self._proxies.origin(peer, request.headers.getall("X-Forwarded-For", ()))
+        headers[HEADER] = self._key.sign(address, leader.term)
+        return headers
+
+
+def _without(headers: CIMultiDictProxy[str]) -> CIMultiDict[str]:
+    """Return headers without those of one connection."""
+    named = {word.strip().lower() for word in headers.get(hdrs.CONNECTION, "").split(",")}
+    return CIMultiDict(
+        (name, value) for name, value in headers.items() if name.lower() not in _OF_CONNECTION | named
+    )
+
+
+def _broken(
+    request: web.Request, leader: Leader, response: web.StreamResponse | None, error: Exception
+) -> web.StreamResponse:
+    """Return what a client gets whose request may have been done.
+
+    Raises:
+        NotForwardedError: It was not done, or changes nothing.
+    """
+    if response is not None and response.prepared:
+        if request.transport is not None:
+            request.transport.abort()  # so that the client does not take the part for the whole
+        return response
+    _log.info("%s %s was not answered by %s: %s", request.method, request.path, leader.name, error)
+    if isinstance(error, aiohttp.ClientConnectorError) or request.method in (hdrs.METH_GET, hdrs.METH_HEAD):
+        raise NotForwardedError(f"{leader.name}, which led until now, does not answer") from error
+    text = f"{leader.name}, which led until now, did not answer: it may have done this or not; look first"
+    return web.json_response({"error": text}, status=502)
