@@ -13,7 +13,7 @@ from rce.model import MEGABYTE, MIN_MEMORY, Resources, write_cores, write_memory
 from rce_master.usage import STEP_S, WINDOW_S, History, rates_between
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from rce_master.state.placement import Room
 
@@ -39,19 +39,30 @@ class Advice(NamedTuple):
     command: str
 
 
-def for_container(tag: str, requested: Resources, history: History, room: Room | None) -> list[Advice]:
-    """Return advice on whether a container should be resized.
+def for_container(
+    tag: str, requested: Resources, history: History, room: Room | None, others: Sequence[Room] = ()
+) -> list[Advice]:
+    """Return advice on whether a container should be resized or moved.
 
     Args:
         tag: The container's.
         requested: Its request.
         history: Its usage.
         room: Its machine, to find out whether it has room to grow; None if unknown.
+        others: Machines that it could move to.
     """
-    return [*_too_small(tag, requested, history, room), *_too_large(tag, requested, history)]
+    rooms = _Rooms(room, others)
+    return [*_too_small(tag, requested, history, rooms), *_too_large(tag, requested, history)]
 
 
-def _too_small(tag: str, requested: Resources, history: History, room: Room | None) -> Iterator[Advice]:
+class _Rooms(NamedTuple):
+    """A container's machine, and others."""
+
+    own: Room | None
+    others: Sequence[Room]
+
+
+def _too_small(tag: str, requested: Resources, history: History, rooms: _Rooms) -> Iterator[Advice]:
     now, samples = history.now.usage, history.samples
     oldest = samples[0]
     watched = history.now.time - oldest.time
@@ -59,10 +70,10 @@ def _too_small(tag: str, requested: Resources, history: History, room: Room | No
     if kills > 0 and now.memory_limit:
         times = "once" if kills == 1 else f"{kills} times"
         text = f"its memory ran out {times} lately (limit {_mb(now.memory_limit)})"
-        yield _more_memory(tag, text, requested, room, 2 * now.memory_limit)
+        yield _more_memory(tag, text, requested, rooms, 2 * now.memory_limit)
     elif now.memory_limit and now.memory > NEARLY_FULL * now.memory_limit:
         text = f"uses {_mb(now.memory)} of its {_mb(now.memory_limit)} of memory"
-        yield _more_memory(tag, text, requested, room, 1.5 * now.memory_limit)
+        yield _more_memory(tag, text, requested, rooms, 1.5 * now.memory_limit)
     throttled = rates_between(oldest, history.now).throttled
     if now.cpu_limit and watched >= _SOON_S and throttled > THROTTLED:
         better = _steps(now.cpu_limit * (1 + throttled), _CORES_STEP)
@@ -75,22 +86,25 @@ def _too_small(tag: str, requested: Resources, history: History, room: Room | No
             change,
             requested,
             Resources(size=requested.size, cpu=better, memory=requested.memory),
-            room,
+            rooms,
         )
 
 
-def _more_memory(tag: str, text: str, requested: Resources, room: Room | None, better: float) -> Advice:
+def _more_memory(tag: str, text: str, requested: Resources, rooms: _Rooms, better: float) -> Advice:
     memory = int(_steps(better, _MEMORY_STEP))
     grown = Resources(size=requested.size, cpu=requested.cpu, memory=memory)
-    return _grow(tag, text, f"--memory {write_memory(memory)}", requested, grown, room)
+    return _grow(tag, text, f"--memory {write_memory(memory)}", requested, grown, rooms)
 
 
-def _grow(
-    tag: str, text: str, change: str, requested: Resources, grown: Resources, room: Room | None
-) -> Advice:
+def _grow(tag: str, text: str, change: str, requested: Resources, grown: Resources, rooms: _Rooms) -> Advice:
+    room, command = rooms.own, f"rce resize {tag} {change}"
     if room is not None and (lacks := room.without(requested).shortages(grown, requested)):
         text += f"; its machine has no room for more ({room.name} {' and '.join(lacks)})"
-    return Advice("too small", text, f"rce resize {tag} {change}")
+        elsewhere = next((one for one in rooms.others if one is not room and one.fits(grown)), None)
+        if elsewhere is not None:
+            text += f", {elsewhere.name} has; an administrator can move it there first"
+            command = f"rce move {tag} {elsewhere.name} --wait && {command}"
+    return Advice("too small", text, command)
 
 
 def _too_large(tag: str, requested: Resources, history: History) -> Iterator[Advice]:

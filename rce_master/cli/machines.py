@@ -1,4 +1,4 @@
-"""``rce machines``, ``rce drain``, ``rce resize``: what containers can run on, and who gets how much."""
+"""``rce machines``, ``rce drain``, ``rce move``, ``rce resize``: where containers run, who gets how much."""
 
 from __future__ import annotations
 
@@ -153,3 +153,36 @@ async def _resize(container: str, body: dict[str, Any], user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
         await client.call("PATCH", f"/containers/{container}", body, query)
     typer.echo(f"resized {container}: {', '.join(f'{key} {value}' for key, value in body.items())}")
+
+
+def move(
+    container: Annotated[str, typer.Argument(help="The container's tag.")],
+    machine: Annotated[str, typer.Argument(help="Name of the machine, or of its container task set.")],
+    user: Annotated[str, typer.Option(help="Whose container.")] = "",
+    wait: Annotated[bool, typer.Option("--wait", help="Wait until it is there, or stays.")] = False,
+) -> None:
+    """Hand a container over to another machine while it runs; administrators only.
+
+    It is started there first and then dropped here, with the containers that share a private network with
+    it. Its memory and files are not moved.
+    """
+    run(_move(container, machine, user, wait=wait))
+
+
+async def _move(container: str, machine: str, user: str, *, wait: bool) -> None:
+    query: dict[str, str | int] = {"user": user} if user else {}
+    async with ApiClient.of(credentials.load()) as client:
+        await client.call("PUT", f"/containers/{container}/machine", {"machine": machine}, query)
+        typer.echo(f"{container} moves to {machine}")
+        while wait:
+            found = [one for one in await client.items("/containers", query=query) if one["tag"] == container]
+            if not found:
+                raise CliError(f"{container} was destroyed")
+            if not found[0]["moving_to"]:
+                break
+            await asyncio.sleep(POLL_S)
+        else:
+            return
+        if machine not in (found[0]["task_set"], found[0]["machine"]):
+            raise CliError(f"{container} is still at {found[0]['task_set']}: {found[0]['detail']}")
+        typer.echo(f"{container} is there")

@@ -1,9 +1,9 @@
-"""REST: draining of container machines."""
+"""REST: draining of container machines, and moves of single containers."""
 
 from __future__ import annotations
 
 from rce_master.http import models
-from rce_master.http.routes import Call, route_table
+from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.http.views import Views
 from rce_master.state import commands
 
@@ -32,6 +32,23 @@ async def drain_machine(call: Call) -> models.MachinesOut:
 async def undrain_machine(call: Call) -> models.MachinesOut:
     """Cancel a drain."""
     return await _set(call, draining=False)
+
+
+@routes.route(
+    "PUT",
+    "/containers/{container}/machine",
+    "Have a container handed over to another machine while it runs",
+    body=models.MoveIn,
+    status=202,
+    admin=True,
+    query=(OF_USER,),
+)
+async def move_container(call: Call) -> None:
+    """Begin a move; the events ``container_moved`` and ``container_stays`` tell how it ended."""
+    machine, tag = call.read(models.MoveIn).machine, call.path("container")
+    await call.services.state_service.submit(
+        commands.MoveContainer(user=call.controlled_owner, tag=tag, machine=machine)
+    )
 
 
 async def _set(call: Call, *, draining: bool) -> models.MachinesOut:

@@ -67,6 +67,13 @@ class RoleIn(Body):
     role: Annotated[str, Field(pattern=ROLES)]
 
 
+class MoveIn(Body):
+    """Where a container is handed over to."""
+
+    machine: Annotated[str, Field(min_length=1, max_length=300)]
+    """Name of the machine, or of its container task set."""
+
+
 class AuditIn(Body):
     """An action of a user at a station."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from heapq import nsmallest
 from typing import TYPE_CHECKING
 
@@ -71,11 +72,17 @@ class UsageViews:
             advice=_shown(self._advice(container, history, room)),
         )
 
-    @staticmethod
-    def _advice(container: Container, history: History | None, room: Room | None) -> list[Advice]:
+    def _advice(self, container: Container, history: History | None, room: Room | None) -> list[Advice]:
         if history is None:
             return []
-        return advice.for_container(container.tag, container.resources, history, room)
+        return advice.for_container(container.tag, container.resources, history, room, self._emptiest)
+
+    @cached_property
+    def _emptiest(self) -> list[Room]:
+        """The emptiest machine, and the one that takes its place in advice about the emptiest one itself."""
+        there = self._tables.is_connected
+        open_ = (room for room in self._rooms.values() if not room.draining and there(room.process))
+        return nsmallest(2, open_, key=lambda room: room.load)
 
     def _nodes(self, container: Container, history: History | None) -> list[models.NodeUsageOut]:
         status = self._tables.container_live(container.id).status
@@ -84,11 +91,8 @@ class UsageViews:
 
     def machines(self) -> list[models.MachineUsageOut]:
         """Show all container machines."""
-        # The emptiest one, and the one that takes its place when the advice is about the emptiest one itself.
-        open_ = (room for room in self._rooms.values() if not room.draining)
-        emptiest = nsmallest(2, open_, key=lambda room: room.load)
         return [
-            self._machine(room, [other for other in emptiest if other is not room])
+            self._machine(room, [other for other in self._emptiest if other is not room])
             for room in self._rooms.values()
         ]
 

@@ -256,6 +256,17 @@ class SetDraining:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MoveContainer:
+    """An operator has a container handed over to another machine."""
+
+    user: str
+    """The container's."""
+    tag: str
+    machine: str
+    """Its name, or that of its container task set."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Continue:
     """Do more of the work that a command left over (:attr:`rce_master.state.changes.Changes.unfinished`)."""
 
@@ -412,6 +423,7 @@ Command: TypeAlias = (
     | RobotLogin
     | RobotLeft
     | SetDraining
+    | MoveContainer
     | Continue
     | Tick
     | Request

@@ -67,6 +67,7 @@ _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
     commands.Continue: task_sets.continue_work,
     commands.Tick: task_sets.tick,
     commands.SetDraining: draining.set_draining,
+    commands.MoveContainer: draining.move_container,
     commands.ResizeContainer: resizing.resize_container,
     commands.DestroyContainer: containers.destroy_container,
     commands.AddNode: containers.add_node,

@@ -1,5 +1,7 @@
 """Draining of machines: they take no new containers, and their containers are handed over.
 
+An operator may have a single container handed over, too.
+
 A container is *handed over* by a move: a copy of it, with its nodes and parameters but without interfaces and
 connections, is made at another machine while the container continues; once the copy's nodes are up, the copy
 becomes the container, gets the interfaces and connections, and the former one is dropped. A node that is not
@@ -7,7 +9,8 @@ up in the container need not be up in the copy: a node without ROS never registe
 moves away from a machine; those in the network of one group move together. A container without room elsewhere
 stays where it is, and is tried again at every tick.
 
-A drain outlives a restart of the master. A move does not: the copy is dropped, and the move starts again.
+A drain outlives a restart of the master. A move does not: the copy is dropped, and the move starts again if
+the machine is draining.
 """
 
 from __future__ import annotations
@@ -17,16 +20,18 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from rce.control import EndpointState, EndpointStatus, NodeState, TaskSetKind, without_wiring
-from rce_master.exceptions import NotFoundError
+from rce_master.exceptions import ConflictError, NoRoomError, NotFoundError
 from rce_master.state import activity, capacity, endpoints, placing, volumes
 from rce_master.state.lifecycle import ContainerEvent
 from rce_master.state.placement import Room, best_of, refusals
 from rce_master.state.records import Container, Drain, Move
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from rce.model import Resources
     from rce_master.state.changes import Transaction
-    from rce_master.state.commands import SetDraining
+    from rce_master.state.commands import MoveContainer, SetDraining
     from rce_master.state.tables import Tables
 
 _NOT_YET = frozenset({NodeState.WAITING, NodeState.STARTING})
@@ -50,6 +55,34 @@ def set_draining(tx: Transaction, command: SetDraining) -> None:
             tx.happen("machine_undrained", process, user="")
     advance(tx)
     placing.place_waiting(tx)
+
+
+def move_container(tx: Transaction, command: MoveContainer) -> None:
+    """Begin to hand a container over to a machine, with those that move together with it.
+
+    Raises:
+        NotFoundError: The container or the machine does not exist.
+        ConflictError: The container is not at a machine yet, is there already, or moves already.
+        NoRoomError: The machine does not take it.
+    """
+    tables = tx.tables
+    container = tables.container(f"{command.user}/{command.tag}")
+    if container is None:
+        raise NotFoundError(f"there is no container {command.tag!r}")
+    processes = _processes(tables, command.machine)
+    unit = _unit(tables, container)
+    if not container.task_set:
+        raise ConflictError(f"container {command.tag!r} waits for a machine; rce ps shows why")
+    if container.task_set in processes:
+        raise ConflictError(f"container {command.tag!r} is at {command.machine} already")
+    if (move := next((tables.moves[each.id] for each in unit if each.id in tables.moves), None)) is not None:
+        raise ConflictError(f"container {command.tag!r} moves to {move.to} already")
+    search = _Search(tx)
+    target = search.target(unit, processes)
+    if not target:
+        raise NoRoomError(f"container {command.tag!r} stays: {search.obstacle(unit, processes)}")
+    for each in unit:
+        _begin(tx, each, target)
 
 
 def _processes(tables: Tables, name: str) -> list[str]:
@@ -129,8 +162,13 @@ class _Search:
         self._too_much: set[Resources] = set()
         self._texts: dict[tuple[str, Resources], str] = {}
 
-    def target(self, unit: list[Container]) -> str:
-        """Return a machine that takes all of some containers; empty if none does."""
+    def target(self, unit: list[Container], among: Collection[str] | None = None) -> str:
+        """Return a machine that takes all of some containers; empty if none does.
+
+        Args:
+            unit: The containers.
+            among: Only the machines of these processes; None: all.
+        """
         tx, first = self._tx, unit[0]
         requested, tables = first.resources, tx.tables
         if requested in self._too_much:
@@ -142,15 +180,17 @@ class _Search:
             )
 
         company = capacity.company(tables, first)
-        found = tables.rooms.candidates(requested, admits, near=company)
+        near = company if among is None else company.keys() & set(among)
+        found = tables.rooms.candidates(requested, admits, among=among, near=near)
         tx.spend(found.looks)
-        if not found.rooms and not tables.rooms.candidates(requested, lambda _: True, most=1).rooms:
+        takes_none = among is None and not found.rooms
+        if takes_none and not tables.rooms.candidates(requested, lambda _: True, most=1).rooms:
             self._too_much.add(requested)
         room = best_of(found.rooms, requested, company=company, own=tables.rooms.of_user(first.user))
         return room.process if room is not None else ""
 
-    def obstacle(self, unit: list[Container]) -> str:
-        """Report why containers cannot be handed over."""
+    def obstacle(self, unit: list[Container], among: Collection[str] | None = None) -> str:
+        """Report why containers cannot be handed over; the arguments are those of :meth:`target`."""
         tables, first = self._tx.tables, unit[0]
         bound = next((each for each in unit if volumes.tied_to(tables, each)), None)
         if bound is not None:
@@ -159,10 +199,16 @@ class _Search:
         whole = f"it moves with {mates} others of its group; " if mates else ""
         key = (first.task_set, first.resources)
         if key not in self._texts:
-            rooms = [room for room in tables.rooms.connected if room.process != first.task_set]
+            rooms = [
+                room
+                for room in tables.rooms.connected
+                if room.process != first.task_set and (among is None or room.process in among)
+            ]
             self._tx.spend(len(rooms))
-            self._texts[key] = refusals(rooms, first.resources) if rooms else "there is no other machine"
-        said = "no machine has room for all of them" if mates else "it is about to move"
+            none = "there is no other machine" if among is None else "that machine is away"
+            self._texts[key] = refusals(rooms, first.resources) if rooms else none
+        ending = "it is about to move" if among is None else "a container of its name is still ending there"
+        said = "no machine has room for all of them" if mates else ending
         return whole + (self._texts[key] or said)
 
 
@@ -195,9 +241,12 @@ def _stay(tx: Transaction, container: Container, why: str) -> None:
     live = tx.tables.container_live(container.id)
     if live.stays != why:
         tx.put(replace(live, stays=why))
-        tx.happen(
-            "container_stays", container.id, f"at {container.task_set}, which is draining: {why}", user=""
-        )
+        draining = ", which is draining" if _is_draining(tx, container) else ""
+        tx.happen("container_stays", container.id, f"at {container.task_set}{draining}: {why}", user="")
+
+
+def _is_draining(tx: Transaction, container: Container) -> bool:
+    return container.task_set in tx.tables.rooms.draining
 
 
 # Progress of moves
@@ -279,7 +328,8 @@ def give_up(tx: Transaction, move: Move, why: str) -> None:
     tx.put(replace(live, rest_until=tx.now + tx.settings.move_rest))
     container = tx.tables.container(move.id)
     assert container is not None
-    _stay(tx, container, f"{move.to}: it {why}; tried again in {tx.settings.move_rest:.0f} s")
+    again = f"; tried again in {tx.settings.move_rest:.0f} s" if _is_draining(tx, container) else ""
+    _stay(tx, container, f"{move.to}: it {why}{again}")
 
 
 def left(tx: Transaction, process: str) -> None:

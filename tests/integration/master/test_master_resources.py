@@ -202,10 +202,34 @@ async def test_a_machine_is_drained_by_command(logged_in: Site, capsys: pytest.C
     assert text.endswith("m1 takes containers again\n")
 
 
+async def test_a_container_is_moved_by_command(logged_in: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    site = logged_in
+    async with site.containers(machine=small()) as first:
+        await site.api("POST", "/containers", {"tag": "c"}, status=204)
+        await put_of(first, "testUser/c")
+        first.report(running("testUser/c"))
+        await until(lambda: _is(lambda: container(site, "c"), "state", "running"))
+        async with site.containers("c2", machine=small("m2")) as second:
+            moving = asyncio.create_task(machines._move("c", "m2", "", wait=True))
+            await put_of(second, "testUser/c")
+            reply = await site.api("PUT", "/containers/c/machine", {"machine": "m2"}, status=409)
+            assert "moves to c2 already" in reply["error"]
+            second.report(running("testUser/c"))
+            assert (await first.get(Drop)).id == "testUser/c"
+            await moving
+            assert (await container(site, "c"))["machine"] == "m2"
+            reply = await site.api("PUT", "/containers/c/machine", {"machine": "m1"}, status=409)
+            assert "a container of its name is still ending there" in reply["error"]
+            await site.api("PUT", "/containers/c/machine", {"machine": "m9"}, status=404)
+            await site.api("PUT", "/containers/c/machine", {}, status=422)
+    assert capsys.readouterr().out == "c moves to m2\nc is there\n"
+
+
 async def test_only_administrators_drain(site: Site) -> None:
     await site.api("POST", "/users", {"name": "anna", "password": "one"}, status=201)
     anna = await site.login("anna", "one")
     await site.api("PUT", "/machines/m1/drain", token=anna, status=403)
+    await site.api("PUT", "/containers/c/machine", {"machine": "m1"}, token=anna, status=403)
     assert (await site.api("GET", "/usage", token=anna))["machines"] == []
 
 

@@ -10,7 +10,7 @@ from support.parts import StatusParts
 
 from rce.control.model import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
 from rce.model.specs import Network, ResourceChanges
-from rce_master.exceptions import NoRoomError, NotFoundError
+from rce_master.exceptions import ConflictError, NoRoomError, NotFoundError
 from rce_master.state import commands
 from rce_master.state.changes import Changes
 from rce_master.state.core import State
@@ -261,3 +261,51 @@ def test_a_machine_may_say_itself_that_it_drains(two: World) -> None:
     assert moves(two) == {"c": "c2"}
     two.container("new")
     assert at(two, "new") == "c2"
+
+
+def move(world: World, tag: str = "c", machine: str = "m2") -> Changes:
+    return world.do(commands.MoveContainer(user="anna", tag=tag, machine=machine))
+
+
+def test_one_container_is_handed_over_and_the_machine_keeps_the_others(two: World) -> None:
+    assert kinds(move(two)) == ["container_moving"]
+    assert moves(two) == {"c": "c2"}
+    changes = report(two, "c", "c2")
+    assert "container_moved" in kinds(changes)
+    assert (at(two, "c"), at(two, "d"), moves(two)) == ("c2", "c1", {})
+    two.container("new")
+    assert at(two, "new") in {"c1", "c2"}, "neither of them is draining"
+    with pytest.raises(NoRoomError, match="a container of its name is still ending there"):
+        move(two, machine="c1")
+    two.do(commands.EndpointGone(process="c1", id="anna/c"))
+    move(two, machine="c1")
+    assert moves(two) == {"c": "c1"}, "back again, by the name of the task set"
+
+
+def test_what_cannot_be_moved_is_said(two: World) -> None:
+    with pytest.raises(NotFoundError, match="no container 'none'"):
+        move(two, "none")
+    with pytest.raises(NotFoundError, match="no container machine 'm9'"):
+        move(two, machine="m9")
+    with pytest.raises(ConflictError, match="is at m1 already"):
+        move(two, machine="m1")
+    move(two)
+    with pytest.raises(ConflictError, match="moves to c2 already"):
+        move(two)
+    two.do(commands.ResizeContainer(user="anna", tag="d", changes=ResourceChanges(size=3)))
+    two.container_set("c3", name="m3", slots=2)
+    with pytest.raises(NoRoomError, match="container 'd' stays: m3 has 2 of 2 slots free"):
+        move(two, "d", "m3")
+    drain(two, "m3")
+    with pytest.raises(NoRoomError, match="m3 is draining"):
+        move(two, "d", "m3")
+
+
+def test_a_move_that_fails_is_not_tried_again(two: World) -> None:
+    move(two)
+    changes = report(two, "c", "c2", EndpointState.FAILED, detail="no such image")
+    assert [event.text for event in changes.events if event.kind == "container_stays"] == [
+        "at c1: c2: it failed there: no such image"
+    ]
+    two.do(commands.Tick())
+    assert (at(two, "c"), moves(two)) == ("c1", {})

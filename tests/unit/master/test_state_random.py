@@ -234,6 +234,10 @@ class Histories(RuleBasedStateMachine):
     def drain(self, process: str, draining: bool) -> None:
         self.do(commands.SetDraining(machine=process, draining=draining))
 
+    @rule(user=USERS, tag=TAGS, process=CONTAINER_SETS)
+    def move(self, user: str, tag: str, process: str) -> None:
+        self.do(commands.MoveContainer(user=user, tag=tag, machine=process))
+
     @rule(state=st.sampled_from(EndpointState), leave=st.booleans())
     def copies_report(self, state: EndpointState, leave: bool) -> None:
         for move in list(self.state.tables.moves):

@@ -145,6 +145,11 @@ def test_advice_to_grow_says_when_the_machine_has_no_room(watched: Watched) -> N
     history = watched.run(10, memory=95 * MB, memory_limit=100 * MB)
     (advice,) = advise(history, room, memory=100 * MB)
     assert "its machine has no room for more (m1 has 100 of 300 MB memory free, 160 MB needed)" in advice.text
+    full = Room(process="c2", machine=machine, memory=200 * MB)
+    empty = Room(process="c3", machine=MachineInfo(name="m3", memory=300 * MB))
+    (advice,) = for_container("c", Resources(memory=100 * MB), history, room, [full, room, empty])
+    assert "m3 has; an administrator can move it there first" in advice.text
+    assert advice.command == "rce move c m3 --wait && rce resize c --memory 160M"
 
 
 def test_what_is_hardly_used_is_too_large_but_not_at_once(watched: Watched) -> None:
