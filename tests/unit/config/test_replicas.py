@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -23,7 +23,7 @@ def etcd(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rce.cli.replicas.shutil.which", lambda name: f"/usr/bin/{name}")
 
 
-def settings_of(program: Program) -> dict[str, dict[str, object]]:
+def settings_of(program: Program) -> dict[str, Any]:
     found = json.loads(program.argv[program.argv.index("--settings") + 1])
     assert isinstance(found, dict)
     return found
