@@ -21,10 +21,10 @@ FIXED_HZ = 4.0
 """A rate that all systems reach: the lowest that the paper tells."""
 PAPER_HZ = 7.5
 """The rate that the paper's robots reached in its Single Master System."""
-CALIBRATION_STEPS = 5
+CALIBRATION_STEPS = 7
 QUICK_CORES = 0.03
 """The client's share of a core where only the programs are tried."""
-LEAST_CORES, MOST_CORES = 0.02, 1.0
+LEAST_CORES, MOST_CORES = 0.002, 1.0
 FULL_CORES = "full_cores"
 """What the preparation finds: the share of a core with which the client reaches the paper's rate."""
 

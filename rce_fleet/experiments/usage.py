@@ -10,6 +10,7 @@ import os
 import subprocess
 import time
 from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -20,9 +21,11 @@ if TYPE_CHECKING:
 
 ROOT = Path("/sys/fs/cgroup")
 PERIOD_US = 100_000
-"""Longest period in which a limited machine gets its share of the processor."""
+"""Longest period in which a limited machine gets its share of the processor, unless that is very small."""
 QUOTA_US = 2_000
 """The share of a period that is aimed at: a slow processor is slow, but it does not stop for long."""
+LEAST_QUOTA_US = 1_000
+"""The kernel takes no smaller one, and no period above a second: so 0.001 of a core is the least."""
 REMOVE_TRIES = 50
 _SECONDS = os.sysconf("SC_CLK_TCK")
 _PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -70,7 +73,14 @@ class Meter(Protocol):
 
 def period_us(cores: float) -> int:
     """Return the period in which a machine gets so much of a core, microseconds."""
-    return min(PERIOD_US, int(QUOTA_US / cores)) if cores else PERIOD_US
+    if not cores:
+        return PERIOD_US
+    return max(min(PERIOD_US, int(QUOTA_US / cores)), ceil(LEAST_QUOTA_US / cores))
+
+
+def quota_us(cores: float) -> int:
+    """Return how long a machine may run in each of its periods, microseconds."""
+    return max(round(cores * period_us(cores)), LEAST_QUOTA_US)
 
 
 def make_meter(name: str, namespace: str) -> Meter:
@@ -117,7 +127,7 @@ class ControlGroups1:
         quota.write_text("-1")
         (self._groups["cpu"] / "cpu.cfs_period_us").write_text(str(period))
         if cores:
-            quota.write_text(str(int(cores * period)))
+            quota.write_text(str(quota_us(cores)))
 
     def read(self) -> Usage:
         """Return what was used; cached files do not count."""
@@ -160,7 +170,7 @@ class ControlGroup2:
     def limit(self, cores: float) -> None:
         """Give the machine so much of a core at most; 0: no limit."""
         period = period_us(cores)
-        quota = str(int(cores * period)) if cores else "max"
+        quota = str(quota_us(cores)) if cores else "max"
         (self._group / "cpu.max").write_text(f"{quota} {period}")
 
     def read(self) -> Usage:
