@@ -27,6 +27,8 @@ TABLE = "results.csv"
 DONE = "done"
 """Metric of the last row of a run: how long it took, seconds."""
 PREPARED = "prepared"
+SAMPLE_S = 60.0
+"""Planned time of what must be done until its pace counts for the rest."""
 LINK = "link"
 LINK_DELAYS_S = (0.005, 0.0, 0.02)
 LINK_UNITS = {"round_trip": "s", "round_trip_p99": "s", "lost": "", "rate": "bit/s"}
@@ -92,14 +94,44 @@ class Plan:
         works = self.works(experiment, rows)
         if not works:
             return 0.0
-        runs = sum(self._run_seconds(work) for work in works)
+        runs = sum(self.run_seconds(work) for work in works)
         return runs + experiment.preparation_seconds(self.options_of(experiment))
 
-    def _run_seconds(self, work: Work) -> float:
+    def run_seconds(self, work: Work) -> float:
+        """Return about how long a run takes."""
         seconds = work.experiment.seconds
         if work.run.number == WARM_UP:
             seconds = work.experiment.warm_up_seconds
         return seconds(work.run.condition, self.options_of(work.experiment))
+
+
+class Pace:
+    """How long the rest of a plan takes: as planned, at the pace of what was done, once that is enough.
+
+    Args:
+        planned: Seconds that all of it takes as planned.
+        clock: Seconds that never go back.
+    """
+
+    def __init__(self, planned: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._left = planned
+        self._done = 0.0
+        self._clock = clock
+        self._began = clock()
+
+    def done(self, planned: float) -> None:
+        """Note that something was done.
+
+        Args:
+            planned: Seconds that it takes as planned.
+        """
+        self._left = max(0.0, self._left - planned)
+        self._done += planned
+
+    def left(self) -> float:
+        """Return about how many seconds the rest takes."""
+        took = self._clock() - self._began
+        return self._left * took / self._done if self._done >= SAMPLE_S else self._left
 
 
 class Runner:
@@ -136,18 +168,19 @@ class Runner:
         self._drop_unfinished()
         await self._prepare_software()
         await self._measure_link()
-        total = sum(self._plan.seconds(one, self.rows()) for one in self._plan.experiments)
-        began = time.monotonic()
+        pace = Pace(sum(self._plan.seconds(one, self.rows()) for one in self._plan.experiments))
         for experiment in self._plan.experiments:
             works = self._plan.works(experiment, self.rows())
             if not works:
                 self._say(f"{experiment.name}: all runs are done")
                 continue
             prepared = await self._prepare(experiment)
+            pace.done(experiment.preparation_seconds(self._plan.options_of(experiment)))
             for number, work in enumerate(works, 1):
-                left = max(0.0, total - (time.monotonic() - began))
-                self._say(f"{_named(work)} ({number} of {len(works)}; about {left / 60:.0f} min left)")
+                left = pace.left() / 60
+                self._say(f"{_named(work)} ({number} of {len(works)}; about {left:.0f} min left)")
                 await self._do(work, prepared)
+                pace.done(self._plan.run_seconds(work))
 
     async def _do(self, work: Work, prepared: dict[str, float]) -> None:
         run = work.run

@@ -10,7 +10,7 @@ from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.experiment import NOT_ANY, Experiment, Measured, Options, Trial
 from rce_fleet.experiments.measures import Value
 from rce_fleet.experiments.results import Condition, Row, by_condition, read_rows, write_rows
-from rce_fleet.experiments.runner import DONE, LINK, LINK_DELAYS_S, TABLE, Plan, Runner
+from rce_fleet.experiments.runner import DONE, LINK, LINK_DELAYS_S, SAMPLE_S, TABLE, Pace, Plan, Runner
 
 OPTIONS = Options(systems=("single_master", "cloud"), software=("rce",))
 RUNS = 2
@@ -115,3 +115,16 @@ async def test_other_seeds_make_another_order(tmp_path: Path) -> None:
         await runner(folder, dice, [], runs=1, seed=seed).run()
         orders.append(tuple(trial.setup.system for trial in dice.trials))
     assert len(set(orders)) > 1
+
+
+def test_the_rest_takes_as_long_as_what_was_done() -> None:
+    now = 100.0
+    pace = Pace(600.0, lambda: now)
+    assert pace.left() == 600.0
+    pace.done(SAMPLE_S - 1.0)
+    assert pace.left() == 601.0 - SAMPLE_S, "that is not enough to tell"
+    pace.done(201.0 - SAMPLE_S)
+    now += 100.0
+    assert pace.left() == 200.0, "twice as fast as planned"
+    pace.done(500.0)
+    assert pace.left() == 0.0
