@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -289,6 +290,17 @@ def rce_data() -> Path:
     folder = data_folder()
     assert folder is not None
     return folder
+
+
+@pytest.fixture(autouse=True)
+def _same_loops() -> Iterator[None]:
+    """Give inner loops the form back that they had before the test: a node compiles those of all modules."""
+    compiled = sys.modules.get("rce_fleet.compiled")
+    before = {each: each._used for each in compiled._kernels} if compiled else {}
+    yield
+    if compiled := sys.modules.get("rce_fleet.compiled"):
+        for each in compiled._kernels:
+            each._used = before.get(each, each.numpy)
 
 
 def _descriptors() -> dict[int, str]:

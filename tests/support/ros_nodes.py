@@ -1,11 +1,15 @@
-"""What fixtures that make nodes give: a function that makes one of a name, at the master of the test."""
+"""What fixtures that make nodes give: a function that makes one of a name, at the master of the test.
+
+And what tests do with those nodes.
+"""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Sequence
 from typing import Protocol, TypedDict, Unpack
 
-from rce.ros.node import Node
+from rce.ros.node import Node, Publisher, Subscriber
 from rce.ros.types import TypeRegistry
 from support.ros_real import Graph
 
@@ -33,3 +37,26 @@ class MakeGraphNode(Protocol):
 
     def __call__(self, graph: Graph, name: str, **options: Unpack[NodeOptions]) -> Node:
         """Make a node; it starts when it is entered."""
+
+
+async def say_until_echoed(say: Publisher, echo: Subscriber, timeout: float = 60.0) -> None:
+    """Publish a ``std_msgs/String`` until it comes back, and take all copies of it from the echo.
+
+    To be connected is not enough: rospy greets a subscriber before it counts it among those who get messages.
+
+    Raises:
+        TimeoutError: Nothing came back within ``timeout`` seconds.
+    """
+    async with asyncio.timeout(timeout):
+        await say.wait_for_subscribers()
+        await echo.wait_for_publishers()
+        first = asyncio.ensure_future(anext(aiter(echo)))
+        try:
+            while not first.done():
+                say.publish(data="anybody there?")
+                await asyncio.sleep(0.05)
+        finally:
+            first.cancel()
+        say.publish(data="begin")
+        while (await anext(aiter(echo))).data != "begin":
+            pass

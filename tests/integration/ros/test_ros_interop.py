@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from support.processes import finish
-from support.ros_nodes import MakeNode
+from support.ros_nodes import MakeNode, say_until_echoed
 
 from rce.ros.core import Core
 from rce.ros.errors import ServiceFaultError
@@ -115,9 +115,8 @@ async def test_a_rospy_node_and_ours(core: Core, make_node: MakeNode, tmp_path: 
 
         echo = await ours.subscribe("echo", STRING)
         say = await ours.advertise("say", STRING)
-        await say.wait_for_subscribers(timeout=20)
+        await say_until_echoed(say, echo)
         async with asyncio.timeout(30):
-            await echo.wait_for_publishers()
             for text in ("", "hello", "x" * 1_000_000, "ü" * 1000):
                 say.publish(data=text)
                 assert (await anext(aiter(echo))).data == text

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import pytest
 from support.ports import free_port
-from support.ros_nodes import MakeGraphNode
+from support.ros_nodes import MakeGraphNode, say_until_echoed
 from support.ros_real import Graph, our_graph
 
 from rce.ros.errors import ServiceFaultError
@@ -87,16 +87,7 @@ async def echoes(node: Node) -> None:
     echo = await node.subscribe("peer_out", STRING)
     say = await node.advertise("peer_in", STRING)
     async with asyncio.timeout(60):
-        await say.wait_for_subscribers()
-        await echo.wait_for_publishers()
-        # rospy greets a subscriber before it counts it among those who get messages.
-        first = asyncio.ensure_future(anext(aiter(echo)))
-        while not first.done():
-            say.publish(data="anybody there?")
-            await asyncio.sleep(0.05)
-        say.publish(data="begin")
-        while (await anext(aiter(echo))).data != "begin":
-            pass
+        await say_until_echoed(say, echo)
         for text in ("", "hello", "x" * 70_000, "x" * 3_000_000, "ü" * 1000):
             say.publish(data=text)
             assert (await anext(aiter(echo))).data == text
@@ -189,8 +180,7 @@ async def test_our_core_is_killed_and_restarted(
             await stack.enter_async_context(start(graph))
             echo = await node.subscribe("peer_out", STRING)
             say = await node.advertise("peer_in", STRING)
-            await say.wait_for_subscribers(timeout=30)
-            await echo.wait_for_publishers(timeout=30)
+            await say_until_echoed(say, echo)
         for life in ("no core", "the next core"):
             say.publish(data=life)
             assert (await asyncio.wait_for(anext(aiter(echo)), 20)).data == life

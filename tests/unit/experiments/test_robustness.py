@@ -63,12 +63,12 @@ def told(what: str, *times: float) -> list[dict[str, object]]:
     ],
 )
 def test_the_longest_time_without_answer_counts(answers: list[float], expected: Outage) -> None:
-    assert outage(answers, 1.0, 10.0, 15.0) == expected
+    assert outage(answers, 1.0, 10.0, 14.0, 15.0) == expected
 
 
 def test_each_of_topics_services_and_new_topics_has_its_values() -> None:
     seen = Seen.of([*told("number", 10.0, 10.1, 14.9), *told("call", 10.2), {"ready": 9.0}])
-    found = {name: value for name, value, _ in values_of(seen, 10.0, 15.0)}
+    found = {name: value for name, value, _ in values_of(seen, 10.0, 14.0, 15.0)}
     assert found["topics_stopped"] == pytest.approx(4.7)
     assert (found["topics_came_back"], found["services_came_back"]) == (1.0, 0.0)
     assert found["new_topics_stopped"] == 5.0 - NEW_S

@@ -24,13 +24,6 @@ FORMS = [False, pytest.param(True, marks=pytest.mark.skipif(not is_available(), 
 KERNELS: tuple[Kernel[..., Any], ...] = (register, evaluate, align)
 
 
-@pytest.fixture(autouse=True)
-def numpy_again() -> object:
-    yield
-    for each in KERNELS:
-        each.use_numpy()
-
-
 def use(*, compiled: bool) -> None:
     for each in KERNELS:
         if compiled:

@@ -186,20 +186,15 @@ def test_compiled_loops_equal_plain_ones() -> None:
     pytest.importorskip("numba")
     grid, cells = drawn(5, 12, 0.2)
     kernels: list[Kernel[..., Any]] = [*lacam.KERNELS, *LIFELONG_KERNELS]
-    used = [each._used for each in kernels]
-    try:
-        answers = []
-        for compiled in (False, True):
-            for each in kernels:
-                if compiled:
-                    each.use_compiled()
-                else:
-                    each.use_numpy()
-            answers.append(_everything(grid, cells))
-        assert answers[0] == answers[1]
-    finally:
-        for each, function in zip(kernels, used, strict=True):
-            each._used = function
+    answers = []
+    for compiled in (False, True):
+        for each in kernels:
+            if compiled:
+                each.use_compiled()
+            else:
+                each.use_numpy()
+        answers.append(_everything(grid, cells))
+    assert answers[0] == answers[1]
 
 
 def _everything(grid: GridMap, cells: list[int]) -> list[object]:
