@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -54,7 +54,7 @@ class RoundTrip(Experiment):
     def seconds(self, setup: Condition, options: Options) -> float:
         """Return about how long a run takes."""
         found = START_S
-        for origin, delay, _ in _rounds(setup, options):
+        for origin, delay, _ in rounds_of(setup, options):
             trips = _trips(options, origin, delay)
             found += 2.0 + sum(number * (0.02 + 2 * size / TRIP_RATE) for size, number in trips.items())
         return found
@@ -68,10 +68,11 @@ class RoundTrip(Experiment):
             for machine in (SERVER, CLIENT)
             for way in ("there", "back")
         ]
-        async with Bench(seed=trial.seed) as bench:
+        rounds = rounds_of(trial.setup, trial.options)
+        async with Bench(seed=trial.seed, delay=rounds[0].delay / 1000) as bench:
             system = trial.system(bench, Layout(server_graph=place == "graph"))
             await system.start(flows, [echo_on(machine) for machine in (SERVER, CLIENT)])
-            for number, (origin, delay, name) in enumerate(_rounds(trial.setup, trial.options)):
+            for number, (origin, delay, name) in enumerate(rounds):
                 if trial.is_warm_up and number:
                     break
                 await bench.set_delay(delay / 1000)
@@ -128,8 +129,20 @@ def echo_on(machine: str) -> Workload:
     return Workload(f"echo_{machine}", "echo", (f"/{asking}_there", f"/{asking}_back"), machine)
 
 
-def _rounds(setup: Condition, options: Options) -> list[tuple[str, int, str]]:
-    """Return origin, delay in milliseconds, and the origin's name in the results, of each series of trips."""
+class Round(NamedTuple):
+    """A series of trips: where they begin, delay in milliseconds, and the origin's name in the results."""
+
+    origin: str
+    delay: int
+    name: str
+
+
+def rounds_of(setup: Condition, options: Options) -> list[Round]:
+    """Return the series of trips, the longest delay first.
+
+    A connection that is there when a delay grows takes that for congestion (HyStart of TCP CUBIC), and is
+    slow for long: CRS keeps its connections, the other systems make new ones for each series.
+    """
     place = dict(setup.factors)["place"]
     is_cloud = setup.system == "cloud"
     origins = [(SERVER, CONTAINER if place == CONTAINER else SERVER)]
@@ -138,8 +151,9 @@ def _rounds(setup: Condition, options: Options) -> list[tuple[str, int, str]]:
     is_main = setup.software == options.software[0]
     delays = DELAYS_MS if is_main and not options.quick else DELAYS_MS[:1]
     first, first_name = origins[0]
-    further = [(first, delay, first_name) for delay in delays[1:]]
-    return [*((origin, delays[0], name) for origin, name in origins), *further]
+    further = [Round(first, delay, first_name) for delay in delays[1:]]
+    found = [*(Round(origin, delays[0], name) for origin, name in origins), *further]
+    return sorted(found, key=lambda one: -one.delay)
 
 
 def _trips(options: Options, origin: str, delay: int) -> Mapping[int, int]:
