@@ -7,6 +7,8 @@ paper: services are not mentioned, and so all are shared, as by fkie's ``master_
 
 from __future__ import annotations
 
+import asyncio
+import time
 from typing import TYPE_CHECKING
 
 from rce_fleet.experiments.bench import SERVER, Bench
@@ -27,6 +29,7 @@ RUNS = 3
 """The same comes out each time, unless something goes wrong."""
 SECONDS = 12.0
 PATIENCE_S = 30.0
+POLL_S = 0.2
 COUNT = "count"
 DEEDS = {"can_publish": MOVED, "can_call": CALLED, "can_end_nodes": ENDED}
 """What robot 1's program can do, by what robot 2's tells then."""
@@ -71,7 +74,7 @@ class Isolation(Experiment):
             core = core_uri(bench.address(SERVER if system.has_one_core else layout.machine_of(2)))
             reach = await system.run(Workload("reach", "reach", ("2", core), place))
             seen = await told(reach, PATIENCE_S)
-            suffered = list(reports(await base.lines()))
+            suffered = await deeds(base, PATIENCE_S if is_ended(seen) else 0.0)
         return trial.measured([*reached(seen, suffered), *to_add(system.wiring(2))])
 
 
@@ -90,6 +93,24 @@ async def start(system: System) -> RunningWorkload:
     for listener in running[: len(listeners)]:
         await listener.wait_ready()
     return running[-1]
+
+
+def is_ended(seen: list[dict[str, object]]) -> bool:
+    """Return whether robot 1's program saw nodes of robot 2, which it told to end."""
+    return any(report.get("nodes_others") for report in seen)
+
+
+async def deeds(base: RunningWorkload, patience: float) -> list[dict[str, object]]:
+    """Return what robot 2's program told, once it has told its end or after some seconds.
+
+    Who tells a node to end is answered before it ends.
+    """
+    deadline = time.monotonic() + patience
+    while True:
+        told_so_far = list(reports(await base.lines()))
+        if any(ENDED in report for report in told_so_far) or time.monotonic() >= deadline:
+            return told_so_far
+        await asyncio.sleep(POLL_S)
 
 
 def reached(seen: list[dict[str, object]], suffered: list[dict[str, object]]) -> list[Value]:

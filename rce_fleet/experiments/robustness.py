@@ -47,7 +47,9 @@ BEFORE_S = 15.0
 STEADY_S = 1.5
 """What answers for so long after the repair has come back."""
 SLACK_S = 1.0
-"""What was sent so long before the end should have arrived."""
+"""What was sent less than so long before the end does not count as lost."""
+LATE_S = 5.0
+"""What arrives so long after the end is late, and not lost."""
 POLL_S = 0.3
 
 
@@ -128,7 +130,14 @@ class Robustness(Experiment):
                 if seen.is_steady(steady):
                     break
             sent = list(reports(await provider.lines()))
-        return trial.measured([*values_of(seen, begin, steady, end), *lost(seen, sent, begin, end)])
+            late = time.monotonic() + LATE_S
+            while missing(seen, sent, begin, end) and time.monotonic() < late:
+                await asyncio.sleep(POLL_S)
+                seen = Seen.of(reports(await watcher.lines()))
+        found = values_of(seen, begin, steady, end)
+        if (count := missing(seen, sent, begin, end)) is not None:
+            found.append(Value("lost_messages", float(count), "count"))
+        return trial.measured(found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,14 +206,13 @@ def values_of(seen: Seen, begin: float, steady: float, end: float) -> list[Value
     return found
 
 
-def lost(seen: Seen, sent: Sequence[Mapping[str, object]], begin: float, end: float) -> list[Value]:
-    """Return how many numbers were sent during the observation and never arrived."""
+def missing(seen: Seen, sent: Sequence[Mapping[str, object]], begin: float, end: float) -> int | None:
+    """Return how many numbers that were sent during the observation have not arrived; None: none was sent."""
     counts = [(float(str(one["at"])), int(str(one["sent"]))) for one in sent if "sent" in one]
     inside = [count for at, count in counts if begin <= at <= end - SLACK_S]
     if not inside:
-        return []
-    missing = sum(number not in seen.numbers for number in range(inside[0], inside[-1]))
-    return [Value("lost_messages", float(missing), "count")]
+        return None
+    return sum(number not in seen.numbers for number in range(inside[0], inside[-1]))
 
 
 def flows(topics: int) -> list[Flow]:

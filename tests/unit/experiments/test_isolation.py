@@ -11,7 +11,7 @@ from xmlrpc.server import SimpleXMLRPCServer
 
 import pytest
 
-from rce_fleet.experiments.isolation import reached, to_add
+from rce_fleet.experiments.isolation import deeds, is_ended, reached, to_add
 from rce_fleet.experiments.systems.multi_master import MultiMaster
 from rce_fleet.experiments.workloads import reach as module
 from rce_fleet.experiments.workloads.core_api import CoreApi
@@ -132,3 +132,22 @@ def test_files_and_lines_of_one_more_robot_are_counted() -> None:
     files, lines = to_add(MultiMaster.wiring(2))
     assert files.value == 1
     assert lines.value == 10
+
+
+class Slow:
+    """A program whose end is told only when its lines are read for the third time."""
+
+    def __init__(self) -> None:
+        self.reads = 0
+
+    async def lines(self) -> list[str]:
+        self.reads += 1
+        return ['report {"moved": true}', 'report {"ended": true}'][: 1 + (self.reads > 2)]
+
+
+async def test_the_end_of_a_node_is_waited_for_where_it_was_told_to() -> None:
+    assert is_ended([{"nodes_others": 1}, {"phase": "end"}])
+    assert not is_ended([{"nodes_others": 0}])
+    slow: Any = Slow()
+    assert await deeds(slow, 0.0) == [{"moved": True}]
+    assert await deeds(slow, 30.0) == [{"moved": True}, {"ended": True}]

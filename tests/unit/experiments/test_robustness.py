@@ -13,7 +13,7 @@ import pytest
 
 from rce_fleet.experiments.experiment import Options
 from rce_fleet.experiments.ownership import command_line, family
-from rce_fleet.experiments.robustness import Outage, Robustness, Seen, lost, outage, values_of
+from rce_fleet.experiments.robustness import Outage, Robustness, Seen, missing, outage, values_of
 from rce_fleet.experiments.workloads.provider import NEW_S, SERVICE, TELL_EVERY, TOPIC, Provider
 from rce_fleet.experiments.workloads.telling import READY, reports
 from rce_fleet.experiments.workloads.watcher import Watcher
@@ -79,8 +79,8 @@ def test_each_of_topics_services_and_new_topics_has_its_values() -> None:
 def test_numbers_that_never_arrived_are_lost() -> None:
     seen = Seen(numbers=frozenset({0, 1, 3, 4, 5}))
     sent = [{"sent": 2, "at": 10.0}, {"sent": 5, "at": 12.0}, {"sent": 8, "at": 14.8}]
-    assert [value.value for value in lost(seen, sent, 9.0, 15.0)] == [1.0]
-    assert lost(seen, [], 9.0, 15.0) == []
+    assert missing(seen, sent, 9.0, 15.0) == 1
+    assert missing(seen, [], 9.0, 15.0) is None
 
 
 def test_a_single_master_system_has_no_master_beside_its_core() -> None:
