@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -18,18 +19,19 @@ READY = "ready"
 REPORT = "report "
 LONGEST = 500
 """Values of a list in one line: longer ones are told in several."""
+_LOCK = threading.Lock()
+"""Held while something is written: each topic of rospy has a thread of its own, and standard output none."""
 
 
 def tell_ready() -> None:
     """Tell that the program has heard of all others, and when: seconds since 1970."""
-    print(READY, flush=True)  # noqa: T201
+    _write(f"{READY}\n")
     tell({READY: time.time()})
 
 
 def tell(report: dict[str, Any]) -> None:
     """Tell a report."""
-    sys.stdout.write(f"{REPORT}{json.dumps(report)}\n")  # one call: threads of rospy must not mix their lines
-    sys.stdout.flush()
+    _write(f"{REPORT}{json.dumps(report)}\n")
 
 
 def tell_samples(phase: str, topic: str, samples: list[tuple[int, ...]]) -> None:
@@ -47,5 +49,10 @@ def reports(lines: Iterable[str]) -> Iterator[dict[str, Any]]:
 
 def show(message: Any) -> None:
     """Print a message as ``rostopic echo`` does."""
-    sys.stdout.write(f"{message}\n---\n")
-    sys.stdout.flush()
+    _write(f"{message}\n---\n")
+
+
+def _write(text: str) -> None:
+    with _LOCK:
+        sys.stdout.write(text)
+        sys.stdout.flush()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +22,7 @@ from rce_fleet.experiments.workloads.graph import Stamp
 from rce_fleet.experiments.workloads.listener import Listener
 from rce_fleet.experiments.workloads.robots import RAYS, scans
 from rce_fleet.experiments.workloads.source import LOOK_S, Source, Stream
-from rce_fleet.experiments.workloads.telling import LONGEST, READY, reports, tell_samples
+from rce_fleet.experiments.workloads.telling import LONGEST, READY, reports, tell, tell_ready, tell_samples
 
 SEC = 1_000_000_000
 
@@ -156,6 +159,25 @@ def test_a_message_that_does_not_come_back_is_lost(capsys: pytest.CaptureFixture
     time.sleep(0.001)
     asker.step()
     assert told(capsys) == [{"bytes": 1_000_000, "trips": [], "lost": 1}, {"phase": "end"}]
+
+
+def test_lines_of_threads_do_not_mix(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Slow(io.StringIO):
+        def write(self, text: str) -> int:
+            for one in text:
+                super().write(one)
+                time.sleep(0)  # another thread's turn
+            return len(text)
+
+    slow = Slow()
+    monkeypatch.setattr(sys, "stdout", slow)
+    with ThreadPoolExecutor(4) as pool:
+        for number in range(100):
+            pool.submit(tell, {"number": number})
+            pool.submit(tell_ready)
+    lines = slow.getvalue().splitlines()
+    assert lines.count(READY) == 100
+    assert {report["number"] for report in reports(lines) if READY not in report} == set(range(100))
 
 
 def test_scans_have_the_kinects_rays_and_differ() -> None:
