@@ -22,6 +22,14 @@ SETTLE_S = 0.5
 START_S = 6.5
 """About how long a system takes to start and to end, seconds."""
 PAPER_SYSTEMS = ("single_master", "multi_master", "cloud")
+NETBOOK_CORES = 0.2
+"""The share of a core that stands for the robot's netbook.
+
+A TurtleBot's netbook has an Atom of 2010 with two cores of 1.8 GHz. By published single-thread ratings such a
+core does about an eighth of what a present server's core does; the second one adds about half as much for
+nodes that wait for each other. The machine that measures is not the one of the ratings: the share is an
+assumption, and 0.15 to 0.25 would be as good.
+"""
 NOT_ANY = "-"
 """System or software of a condition that has none."""
 
@@ -44,6 +52,10 @@ class Options:
     robots: int = 5
     seconds: float = 3.0
     quick: bool = False
+
+    def has_all(self, setup: Condition) -> bool:
+        """Return whether all conditions are measured with a set-up's software, not only the main ones."""
+        return not self.quick and setup.software == self.software[0]
 
 
 class Measured(NamedTuple):
@@ -135,14 +147,14 @@ class Experiment(ABC):
         del options
         return 0.0
 
-    async def prepare(self, options: Options, seed: int) -> dict[str, float]:
-        """Find out what all runs need to know, once; return values by name.
+    async def prepare(self, options: Options, seed: int) -> list[Value]:
+        """Find out what all runs need to know, once.
 
         Raises:
             ExperimentError: It cannot be done.
         """
         del options, seed
-        return {}
+        return []
 
     def each(self, options: Options, *, software: Iterable[str] | None = None) -> list[Condition]:
         """Return a set-up for each system and software."""

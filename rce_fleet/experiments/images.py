@@ -47,17 +47,17 @@ class Images(Experiment):
     programs = ("camera", "listener")
 
     def setups(self, options: Options) -> list[Condition]:
-        """Return a set-up for each system, with the first software."""
-        return self.each(options, software=options.software[:1])
+        """Return a set-up for each system and software; quickly, with the first one."""
+        return self.each(options, software=options.software[:1] if options.quick else None)
 
     def seconds(self, setup: Condition, options: Options) -> float:
         """Return about how long a run takes."""
-        return START_S + len(parts(options, setup.system)) * (SETTLE_S + options.seconds)
+        return START_S + len(parts(options, setup)) * (SETTLE_S + options.seconds)
 
     async def measure(self, trial: Trial) -> list[Measured]:
         """Run a set-up once."""
         options = trial.options
-        wanted = parts(options, trial.setup.system)
+        wanted = parts(options, trial.setup)
         encodings = sorted({part.factors["encoding"] for part in wanted})
         async with Bench(seed=trial.seed) as bench:
             flows = [Flow(*TOPICS[one], from_client=one == PNG) for one in encodings]
@@ -90,15 +90,23 @@ class Shot(NamedTuple):
     data: bytes
 
 
-def parts(options: Options, system: str) -> list[Part]:
-    """Return what is measured in each run: a main condition, and one or more for each factor."""
+def parts(options: Options, setup: Condition) -> list[Part]:
+    """Return what is measured in each run: the main condition, and with the first software further ones.
+
+    The rate that the link cannot carry comes last: what is left of it in queues is sent for seconds, and
+    would count in the part after it.
+    """
     found = [_part(MAIN_SIZE, RAW)]
+    if setup.software != options.software[0]:
+        return found
     if not options.quick:
         found += [_part(size, RAW) for size in SIZES if size != MAIN_SIZE]
-        found += [_part(MAIN_SIZE, RAW, is_above=True), _part(MAIN_SIZE, RAW, mode=QUIET)]
+        found.append(_part(MAIN_SIZE, RAW, mode=QUIET))
     found.append(_part(MAIN_SIZE, JPEG))
-    if system == "cloud":
+    if setup.system == "cloud":
         found.append(_part(MAIN_SIZE, PNG))
+    if not options.quick:
+        found.append(_part(MAIN_SIZE, RAW, is_above=True))
     return found
 
 

@@ -1,11 +1,27 @@
-"""The paper's first experiment: robots' laser scans, printed on machine 1."""
+"""The paper's first experiment: robots' laser scans, printed on machine 1.
+
+The paper's machine 2 was full with the simulation of its robots. So here it is a netbook where it is full,
+and the program that sends the scans uses processor time for each, as a simulator does: so much that the
+robots reach the paper's rate in the Single Master System. A share so small that sending alone fills it (0.5 %
+of a core) would measure the kernel instead: it stops the machine for several periods after each clock tick.
+"""
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import TYPE_CHECKING
 
 from rce_fleet.experiments.bench import CLIENT, SERVER, Bench
-from rce_fleet.experiments.experiment import SETTLE_S, START_S, Experiment, Measured, Options, Trial
+from rce_fleet.experiments.experiment import (
+    NETBOOK_CORES,
+    SETTLE_S,
+    START_S,
+    Experiment,
+    Measured,
+    Options,
+    Trial,
+)
+from rce_fleet.experiments.measures import Value
 from rce_fleet.experiments.results import Condition
 from rce_fleet.experiments.streaming import Part, Streaming
 from rce_fleet.experiments.systems.base import Flow, Layout, Workload
@@ -13,6 +29,8 @@ from rce_fleet.experiments.workloads.control import PRINTED, QUIET
 from rce_fleet.experiments.workloads.robots import SCAN
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
     from rce_fleet.experiments.systems.base import System
 
 ASKED_HZ = 30.0
@@ -22,11 +40,12 @@ FIXED_HZ = 4.0
 PAPER_HZ = 7.5
 """The rate that the paper's robots reached in its Single Master System."""
 CALIBRATION_STEPS = 7
-QUICK_CORES = 0.03
-"""The client's share of a core where only the programs are tried."""
-LEAST_CORES, MOST_CORES = 0.002, 1.0
-FULL_CORES = "full_cores"
-"""What the preparation finds: the share of a core with which the client reaches the paper's rate."""
+CALIBRATION_S = 2.0
+"""How long the rate is measured in each step."""
+LEAST_SHARE = 0.1
+"""Making scans takes this share of a full client's processor time at least."""
+SCAN_WORK = "scan_work"
+"""What the preparation finds: processor time for a scan with which a full client reaches the paper's rate."""
 
 
 class Laser(Experiment):
@@ -46,38 +65,34 @@ class Laser(Experiment):
 
     def seconds(self, setup: Condition, options: Options) -> float:
         """Return about how long a run takes."""
-        del setup
-        return START_S + len(parts(options, 1.0)) * (SETTLE_S + options.seconds)
+        return START_S + len(parts(options, setup, 1.0)) * (SETTLE_S + options.seconds)
 
     def preparation_seconds(self, options: Options) -> float:
         """Return about how long it takes to find the client's share."""
-        return 0.0 if options.quick else START_S + CALIBRATION_STEPS * (SETTLE_S + 1.0)
+        return 0.0 if options.quick else START_S + CALIBRATION_STEPS * (SETTLE_S + CALIBRATION_S)
 
-    async def prepare(self, options: Options, seed: int) -> dict[str, float]:
-        """Find the client's share of a core with which the Single Master System reaches the paper's rate."""
+    async def prepare(self, options: Options, seed: int) -> list[Value]:
+        """Find the work for a scan with which the Single Master System reaches the paper's rate."""
         setup = Condition.of(self.name, "single_master", options.software[0], robots=options.robots)
         trial = Trial(setup, options, seed)
         async with Bench(seed=seed) as bench:
             if not bench.meters[CLIENT].limits:
-                return {}
+                return []
             streaming = await start(trial.system(bench), options.robots)
-            low, high = LEAST_CORES, MOST_CORES
-            for _ in range(CALIBRATION_STEPS):
-                middle = (low * high) ** 0.5
-                part = Part({}, PRINTED, ASKED_HZ, client_cores=middle)
-                if await streaming.sent_rate(part, 1.0) < PAPER_HZ:
-                    low = middle
-                else:
-                    high = middle
-        return {FULL_CORES: (low * high) ** 0.5}
+
+            async def rate_with(work_s: float) -> float:
+                part = Part({}, PRINTED, ASKED_HZ, client_cores=NETBOOK_CORES, work_s=work_s)
+                return await streaming.sent_rate(part, CALIBRATION_S)
+
+            return [Value(SCAN_WORK, await calibrated(rate_with, options.robots), "s")]
 
     async def measure(self, trial: Trial) -> list[Measured]:
         """Run a set-up once."""
         options = trial.options
-        full = QUICK_CORES if options.quick else trial.prepared.get(FULL_CORES, 0.0)
+        work_s = most_work(options.robots) if options.quick else trial.prepared.get(SCAN_WORK, 0.0)
         async with Bench(seed=trial.seed) as bench:
             streaming = await start(trial.system(bench, Layout(robots=options.robots)), options.robots)
-            wanted = parts(options, full if bench.meters[CLIENT].limits else 0.0)
+            wanted = parts(options, trial.setup, work_s if bench.meters[CLIENT].limits else 0.0)
             found = await streaming.measure(wanted[: 1 if trial.is_warm_up else None], options.seconds)
         return [one for part, values in found for one in trial.measured(values, **part.factors)]
 
@@ -99,18 +114,43 @@ async def start(system: System, robots: int) -> Streaming:
     return Streaming(bench, control, [robot], [listener])
 
 
-def parts(options: Options, full_cores: float) -> list[Part]:
-    """Return what is measured in each run: the paper's condition, and one for each factor.
+async def calibrated(rate_with: Callable[[float], Awaitable[float]], robots: int) -> float:
+    """Return the work for a scan with which the robots reach the paper's rate, seconds of processor time.
+
+    Args:
+        rate_with: Returns the rate, Hz, that robots reach with so much work.
+        robots: Their number.
+    """
+    high = most_work(robots)
+    low = LEAST_SHARE * high
+    for _ in range(CALIBRATION_STEPS):
+        middle = sqrt(low * high)
+        if await rate_with(middle) < PAPER_HZ:
+            high = middle
+        else:
+            low = middle
+    return sqrt(low * high)
+
+
+def most_work(robots: int) -> float:
+    """Return the processor time for a scan with which nothing is left of a full client, seconds."""
+    return NETBOOK_CORES / (PAPER_HZ * robots)
+
+
+def parts(options: Options, setup: Condition, work_s: float) -> list[Part]:
+    """Return what is measured in each run: the main conditions, and one for each further factor.
 
     Args:
         options: How experiments are done.
-        full_cores: The client's share of a core where it is as full as the paper's; 0: not limited here.
+        setup: What is started.
+        work_s: Processor time for a scan where the client is as full as the paper's; 0: it cannot be limited.
     """
     main = {"printed": "yes", "client_cpu": "all", "rate": "free"}
     found = [Part(main, PRINTED, ASKED_HZ)]
-    if full_cores:
-        found.append(Part(main | {"client_cpu": "full"}, PRINTED, ASKED_HZ, client_cores=full_cores))
-    if not options.quick:
+    if work_s:
+        full = main | {"client_cpu": "full"}
+        found.append(Part(full, PRINTED, ASKED_HZ, client_cores=NETBOOK_CORES, work_s=work_s))
+    if options.has_all(setup):
         found.append(Part(main | {"rate": "fixed"}, PRINTED, FIXED_HZ))
         found.append(Part(main | {"printed": "no"}, QUIET, ASKED_HZ))
     return found

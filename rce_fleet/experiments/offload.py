@@ -18,7 +18,7 @@ import numpy as np
 
 from rce_fleet.drivers.robot_models import load_model
 from rce_fleet.experiments.bench import CLIENT, SERVER, Bench, Reading
-from rce_fleet.experiments.experiment import Experiment, Measured, Options, Trial
+from rce_fleet.experiments.experiment import NETBOOK_CORES, Experiment, Measured, Options, Trial
 from rce_fleet.experiments.measures import Value, used
 from rce_fleet.experiments.results import Condition
 from rce_fleet.experiments.robot_energy import Effort, energy_of
@@ -31,14 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 PLANNING = "planning"
-NETBOOK_CORES = 0.2
-"""The share of a core that stands for the robot's netbook.
-
-A TurtleBot's netbook has an Atom of 2010 with two cores of 1.8 GHz. By published single-thread ratings such a
-core does about an eighth of what a present server's core does; the second one adds about half as much for
-nodes that wait for each other. The machine that measures is not the one of the ratings: the share is an
-assumption, and 0.15 to 0.25 would be as good.
-"""
 
 
 class Link(NamedTuple):

@@ -77,11 +77,19 @@ class Robustness(Experiment):
     programs = ("provider", "watcher")
 
     def setups(self, options: Options) -> list[Condition]:
-        """Return set-ups by fault and system, with the first software; quickly, one of each system."""
-        return [
+        """Return set-ups by fault and system; with further software, only a killed core.
+
+        Quickly, one of each system is done, with the first software.
+        """
+        found = [
             Condition.of(self.name, setup.system, setup.software, fault=fault)
             for setup in self.each(options, software=options.software[:1])
             for fault in faults(setup.system, is_quick=options.quick)
+        ]
+        further = () if options.quick else options.software[1:]
+        return found + [
+            Condition.of(self.name, setup.system, setup.software, fault=CORE)
+            for setup in self.each(options, software=further)
         ]
 
     def seconds(self, setup: Condition, options: Options) -> float:

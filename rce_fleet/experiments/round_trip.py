@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 TRIPS = {7: 20, 100: 10, 1_000: 10, 10_000: 10, 100_000: 6, 1_000_000: 3, 10_000_000: 1}
 """Trips of each size, bytes, in a run, from machine 1, as in the paper."""
 BACK_TRIPS = {size: trips for size, trips in TRIPS.items() if size < max(TRIPS)}
-"""The same from machine 2."""
+"""The same from machine 2, and with further software."""
 FEW_TRIPS = {7: 10, 1_000: 5, 100_000: 3, 1_000_000: 1}
 """The same from machine 1 for the delays that are not the link's usual one."""
 QUICK_TRIPS = {7: 3, 1_000: 3, 100_000: 1}
@@ -55,7 +55,7 @@ class RoundTrip(Experiment):
         """Return about how long a run takes."""
         found = START_S
         for origin, delay, _ in rounds_of(setup, options):
-            trips = _trips(options, origin, delay)
+            trips = trips_of(setup, options, origin, delay)
             found += 2.0 + sum(number * (0.02 + 2 * size / TRIP_RATE) for size, number in trips.items())
         return found
 
@@ -76,7 +76,7 @@ class RoundTrip(Experiment):
                 if trial.is_warm_up and number:
                     break
                 await bench.set_delay(delay / 1000)
-                trips = _trips(trial.options, origin, delay)
+                trips = trips_of(trial.setup, trial.options, origin, delay)
                 if trial.is_warm_up:
                     trips = {size: 1 for size in trips if size < max(TRIPS)}
                 reports = await ask(system, origin, f"asker_{number}", trips)
@@ -148,17 +148,17 @@ def rounds_of(setup: Condition, options: Options) -> list[Round]:
     origins = [(SERVER, CONTAINER if place == CONTAINER else SERVER)]
     if not is_cloud or place == CONTAINER:
         origins.append((CLIENT, CLIENT))
-    is_main = setup.software == options.software[0]
-    delays = DELAYS_MS if is_main and not options.quick else DELAYS_MS[:1]
+    delays = DELAYS_MS if options.has_all(setup) else DELAYS_MS[:1]
     first, first_name = origins[0]
     further = [Round(first, delay, first_name) for delay in delays[1:]]
     found = [*(Round(origin, delays[0], name) for origin, name in origins), *further]
     return sorted(found, key=lambda one: -one.delay)
 
 
-def _trips(options: Options, origin: str, delay: int) -> Mapping[int, int]:
+def trips_of(setup: Condition, options: Options, origin: str, delay: int) -> Mapping[int, int]:
+    """Return how many trips of each size, bytes, are made from a machine."""
     if options.quick:
         return QUICK_TRIPS
     if delay != DELAYS_MS[0]:
         return FEW_TRIPS
-    return TRIPS if origin == SERVER else BACK_TRIPS
+    return TRIPS if origin == SERVER and options.has_all(setup) else BACK_TRIPS

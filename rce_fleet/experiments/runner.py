@@ -214,8 +214,9 @@ class Runner:
         options = self._plan.options_of(experiment)
         if not found and experiment.preparation_seconds(options):
             self._say(f"{experiment.name}: preparing")
-            found = await experiment.prepare(options, self._plan.seed)
-            write_rows(self._table, [Row(condition, 1, name, value, "") for name, value in found.items()])
+            values = await experiment.prepare(options, self._plan.seed)
+            write_rows(self._table, [Row(condition, 1, *value) for value in values])
+            found = {value.metric: value.value for value in values}
         return found
 
     async def _measure_link(self) -> None:

@@ -48,6 +48,7 @@ class Part:
         rate: Messages that are to be sent, per second and topic.
         stream: Which stream; empty: all.
         client_cores: Share of a core that the client has; 0: all that there is.
+        work_s: Processor time that making a message takes, seconds.
     """
 
     factors: Mapping[str, str]
@@ -55,6 +56,7 @@ class Part:
     rate: float
     stream: str = ""
     client_cores: float = 0.0
+    work_s: float = 0.0
 
 
 @dataclass(slots=True)
@@ -144,7 +146,7 @@ class Streaming:
 
     async def _watch(self, name: str, part: Part, seconds: float) -> _Watched:
         self._limit(part.client_cores)
-        give(self._control, Phase(name, part.mode, part.rate, part.stream))
+        give(self._control, Phase(name, part.mode, part.rate, part.stream, part.work_s))
         await asyncio.sleep(SETTLE_S)
         emulation = await self._bench.emulation_s()
         client = [await self._bench.read(CLIENT)]

@@ -148,7 +148,10 @@ def _cause(case: Case, total: Quantity, rate: Quantity, each: Quantity) -> str:
 
 
 def _blame(rate_ratio: float, cost_ratio: float) -> str:
-    rate, cost = (_log(value) for value in (rate_ratio, cost_ratio))
+    # What differs by less than systems that can be told apart makes no difference.
+    rate, cost = (
+        0.0 if abs(value) < log(MIN_RATIO) else value for value in map(_log, (rate_ratio, cost_ratio))
+    )
     if rate > DOMINANT * max(cost, 0.0):
         return "more messages make the difference" if cost >= 0 else "more messages outweigh cheaper ones"
     if cost > DOMINANT * max(rate, 0.0):

@@ -54,8 +54,9 @@ SECTIONS = (
         "laser",
         "Laser scans",
         "Machine 2 simulates TurtleBots that publish laser scans; machine 1 subscribes to all scans and "
-        "prints them (`printed=yes`) or not. `client_cpu=full` limits machine 2 to a share of the "
-        "processor at which the robots of SMS publish at about 7.5 Hz, as in the paper. `rate=free` "
+        "prints them (`printed=yes`) or not. `client_cpu=full` has machine 2 as full with the "
+        "simulation as the paper's: it has 0.2 of a core, and making a scan takes so much of it "
+        "(`scan_work`) that the robots of SMS publish at about 7.5 Hz. `rate=free` "
         "publishes as fast as possible, at most as asked; `rate=fixed` publishes at the same rate in all "
         "systems. Rates are per robot; a delay is the time from the scan's stamp until it is printed.",
         (_DELIVERY, _TRAFFIC, _USE),

@@ -22,12 +22,14 @@ class Phase(NamedTuple):
             programs shall tell what they have seen.
         rate: Messages that are to be sent, per second and topic.
         stream: Which of its streams the source sends; empty: all.
+        work_s: Processor time that the source uses before each message, as a simulator to make it, seconds.
     """
 
     name: str = START
     mode: str = QUIET
     rate: float = 5.0
     stream: str = ""
+    work_s: float = 0.0
 
     @property
     def is_small(self) -> bool:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .control import END, Control
+from .control import END, Control, Phase
 from .graph import Stamp
 from .telling import tell, tell_samples
 
@@ -20,6 +21,8 @@ LOOK_S = 0.1
 """How often it looks at the phase, seconds."""
 LAST_HZ = 5.0
 """Rate at which it says that the last phase has ended."""
+_BLOCK = bytes(65_536)
+"""Work is hashes of it, which take a fraction of a millisecond each."""
 
 
 class Stream(NamedTuple):
@@ -56,6 +59,8 @@ class Source:
         self._control = Control(control)
         self._sent: dict[tuple[str, str], list[tuple[int, ...]]] = defaultdict(list)
         self._due = time.monotonic()
+        self._pending: deque[Stream] = deque()
+        """Whose messages are due."""
         self._look_at = 0.0
         self._phase = self._control.read()
 
@@ -68,11 +73,16 @@ class Source:
             if phase != self._phase:
                 self._tell()
                 self._phase, self._due = phase, now
-        if now >= self._due:
-            self._send()
+                self._pending.clear()
+        if now >= self._due and not self._pending:
+            self._pending.extend(one for one in self._streams if phase_has(self._phase, one))
             period = 1.0 / (LAST_HZ if self._phase.mode == END else self._phase.rate)
             # What could not be sent in time is not made up for.
             self._due = max(self._due + period, now)
+        while self._pending:
+            self._send(self._pending.popleft())
+            if self._pending and self._phase.work_s:
+                return 0.0  # the program's graph writes each message before the next one is worked on
         return max(0.0, min(self._due, self._look_at) - time.monotonic())
 
     def _tell(self) -> None:
@@ -82,13 +92,24 @@ class Source:
         if self._control.read().mode == END:
             tell({"phase": END})
 
-    def _send(self) -> None:
+    def _send(self, stream: Stream) -> None:
         phase = self._phase
-        for stream in self._streams:
-            if phase.stream and stream.name != phase.stream:
-                continue
-            fields = stream.last if phase.is_small else next(stream.messages)
-            stamp = time.time_ns() // 1000 * 1000
-            self._outputs[stream.topic].send(fields, Stamp(stamp, phase.frame))
-            if not phase.is_small:
-                self._sent[phase.name, stream.topic].append((stamp // 1000,))
+        if not phase.is_small:
+            work(phase.work_s)
+        fields = stream.last if phase.is_small else next(stream.messages)
+        stamp = time.time_ns() // 1000 * 1000
+        self._outputs[stream.topic].send(fields, Stamp(stamp, phase.frame))
+        if not phase.is_small:
+            self._sent[phase.name, stream.topic].append((stamp // 1000,))
+
+
+def phase_has(phase: Phase, stream: Stream) -> bool:
+    """Return whether a stream is sent in a phase."""
+    return not phase.stream or stream.name == phase.stream
+
+
+def work(seconds: float) -> None:
+    """Use so much processor time, seconds; other threads run on, as beside a simulator in C++."""
+    end = time.thread_time() + seconds
+    while time.thread_time() < end:
+        hashlib.sha256(_BLOCK)

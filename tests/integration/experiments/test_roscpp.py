@@ -29,6 +29,8 @@ pytestmark = pytest.mark.needs("roscpp_sensor_msgs", "rospy", "roslaunch")
 
 TIMEOUT_S = 120.0
 FEW = 4
+WORK_S = 0.05
+"""Processor time that a message takes: more than all the rest of the program."""
 STAMP = re.compile(r"secs: *(\d+)")
 FIELD = re.compile(r"^\w+:", re.MULTILINE)
 """Messages of each topic that are printed."""
@@ -45,8 +47,14 @@ def compiled() -> None:
 class Started:
     """A program with its output in a file."""
 
-    def __init__(self, output: Path) -> None:
+    def __init__(self, output: Path, pid: int) -> None:
         self._output = output
+        self._pid = pid
+
+    def cpu_s(self) -> float:
+        """Processor time so far, seconds."""
+        fields = Path(f"/proc/{self._pid}/stat").read_text().rpartition(")")[2].split()
+        return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
 
     def lines(self) -> list[str]:
         text = self._output.read_text()
@@ -84,7 +92,7 @@ async def started(
             start_new_session=True,
         )
     try:
-        yield Started(output)
+        yield Started(output, process.pid)
     finally:
         await finish(process)
 
@@ -117,11 +125,13 @@ async def test_programs_print_and_tell_as_those_in_python(tmp_path: Path) -> Non
     ):
         everyone = (listener, reference, robots, camera)
         await until(lambda: all(READY in one.lines() for one in (listener, reference)), listener.lines)
-        give(control, Phase("0", PRINTED, 5.0))
+        before = robots.cpu_s()
+        give(control, Phase("0", PRINTED, 5.0, work_s=WORK_S))
         await until(
             lambda: all(one.lines().count("---") >= FEW * len(kinds) for one in (listener, reference)),
             lambda: [one.lines()[-5:] for one in everyone],
         )
+        assert robots.cpu_s() - before >= FEW * WORK_S
         give(control, Phase("end", END))
         await until(
             lambda: all(one.has_ended() for one in everyone), lambda: [one.lines()[-5:] for one in everyone]

@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 
 from rce_fleet.experiments.experiment import Options
-from rce_fleet.experiments.images import JPEG, PNG, RAW, parts, picture, shot_of, write_images
+from rce_fleet.experiments.images import JPEG, PNG, RAW, Images, parts, picture, shot_of, write_images
+from rce_fleet.experiments.results import Condition
 
 
 def test_pictures_differ_and_compress_as_a_cameras() -> None:
@@ -39,8 +40,27 @@ def test_the_list_names_each_image(tmp_path: Path) -> None:
 def test_only_an_engine_has_png(quick: bool) -> None:
     options = Options(quick=quick)
     encodings = {
-        system: {part.factors["encoding"] for part in parts(options, system)} for system in ("cloud", "x")
+        system: {part.factors["encoding"] for part in parts(options, setup_of(system))}
+        for system in ("cloud", "single_master")
     }
-    assert encodings == {"cloud": {RAW, JPEG, PNG}, "x": {RAW, JPEG}}
-    factors = [tuple(part.factors.items()) for part in parts(options, "cloud")]
+    assert encodings == {"cloud": {RAW, JPEG, PNG}, "single_master": {RAW, JPEG}}
+    factors = [tuple(part.factors.items()) for part in parts(options, setup_of("cloud"))]
     assert len(set(factors)) == len(factors)
+
+
+def test_rate_above_the_link_comes_last() -> None:
+    """What it leaves in queues counts in no other part."""
+    rates = [part.factors["rate"] for part in parts(Options(), setup_of("cloud"))]
+    assert rates.count("above") == 1
+    assert rates[-1] == "above"
+
+
+def test_further_software_has_the_main_condition_only() -> None:
+    options = Options(software=("ros", "rce"))
+    assert parts(options, setup_of("cloud", "rce")) == parts(options, setup_of("cloud"))[:1]
+    assert {setup.software for setup in Images().setups(options)} == {"ros", "rce"}
+    assert {setup.software for setup in Images().setups(Options(quick=True))} == {"ros"}
+
+
+def setup_of(system: str, software: str = "ros") -> Condition:
+    return Condition.of("images", system, software)

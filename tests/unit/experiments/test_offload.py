@@ -15,11 +15,10 @@ import pytest
 from rce.config.client import loads
 from rce.config.documents import write_items
 from rce_client.ros_bridge.explain import wires
-from rce_fleet.experiments.experiment import Options
+from rce_fleet.experiments.experiment import NETBOOK_CORES, Options
 from rce_fleet.experiments.measures import Value
 from rce_fleet.experiments.offload import (
     LINKS,
-    NETBOOK_CORES,
     PLANS,
     Link,
     Offload,

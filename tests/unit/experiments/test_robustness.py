@@ -87,7 +87,11 @@ def test_a_single_master_system_has_no_master_beside_its_core() -> None:
     setups = Robustness().setups(Options())
     without = [setup for setup in setups if dict(setup.factors)["fault"] == "master_killed"]
     assert {setup.system for setup in without} == {"multi_master", "cloud"}
-    assert len(setups) == 8
+    first = [setup for setup in setups if setup.software == "ros"]
+    assert len(first) == 8
+    further = [setup for setup in setups if setup.software == "rce"]
+    assert {dict(setup.factors)["fault"] for setup in further} == {"core_killed"}
+    assert {setup.system for setup in further} == {setup.system for setup in first}
     assert len(Robustness().setups(Options(quick=True))) == 3
 
 

@@ -6,8 +6,9 @@ from itertools import pairwise
 
 import pytest
 
+from rce_fleet.experiments.bench import SERVER
 from rce_fleet.experiments.experiment import Options
-from rce_fleet.experiments.round_trip import DELAYS_MS, RoundTrip, rounds_of
+from rce_fleet.experiments.round_trip import DELAYS_MS, TRIPS, RoundTrip, rounds_of, trips_of
 
 
 @pytest.mark.parametrize("quick", [False, True])
@@ -19,3 +20,13 @@ def test_no_delay_grows_in_a_run(quick: bool) -> None:
         assert all(before >= after for before, after in pairwise(delays))
         seen.update(delays)
     assert seen == (set(DELAYS_MS[:1]) if quick else set(DELAYS_MS))
+
+
+def test_first_software_sends_the_largest_message() -> None:
+    options = Options(software=("ros", "rce"))
+    largest = {
+        setup.software: max(trips_of(setup, options, SERVER, DELAYS_MS[0]))
+        for setup in RoundTrip().setups(options)
+    }
+    assert largest["ros"] == max(TRIPS)
+    assert largest["rce"] < max(TRIPS)

@@ -38,10 +38,10 @@ class Dice(Experiment):
         del options
         return 5.0
 
-    async def prepare(self, options: Options, seed: int) -> dict[str, float]:
+    async def prepare(self, options: Options, seed: int) -> list[Value]:
         del options, seed
         self.prepared += 1
-        return {"sides": 6.0}
+        return [Value("sides", 6.0, "count")]
 
     async def measure(self, trial: Trial) -> list[Measured]:
         self.trials.append(trial)

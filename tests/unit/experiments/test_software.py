@@ -94,7 +94,7 @@ def test_experiments_are_done_with_software_that_has_their_programs() -> None:
 
 def test_the_first_software_of_an_experiment_is_one_that_it_can_have() -> None:
     plan = Plan(list(EXPERIMENTS.values()), Options(software=("roscpp", "rce")), 1, 1)
-    for name, software in (("images", "roscpp"), ("scaling", "roscpp"), ("robustness", "rce")):
+    for name, software in (("scaling", "roscpp"), ("robustness", "rce")):
         works = plan.works(EXPERIMENTS[name], [])
         assert {work.run.condition.software for work in works} == {software}
 

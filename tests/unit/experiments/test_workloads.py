@@ -101,6 +101,21 @@ def test_a_source_sends_each_stream_at_the_rate_and_tells_it_after_the_phase(
     assert found[-1] == {"phase": END}
 
 
+def test_a_source_works_for_each_message_and_sends_one_at_a_time(tmp_path: Path) -> None:
+    graph, control = Graph(), tmp_path / "control.json"
+    streams = [Stream(topic, topic, "a/B", numbered(), {}) for topic in ("/a", "/b")]
+    give(control, Phase("1", PRINTED, 1e-3, work_s=0.01))
+    source = Source(graph, streams, control)
+    for topic in ("/a", "/b"):
+        before = time.thread_time()
+        source.step()
+        assert time.thread_time() - before >= 0.01
+        assert graph.sent[-1][0] == topic
+    assert len(graph.sent) == len(streams)
+    source.step()
+    assert len(graph.sent) == len(streams), "the next message is due later"
+
+
 def test_a_listener_is_ready_when_it_has_heard_all_and_tells_when_all_have_ended(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -19,11 +19,13 @@ struct Phase {
   std::string mode = QUIET;
   double rate = 5.0;
   std::string stream;
+  double work_s = 0.0;
 
   bool is_small() const { return mode == END || name == START; }
   std::string frame() const { return name + '/' + mode; }
   bool operator!=(const Phase& other) const {
-    return std::tie(name, mode, rate, stream) != std::tie(other.name, other.mode, other.rate, other.stream);
+    return std::tie(name, mode, rate, stream, work_s) !=
+           std::tie(other.name, other.mode, other.rate, other.stream, other.work_s);
   }
 };
 
@@ -48,7 +50,7 @@ class Control {
       boost::property_tree::read_json(path_, values);
       changed_ = changed;
       phase_ = {values.get<std::string>("name"), values.get<std::string>("mode"), values.get<double>("rate"),
-                values.get<std::string>("stream")};
+                values.get<std::string>("stream"), values.get<double>("work_s")};
     }
     return phase_;
   }

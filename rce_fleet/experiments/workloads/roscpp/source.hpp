@@ -2,6 +2,8 @@
 
 #pragma once
 
+#include <time.h>
+
 #include <algorithm>
 #include <functional>
 #include <map>
@@ -24,6 +26,20 @@ struct Stream {
   // Sends the next message, or the small one, with a stamp and a frame.
   std::function<void(const ros::Time&, const std::string&, bool is_small)> send;
 };
+
+// Processor time of this thread, seconds.
+inline double thread_s() {
+  timespec now{};
+  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &now);
+  return now.tv_sec + 1e-9 * now.tv_nsec;
+}
+
+// Uses so much processor time, seconds.
+inline void work(double seconds) {
+  const double end = thread_s() + seconds;
+  while (thread_s() < end) {
+  }
+}
 
 // A stream of messages that come again and again.
 template <class Message>
@@ -79,6 +95,9 @@ class Source {
     for (Stream& stream : streams_) {
       if (!phase_.stream.empty() && stream.name != phase_.stream) {
         continue;
+      }
+      if (!phase_.is_small() && phase_.work_s > 0.0) {
+        work(phase_.work_s);
       }
       const std::int64_t stamp = now_us();
       const ros::Time time(static_cast<std::uint32_t>(stamp / 1000000),
