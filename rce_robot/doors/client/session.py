@@ -11,7 +11,6 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING, Any, assert_never
 
-from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
 from rce.aio.queues import OverflowPolicy
@@ -132,15 +131,13 @@ class Session:
         await self.ended.wait()
 
     async def probe(self) -> bool:
-        """Return whether the robot still answers; end the connection if it does not.
+        """Return whether the robot still answers or sends; end the connection if it does not.
 
         The answer comes when the session has ended, which takes as long as its last requests take.
         """
         if not self.lost:
-            with contextlib.suppress(TimeoutError, ConnectionClosed):
-                async with asyncio.timeout(self._settings.probe_timeout):
-                    await (await self._socket.ping())
-                    return True
+            if await self._socket.probe(self._settings.probe_timeout):
+                return True
             self._socket.abort()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._drain_timeout + self._settings.probe_timeout):

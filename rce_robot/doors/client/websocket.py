@@ -16,11 +16,13 @@ The rule for writing is the transport's own: write while :attr:`RobotSocket.writ
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import socket
 from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
+from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode, Frame, Opcode
 from websockets.protocol import State
 
@@ -30,7 +32,6 @@ from rce_robot.doors.client.frames import FIN_BINARY, FIN_TEXT, JOIN_BELOW, add_
 from rce_robot.doors.client.steps import LARGE_FRAME, Steps
 
 if TYPE_CHECKING:
-    import asyncio
     from collections.abc import Iterator, Sequence
 
     from websockets.protocol import Event
@@ -138,6 +139,19 @@ class RobotSocket(GuardedConnection):
         """Drop the connection at once, without waiting for the robot."""
         self.transport.abort()
 
+    async def probe(self, timeout_s: float) -> bool:
+        """Ping the robot; return whether any data comes from it within ``timeout_s`` seconds.
+
+        A robot whose program does not read answers no ping, but its messages show that it is there.
+        """
+        before = self._data_count
+        self._data_came.clear()
+        with contextlib.suppress(TimeoutError, ConnectionClosed):
+            async with asyncio.timeout(timeout_s):
+                await self.ping()
+                await self._data_came.wait()
+        return self._data_count != before and self.protocol.state is State.OPEN
+
     def share_loop(self, share: LoopShare, user: str) -> None:
         """Handle received data in the turns of this user from now on."""
         self._share = share
@@ -172,6 +186,9 @@ class RobotSocket(GuardedConnection):
         self._input_bytes = 0
         self._waits = False
         """Whether the connection waits for its turn."""
+        self._data_count = 0
+        """How often data came."""
+        self._data_came = asyncio.Event()
         self._paused_reading = False
         self._eof = False
         self._steps = Steps(self.protocol.reader)
@@ -193,6 +210,8 @@ class RobotSocket(GuardedConnection):
 
     def data_received(self, data: bytes) -> None:
         """Handle received data, now or when it is the user's turn."""
+        self._data_count += 1
+        self._data_came.set()
         if self._share is None:
             self._steps.allow(None)
             super().data_received(data)

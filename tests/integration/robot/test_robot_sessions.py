@@ -143,6 +143,28 @@ async def test_a_dead_connection_makes_room_for_the_robots_new_one(dial: Dial) -
             await dead.recv()
 
 
+async def test_robot_that_sends_but_does_not_read_keeps_its_place(dial: Dial, robot_of: type[Robot]) -> None:
+    """A robot whose program reads late is not displaced while it sends."""
+    settings = SessionSettings(probe_timeout=0.5, drain_timeout=1.0)
+    async with running_cloud(settings) as cloud, dial(cloud) as busy:
+        busy.transport.pause_reading()
+        robot = robot_of(busy)
+
+        async def send() -> None:
+            while True:
+                await robot.say("unknown", STRING, {"data": "x"})
+                await asyncio.sleep(0.02)  # the rate of a sensor
+
+        sending = asyncio.create_task(send())
+        try:
+            status, _ = await refused(dial(cloud))
+        finally:
+            sending.cancel()
+        assert status == 409
+        busy.transport.resume_reading()
+        await (await busy.ping())
+
+
 async def test_robot_that_returns_waits_for_its_last_requests(dial: Dial, robot_of: type[Robot]) -> None:
     """A robot that disconnects during a request and connects again is admitted."""
     async with running_cloud(SessionSettings(probe_timeout=0.05, drain_timeout=30.0)) as cloud:
