@@ -15,6 +15,7 @@ from benchmarks import (
     abuse,
     bridge,
     containers,
+    failover,
     fanout,
     joining,
     latched,
@@ -71,6 +72,10 @@ def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awa
         "joining": (
             "Robots join one container",
             lambda e: joining.run(e, robots=200 if quick else 1000),
+        ),
+        "failover": (
+            "A robot task set ends, and its robots are at another one",
+            lambda _: failover.run(robots=200, passes=1 if quick else 3),
         ),
         "abuse": (
             "Beside another user's abuse",

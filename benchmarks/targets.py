@@ -250,6 +250,13 @@ TARGETS = [
         "x first hundred",
     ),
     Target(
+        "a robot task set ends: its 200 robots are at another one, with all that they had",
+        "failover",
+        _greatest("seconds until all are elsewhere", robots=200),
+        2,
+        "s",
+    ),
+    Target(
         "one client stalls: what the others get",
         "stalled",
         _column("share %", phase="it still stalls"),

@@ -40,6 +40,7 @@ from rce_master.exceptions import (
 )
 from rce_master.quotas import Quotas
 from rce_master.state import commands
+from rce_master.state.robots import DRAINED
 from rce_master.tokens import Tokens
 
 if TYPE_CHECKING:
@@ -195,6 +196,8 @@ class ControlHandler:
         return reply
 
     async def _try_login(self, process: str, id_: str, login: Login) -> LoginReply:
+        if process in self._state_service.tables.drains:
+            return LoginReply(request=login.request, status=_UNAVAILABLE, reason=DRAINED)
         try:
             await self._state_service.submit(await self._admission(process, id_, login))
             return LoginReply(request=login.request, endpoint=self._state_service.spec(id_))

@@ -183,7 +183,12 @@ class Reconciler:
     def on_changes(self, changes: Changes) -> None:
         """Send the messages that follow from a change."""
         for withdrawal in changes.withdrawals:
-            message = Drop(id=withdrawal.id, revision=withdrawal.revision, reason=withdrawal.reason)
+            message = Drop(
+                id=withdrawal.id,
+                revision=withdrawal.revision,
+                reason=withdrawal.reason,
+                elsewhere=withdrawal.elsewhere,
+            )
             self._sent.get(withdrawal.process, {}).pop(withdrawal.id, None)
             self._send(withdrawal.process, message)
         for id_, touched in changes.touched.items():

@@ -134,11 +134,17 @@ class App:
             task_set.use(channel)
             door: Door = ClientDoor(settings, listener, lobby, for_robots.server if for_robots else None)
             async with asyncio.TaskGroup() as tasks:
-                running = [tasks.create_task(channel.run())]
+                connected = tasks.create_task(channel.run())
+                running: list[asyncio.Task[None]] = []
                 async with door.opened(task_set):
                     running.append(tasks.create_task(task_set.run()))
                     running.append(tasks.create_task(_announce(channel, url, ready)))
-                    yield
+                    try:
+                        yield
+                    finally:
+                        # Before the robots leave: the master must not send them here again.
+                        connected.cancel()
+                        await asyncio.wait([connected])
                 for task in reversed(running):
                     task.cancel()
         finally:

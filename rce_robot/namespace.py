@@ -131,10 +131,15 @@ class Namespace:
         self._changed()
         return True
 
-    async def close(self, reason: str) -> None:
-        """End the connection, if any, and remove all interfaces."""
+    async def close(self, reason: str, *, elsewhere: bool = False) -> None:
+        """End the connection, if any, and remove all interfaces.
+
+        Args:
+            reason: For the robot.
+            elsewhere: Whether the robot is to connect again, at another task set.
+        """
         if self.session is not None:
-            await self.session.close(reason)
+            await self.session.close(reason, elsewhere=elsewhere)
         async with self._applying:
             await self._endpoint.close()
         self._account.close()

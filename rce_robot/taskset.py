@@ -149,7 +149,12 @@ class RobotTaskSet:
             case StatusWanted():
                 self._report_whole(EndpointId.parse(message.id))
             case Drop():
-                self._drop(EndpointId.parse(message.id), message.reason or "removed", message.revision)
+                self._drop(
+                    EndpointId.parse(message.id),
+                    message.reason or "removed",
+                    message.revision,
+                    elsewhere=message.elsewhere,
+                )
             case Sync():
                 await self._sync(message.endpoints)
             case Notify():
@@ -180,7 +185,7 @@ class RobotTaskSet:
             self._tasks = None
             async with asyncio.TaskGroup() as tasks:
                 for namespace in self._namespaces.values():
-                    tasks.create_task(_end(namespace, "the robot endpoint is shutting down"))
+                    tasks.create_task(_end(namespace, "the robot endpoint is shutting down", elsewhere=True))
             self._namespaces.clear()
 
     # Called by the gate: rce_robot.doors.base.Admission
@@ -310,18 +315,18 @@ class RobotTaskSet:
         for spec in specs:
             await self.settle(spec)
 
-    def _drop(self, id_: EndpointId, reason: str, revision: int) -> None:
+    def _drop(self, id_: EndpointId, reason: str, revision: int, *, elsewhere: bool = False) -> None:
         """Start to close a robot's namespace; report its end to the master."""
         namespace = self._namespaces.pop(id_, None)
         if namespace is None or self._tasks is None:
             self._channel.send(Gone(id=str(id_), revision=revision))
             return
         self._closing[id_] = asyncio.Event()
-        self._tasks.create_task(self._close(namespace, reason, revision))
+        self._tasks.create_task(self._close(namespace, reason, revision, elsewhere=elsewhere))
 
-    async def _close(self, namespace: Namespace, reason: str, revision: int) -> None:
+    async def _close(self, namespace: Namespace, reason: str, revision: int, *, elsewhere: bool) -> None:
         try:
-            await _end(namespace, reason)
+            await _end(namespace, reason, elsewhere=elsewhere)
         finally:
             self._closing.pop(namespace.id).set()
         self._channel.send(Gone(id=str(namespace.id), revision=revision))
@@ -332,8 +337,8 @@ class RobotTaskSet:
                 namespace.report(message.text)
 
 
-async def _end(namespace: Namespace, reason: str) -> None:
+async def _end(namespace: Namespace, reason: str, *, elsewhere: bool) -> None:
     try:
-        await namespace.close(reason)
+        await namespace.close(reason, elsewhere=elsewhere)
     except Exception:  # noqa: BLE001 - logged; it must not end anything else
         _log.exception("closing robot %s", namespace.id)

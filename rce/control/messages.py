@@ -283,6 +283,8 @@ class Drop(_Message, frozen=True, kw_only=True, omit_defaults=True):
     id: str
     revision: int
     reason: str = ""
+    elsewhere: bool = False
+    """Whether the robot is to connect again, at another task set."""
 
 
 class Notify(_Message, frozen=True, kw_only=True, omit_defaults=True):

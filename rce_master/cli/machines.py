@@ -81,16 +81,14 @@ def _print_staying(machine: Machine) -> None:
 
 
 def drain(
-    machine: Annotated[str, typer.Argument(help="Name of the machine, or of its container task set.")],
-    undo: Annotated[bool, typer.Option("--undo", help="Let it take containers again.")] = False,
-    wait: Annotated[
-        bool, typer.Option("--wait", help="Wait until all its containers are elsewhere.")
-    ] = False,
+    machine: Annotated[str, typer.Argument(help="Name of the machine, or of one of its task sets.")],
+    undo: Annotated[bool, typer.Option("--undo", help="Let it take containers and robots again.")] = False,
+    wait: Annotated[bool, typer.Option("--wait", help="Wait until all that it has is elsewhere.")] = False,
 ) -> None:
-    """Give a machine no new containers, and hand over those that it has; administrators only.
+    """Give a machine no new containers and robots, and hand over those that it has; administrators only.
 
-    Each container is started elsewhere first and then dropped here. What finds no room elsewhere stays, and
-    goes as soon as there is room.
+    Each container is started elsewhere first and then dropped here. Robots are disconnected, and connect to
+    another robot task set. What finds no place elsewhere stays, and goes as soon as there is one.
     """
     run(_undrain(machine) if undo else _drain(machine, wait=wait))
 
@@ -98,13 +96,13 @@ def drain(
 async def _undrain(machine: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
         await client.call("DELETE", f"/machines/{machine}/drain")
-    typer.echo(f"{machine} takes containers again")
+    typer.echo(f"{machine} takes containers and robots again")
 
 
 async def _drain(machine: str, *, wait: bool) -> None:
     async with ApiClient.of(credentials.load()) as client:
         found = (await client.call("PUT", f"/machines/{machine}/drain"))["machines"]
-        typer.echo(f"{machine} takes no new containers")
+        typer.echo(f"{machine} takes no new containers and robots")
         said: dict[str, str] = {}
         while True:
             _tell_changes(found, said)
@@ -119,13 +117,16 @@ async def _drain(machine: str, *, wait: bool) -> None:
 
 def _tell_changes(found: list[Machine], said: dict[str, str]) -> None:
     staying = {item["container"]: item["why"] for machine in found for item in machine["staying"]}
-    for container in [container for container in said if container not in staying]:
-        del said[container]
-        typer.echo(f"{container}: is elsewhere now")
-    for container, why in staying.items():
-        if said.get(container) != why:
-            typer.echo(f"{container}: {why}")
-            said[container] = why
+    for machine in found:
+        if machine["kind"] == "robot" and machine["endpoints"]:
+            staying[machine["process"]] = "its robots stay until another robot task set takes them"
+    for what in [what for what in said if what not in staying]:
+        del said[what]
+        typer.echo(f"{what}: {'is' if '/' in what else 'its robots are'} elsewhere now")
+    for what, why in staying.items():
+        if said.get(what) != why:
+            typer.echo(f"{what}: {why}")
+            said[what] = why
     if not staying:
         typer.echo("it is empty")
 

@@ -1,4 +1,4 @@
-"""REST: draining of container machines, and moves of single containers."""
+"""REST: draining of machines and task sets, and moves of single containers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ routes = route_table("machines")
 @routes.route(
     "PUT",
     "/machines/{machine}/drain",
-    "Give a machine no new containers and hand over those that it has",
+    "Give a machine no new containers and robots, and hand over those that it has",
     reply=models.MachinesOut,
     admin=True,
 )
@@ -25,7 +25,7 @@ async def drain_machine(call: Call) -> models.MachinesOut:
 @routes.route(
     "DELETE",
     "/machines/{machine}/drain",
-    "Let a machine take containers again",
+    "Let a machine take containers and robots again",
     reply=models.MachinesOut,
     admin=True,
 )

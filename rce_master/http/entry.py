@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter, deque
 from typing import TYPE_CHECKING
 
-from rce.control import TaskSetKind
 from rce.protocol import HandshakeError, master_reply, read_master_request
 from rce.web.entry import EntryAnswer
+from rce_master.state import robots
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -61,11 +61,7 @@ class Entry:
         now = self._clock()
         while self._sent and (self._sent[0][0] <= now - EXPECTED_S or len(self._sent) >= MAX_EXPECTED):
             self._expected[self._sent.popleft()[1]] -= 1
-        there = [
-            s
-            for s in self._tables.task_sets
-            if s.kind is TaskSetKind.ROBOT and s.url and self._tables.is_connected(s.process)
-        ]
+        there = [one for one in robots.open_task_sets(self._tables) if one.url]
         chosen = min(
             there, key=lambda s: (self._load(s) + self._expected[s.process], s.process), default=None
         )

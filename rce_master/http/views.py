@@ -176,7 +176,7 @@ class Views:
             promised_slots=room.slots,
             promised_cores=round(room.cpu, 4),
             promised_memory=room.memory,
-            draining=room.draining,
+            draining=room.draining or task_set.process in self._tables.drains,
             staying=self.staying(task_set) if room.draining else [],
         )
 

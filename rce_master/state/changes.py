@@ -49,6 +49,8 @@ class Withdrawal:
     id: str
     revision: int
     reason: str
+    elsewhere: bool = False
+    """Whether the robot is to connect again, at another task set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,9 +247,17 @@ class Transaction:
         """Make a secret for a link."""
         return self._make_token()
 
-    def withdraw(self, process: str, endpoint: str, reason: str) -> None:
-        """Have a task set drop an endpoint."""
-        self.changes.withdrawals.append(Withdrawal(process, endpoint, self.next_number("revision"), reason))
+    def withdraw(self, process: str, endpoint: str, reason: str, *, elsewhere: bool = False) -> None:
+        """Have a task set drop an endpoint.
+
+        Args:
+            process: The task set.
+            endpoint: Its id.
+            reason: For its user.
+            elsewhere: Whether the robot is to connect again, at another task set.
+        """
+        revision = self.next_number("revision")
+        self.changes.withdrawals.append(Withdrawal(process, endpoint, revision, reason, elsewhere))
 
     def notify(self, to: str, text: str) -> None:
         """Have an ``ER`` sent to a robot or to all robots of a user."""

@@ -251,7 +251,7 @@ class SetDraining:
     """An operator starts or cancels the drain of a machine."""
 
     machine: str
-    """Its name, or that of its container task set."""
+    """Its name, or that of a task set."""
     draining: bool
 
 

@@ -1,4 +1,7 @@
-"""Draining of machines: they take no new containers, and their containers are handed over.
+"""Draining of machines: they take no new containers and robots, and hand over those that they have.
+
+The robots of a drained robot task set are disconnected, and connect again at another one
+(:func:`rce_master.state.robots.empty_drained`).
 
 An operator may have a single container handed over, too.
 
@@ -21,7 +24,7 @@ from msgspec.structs import replace
 
 from rce.control import EndpointState, EndpointStatus, NodeState, TaskSetKind, without_wiring
 from rce_master.exceptions import ConflictError, NoRoomError, NotFoundError
-from rce_master.state import activity, capacity, endpoints, placing, volumes
+from rce_master.state import activity, capacity, endpoints, placing, robots, volumes
 from rce_master.state.lifecycle import ContainerEvent
 from rce_master.state.placement import Room, best_of, refusals
 from rce_master.state.records import Container, Drain, Move
@@ -42,8 +45,8 @@ _MOVE = 100
 
 
 def set_draining(tx: Transaction, command: SetDraining) -> None:
-    """Drain a machine, or cancel that; without effect if it is already so."""
-    for process in _processes(tx.tables, command.machine):
+    """Drain a machine or a task set, or cancel that; without effect if it is already so."""
+    for process in _drained(tx.tables, command.machine):
         if command.draining == (process in tx.tables.drains):
             continue
         if command.draining:
@@ -54,6 +57,7 @@ def set_draining(tx: Transaction, command: SetDraining) -> None:
             _call_back(tx, process)
             tx.happen("machine_undrained", process, user="")
     advance(tx)
+    robots.empty_drained(tx)
     placing.place_waiting(tx)
 
 
@@ -92,10 +96,18 @@ def _processes(tables: Tables, name: str) -> list[str]:
         for s in tables.task_sets
         if s.kind is TaskSetKind.CONTAINER and name in (s.process, s.machine.name)
     ]
+    if not found:
+        raise NotFoundError(f"there is no container machine {name!r}; rce machines lists them")
+    return found
+
+
+def _drained(tables: Tables, name: str) -> list[str]:
+    """Find the task sets that a drain concerns: those of a machine, or the one of this name."""
+    found = [s.process for s in tables.task_sets if name in (s.process, s.machine.name)]
     if name in tables.drains and name not in found:
         found.append(name)
     if not found:
-        raise NotFoundError(f"there is no container machine {name!r}; rce machines lists them")
+        raise NotFoundError(f"there is no machine or task set {name!r}; rce machines lists them")
     return found
 
 

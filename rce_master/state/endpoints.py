@@ -72,14 +72,15 @@ def remove_connection(tx: Transaction, connection: Connection) -> None:
             tx.touch_link(endpoint, connection.link)
 
 
-def withdraw(tx: Transaction, endpoint: Endpoint, reason: str) -> None:
+def withdraw(tx: Transaction, endpoint: Endpoint, reason: str, *, elsewhere: bool = False) -> None:
     """Have the endpoint's present task set drop it.
 
-    A task set that is away learns it from ``Sync`` when it comes back.
+    A task set that is away learns it from ``Sync`` when it comes back. The arguments are those of
+    :meth:`Transaction.withdraw`.
     """
     if not tx.tables.is_connected(endpoint.task_set):
         return
-    tx.withdraw(endpoint.task_set, endpoint.id, reason)
+    tx.withdraw(endpoint.task_set, endpoint.id, reason, elsewhere=elsewhere)
     if isinstance(endpoint, Container):
         tx.put(Tombstone(process=endpoint.task_set, id=endpoint.id))
 

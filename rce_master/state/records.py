@@ -288,10 +288,10 @@ class TaskSet(Struct, frozen=True, kw_only=True):
 
 
 class Drain(Struct, frozen=True, kw_only=True):
-    """A machine that is drained; kept until the operator cancels the drain."""
+    """A task set that is drained; kept until the operator cancels the drain, or a robot task set is gone."""
 
     process: str
-    """Of its container task set."""
+    """Its name."""
 
 
 class Counter(Struct, frozen=True, kw_only=True):

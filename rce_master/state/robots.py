@@ -23,7 +23,11 @@ from rce_master.state.tables import WAITING
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import RobotLeft, RobotLogin
+    from rce_master.state.records import TaskSet
+    from rce_master.state.tables import Tables
 
+DRAINED = "this robot process is being emptied; connect again"
+"""What robots of a drained task set are told."""
 _REMOVAL = 100
 """The work of removing a robot or a connection, as :attr:`StateSettings.max_work` counts it."""
 
@@ -108,14 +112,48 @@ def leave(tx: Transaction, robot: Robot, reason: str) -> None:
         tx.happen("robot_left", robot.id, reason)
 
 
-def send_away(tx: Transaction, robot: Robot, reason: str) -> None:
-    """End a robot's session. It is absent then, and finds everything again if it can log in again in time."""
+def send_away(tx: Transaction, robot: Robot, reason: str, *, elsewhere: bool = False) -> None:
+    """End a robot's session. It is absent then, and finds everything again if it can log in again in time.
+
+    Args:
+        tx: The transaction.
+        robot: The robot.
+        reason: For the robot and for its user.
+        elsewhere: Whether it is to connect again, at another task set.
+    """
     leave(tx, robot, reason)
     if robot.task_set:
-        endpoints.withdraw(tx, robot, reason)
+        endpoints.withdraw(tx, robot, reason, elsewhere=elsewhere)
         tx.put(replace(robot, task_set=""))
         tx.touch(robot.id)
         endpoints.touch_dialers(tx, robot.id)
+
+
+def open_task_sets(tables: Tables) -> list[TaskSet]:
+    """Return the robot task sets that take robots: those that are connected and not drained."""
+    return [
+        one
+        for one in tables.task_sets
+        if one.kind is TaskSetKind.ROBOT
+        and tables.is_connected(one.process)
+        and one.process not in tables.drains
+    ]
+
+
+def empty_drained(tx: Transaction) -> None:
+    """Send the robots of drained task sets elsewhere; they stay while no task set takes them."""
+    if not tx.tables.drains or not open_task_sets(tx.tables):
+        return
+    for drain in tx.tables.drains:
+        task_set = tx.tables.task_sets.get(drain.process)
+        if task_set is None or task_set.kind is not TaskSetKind.ROBOT:
+            continue
+        for robot in tx.tables.endpoints.by("task_set", drain.process):
+            assert isinstance(robot, Robot)
+            if tx.is_out_of_work():
+                return
+            tx.spend(_REMOVAL)
+            send_away(tx, robot, DRAINED, elsewhere=True)
 
 
 def reported(tx: Transaction, robot: Robot, status: EndpointStatus) -> None:

@@ -65,7 +65,7 @@ class Tables:
     - ``active``, ``open_ends``: only of endpoints of which a status is known.
     - ``presence``: exactly one record for each task set.
     - ``tombstones``: only of connected task sets.
-    - ``drains``: also of task sets that are gone: they may come back.
+    - ``drains``: also of container task sets that are gone: they may come back.
     - ``moves``: only of containers that are placed, to task sets that are connected.
     """
 

@@ -265,6 +265,7 @@ def _advance(tx: Transaction) -> None:
     for presence in [one for one in tx.tables.presence if not one.connected]:
         _expire(tx, presence)
     draining.continue_round(tx)
+    robots.empty_drained(tx)
     placing.place_waiting(tx)
     placing.tell_waiting(tx)
 
@@ -283,6 +284,8 @@ def _expire(tx: Transaction, presence: Presence) -> None:
     if not tx.tables.endpoints.count("task_set", presence.process):
         tx.delete(tx.tables.task_sets, presence.process)
         tx.delete(tx.tables.presence, presence.process)
+        if task_set.kind is TaskSetKind.ROBOT and presence.process in tx.tables.drains:
+            tx.delete(tx.tables.drains, presence.process)  # its next process has another name
         tx.happen("task_set_gone", presence.process, f"away for {grace:.0f} s", user="")
 
 

@@ -69,8 +69,8 @@ class DoorSession(Protocol):
     def fail(self, reason: str) -> None:
         """Drop the connection."""
 
-    async def close(self, reason: str) -> None:
-        """End the connection, and tell the robot why."""
+    async def close(self, reason: str, *, elsewhere: bool = False) -> None:
+        """End the connection, and tell the robot why, and if so that it can connect elsewhere."""
 
     async def probe(self) -> bool:
         """End the connection unless the robot answers; return whether it does."""

@@ -199,7 +199,7 @@ async def test_a_machine_is_drained_by_command(logged_in: Site, capsys: pytest.C
     text = capsys.readouterr().out
     assert "testUser/c: is being handed over to c2\ntestUser/c: is elsewhere now\nit is empty\n" in text
     assert "draining" in text
-    assert text.endswith("m1 takes containers again\n")
+    assert text.endswith("m1 takes containers and robots again\n")
 
 
 async def test_a_container_is_moved_by_command(logged_in: Site, capsys: pytest.CaptureFixture[str]) -> None:

@@ -117,7 +117,7 @@ def test_a_draining_machine_takes_nothing_new(two: World) -> None:
     drain(two, "m1", undo=True)
     two.container("newer")
     assert at(two, "newer") == "c1"
-    with pytest.raises(NotFoundError, match="there is no container machine 'm3'"):
+    with pytest.raises(NotFoundError, match="there is no machine or task set 'm3'"):
         drain(two, "m3")
 
 
