@@ -29,6 +29,7 @@ _PROGRAMS = {
     Role.ROBOT: ("rce-robot",),
     Role.CONTAINER: ("rce-container",),
 }
+_ETCD_PROGRAM = Path("/usr/bin/etcd")
 
 UserUnit = Annotated[
     bool | None,
@@ -53,28 +54,19 @@ def install_service(
     show: Annotated[bool, typer.Option("--print", help="Print the unit, install nothing.")] = False,
 ) -> None:
     """Install a systemd service and start it."""
-    system = _is_system(user_unit)
+    system = is_system(user_unit)
     service = make_service(role, tuple(arguments or ()), system=system, config=config, run_as=run_as)
-    text = unit(service)
     if show:
-        typer.echo(text, nl=False)
+        typer.echo(unit(service), nl=False)
         return
-    _check(service)
-    if service.user:
-        _make_user(service.user)
-    folder = _units(system=system)
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / service.name
-    path.write_text(text, encoding="utf-8")
-    typer.echo(f"made {path}")
-    _systemctl(system, ["daemon-reload"], ["enable", "--now", service.name])
+    install(service)
 
 
 def uninstall_service(
     role: Annotated[Role, typer.Argument(help="Program of the unit.")], *, user_unit: UserUnit = None
 ) -> None:
     """Stop and remove a systemd service; keep state and settings."""
-    system = _is_system(user_unit)
+    system = is_system(user_unit)
     path = _units(system=system) / f"rce-{role}.service"
     if not path.exists():
         _fail(f"{path} does not exist: this service is not installed")
@@ -82,6 +74,23 @@ def uninstall_service(
     path.unlink()
     _systemctl(system, ["daemon-reload"])
     typer.echo(f"removed {path}")
+
+
+def install(service: Service) -> None:
+    """Write the unit of a service, and start it; without systemd, print the commands for that.
+
+    Raises:
+        typer.Exit: What the service needs is missing, or it cannot be started.
+    """
+    check(service)
+    if service.user:
+        make_user(service.user)
+    folder = _units(system=service.system)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / service.name
+    path.write_text(unit(service), encoding="utf-8")
+    typer.echo(f"made {path}")
+    _systemctl(service.system, ["daemon-reload"], ["enable", "--now", service.name])
 
 
 def make_service(
@@ -92,6 +101,16 @@ def make_service(
     default = folder / "engine.yaml"
     file = default if config is None and default.exists() else config
     settings = _load(file)
+    if role is Role.ETCD:
+        state = SYSTEM_STATE if system else settings.state_dir
+        return Service(
+            role=role,
+            program=Path(shutil.which("etcd") or _ETCD_PROGRAM),
+            arguments=arguments or ("--config-file", str(state / "etcd.yaml")),
+            system=system,
+            user=run_as if system and run_as != "root" else "",
+            state=state / "etcd",
+        )
     program = Path(sys.executable).parent / _PROGRAMS[role][0]
     words = [*_PROGRAMS[role][1:]]
     if file is not None:
@@ -125,7 +144,8 @@ def _load(file: Path | None) -> EngineSettings:
         raise typer.Exit(2) from None
 
 
-def _is_system(user_unit: bool | None) -> bool:
+def is_system(user_unit: bool | None) -> bool:
+    """Return whether services are the machine's; by default they are for root."""
     return os.geteuid() == 0 if user_unit is None else not user_unit
 
 
@@ -133,8 +153,15 @@ def _units(*, system: bool) -> Path:
     return SYSTEM_UNITS if system else platformdirs.user_config_path("systemd") / "user"
 
 
-def _check(service: Service) -> None:
-    """Check what the service needs to start."""
+def check(service: Service) -> None:
+    """Check what a service needs to start.
+
+    Raises:
+        typer.Exit: It is missing.
+    """
+    if service.role is Role.ETCD:
+        _check_etcd(service)
+        return
     if not service.program.exists():
         _fail(f"{service.program} is not installed; install RCE with the extra 'server'")
     closed = next(filter(None, map(_closed_folder, _needed(service.program))), None)
@@ -153,6 +180,14 @@ def _check(service: Service) -> None:
         typer.echo(f"note: {default_secret_file()} has no secret yet; create one with: rce secret new")
 
 
+def _check_etcd(service: Service) -> None:
+    if not service.program.exists():
+        _fail("etcd is not installed; install release 3.4 or later (Debian: etcd-server)")
+    config = Path(service.arguments[-1])
+    if not config.exists():
+        _fail(f"{config} is missing: rce cluster init and rce cluster join write it")
+
+
 def _needed(program: Path) -> tuple[Path, ...]:
     """Return the folders of a program, its Python and this package."""
     return program, Path(sys.executable).resolve(), Path(sys.base_prefix), Path(__file__).resolve()
@@ -163,7 +198,8 @@ def _closed_folder(path: Path) -> Path | None:
     return next((each for each in reversed(path.parents) if not each.stat().st_mode & stat.S_IXOTH), None)
 
 
-def _make_user(name: str) -> None:
+def make_user(name: str) -> None:
+    """Create the user of services if it is missing."""
     try:
         pwd.getpwnam(name)
     except KeyError:
@@ -174,10 +210,15 @@ def _make_user(name: str) -> None:
         typer.echo(f"created the user {name}")
 
 
+def systemd_runs() -> bool:
+    """Return whether systemd runs on this machine."""
+    return Path("/run/systemd/system").is_dir() and shutil.which("systemctl") is not None
+
+
 def _systemctl(system: bool, *commands: list[str]) -> None:
     """Run systemctl, or print the command if systemd does not run."""
     scope = [] if system else ["--user"]
-    runs = Path("/run/systemd/system").is_dir() and shutil.which("systemctl")
+    runs = systemd_runs()
     for command in commands:
         argv = ["systemctl", *scope, *command]
         if not runs:

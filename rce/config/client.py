@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, ValidationError, model_validator
 
 from rce.config import client_checks
 from rce.config.bridges import Bridge, expand
@@ -65,7 +65,26 @@ def _check_authority(text: str) -> str:
 
 
 class ClientConfig(Strict):
-    """The contents of one robot's file."""
+    """The contents of one robot's file.
+
+    Beside ``url`` the file may have ``urls``, a list of further masters; programs that know ``url`` only
+    can read the same file.
+    """
+
+    @model_validator(mode="before")
+    @classmethod
+    def _join_urls(cls, document: Any) -> Any:
+        if not isinstance(document, dict) or "urls" not in document:
+            return document
+        rest = {key: value for key, value in document.items() if key != "urls"}
+        more = document["urls"]
+        if not isinstance(more, list | tuple) or not all(isinstance(url, str) for url in more):
+            raise ValueError("urls must be a list of masters' addresses, such as [http://master2:9000/]")
+        first = rest.get("url", [])
+        found = [*(first if isinstance(first, list | tuple) else [first]), *more]
+        if found:
+            rest["url"] = list(dict.fromkeys(found)) if all(isinstance(url, str) for url in found) else found
+        return rest
 
     url: Annotated[str, BeforeValidator(_check_urls)]
     """The master's address; several, which are separated by commas here and may be a list in the file, are

@@ -22,6 +22,8 @@ class Role(StrEnum):
     MASTER = "master"
     ROBOT = "robot"
     CONTAINER = "container"
+    ETCD = "etcd"
+    """A member of etcd, which keeps the state of several masters; configured by ``rce cluster``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,6 +61,7 @@ _TITLES = {
     Role.MASTER: "RCE master: clients, users, desired state",
     Role.ROBOT: "RCE robot endpoint: robots' connections",
     Role.CONTAINER: "RCE container task set: makes containers",
+    Role.ETCD: "RCE etcd: keeps the state of the masters",
 }
 
 _NO_RIGHTS = """\

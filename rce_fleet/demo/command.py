@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 import signal
 from collections.abc import Callable, Coroutine, Iterable
+from contextlib import AsyncExitStack
 from dataclasses import fields, replace
 from pathlib import Path
 from random import Random
@@ -15,11 +17,13 @@ import typer
 import uvloop
 
 from rce.cli.program_files import from_file
+from rce.cli.replicas import COUNTS
 from rce.config import Runtime
 from rce.own_process import end_signals
 from rce_fleet.demo.config import CoreProgram, DemoConfig, MachineBackend, Mode, TaskSource
 from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.headless import run_headless
+from rce_fleet.demo.leader_key import KEY, leader_key
 from rce_fleet.demo.modes import start_demo
 from rce_fleet.demo.random_goals import send_random_goals
 from rce_fleet.demo.resources import ANY, Ports, run_folder
@@ -92,6 +96,12 @@ def demo(
         Path | None,
         typer.Option(help="Starts and goals on the map (MovingAI .scen).", exists=True, dir_okay=False),
     ] = None,
+    replicas: Annotated[
+        int,
+        typer.Option(
+            metavar="N", help="Run 3 or 5 masters on an etcd; the key k and the page kill the leading one."
+        ),
+    ] = 1,
     slam: Annotated[
         bool, typer.Option("--slam", help="Begin without a map: the first robot explores and makes it.")
     ] = False,
@@ -145,13 +155,14 @@ def demo(
             raise DemoError(f"--offload needs containers: use it with --mode cloud, not --mode {mode}")
         if offload and slam:
             raise DemoError("--slam maps on the robot: use it without --offload")
+        _check_replicas(replicas, mode)
         count = robots or (DEFAULT_ROBOTS if scen is None else DEFAULT_ROBOTS_OF_SCEN)
         fleet = _choose_fleet(count, full_stack, find_world(world), seed, scen)
         _refuse_light_robots(mode, offload=offload, slam=slam, light=fleet.has_light)
         _check_duration(duration, mode, headless=headless)
         if timeout is None:
             timeout = TIMEOUT + TIMEOUT_PER_ROBOT * max(0, count - MANY) + (duration or 0.0)
-        ports = _choose_ports(headless, given, _needed_ports(mode, core_uri))
+        ports = _choose_ports(headless, given, _needed_ports(mode, core_uri), replicas)
         with run_folder(state_dir) as folder:
             config = DemoConfig(
                 fleet.scenario,
@@ -171,6 +182,7 @@ def demo(
                 duration=duration,
                 tasks=tasks,
                 world=fleet.world,
+                replicas=replicas,
             )
             show = typer.echo if verbose else _show_warning
             if headless:
@@ -220,6 +232,18 @@ def _check_duration(duration: float | None, mode: Mode, *, headless: bool) -> No
         raise DemoError(f"--duration kills the planner's container: use --mode cloud, not --mode {mode}")
 
 
+def _check_replicas(replicas: int, mode: Mode) -> None:
+    """Raise DemoError if so many masters cannot be run."""
+    if replicas == 1:
+        return
+    if mode is not Mode.CLOUD:
+        raise DemoError(f"--replicas needs the engine: use it with --mode cloud, not --mode {mode}")
+    if replicas not in COUNTS:
+        raise DemoError(f"--replicas must be 1, {' or '.join(map(str, COUNTS))}, found {replicas}")
+    if shutil.which("etcd") is None:
+        raise DemoError("etcd is not installed, which --replicas needs (Debian: etcd-server)")
+
+
 def _refuse_light_robots(mode: Mode, *, offload: bool, slam: bool, light: bool) -> None:
     """Raise DemoError for options that need robots with localization and navigation of their own."""
     if not light:
@@ -260,9 +284,16 @@ async def _headless(
 
 async def _with_page(config: DemoConfig, show: Callable[[str], None], *, auto: bool) -> int:
     say(f"starting the fleet, mode {config.mode}")
-    async with start_demo(config, show, say) as demo, aiohttp.ClientSession() as session:
+    async with (
+        start_demo(config, show, say) as demo,
+        aiohttp.ClientSession() as session,
+        AsyncExitStack() as stack,
+    ):
         demo.group.enable_restarts(say)
         typer.echo(f"RCE demo: {demo.page}")
+        if config.replicas > 1:
+            stack.enter_context(leader_key(config.master_urls, say))
+            say(f"press {KEY} to kill the leading master")
         station = StationClient(session, demo.page)
         rng = Random(config.seed)  # noqa: S311 - for goals, not for secrets
         await demo.group.run_while_alive(
@@ -315,11 +346,14 @@ def _needed_ports(mode: Mode, core_uri: str) -> tuple[str, ...]:
             assert_never(mode)
 
 
-def _choose_ports(headless: bool, given: dict[str, int | None], needed: Iterable[str]) -> Ports:
+def _choose_ports(
+    headless: bool, given: dict[str, int | None], needed: Iterable[str], replicas: int
+) -> Ports:
     """Return the ports to use; a headless run uses free ones for those without an option."""
     base = ANY if headless else Ports()
     chosen = {name: value for name, value in given.items() if value is not None}
-    return Ports(**{name: getattr(base, name) for name in given} | chosen).choose(needed)
+    ports = Ports(**{name: getattr(base, name) for name in given} | chosen)
+    return (ports if replicas == 1 else ports.in_rows(replicas)).choose(needed)
 
 
 def _show_warning(line: str) -> None:

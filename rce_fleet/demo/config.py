@@ -89,6 +89,7 @@ class DemoConfig:
         duration: Seconds for which tasks are streamed; None: one goal for each robot.
         tasks: What is streamed.
         world: What the world has besides cells.
+        replicas: How many masters the engine has.
     """
 
     scenario: Scenario
@@ -108,6 +109,7 @@ class DemoConfig:
     duration: float | None = None
     tasks: TaskSource = TaskSource.MANAGER
     world: NamedWorld | None = None
+    replicas: int = 1
 
     @property
     def full(self) -> int:
@@ -124,7 +126,13 @@ class DemoConfig:
     @property
     def account(self) -> FleetAccount:
         """The engine's address and the development user."""
-        return FleetAccount(url=f"http://{LOOPBACK}:{self.ports.http}/")
+        return FleetAccount(url=",".join(self.master_urls))
+
+    @property
+    def master_urls(self) -> tuple[str, ...]:
+        """The addresses of all masters."""
+        first = self.ports.http
+        return tuple(f"http://{LOOPBACK}:{port}/" for port in range(first, first + self.replicas))
 
     @property
     def scene(self) -> Path:

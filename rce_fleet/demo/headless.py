@@ -19,9 +19,10 @@ from rce_fleet.demo.exploration import Explored
 from rce_fleet.demo.goal_tasks import GoalTasks
 from rce_fleet.demo.judge import Judge, RobotScore
 from rce_fleet.demo.manager_tasks import ManagerTasks
+from rce_fleet.demo.masters import MasterKills
 from rce_fleet.demo.modes import RunningDemo, start_demo
 from rce_fleet.demo.scenario_run import ScenarioRun
-from rce_fleet.demo.task_run import TaskRun, kill_container
+from rce_fleet.demo.task_run import KILLS, TaskRun, kill_container
 from rce_fleet.demo.task_stream import TaskStream
 from rce_fleet.demo.traffic import MessageTotals
 from rce_fleet.drivers.report import WorldReport, read_report
@@ -48,6 +49,7 @@ class RunReport:
         scores: How well each robot localized; empty if the run did not begin.
         explored: What the first robot explored; None if there was a map, or it was not complete.
         tasks: The run, if tasks were streamed; then there is no ``run``.
+        masters: The kills of leading masters; None if there was one master.
     """
 
     scenario: Scenario
@@ -60,6 +62,7 @@ class RunReport:
     scores: Mapping[str, RobotScore] = field(default_factory=dict)
     explored: Explored | None = None
     tasks: TaskRun | None = None
+    masters: MasterKills | None = None
 
     @property
     def ok(self) -> bool:
@@ -77,6 +80,8 @@ class RunReport:
             missing = [robot for robot in self.scenario.robots if robot not in reached]
             if missing:
                 faults.append(f"not at their goals: {', '.join(missing)}")
+        if self.masters is not None:
+            faults += self.masters.faults
         if self.truth is None:
             faults.append("the simulated world wrote no report")
         elif self.truth.collisions.total:
@@ -119,6 +124,7 @@ class RunReport:
                 "messages": None if totals is None else totals.messages,
                 "dropped": None if totals is None else totals.dropped,
             },
+            **({} if self.masters is None else {"masters": self.masters.as_json()}),
             "blocked_cell": blocked[0] if blocked else None,
             "blocked_cells": blocked,
             "seed": self.seed,
@@ -183,6 +189,7 @@ async def run_headless(
         headless.scores,
         headless.explored,
         headless.tasks,
+        headless.masters,
     )
 
 
@@ -217,6 +224,7 @@ class _HeadlessRun:
         self.totals: MessageTotals | None = None
         self.scores: Mapping[str, RobotScore] = {}
         self.explored: Explored | None = None
+        self.masters: MasterKills | None = None
         self._config = config
         self._say = say
 
@@ -227,6 +235,10 @@ class _HeadlessRun:
         async with aiohttp.ClientSession() as session, judge:
             station = StationClient(session, demo.page)
             work = self._stream_tasks(station, demo) if self._config.duration else self._drive(station, demo)
+            if self._config.replicas > 1:
+                rng = Random(self._config.seed)  # noqa: S311 - for moments, not for secrets
+                self.masters = MasterKills(self._config.master_urls, rng, demo.truth, self._say)
+                work = self.masters.beside(work)
             try:
                 await work
             finally:
@@ -259,6 +271,7 @@ class _HeadlessRun:
                 demo.truth,
                 partial(kill_container, config.account.user),
                 self._say,
+                kills=KILLS if config.replicas == 1 else 0,
             )
             await self.tasks.run()
 

@@ -156,13 +156,15 @@ class CloudPrograms:
             "--robot-link-port": ports.robot_link,
             "--container-link-port": ports.container_link,
             **({"--runtime": config.runtime} if config.runtime else {}),
+            **({"--replicas": config.replicas} if config.replicas > 1 else {}),
         }
         return [*RCE, "up", "--dev", *(str(part) for item in options.items() for part in item)]
 
     def _station_argv(self, world: str) -> list[str]:
         folder, page = self._config.folder, str(self._config.ports.page)
         options = ["--port", page, "--world", world, "--state-dir", str(folder / "station")]
-        return [sys.executable, "-m", "rce_fleet.station", str(folder / "fleet.config"), *options]
+        demo = ["--demo"] if self._config.replicas > 1 else []
+        return [sys.executable, "-m", "rce_fleet.station", str(folder / "fleet.config"), *options, *demo]
 
     def _world_argv(self) -> list[str]:
         config, account = self._config, self._config.account

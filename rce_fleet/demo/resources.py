@@ -63,6 +63,19 @@ class Ports:
             found = {name: bound.enter_context(_bind(getattr(self, name), option_of(name))) for name in names}
         return replace(self, **found)
 
+    def in_rows(self, count: int) -> Ports:
+        """Return the same with ports for so many masters: theirs and the next ones are free.
+
+        Raises:
+            PortInUseError: A port is in use.
+        """
+        with contextlib.ExitStack() as bound:
+            found = {
+                name: _bind_row(bound, getattr(self, name), count, option_of(name))
+                for name in ("http", "control")
+            }
+        return replace(self, **found)
+
 
 ANY = Ports(page=0, http=0, control=0, ws=0, robot_link=0, container_link=0, core=0)
 """Free ports, so that several demos can run side by side."""
@@ -101,6 +114,32 @@ def _listen_anywhere(option: str) -> socket.socket:
     for port in random.SystemRandom().sample(QUIET_PORTS, ATTEMPTS):
         with contextlib.suppress(PortInUseError):
             return _listen(port, option)
+    raise PortInUseError(QUIET_PORTS.start, option)
+
+
+def _bind_row(bound: contextlib.ExitStack, first: int, count: int, option: str) -> int:
+    """Bind free ports in a row; return the first of them.
+
+    Args:
+        bound: Releases them.
+        first: The first one; 0: any.
+        count: How many.
+        option: The option that sets the first one.
+
+    Raises:
+        PortInUseError: One is in use.
+    """
+    if first:
+        for port in range(first, first + count):
+            bound.enter_context(_listen(port, option))
+        return first
+    starts = range(QUIET_PORTS.start, QUIET_PORTS.stop - count)
+    for start in random.SystemRandom().sample(starts, ATTEMPTS):
+        with contextlib.ExitStack() as row, contextlib.suppress(PortInUseError):
+            for port in range(start, start + count):
+                row.enter_context(_listen(port, option))
+            bound.push(row.pop_all())
+            return start
     raise PortInUseError(QUIET_PORTS.start, option)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import aiohttp
 from yarl import URL
 
+from rce.masters import split_addresses
 from rce.ros.errors import MasterError, XmlRpcError
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import RpcClient
@@ -34,17 +35,27 @@ class MessageTotals:
     dropped: int | None
 
 
-async def read_engine_totals(master: str, user: str, password: str) -> MessageTotals:
+async def read_engine_totals(masters: str, user: str, password: str) -> MessageTotals:
     """Read the totals of a user's interfaces from the engine's master.
 
+    Args:
+        masters: Its URL, or those of several, separated by commas; the first one that answers is used.
+        user: User ID.
+        password: The user's password.
+
     Raises:
-        DemoError: The master does not answer as expected.
+        DemoError: No master answers as expected.
     """
-    try:
-        async with aiohttp.ClientSession(timeout=HTTP_TIMEOUT, raise_for_status=True) as session:
-            interfaces = await _interfaces(session, URL(master) / "api/v1", user, password)
-    except (aiohttp.ClientError, TimeoutError, KeyError) as error:
-        raise DemoError(f"cannot read the message counters from the master: {error}") from error
+    interfaces, problem = None, ""
+    async with aiohttp.ClientSession(timeout=HTTP_TIMEOUT, raise_for_status=True) as session:
+        for master in split_addresses(masters):
+            try:
+                interfaces = await _interfaces(session, URL(master) / "api/v1", user, password)
+                break
+            except (aiohttp.ClientError, TimeoutError, KeyError) as error:
+                problem = str(error)
+    if interfaces is None:
+        raise DemoError(f"cannot read the message counters from the master: {problem}")
     return MessageTotals(
         messages=sum(interface["messages_in"] for interface in interfaces),
         dropped=sum(interface["dropped"] for interface in interfaces),

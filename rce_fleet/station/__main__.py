@@ -46,6 +46,7 @@ from rce_fleet.station.layers.engine_source import EngineLayerSource
 from rce_fleet.station.layers.hub import LayerHub
 from rce_fleet.station.layers.ros_source import RosLayerSource
 from rce_fleet.station.layers.sources import LayerSource
+from rce_fleet.station.masters_watch import DemoProcess, MastersWatch, masters_text
 from rce_fleet.station.planner_client import PlannerClient
 from rce_fleet.station.recording import Recorder, Records
 from rce_fleet.station.ros_planner_client import RosPlannerClient
@@ -56,7 +57,7 @@ from rce_fleet.station.world_link import WorldLink, states_text, things_text
 PORT = 9080
 
 
-@from_file("ui", shared=tls_of)
+@from_file("ui", leave_out=("demo",), shared=tls_of)
 def ui(
     config: Annotated[
         Path | None, typer.Argument(help="The operator's config: user, robotID, the planner's container.")
@@ -96,6 +97,7 @@ def ui(
     state_dir: Annotated[
         Path | None, typer.Option(help="Folder for the station's webhooks [STATE/station].")
     ] = None,
+    demo: Annotated[bool, typer.Option("--demo", hidden=True)] = False,
     tls: Tls = False,
     certificates: Certificates = None,
     certificate: CertificateName = ENGINE,
@@ -131,6 +133,7 @@ def ui(
             serve(
                 *(backend, bind, port, authenticator, names, server_tls, history, world),
                 webhooks=place / "webhooks.json",
+                kill_leader=DemoProcess().kill_leader if demo else None,
             )
         )
     except* RefusedError as group:
@@ -202,6 +205,9 @@ class Backend(Protocol):
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
         """Call ``on_state`` with the state of engine or graph until cancelled."""
 
+    def masters(self, on_state: Callable[[dict[str, Any]], None], *, kills: bool) -> MastersWatch | None:
+        """Return what calls ``on_state`` with who leads; None if there are not several masters."""
+
 
 class EngineBackend:
     """The planner runs in a container of the engine."""
@@ -227,6 +233,12 @@ class EngineBackend:
         self._on_state = on_state
         await self._watch.run()
 
+    def masters(self, on_state: Callable[[dict[str, Any]], None], *, kills: bool) -> MastersWatch | None:
+        """Return what calls ``on_state`` with who leads; None if the config names one master."""
+        if len(split_addresses(self.account.url)) == 1:
+            return None
+        return MastersWatch(self.account.url, tls=self._tls, on_state=on_state, kills=kills)
+
     def _take(self, state: dict[str, Any]) -> None:
         self._on_state(state)
         self.client.on_engine(state)
@@ -250,6 +262,11 @@ class RosBackend:
         """Call ``on_state`` with the graph's nodes until cancelled."""
         await GraphWatch(self._master_uri, on_state=on_state).run()
 
+    def masters(self, on_state: Callable[[dict[str, Any]], None], *, kills: bool) -> MastersWatch | None:
+        """Return None: a ROS graph has one master."""
+        del on_state, kills
+        return None
+
 
 async def serve(
     backend: Backend,
@@ -262,6 +279,7 @@ async def serve(
     world: str = "",
     *,
     webhooks: Path | None = None,
+    kill_leader: Callable[[], None] | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM."""
     view = FleetView()
@@ -305,6 +323,10 @@ async def serve(
         records=recorder.records,
         world=link,
         webhooks=webhooks,
+        kill_leader=kill_leader,
+    )
+    masters = backend.masters(
+        lambda state: feed.pages.send("masters", masters_text(state)), kills=kill_leader is not None
     )
     figures = FigureRecorder(view, recorder.records, station.fleet_api.statistics)
     await station.fleet_api.load()
@@ -328,6 +350,7 @@ async def serve(
             recorder.run,
             figures.run,
             *([link.run] if link else []),
+            *([masters.run] if masters else []),
             station.fleet_api.run,
         )
 

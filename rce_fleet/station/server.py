@@ -16,7 +16,7 @@ from rce.web.openapi import PREFIX, build_document
 from rce.web.origin import ServerNames
 from rce.web.routes import Route, RouteTable
 from rce_fleet.exceptions import EventsRestartedError, RequestRefusedError
-from rce_fleet.station import replay_routes, world_link
+from rce_fleet.station import masters_watch, replay_routes, world_link
 from rce_fleet.station.access import COOKIE, USER, AccessControl, problem, set_cookie, token_of
 from rce_fleet.station.api import (
     MAX_CELL,
@@ -85,6 +85,7 @@ class Station:
         records: What the fleet did, for replays; if None, there are none.
         world: The simulated world in which the fleet drives; if None, there is none.
         webhooks: File in which webhooks are kept; if None, they end with the program.
+        kill_leader: Kills the leading master of a demo; if None, this is not one.
 
     Attributes:
         fleet_api: The part of the API that the fleet manager answers.
@@ -103,6 +104,7 @@ class Station:
         records: Records | None = None,
         world: WorldLink | None = None,
         webhooks: Path | None = None,
+        kill_leader: Callable[[], None] | None = None,
     ) -> None:
         self._view = view
         self._fleet = fleet
@@ -113,6 +115,7 @@ class Station:
         self._socket = PageSocket(pages, layers, self._access)
         self._replay = ReplayRoutes(records)
         self._world = world_link.WorldRoutes(world, self._access)
+        self._masters = masters_watch.MastersRoutes(kill_leader, self._access)
         self._control = control_routes.ControlRoutes(control, fleet, self._access)
         has_roles = self._authenticator.has_logins
         self.fleet_api = FleetApi(fleet, self._access, webhooks, has_roles=has_roles)
@@ -130,11 +133,20 @@ class Station:
         for world_route in world_link.ROUTES:
             handler = partial(world_route.handler, self._world)
             app.router.add_route(world_route.method, PREFIX + world_route.path, handler)
+        for masters_route in masters_watch.ROUTES:
+            handler = partial(masters_route.handler, self._masters)
+            app.router.add_route(masters_route.method, PREFIX + masters_route.path, handler)
         for replay_route in replay_routes.ROUTES:
             handler = partial(replay_route.handler, self._replay)
             app.router.add_route(replay_route.method, PREFIX + replay_route.path, handler)
         self.fleet_api.add_to(app)
-        routes = (*ROUTES, *control_routes.ROUTES, *replay_routes.ROUTES, *world_link.ROUTES)
+        routes = (
+            *ROUTES,
+            *control_routes.ROUTES,
+            *replay_routes.ROUTES,
+            *world_link.ROUTES,
+            *masters_watch.ROUTES,
+        )
         document = build_document(
             [*(route.operation for route in routes), *self.fleet_api.operations],
             title="RCE operator station",

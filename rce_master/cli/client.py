@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
+from urllib.parse import urlsplit
 
 import aiohttp
 import msgspec
@@ -17,7 +18,7 @@ from rce.web.client import session_connector
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.events import Event
 from rce_master.exceptions import MasterError
-from rce_master.leadership.core import STANDBY_HEADER
+from rce_master.leadership.core import LEADER_HEADER, STANDBY_HEADER
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine
@@ -152,15 +153,42 @@ class ApiClient:
             CliError: The master could not be reached.
         """
         try:
-            async with self._session.ws_connect(
-                self._base + path, params=query, max_msg_size=max_size, heartbeat=REQUEST_S, timeout=_CLOSE
-            ) as socket:
+            async with await self._open_websocket(path, query, max_size) as socket:
                 yield socket
         except aiohttp.WSServerHandshakeError as error:
             await self.call("GET", path, query=dict(query))  # says why, which a handshake cannot
             raise ApiError(error.status, error.message) from error
         except aiohttp.ClientError as error:
             raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
+
+    async def _open_websocket(
+        self, path: str, query: dict[str, str], max_size: int
+    ) -> aiohttp.ClientWebSocketResponse:
+        """Open a WebSocket at the leading master, which a stand-by names."""
+        for number in range(len(self._masters.all), -1, -1):
+            url = self._masters.current
+            try:
+                return await self._session.ws_connect(
+                    self._base + path,
+                    params=query,
+                    max_msg_size=max_size,
+                    heartbeat=REQUEST_S,
+                    timeout=_CLOSE,
+                )
+            except aiohttp.ClientConnectorError:
+                if number <= 1:
+                    raise
+                self._masters.failed(url)
+            except aiohttp.WSServerHandshakeError as error:
+                headers = error.headers or {}
+                if number == 0 or STANDBY_HEADER not in headers:
+                    raise
+                leader = headers.get(LEADER_HEADER, "")
+                if leader and urlsplit(leader).scheme == urlsplit(url).scheme:
+                    self._masters = Masters((leader, *(one for one in self._masters.all if one != leader)))
+                else:
+                    self._masters.failed(url)
+        raise AssertionError("there is a master at least")
 
     async def upload(self, path: str, file: BinaryIO, query: dict[str, str]) -> Any:
         """Send a file's contents.
@@ -174,6 +202,9 @@ class ApiClient:
         """
         timeout = aiohttp.ClientTimeout(total=None, sock_connect=REQUEST_S, sock_read=UPLOAD_S)
         headers = {"Content-Type": "application/gzip"}
+        if len(self._masters.all) > 1:
+            # A file is sent once; this finds a master that answers.
+            await self.call("GET", "/packages", query={"limit": 1})
         try:
             async with self._session.put(
                 self._base + path,

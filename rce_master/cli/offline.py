@@ -138,15 +138,19 @@ class OfflineState:
 
 
 @asynccontextmanager
-async def open_state(place: Path | EtcdAddress) -> AsyncIterator[OfflineState]:
+async def open_state(place: Path | EtcdAddress, state_dir: Path | None = None) -> AsyncIterator[OfflineState]:
     """Open the state in a folder, the master's own or the engine's, which contains the master's, or in etcd.
+
+    Args:
+        place: Where the state is.
+        state_dir: For etcd, the folder with the audit log and the certificates; None: the default one.
 
     Raises:
         CliError: A master runs on it, there are two states, or the settings cannot be read.
         StoreError: The store cannot be used.
     """
     try:
-        settings = load_settings(None)
+        settings = load_settings(None, *([{"state_dir": state_dir}] if state_dir else []))
     except ConfigError as error:
         raise CliError(str(error)) from error
     folder = find_state(place) if isinstance(place, Path) else settings.master_state

@@ -202,7 +202,7 @@ async def _directory(state_dir: Path | None, store: str = "") -> AsyncIterator[_
         async with ApiClient.of(place) as client:
             yield _ApiDirectory(client, place.url)
         return
-    async with open_state(place) as offline:
+    async with open_state(place, state_dir if store else None) as offline:
         directory = _StoreDirectory(offline)
         try:
             yield directory

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from aiohttp import web
 
+from rce import __version__
 from rce_master.exceptions import StoreError
 
 if TYPE_CHECKING:
@@ -60,4 +61,11 @@ def describe_role(role: str, term: int, leader: str, *, ready: bool) -> dict[str
         leader: The name of the leading master; empty: none, or unknown.
         ready: Whether this master serves clients.
     """
-    return {"live": True, "ready": ready, "role": role, "term": term, "leader": leader}
+    return {
+        "live": True,
+        "ready": ready,
+        "role": role,
+        "term": term,
+        "leader": leader,
+        "version": __version__,
+    }

@@ -11,7 +11,7 @@ from rce.web.origin import ServerNames
 from rce_master.http.forward import NotForwardedError
 from rce_master.http.health import describe_role
 from rce_master.http.origin_guard import origin_guard
-from rce_master.leadership.core import STANDBY_HEADER
+from rce_master.leadership.core import LEADER_HEADER, STANDBY_HEADER
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -70,6 +70,8 @@ class _Standby:
         except NotForwardedError as error:
             text = f"this master is a stand-by; {self._keeper.fault or error}"
             headers = {hdrs.RETRY_AFTER: "1", STANDBY_HEADER: "yes"}
+            if self._keeper.leader is not None and self._keeper.leader.url:
+                headers[LEADER_HEADER] = self._keeper.leader.url
             return web.json_response({"error": text}, status=503, headers=headers)
 
     @property

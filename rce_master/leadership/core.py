@@ -61,6 +61,8 @@ LEADERSHIP_LIFE = LifeCycle(
 
 STANDBY_HEADER = "RCE-Standby"
 """In answers of a master that does not lead: the request was not done, and another master may do it."""
+LEADER_HEADER = "RCE-Leader"
+"""In the same answers: the URL of the leading master, where a WebSocket can be opened."""
 RENEWALS = 6
 """Renewals of a lease in the time that it lasts."""
 POLL_S = 0.25

@@ -15,6 +15,7 @@ export class Fleet extends EventTarget {
   blocked = new Set();
   pending = new Set();
   engine = null;
+  masters = null;      // which of several leads; null: there is one
   selected = null;
   models = [];         // of a simulated world: [name, x, y, yaw]
   things = {};         // what they are: {name: ["robot" or "light"], ["box", width, depth] or ["walker", radius]}
@@ -135,6 +136,10 @@ export class Fleet extends EventTarget {
 
   on_manager({ here }) {
     this.manager = here;
+  }
+
+  on_masters(message) {
+    this.masters = message;
   }
 
   on_engine(message) {

@@ -1,0 +1,299 @@
+"""``rce cluster`` on machines that are network namespaces: one is lost for good, and replaced."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import shlex
+import shutil
+import sys
+import tempfile
+from collections.abc import AsyncIterator, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.engine import Program, until
+from support.networks import NetworkMachine, network
+
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.needs("root", "netns", "etcd"),
+    pytest.mark.timeout(600),
+    pytest.mark.asyncio,
+]
+
+BIN = Path(sys.executable).parent
+SECRET = "a secret of all machines"
+START_S = 240.0
+USER = "alice"
+PASSWORD = "a long password"
+WRITER = """
+import asyncio, ssl, sys
+import aiohttp
+
+async def main(authority, password, *urls):
+    tls = ssl.create_default_context(cafile=authority)
+    timeout = aiohttp.ClientTimeout(total=5)
+    number = 0
+    token = ""
+    async with aiohttp.ClientSession(timeout=timeout) as session:
+        while True:
+            url = urls[number % len(urls)]
+            number += 1
+            try:
+                if not token:
+                    body = {"userID": "alice", "password": password}
+                    async with session.post(url + "api/v1/login", json=body, ssl=tls) as reply:
+                        token = (await reply.json()).get("token", "")
+                    continue
+                headers = {"Authorization": "Bearer " + token}
+                body = {"robot": f"robot{number}"}
+                async with session.post(
+                    url + "api/v1/robot-tokens", json=body, headers=headers, ssl=tls
+                ) as reply:
+                    if reply.status == 201:
+                        print(f"acknowledged robot{number}", flush=True)
+            except (aiohttp.ClientError, TimeoutError, OSError):
+                pass
+            await asyncio.sleep(0.2)
+
+asyncio.run(main(*sys.argv[1:]))
+"""
+LISTING = """
+import asyncio, json, ssl, sys
+import aiohttp
+
+async def main(authority, password, url):
+    tls = ssl.create_default_context(cafile=authority)
+    async with aiohttp.ClientSession() as session:
+        body = {"userID": "alice", "password": password}
+        async with session.post(url + "api/v1/login", json=body, ssl=tls) as reply:
+            headers = {"Authorization": "Bearer " + (await reply.json())["token"]}
+        async with session.get(url + "api/v1/robot-tokens", headers=headers, ssl=tls) as reply:
+            print(json.dumps([token["robot"] for token in (await reply.json())["tokens"]]))
+
+asyncio.run(main(*sys.argv[1:]))
+"""
+
+
+class Host:
+    """A machine of the cluster, its folder and its programs."""
+
+    def __init__(self, machine: NetworkMachine, folder: Path, name: str) -> None:
+        self.machine = machine
+        self.name = name
+        self.folder = folder / name
+        self.folder.mkdir()
+        (self.folder / "secret").write_text(SECRET)
+        (self.folder / "secret").chmod(0o600)
+        self.state = self.folder / "state"
+        env = {key: value for key, value in os.environ.items() if not key.startswith(("RCE_", "ROS_"))}
+        self.env = env | {"XDG_RUNTIME_DIR": str(self.folder), "HOME": str(self.folder)}
+        self.etcd: Program | None = None
+        self.master: Program | None = None
+
+    @property
+    def url(self) -> str:
+        return f"https://{self.machine.address}:9000/"
+
+    def program(self, name: str, *words: str) -> Program:
+        return Program(f"{self.name}-{name}", [*self.machine.prefix, *words], self.env, self.folder)
+
+    async def run(self, *words: str, given: str = "") -> tuple[int, str]:
+        process = await asyncio.create_subprocess_exec(
+            *self.machine.prefix,
+            *words,
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+            env=self.env,
+        )
+        output, _ = await process.communicate(given.encode())
+        assert process.returncode is not None
+        return process.returncode, output.decode()
+
+    async def rce(self, *words: str, given: str = "") -> tuple[int, str]:
+        return await self.run(str(BIN / "rce"), *words, given=given)
+
+    def cluster_words(self, command: str, *words: str) -> list[str]:
+        place = ("--address", self.machine.address, "--name", self.name, "--state-dir", str(self.state))
+        return ["cluster", command, *words, *place, "--foreground"]
+
+    async def start_etcd(self, command: str, *words: str) -> None:
+        self.etcd = self.program("etcd", str(BIN / "rce"), *self.cluster_words(command, *words))
+        await self.etcd.start(ready="etcd ready: ", timeout=START_S)
+
+    async def start_master(self) -> None:
+        """Start the master as the command that started etcd says."""
+        assert self.etcd is not None
+        told = next(
+            line.partition(": ")[2]
+            for line in self.etcd.output().splitlines()
+            if line.startswith("run the master: ")
+        )
+        _, *words = shlex.split(told)
+        secret = ("--secret-file", str(self.folder / "secret"))
+        self.master = self.program("master", str(BIN / "rce-master"), *words, *secret)
+        await self.master.start(ready="rce-master stand-by: ", timeout=START_S)
+
+    async def status(self) -> dict[str, Any]:
+        _, output = await self.rce("cluster", "status", "--json", "--state-dir", str(self.state))
+        try:
+            return dict(json.loads(output))
+        except ValueError:
+            return {"ok": False, "output": output}
+
+    async def lose(self) -> None:
+        """Pull the cable, and end everything on it."""
+        self.machine.unplug()
+        for program in (self.master, self.etcd):
+            assert program is not None
+            await program.kill()
+
+    async def end(self) -> None:
+        for program in (self.master, self.etcd):
+            if program is not None and program.running:
+                await program.stop()
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    yield path
+    shutil.rmtree(path)
+
+
+@asynccontextmanager
+async def hosts(folder: Path, count: int) -> AsyncIterator[list[Host]]:
+    with network(count) as machines:
+        made = [Host(machine, folder, f"m{index + 1}") for index, machine in enumerate(machines)]
+        async with AsyncExitStack() as stack:
+            for host in made:
+                stack.push_async_callback(host.end)
+            yield made
+
+
+async def give_certificate(first: Host, other: Host) -> None:
+    """Issue a certificate on the first machine and copy it."""
+    source = first.state / "certificates"
+    place = ("--host", other.machine.address, "--certificates", str(source))
+    code, output = await first.rce("certificate", "issue", other.name, *place)
+    assert code == 0, output
+    target = other.state / "certificates"
+    target.mkdir(parents=True, mode=0o700)
+    for suffix in ("pem", "key"):
+        shutil.copy(source / f"{other.name}.{suffix}", target / f"engine.{suffix}")
+    shutil.copy(source / "authority.pem", target / "authority.pem")
+
+
+def acknowledged(writer: Program) -> list[str]:
+    return [line.split()[1] for line in writer.output().splitlines() if line.startswith("acknowledged ")]
+
+
+async def wait_for_writes(writer: Program, count: int = 3) -> None:
+    wanted = len(acknowledged(writer)) + count
+    await until(lambda: len(acknowledged(writer)) >= wanted, timeout=START_S, what="writes are acknowledged")
+
+
+async def wait_until_whole(host: Host, names: set[str]) -> dict[str, Any]:
+    """Wait until a machine's status finds nothing to do, and the members are these."""
+
+    async def look() -> dict[str, Any] | None:
+        found = await host.status()
+        is_whole = found["ok"] and {each["name"] for each in found["members"]} == names
+        return (
+            found
+            if is_whole and {each["role"] for each in found["masters"]} == {"leader", "standby"}
+            else None
+        )
+
+    return await until(look, timeout=START_S, what=f"{names} are a cluster")
+
+
+async def test_lost_machine_is_replaced(folder: Path) -> None:
+    """The state is there, and writes are acknowledged all the time but for the change of the lead."""
+    async with hosts(folder, 4) as (one, two, three, four):
+        await one.start_etcd("init")
+        store = f"etcds://{one.machine.address}:2379"
+        code, output = await one.rce(
+            *("user", "add", USER, "--admin", "--password-stdin"),
+            *("--state-dir", str(one.state), "--store", store),
+            given=PASSWORD,
+        )
+        assert code == 0, output
+        await one.start_master()
+        assert "join two more" in (await one.rce("cluster", "status", "--state-dir", str(one.state)))[1]
+        for host in (two, three):
+            await give_certificate(one, host)
+            await host.start_etcd("join", one.machine.address)
+            await host.start_master()
+        assert "two machines cannot be highly available" in two.etcd.output()  # type: ignore[union-attr]
+        await wait_until_whole(one, {"m1", "m2", "m3"})
+
+        authority = str(one.state / "certificates" / "authority.pem")
+        urls = [host.url for host in (one, two, three)]
+        writer = one.program("writer", sys.executable, "-c", WRITER, authority, PASSWORD, *urls)
+        await writer.start(ready="acknowledged ", timeout=START_S)
+        await three.lose()
+        await wait_for_writes(writer)
+        await give_certificate(one, four)
+        code, output = await four.rce(*four.cluster_words("join", one.machine.address))
+        assert (code, "rce cluster remove m3" in output) == (1, True), output
+        code, output = await one.rce("cluster", "remove", "m2", "--state-dir", str(one.state))
+        assert (code, "m3 does not answer" in output) == (1, True), output
+        code, output = await one.rce("cluster", "remove", "m3", "--state-dir", str(one.state))
+        assert code == 0, output
+        await wait_for_writes(writer)
+        await four.start_etcd("join", f"{one.machine.address},{two.machine.address}")
+        await four.start_master()
+        await wait_until_whole(two, {"m1", "m2", "m4"})
+        await wait_for_writes(writer)
+        await writer.kill()
+
+        # The first machine fails too: the new one has the state, or it would have no quorum.
+        await one.lose()
+        await until(
+            lambda: _leads_one_of(two, {"m2", "m4"}), timeout=START_S, what="another master leads without m1"
+        )
+        authority = str(four.state / "certificates" / "authority.pem")
+        code, output = await four.run(sys.executable, "-c", LISTING, authority, PASSWORD, four.url)
+        assert code == 0, output
+        assert set(acknowledged(writer)) <= set(json.loads(output))
+
+
+async def _leads_one_of(host: Host, names: set[str]) -> bool:
+    found = await host.status()
+    with contextlib.suppress(KeyError):
+        return any(each["role"] == "leader" and each["name"] in names for each in found["masters"])
+    return False
+
+
+async def test_refused_joins_change_nothing(folder: Path) -> None:
+    """Names and addresses are unique, certificates must be there, and data is never overwritten."""
+    async with hosts(folder, 2) as (one, two):
+        await one.start_etcd("init")
+        code, output = await two.rce(*two.cluster_words("join", one.machine.address))
+        assert (code, "rce certificate issue m2 --host 10.77.0.2" in output) == (1, True), output
+        await give_certificate(one, two)
+        words = two.cluster_words("join", one.machine.address)
+        words[words.index("m2")] = "m1"
+        code, output = await two.rce(*words)
+        assert (code, "a member is named m1 already" in output) == (1, True), output
+        words = two.cluster_words("join", one.machine.address)
+        words[words.index("10.77.0.2")] = "10.77.0.9"
+        code, output = await two.rce(*words)
+        assert (code, "10.77.0.9" in output) == (1, True), output
+        code, output = await two.rce(*two.cluster_words("join", "10.77.0.9"))
+        assert (code, "etcd does not answer" in output) == (1, True), output
+        code, output = await one.rce(*one.cluster_words("join", two.machine.address), "--peer-port", "2390")
+        assert (code, "has the data of a member already" in output) == (1, True), output
+        code, output = await one.rce("cluster", "remove", "m1", "--state-dir", str(one.state))
+        assert (code, "the last member" in output) == (1, True), output
+        code, output = await two.rce("cluster", "status", "--state-dir", str(two.state))
+        assert (code, "this machine is in no cluster" in output) == (1, True), output
+        found = await one.status()
+        assert [each["name"] for each in found["members"]] == ["m1"]
