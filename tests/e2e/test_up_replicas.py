@@ -15,7 +15,7 @@ from pathlib import Path
 import aiohttp
 import pytest
 from support.engine import Program, command_line, engine_processes, until
-from support.ports import free_port, free_ports
+from support.ports import free_port, free_ports, free_row
 from support.stranger import check_echo, stranger, wire_echo
 
 from tools.leaks import sweep_cgroups
@@ -39,19 +39,11 @@ def folder() -> Iterator[Path]:
     assert not cgroups, f"left behind: {cgroups}"
 
 
-def free_row() -> int:
-    """Return the first of as many free ports in a row as there are masters."""
-    while True:
-        first, second, third = free_ports(COUNT)
-        if (second, third) == (first + 1, first + 2):
-            return first
-
-
 @contextlib.asynccontextmanager
 async def replicas(folder: Path, http: int) -> AsyncIterator[Program]:
     (folder / "state" / "etcd").mkdir(parents=True)
     (folder / "state" / "etcd" / "ports.json").write_text(json.dumps(free_ports(2 * COUNT)))
-    ports = {"http": http, "control": free_row(), "ws": free_port()}
+    ports = {"http": http, "control": free_row(COUNT), "ws": free_port()}
     ports |= {"robot-link": free_port(), "container-link": free_port()}
     env = {key: value for key, value in os.environ.items() if not key.startswith(("RCE_", "ROS_"))}
     argv = [
@@ -89,7 +81,7 @@ async def leader(http: int, *, after: int = 0) -> tuple[int, int] | None:
 
 
 async def test_a_robot_talks_on_and_another_one_logs_in(folder: Path) -> None:
-    http = free_row()
+    http = free_row(COUNT)
     async with replicas(folder, http) as up:
         urls = ",".join(f"http://127.0.0.1:{port}/" for port in range(http, http + COUNT))
         await up.start(ready=f"RCE ready: {urls}")

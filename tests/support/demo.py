@@ -103,8 +103,16 @@ class Demo:
 
 
 @contextlib.asynccontextmanager
-async def running_demo(*options: object) -> AsyncIterator[Demo]:
-    """Run a demo with a page; at the end it is stopped and must leave nothing."""
+async def running_demo(
+    *options: object, stdin: int = asyncio.subprocess.DEVNULL, start_timeout: float = 120.0
+) -> AsyncIterator[Demo]:
+    """Run a demo with a page; at the end it is stopped and must leave nothing.
+
+    Args:
+        options: Of ``rce demo``.
+        stdin: Its standard input.
+        start_timeout: Seconds until it must say where its page is.
+    """
     with clean_folder() as folder:
         ports, given = port_options()
         log = Path(tempfile.mktemp(prefix="rce-demo-log-", dir="/tmp"))
@@ -113,7 +121,7 @@ async def running_demo(*options: object) -> AsyncIterator[Demo]:
                 *(sys.executable, "-m", "rce_fleet.demo"),
                 *given,
                 *map(str, options),
-                stdin=asyncio.subprocess.DEVNULL,
+                stdin=stdin,
                 stdout=output,
                 stderr=output,
                 env=environment(folder),
@@ -122,7 +130,7 @@ async def running_demo(*options: object) -> AsyncIterator[Demo]:
         try:
             await until(
                 lambda: process.returncode is not None or f"RCE demo: {demo.page}" in demo.output(),
-                timeout=120,
+                timeout=start_timeout,
                 what="the demo says where its page is",
             )
             assert process.returncode is None, demo.output()

@@ -51,3 +51,11 @@ def free_ports(count: int) -> list[int]:
 def free_port() -> int:
     """Return one such port."""
     return free_ports(1)[0]
+
+
+def free_row(count: int) -> int:
+    """Return the first of so many free ports in a row."""
+    while True:
+        first, *others = sorted(free_ports(count))
+        if others == list(range(first + 1, first + count)):
+            return first

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from support.engine import until
 from support.etcd import Cluster, cluster
 from support.masters import DEV_USER, MasterProcess, Masters, masters
+from support.ports import free_port
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
@@ -32,6 +33,7 @@ from rce.control.messages import (
 from rce.control_channel.channel import TaskSetChannel
 from rce.control_channel.terms import Terms
 from rce_master.cli.client import ApiClient
+from rce_master.cli.exceptions import ApiError
 
 pytestmark = [pytest.mark.needs("etcd"), pytest.mark.asyncio(loop_scope="module")]
 
@@ -124,6 +126,19 @@ async def test_what_a_stand_by_does_not_forward(shared_masters: Masters) -> None
             assert (reply.status, "asked by another stand-by" in await reply.text()) == (503, True)
         with pytest.raises(aiohttp.WSServerHandshakeError, match="503"):
             await session.ws_connect(f"{standby.url}api/v1/containers/c/exec")
+
+
+async def test_a_websocket_is_opened_at_the_leader(shared_masters: Masters) -> None:
+    """By a client that knows a stand-by only, or an address at which there is no master first."""
+    leader = await shared_masters.leader()
+    standby = next(master for master in shared_masters.all if master is not leader)
+    nowhere = f"http://127.0.0.1:{free_port()}/"
+    for urls in (standby.url, f"{nowhere},{standby.url}", f"{nowhere},{leader.url}"):
+        async with ApiClient(urls, shared_masters.token) as client:
+            with pytest.raises(ApiError, match="nothing") as caught:
+                async with client.websocket("/containers/nothing/exec", {}, 1000):
+                    pytest.fail("there is no such container")
+            assert caught.value.status == 404
 
 
 async def test_the_leader_knows_who_asked_a_stand_by(shared_masters: Masters) -> None:

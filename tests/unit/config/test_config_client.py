@@ -432,3 +432,27 @@ def test_nodes_that_wait_for_one_another_are_found() -> None:
         for tag, after in ("ab", "bc", "ca")
     ]
     assert [fault.split(": ")[0] for fault in faults(data)] == [f"nodes[{index}].after" for index in range(3)]
+
+
+@pytest.mark.parametrize("first", ["http://one:9000/", ["http://one:9000/"]])
+def test_urls_are_further_masters(first: str | list[str]) -> None:
+    data = good() | {"url": first, "urls": ["http://two:9000/", "http://one:9000/", "http://three:9000/"]}
+    assert loads(json.dumps(data)).url == "http://one:9000/,http://two:9000/,http://three:9000/"
+
+
+def test_urls_alone_name_the_masters() -> None:
+    data = good() | {"urls": ["http://one:9000/", "http://two:9000/"]}
+    del data["url"]
+    assert loads(json.dumps(data)).url == "http://one:9000/,http://two:9000/"
+
+
+@pytest.mark.parametrize("urls", ["http://two:9000/", 7, [7], {"a": "b"}, None])
+def test_urls_must_be_a_list_of_addresses(urls: object) -> None:
+    (fault,) = faults(good() | {"urls": urls})
+    assert "urls must be a list" in fault
+
+
+@pytest.mark.parametrize("urls", [["ftp://two"], ["http://"], [""]])
+def test_urls_are_checked_like_url(urls: list[str]) -> None:
+    (fault,) = faults(good() | {"urls": urls})
+    assert fault.startswith("url: ")
