@@ -10,7 +10,7 @@ import time
 from collections import OrderedDict
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any, Self, TypedDict
+from typing import TYPE_CHECKING, Any, Self, TypedDict, TypeVar
 
 import aiohttp
 from aiohttp import hdrs
@@ -22,6 +22,8 @@ from rce.web.client import session_connector
 from rce_fleet.station.authentication import AuditedAction, AuthenticationError, StationUser
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
     from rce.tls.identity import Context
 
 _log = logging.getLogger(__name__)
@@ -36,6 +38,7 @@ MAX_CACHED = 1000
 MAX_QUEUED_ACTIONS = 1000
 _PASSED_ON = {400: 400, 401: 401, 403: 403, 422: 400, 429: 429}
 """Status of the master's answer to a login -> status of the station's; all others become 503."""
+T = TypeVar("T")
 _REQUEST_ERRORS = (aiohttp.ClientError, TimeoutError, ValueError, KeyError, AttributeError, TypeError)
 """Raised by requests to the master, also if another program answers at its address."""
 _TIMEOUT = aiohttp.ClientTimeout(total=10)
@@ -125,11 +128,9 @@ class EngineAuthenticator:
         asked_at, known = self._cache.get(token, (0.0, None))
         if token in self._cache and now - asked_at < CACHE_S:
             return known
-        master = self._masters.current
         try:
-            user = await self._ask(token)
+            user = await self._in_turn(lambda: self._ask(token))
         except _REQUEST_ERRORS as error:
-            self._masters.failed(master)
             if token in self._cache and known is not None and now - asked_at < OFFLINE_CACHE_S:
                 return known
             raise AuthenticationError(
@@ -151,12 +152,10 @@ class EngineAuthenticator:
         """
         body = {"userID": user, "password": password, "label": "station page", "lifetime": LIFETIME_S}
         headers = {"X-Forwarded-For": address} if address else {}
-        master = self._masters.current
         try:
-            token = await self._log_in(body, headers)
+            token = await self._in_turn(lambda: self._log_in(body, headers))
             found = await self.authenticate(token)
         except _REQUEST_ERRORS as error:
-            self._masters.failed(master)
             raise AuthenticationError(
                 503, f"the engine cannot be reached; try again ({_reason_of(error)})"
             ) from error
@@ -186,6 +185,21 @@ class EngineAuthenticator:
         except asyncio.QueueFull:
             _log.warning("not in the audit log, the queue is full: %s %s", action.name, action.subject)
 
+    async def _in_turn(self, request: Callable[[], Awaitable[T]]) -> T:
+        """Make a request at the master in use, and if there is none, at the others in turn."""
+        for left in range(len(self._masters.all) - 1, -1, -1):
+            master = self._masters.current
+            try:
+                return await request()
+            except aiohttp.ClientConnectorError:  # nothing was sent
+                self._masters.failed(master)
+                if not left:
+                    raise
+            except _REQUEST_ERRORS:
+                self._masters.failed(master)
+                raise
+        raise AssertionError("there is a master at least")
+
     async def _ask(self, token: str) -> StationUser | None:
         async with self._session.get(
             self._api / "user", headers=_bearer(token), **self._account.options
@@ -214,7 +228,7 @@ class EngineAuthenticator:
         while True:
             token, action = await self._actions.get()
             try:
-                await self._send_action(token, action)
+                await self._in_turn(lambda: self._send_action(token, action))  # noqa: B023 - called at once
             except (*_REQUEST_ERRORS, AuthenticationError) as error:
                 _log.warning("not in the audit log: %s %s: %s", action.name, action.subject, error)
 

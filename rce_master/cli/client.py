@@ -21,7 +21,7 @@ from rce_master.exceptions import MasterError
 from rce_master.leadership.core import LEADER_HEADER, STANDBY_HEADER
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Coroutine
+    from collections.abc import AsyncIterator, Coroutine, Mapping
     from types import TracebackType
     from typing import Self
 
@@ -180,7 +180,7 @@ class ApiClient:
                     raise
                 self._masters.failed(url)
             except aiohttp.WSServerHandshakeError as error:
-                headers = error.headers or {}
+                headers: Mapping[str, str] = error.headers or {}
                 if number == 0 or STANDBY_HEADER not in headers:
                     raise
                 leader = headers.get(LEADER_HEADER, "")
