@@ -27,6 +27,7 @@ import msgspec
 
 from rce import __version__
 from rce_master.exceptions import StoreError
+from rce_master.packages.contents import BUNDLES
 from rce_master.state.records import UserPackage
 from rce_master.state.tables import Tables
 from rce_master.store.base import SCHEMA_VERSION
@@ -34,7 +35,7 @@ from rce_master.store.lock import FolderLock
 from rce_master.store.sqlite import FILE_NAME
 
 FORMAT = 1
-MASTER, CERTIFICATES, BUNDLES = "master", "certificates", "bundles"
+MASTER, CERTIFICATES = "master", "certificates"
 MANIFEST = "manifest.json"
 
 _ATTEMPTS = 5

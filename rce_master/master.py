@@ -27,7 +27,7 @@ from rce_master.executions import Executions
 from rce_master.http.entry import Entry, refusal
 from rce_master.http.forwarded import PURPOSE, ForwardingKey
 from rce_master.http.routes import Services
-from rce_master.packages.contents import ContentStore
+from rce_master.packages.contents import BUNDLES, ContentStore
 from rce_master.packages.service import PackageService
 from rce_master.quotas import Quotas
 from rce_master.reconciler import Reconciler
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from rce.config import Secret
     from rce.web.entry import EntryAnswer
     from rce_master.leadership import Fence
+    from rce_master.packages.copies import ArchiveCopies
     from rce_master.settings import MasterSettings
     from rce_master.state.changes import Changes
     from rce_master.store import Store
@@ -77,6 +78,7 @@ class Master:
         store: Keeps the desired state; the caller closes it.
         hasher: How passwords are hashed.
         fence: Tells whether this master leads, if there may be others; the store is one of its term.
+        copies: Makes what copies packages' archives to the other masters, if there may be any.
     """
 
     def __init__(
@@ -87,8 +89,10 @@ class Master:
         *,
         hasher: PasswordHasher | None = None,
         fence: Fence | None = None,
+        copies: Callable[[ContentStore], ArchiveCopies] | None = None,
     ) -> None:
         self._fence = fence
+        self._copies = copies
         self._settings = settings
         self._secret = secret
         self._store = store
@@ -136,8 +140,9 @@ class Master:
             state_service, reconciler, authenticator, tokens, quotas, audit, self._fence
         )
         lifetime = self._settings.token_lifetime
-        self._contents = ContentStore(self._settings.state_dir / "bundles")
-        packages = PackageService(state_service, self._contents)
+        contents = ContentStore(self._settings.state_dir / BUNDLES)
+        copies = None if self._copies is None else self._copies(contents)
+        packages = PackageService(state_service, contents, copies=copies)
         services = Services(
             state_service=state_service,
             reconciler=reconciler,
@@ -202,7 +207,7 @@ class Master:
             master="rce-master",
             host=settings.bind,
             port=settings.control_port,
-            contents=self._contents.read,
+            contents=services.packages.read,
             tls=for_task_sets.mutual_server if for_task_sets else None,
             is_revoked=for_task_sets.is_revoked if for_task_sets else None,
             on_execution=services.executions.arrived,

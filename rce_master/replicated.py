@@ -8,6 +8,7 @@ import logging
 from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import TaskScope
 from rce.config.store_address import ETCD_PORT
 from rce.guard import TrustedProxies
 from rce.link.address import in_url, is_any, own_address
@@ -19,7 +20,13 @@ from rce_master.exceptions import FencedError, MasterError
 from rce_master.http.forwarded import PURPOSE, ForwardingKey
 from rce_master.leadership import LeaseSettings
 from rce_master.leadership.keeper import LeadershipKeeper
+from rce_master.leadership.registry import MasterRegistry
 from rce_master.master import Master
+from rce_master.packages.contents import BUNDLES, ContentStore
+from rce_master.packages.copies import ArchiveCopies
+from rce_master.packages.request_key import PURPOSE as ARCHIVES
+from rce_master.packages.request_key import RequestKey
+from rce_master.packages.transfer import CONNECT_S, ArchiveClient
 from rce_master.store.etcd import EtcdClient
 from rce_master.store.etcd.exceptions import EtcdAwayError, NoQuorumError
 from rce_master.store.etcd.layout import prepare
@@ -28,9 +35,11 @@ from rce_master.store.lock import FolderLock
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from aiohttp import ClientSession
     from argon2 import PasswordHasher
 
     from rce.config import Secret
+    from rce.tls import Context
     from rce_master.http.forward import Forwarder
     from rce_master.master import RunningMaster
     from rce_master.settings import MasterSettings
@@ -98,26 +107,33 @@ class ReplicatedMaster:
             async with EtcdClient(address.endpoints, tls=tls, attempt=attempt) as client:
                 lease = LeaseSettings(ttl=settings.lease)
                 keeper = LeadershipKeeper(client, address.prefix, settings.name, lease)
-                while not is_stopping():
-                    await self._stand_by_and_lead(keeper, on_ready, on_standby)
+                registry = MasterRegistry(client, address.prefix, settings.name)
+                async with TaskScope() as tasks:
+                    tasks.spawn(registry.run(), name="registry of masters")
+                    while not is_stopping():
+                        await self._stand_by_and_lead(keeper, registry, on_ready, on_standby)
         finally:
             lock.close()
 
     async def _stand_by_and_lead(
         self,
         keeper: LeadershipKeeper,
+        registry: MasterRegistry,
         on_ready: Callable[[RunningMaster], None],
         on_standby: Callable[[str], None],
     ) -> None:
-        from rce_master.http.standby import make_standby_app  # loads aiohttp's server
+        from rce_master.http.archives import ArchiveRoutes  # loads aiohttp's server
+        from rce_master.http.standby import make_standby_app
 
         settings = self._settings
         for_clients = settings.tls.for_clients()
         names = ServerNames(settings.bind, settings.names)
-        async with AsyncExitStack() as waiting:
+        key = RequestKey(self._secret.derive(ARCHIVES))
+        archives = ArchiveRoutes(ContentStore(settings.state_dir / BUNDLES), key, keeper.newest_term)
+        async with AsyncExitStack() as waiting, self._session() as session:
             forwarder = await waiting.enter_async_context(self._forwarder())
             server = HttpServer(
-                make_standby_app(keeper, forwarder, names, settings.allowed_origins),
+                make_standby_app(keeper, forwarder, archives, names, settings.allowed_origins),
                 settings.bind,
                 settings.http_port,
                 for_clients.server if for_clients else None,
@@ -128,11 +144,19 @@ class ReplicatedMaster:
             except OSError as error:
                 raise MasterError(str(error)) from error
             keeper.url = await self._own_url(server.url)
+            registry.announce(keeper.url)
             on_standby(server.url)
             store, fence = await keeper.acquire()
             _log.info("this master leads in term %d", fence.term)
+            client = ArchiveClient(session, key, fence, self._masters_tls())
+
+            def copies(contents: ContentStore) -> ArchiveCopies:
+                return ArchiveCopies(contents, registry, client)
+
             try:
-                master = Master(settings, self._secret, store, hasher=self._hasher, fence=fence)
+                master = Master(
+                    settings, self._secret, store, hasher=self._hasher, fence=fence, copies=copies
+                )
                 async with asyncio.TaskGroup() as group:
                     keeping = group.create_task(keeper.keep())
                     await master.run(on_ready, waiting.aclose)
@@ -146,10 +170,20 @@ class ReplicatedMaster:
     def _forwarder(self) -> Forwarder:
         from rce_master.http.forward import Forwarder  # loads aiohttp
 
-        tls = self._settings.tls
-        context = tls.own_identity().client if tls.enabled and tls.certificate is None else None
         key = ForwardingKey(self._secret.derive(PURPOSE))
-        return Forwarder(key, TrustedProxies(self._settings.trusted_proxies), context)
+        return Forwarder(key, TrustedProxies(self._settings.trusted_proxies), self._masters_tls())
+
+    def _masters_tls(self) -> Context | None:
+        """Return what gives the TLS context of a connection to another master; None: the library's own."""
+        tls = self._settings.tls
+        return tls.own_identity().client if tls.enabled and tls.certificate is None else None
+
+    @staticmethod
+    def _session() -> ClientSession:
+        from aiohttp import ClientSession, ClientTimeout, DummyCookieJar
+
+        timeout = ClientTimeout(total=None, sock_connect=CONNECT_S)  # each request has a limit of its own
+        return ClientSession(cookie_jar=DummyCookieJar(), timeout=timeout, trust_env=False)
 
     async def _own_url(self, url: str) -> str:
         """Return the URL of this machine's HTTP server for the other masters.

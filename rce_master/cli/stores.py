@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from contextlib import AsyncExitStack
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
@@ -20,19 +21,12 @@ from rce_master.cli.client import run
 from rce_master.cli.exceptions import CliError
 from rce_master.cli.offline import find_state, open_store
 from rce_master.exceptions import StoreBusyError
-from rce_master.state.tables import Tables
+from rce_master.packages.carrying import carry, packages_of
+from rce_master.packages.contents import BUNDLES
 from rce_master.state_service import load_converted
 from rce_master.store.copying import copy_rows
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from rce_master.store import Snapshot
-
 _ADDRESS = "sqlite:FOLDER|etcd://HOST:2379,..."
-
-_SHOWN = 5
-"""Packages that a message names."""
 
 app = typer.Typer(no_args_is_help=True, help="Move the state of the master to another store.")
 
@@ -46,33 +40,46 @@ def _root() -> None:
 def copy(
     source: Annotated[str, typer.Option("--from", metavar=_ADDRESS, help="The store that is copied.")],
     target: Annotated[str, typer.Option("--to", metavar=_ADDRESS, help="The store that is filled.")],
+    state_dir: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH", help="State folder of this machine's master on etcd: holds archives of packages."
+        ),
+    ] = None,
 ) -> None:
     """Copy the state of a master to an empty store, while no master runs on either."""
-    run(_copy(source, target))
+    run(_copy(source, target, None if state_dir is None else find_state(state_dir.absolute())))
 
 
-async def _copy(source: str, target: str) -> None:
+async def _copy(source: str, target: str, state_dir: Path | None) -> None:
     here, there = _read(source, "--from"), _read(target, "--to")
     if here == there:
         raise CliError("--from and --to name the same store")
     if not isinstance(here, EtcdAddress) and not (here / STORE_FILE).exists():
         raise CliError(f"--from names {here}, which holds no state: it has no {STORE_FILE}")
     try:
-        tls = TlsChoice.of(load_settings(None))
+        settings = load_settings(None)
+        tls = TlsChoice.of(settings)
     except ConfigError as error:
         raise CliError(str(error)) from error
+    beside_etcd = settings.master_state if state_dir is None else state_dir
+    folder, new_folder = (beside_etcd if isinstance(one, EtcdAddress) else one for one in (here, there))
     async with AsyncExitStack() as stack:
         try:
             old = await stack.enter_async_context(open_store(here, tls))
             term = await old.begin_term()
             new = await stack.enter_async_context(open_store(there, tls))
             snapshot = await load_converted(old, term)
-            if isinstance(there, EtcdAddress):
-                _check_packages(snapshot)
+            archives = carry(packages_of(snapshot), folder, new_folder)
             count = await copy_rows(snapshot, new, above=term)
         except StoreBusyError as error:
             raise CliError(f"{error}; the state is copied while no master runs") from error
     typer.echo(f"copied {count} records to {there}; start no master on {here} any more")
+    if archives and isinstance(there, EtcdAddress):
+        typer.echo(
+            f"{archives} archives of packages are in {new_folder / BUNDLES}: start a master of this machine"
+            f" on that folder (--state-dir {new_folder}); the others get them from it"
+        )
 
 
 def _read(text: str, option: str) -> Path | EtcdAddress:
@@ -84,14 +91,3 @@ def _read(text: str, option: str) -> Path | EtcdAddress:
     if isinstance(address, EtcdAddress):
         return address
     return find_state((address.folder or default_state_dir()).absolute())
-
-
-def _check_packages(snapshot: Snapshot) -> None:
-    """Refuse users' packages, which are files of one machine."""
-    names = sorted(snapshot.get(Tables().packages.name, {}))
-    if names:
-        shown = ", ".join([*names[:_SHOWN], *(["..."] if len(names) > _SHOWN else [])])
-        raise CliError(
-            f"users have packages ({shown}), which a master with a store in etcd cannot keep: remove them"
-            " first, with rce package remove"
-        )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from rce.packages import BadKeyError, key_id
 from rce.web.bodies import read_pieces
 from rce.web.openapi import Query
-from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError
+from rce_master.exceptions import InvalidRequestError, NotFoundError
 from rce_master.http import package_models as models
 from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.packages.service import PushRequest
@@ -69,11 +69,6 @@ async def show_package(call: Call) -> models.PackageOut:
 )
 async def push_package(call: Call) -> models.PackageOut:
     """Accept a version of a package; an identical one changes nothing."""
-    if call.services.fence is not None:
-        raise ConflictError(
-            "packages are files of one machine, and another master may lead tomorrow: an engine with a store"
-            " in etcd takes none yet; install the package where containers run (--package-path)"
-        )
     request = PushRequest(
         user=call.caller.name,
         name=call.path("name"),

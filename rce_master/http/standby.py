@@ -16,6 +16,7 @@ from rce_master.leadership.core import LEADER_HEADER, STANDBY_HEADER
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+    from rce_master.http.archives import ArchiveRoutes
     from rce_master.http.forward import Forwarder
     from rce_master.leadership.keeper import LeadershipKeeper
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 def make_standby_app(
     keeper: LeadershipKeeper,
     forwarder: Forwarder,
+    archives: ArchiveRoutes,
     names: ServerNames | None = None,
     allowed_origins: Iterable[str] = (),
 ) -> web.Application:
@@ -31,6 +33,7 @@ def make_standby_app(
     Args:
         keeper: Knows who leads.
         forwarder: Sends requests on to that master; it is open.
+        archives: Of packages, for the leading master.
         names: The allowed host names of the server.
         allowed_origins: Origins of other sites whose pages may use the server.
     """
@@ -38,6 +41,7 @@ def make_standby_app(
     app = web.Application(middlewares=[origin_guard(frozenset(allowed_origins), names or ServerNames())])
     app.router.add_get("/healthz", standby.health)
     app.router.add_get("/metrics", standby.metrics)
+    archives.add_to(app)
     app.router.add_route("*", "/{rest:.*}", standby.forward)
     return app
 

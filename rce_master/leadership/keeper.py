@@ -67,6 +67,10 @@ class LeadershipKeeper:
         self.leader: Leader | None = None
         self.fault = ""
 
+    def newest_term(self) -> int:
+        """Return the newest term that this master knows; 0: none."""
+        return 0 if self.leader is None else self.leader.term
+
     async def acquire(self) -> tuple[EtcdStore, Fence]:
         """Wait until no other master leads, and take the lead.
 

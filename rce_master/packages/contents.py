@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
     from rce.packages.contents import Contents
 
+BUNDLES = "bundles"
+"""Name of the folder in a master's state folder."""
 _HASH = re.compile(r"[0-9a-f]{64}")
 _INCOMING = "incoming"
 _BUFFER = 1 << 20
@@ -102,6 +104,17 @@ class ContentStore:
         if _HASH.fullmatch(sha256) is None:
             return None
         return await asyncio.to_thread(self._read, sha256, offset, count)
+
+    def path(self, sha256: str) -> Path:
+        """Return where an archive is, or would be."""
+        return self._folder / sha256
+
+    def held(self) -> set[str]:
+        """Return the hashes of all archives. Blocks."""
+        try:
+            return {path.name for path in self._folder.iterdir() if _HASH.fullmatch(path.name)}
+        except FileNotFoundError:
+            return set()
 
     def sweep(self, known: Collection[str]) -> None:
         """Remove all archives except those with known hashes. Blocks."""

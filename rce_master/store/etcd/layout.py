@@ -6,6 +6,7 @@ schema                  version of what the rows hold
 leadership/leader       name and term of the leading master; removed when its lease ends
 leadership/term         the newest term, and a mark of the store that began it
 leadership/last         TERM:NUMBER of the last save
+masters/NAME            where other masters reach one; removed a day after it was last seen
 tables/TABLE/KEY        a row
 """
 
@@ -36,6 +37,15 @@ class Leader:
     """Where other masters reach its HTTP server; empty: it does not say."""
 
 
+@dataclass(frozen=True, slots=True)
+class OtherMaster:
+    """A master of the same engine, which may be down."""
+
+    name: str
+    url: str
+    """Where other masters reach its HTTP server."""
+
+
 class Keys:
     """The keys below a prefix."""
 
@@ -46,6 +56,7 @@ class Keys:
         self.leader = self.leadership + "leader"
         self.term = self.leadership + "term"
         self.last = self.leadership + "last"
+        self.masters = self.root + "masters/"
         self.tables = self.root + "tables/"
 
     def row(self, table: str, key: str) -> str:
@@ -106,6 +117,23 @@ def read_leader(record: Record) -> Leader:
         value = json.loads(record.value)
         return Leader(str(value["name"]), int(value["term"]), str(value.get("url", "")))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise StoreError(f"the key {record.key} of etcd was overwritten") from error
+
+
+def write_master(url: str) -> bytes:
+    """Return what the key of a master holds."""
+    return json.dumps({"url": url}).encode()
+
+
+def read_master(keys: Keys, record: Record) -> OtherMaster:
+    """Read the key of a master.
+
+    Raises:
+        StoreError: It was overwritten by another program.
+    """
+    try:
+        return OtherMaster(record.key.removeprefix(keys.masters), str(json.loads(record.value)["url"]))
+    except (ValueError, KeyError, TypeError) as error:
         raise StoreError(f"the key {record.key} of etcd was overwritten") from error
 
 

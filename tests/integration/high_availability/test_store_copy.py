@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import TYPE_CHECKING
 
+import msgspec
 import pytest
 from support.etcd import cluster
 from support.master_program import rce
 
+from rce_master.state.records import UserPackage
 from rce_master.state.tables import Tables
 from rce_master.store import Row, SqliteStore
 from rce_master.store.copying import UNFINISHED
@@ -67,14 +70,52 @@ async def test_a_state_is_copied_to_etcd_and_back(tmp_path: Path) -> None:
         assert "another master leads: one:9000; the state is copied while no master runs" in told
 
 
-async def test_packages_and_parts_of_a_state_are_refused(tmp_path: Path) -> None:
-    await make_state(tmp_path)
-    store = await SqliteStore.open(tmp_path / "state" / "master")
-    await store.save([Row(Tables().packages.name, "anna/tools", b"{}")], await store.begin_term())
+async def add_package(folder: Path, archive: bytes) -> Path:
+    """Add a package to the state; return where its archive has to be."""
+    sha256 = hashlib.sha256(archive).hexdigest()
+    package = UserPackage(
+        user="anna",
+        name="tools",
+        version="1.0",
+        sha256=sha256,
+        digest="",
+        key="",
+        signature="",
+        packed=len(archive),
+        size=1,
+        files=1,
+        created=1.0,
+    )
+    store = await SqliteStore.open(folder / "state" / "master")
+    rows = [Row(Tables().packages.name, package.id, msgspec.json.encode(package))]
+    await store.save(rows, await store.begin_term())
     await store.close()
+    return folder / "state" / "master" / "bundles" / sha256
+
+
+async def test_archives_of_packages_move_too(tmp_path: Path) -> None:
+    await make_state(tmp_path)
+    archive = await add_package(tmp_path, b"an archive")
+    own = ("--state-dir", "beside/master")
+    async with cluster(tmp_path / "etcd") as etcd:
+        copy = ("copy", "--from", "sqlite:state", "--to", etcd.store, *own)
+        archive.parent.mkdir()
+        for damage in (None, b"another one"):
+            if damage is not None:
+                archive.write_bytes(damage)
+            told = await rce(tmp_path, "master", *copy, code=1)
+            assert "lacks the archives of anna/tools@1.0, or they are damaged" in told
+        archive.write_bytes(b"an archive")
+        told = await rce(tmp_path, "master", *copy)
+        beside = tmp_path / "beside" / "master" / "bundles" / archive.name
+        assert f"1 archives of packages are in {beside.parent}" in told
+        assert beside.read_bytes() == b"an archive"
+        await rce(tmp_path, "master", "copy", "--from", etcd.store, "--to", "sqlite:back", *own)
+    assert (tmp_path / "back" / "master" / "bundles" / archive.name).read_bytes() == b"an archive"
+
+
+async def test_parts_of_a_state_are_refused(tmp_path: Path) -> None:
     async with cluster(tmp_path / "etcd") as etcd, EtcdClient(etcd.endpoints, attempt=20.0) as client:
-        told = await rce(tmp_path, "master", "copy", "--from", "sqlite:state", "--to", etcd.store, code=1)
-        assert "users have packages (anna/tools)" in told
         await prepare(client, "/part")
         await EtcdStore(client, "/part").save([Row(UNFINISHED, "mark", b"{}")])
         there = f"{etcd.store}/part"

@@ -102,7 +102,7 @@ async def test_a_stand_by_forwards_what_it_is_asked(shared_masters: Masters) -> 
         query = {"key": "0" * 64, "signature": "0" * 128}
         body = b"x" * 500_000
         async with session.put(f"{api}/packages/pkg/1.0.0", params=query, data=body) as reply:
-            assert (reply.status, "takes none yet" in await reply.text()) == (409, True)
+            assert (reply.status, "is not registered" in await reply.text()) == (403, True)
         async with session.get(f"{api}/events", params={"since": 0}) as reply:
             assert reply.headers["Content-Type"] == "text/event-stream"
             lines = [await reply.content.readline() for _ in range(4)]

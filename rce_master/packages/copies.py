@@ -1,0 +1,213 @@
+"""Copies of packages' archives at the other masters: a package is accepted once a majority holds it.
+
+Only the leading master acts. It sends archives to the stand-bys, fetches those that it lacks from them, and
+lets them remove those that no package has.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import asynccontextmanager
+from errno import EAGAIN
+from typing import TYPE_CHECKING
+
+from rce.aio.tasks import BackgroundTasks
+from rce_master.exceptions import FencedError, StoreError
+from rce_master.packages.transfer import TransferError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from rce_master.leadership.registry import MasterRegistry
+    from rce_master.packages.contents import ContentStore
+    from rce_master.packages.transfer import ArchiveClient
+    from rce_master.store.etcd.layout import OtherMaster
+
+_log = logging.getLogger(__name__)
+
+LOOK_S = 10.0
+"""Longest time from one comparison with the other masters to the next."""
+WAIT_S = 5.0
+"""How long a task set waits for an archive that this master fetches; then it asks again."""
+
+
+class ArchiveCopies:
+    """The archives of the leading master, beside those of the others.
+
+    Args:
+        store: Where this master keeps archives.
+        registry: Knows the other masters.
+        client: Asks them.
+    """
+
+    def __init__(self, store: ContentStore, registry: MasterRegistry, client: ArchiveClient) -> None:
+        self._store = store
+        self._registry = registry
+        self._client = client
+        self._tasks = BackgroundTasks()
+        self._wanted = asyncio.Event()
+        self._removal = asyncio.Lock()
+        """Held while another master removes an archive, which must not be pushed meanwhile."""
+        self._pushed: list[str] = []
+        """Hashes of archives that may get a package soon."""
+        self._sending: set[tuple[str, str]] = set()
+        """Names of masters, and hashes."""
+        self._fetching: dict[str, asyncio.Task[None]] = {}
+        self._faults: dict[str, str] = {}
+        """What was wrong with each master at the last look."""
+
+    def look(self) -> None:
+        """Compare with the other masters soon."""
+        self._wanted.set()
+
+    async def run(self, needed: Callable[[], set[str]]) -> None:
+        """Compare with the other masters now and then, until cancelled.
+
+        Args:
+            needed: Returns the hashes of all packages' archives.
+
+        Raises:
+            FencedError: This master leads no more.
+        """
+        try:
+            while True:
+                self._wanted.clear()
+                await self._compare(needed)
+                try:
+                    async with asyncio.timeout(LOOK_S):
+                        await self._wanted.wait()
+                except TimeoutError:
+                    continue
+        finally:
+            await self._tasks.close()
+
+    # Pushing
+
+    @asynccontextmanager
+    async def spread(self, sha256: str) -> AsyncIterator[None]:
+        """Copy an archive of this master to others; while the block runs, none of them removes it.
+
+        Raises:
+            StoreError: Too few masters have it; it has to be pushed again.
+        """
+        async with self._removal:
+            self._pushed.append(sha256)
+        try:
+            await self._send_to_majority(sha256)
+            yield
+        finally:
+            self._pushed.remove(sha256)
+            self.look()
+
+    async def _send_to_majority(self, sha256: str) -> None:
+        others = await self._registry.others()
+        missing = (len(others) + 1) // 2  # beside this master
+        sent = {self._tasks.spawn(self._send(other, sha256), name=f"send {sha256}") for other in others}
+        reasons = []
+        while missing > 0 and sent:
+            done, sent = await asyncio.wait(sent, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                if why := task.result():
+                    reasons.append(why)
+                else:
+                    missing -= 1
+        if missing > 0:
+            raise StoreError(
+                f"a package must be on more than half of the {len(others) + 1} masters, and {missing} more"
+                f" must take it: {'; '.join(reasons)}; push it again later"
+            )
+
+    async def _send(self, other: OtherMaster, sha256: str) -> str:
+        """Send an archive to a master that may have it; return why it does not."""
+        self._sending.add((other.name, sha256))
+        try:
+            if sha256 not in await self._client.held(other):
+                await self._client.send(other, sha256, self._store)
+        except (TransferError, FencedError) as error:
+            return str(error)
+        finally:
+            self._sending.discard((other.name, sha256))
+        return ""
+
+    # Fetching
+
+    async def obtain(self, sha256: str) -> None:
+        """Fetch an archive from another master, for a task set that waits for it.
+
+        Raises:
+            OSError: It is not there yet; the text says why.
+        """
+        try:
+            async with asyncio.timeout(WAIT_S):
+                await asyncio.shield(self._fetch(sha256))
+        except TimeoutError:
+            raise OSError(EAGAIN, "it is being fetched from another master") from None
+        except (StoreError, TransferError) as error:
+            raise OSError(EAGAIN, str(error)) from error
+
+    def _fetch(self, sha256: str) -> asyncio.Task[None]:
+        """Return the fetch of an archive, of which one runs at a time."""
+        task = self._fetching.get(sha256)
+        if task is None:
+            task = self._tasks.spawn(self._fetch_from_any(sha256), name=f"fetch {sha256}")
+            self._fetching[sha256] = task
+            task.add_done_callback(lambda done: self._fetched(sha256, done))
+        return task
+
+    def _fetched(self, sha256: str, task: asyncio.Task[None]) -> None:
+        del self._fetching[sha256]
+        if not task.cancelled() and (error := task.exception()) is not None:
+            _log.debug("an archive was not fetched: %s", error)
+
+    async def _fetch_from_any(self, sha256: str) -> None:
+        reasons = []
+        for other in await self._registry.others():
+            try:
+                await self._client.fetch(other, sha256, self._store)
+            except TransferError as error:
+                reasons.append(str(error))
+            else:
+                _log.info("fetched the archive %s from %s", sha256, other.name)
+                return
+        raise TransferError(f"no other master gives the archive: {'; '.join(reasons) or 'there is none'}")
+
+    # Comparing
+
+    async def _compare(self, needed: Callable[[], set[str]]) -> None:
+        try:
+            others = await self._registry.others()
+            own = await asyncio.to_thread(self._store.held)
+            for sha256 in needed() - own:
+                await self._fetch(sha256)
+                own.add(sha256)
+        except FencedError:
+            raise
+        except (StoreError, TransferError) as error:
+            self._note("this master", f"packages are incomplete: {error}")
+            others = []
+        else:
+            self._note("this master", "")
+        for other in others:
+            try:
+                await self._complete(other, needed, own)
+            except TransferError as error:
+                self._note(other.name, f"its packages are not compared: {error}")
+            else:
+                self._note(other.name, "")
+
+    async def _complete(self, other: OtherMaster, needed: Callable[[], set[str]], own: set[str]) -> None:
+        """Send another master what it lacks, and let it remove what no package has."""
+        held = await self._client.held(other)
+        for sha256 in (needed() & own) - held:
+            if (other.name, sha256) not in self._sending:
+                await self._client.send(other, sha256, self._store)
+        for sha256 in held:
+            async with self._removal:
+                if sha256 not in needed() and sha256 not in self._pushed:
+                    await self._client.remove(other, sha256)
+
+    def _note(self, name: str, fault: str) -> None:
+        if fault and fault != self._faults.get(name):
+            _log.warning("%s", f"{name}: {fault}")
+        self._faults[name] = fault
