@@ -17,17 +17,18 @@ import sqlite3
 import tarfile
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from typing import IO, Any, TypeAlias
 
 import msgspec
 
 from rce import __version__
 from rce_master.exceptions import StoreError
-from rce_master.packages.contents import BUNDLES
+from rce_master.packages.contents import ARCHIVES
 from rce_master.state.records import UserPackage
 from rce_master.state.tables import Tables
 from rce_master.store.base import SCHEMA_VERSION
@@ -38,8 +39,11 @@ FORMAT = 1
 MASTER, CERTIFICATES = "master", "certificates"
 MANIFEST = "manifest.json"
 
+Export: TypeAlias = Callable[[], AbstractContextManager[Path]]
+"""Gives a store as an SQLite file."""
+
 _ATTEMPTS = 5
-_LEFT_OUT = {"lock", FILE_NAME, f"{FILE_NAME}-wal", f"{FILE_NAME}-shm", f"{FILE_NAME}-journal", BUNDLES}
+_LEFT_OUT = {"lock", FILE_NAME, f"{FILE_NAME}-wal", f"{FILE_NAME}-shm", f"{FILE_NAME}-journal", ARCHIVES}
 _PIECE = 1 << 20
 
 
@@ -60,18 +64,19 @@ class Copy:
     """Bytes of all files."""
 
 
-def back_up(folders: Mapping[str, Path], out: Path) -> Copy:
+def back_up(folders: Mapping[str, Path], out: Path, export: Export | None = None) -> Copy:
     """Copy a master's state, also while it runs.
 
     Args:
         folders: Its parts: the master's folder, and that of certificates.
         out: The file to make. It appears complete or not at all.
+        export: Gives an SQLite file with the contents of a store that is elsewhere.
 
     Raises:
         BackupError: The folder has no state, the state cannot be copied, or the file exists already.
     """
     store = folders[MASTER] / FILE_NAME
-    if not store.exists():
+    if export is None and not store.exists():
         raise BackupError(
             f"{folders[MASTER]} is not a master's state folder: it has no {FILE_NAME}; "
             "name the folder with --state-dir or --config"
@@ -82,7 +87,7 @@ def back_up(folders: Mapping[str, Path], out: Path) -> Copy:
         descriptor, name = tempfile.mkstemp(dir=out.parent, prefix=f".{out.name}-")
         try:
             with os.fdopen(descriptor, "wb") as aside:
-                made = _write_again(folders, aside)
+                made = _write_again(folders, aside, export or partial(_snapshot, store))
             Path(name).rename(out)
         except BaseException:
             Path(name).unlink()
@@ -110,14 +115,14 @@ def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -
         BackupError: The copy is incomplete or was made by a newer program, or the folder already has state.
     """
     master = folders[MASTER]
-    with _locked(master):
+    with locked(master):
         there = [folder for folder in folders.values() if _holds_state(folder)]
         if there and not replace:
             raise BackupError(f"there is state in {there[0]}; to move it aside, give --replace")
         try:
             with tempfile.TemporaryDirectory(dir=master.parent, prefix=".rce-restore-") as name:
-                found = _extract(file, Path(name))
-                _check_store(Path(name) / MASTER / FILE_NAME)
+                found = extract(file, Path(name))
+                check_store(Path(name) / MASTER / FILE_NAME)
                 stamp = time.strftime("%Y%m%d-%H%M%S")
                 aside = [_move_aside(folder, stamp) for folder in there]
                 for part, folder in folders.items():
@@ -128,7 +133,7 @@ def restore(file: Path, folders: Mapping[str, Path], *, replace: bool = False) -
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path) -> Iterator[None]:
     """Hold the lock on a state folder. After an error, remove the folders that were made for it."""
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     lock = FolderLock(folder)
@@ -149,22 +154,22 @@ class _PackageRemovedError(BackupError):
     """A package was removed after the store was copied: the copy would lack what its store names."""
 
 
-def _write_again(folders: Mapping[str, Path], out: IO[bytes]) -> Copy:
+def _write_again(folders: Mapping[str, Path], out: IO[bytes], export: Export) -> Copy:
     """Write a copy; retry if packages were removed meanwhile."""
     for _ in range(_ATTEMPTS - 1):
         try:
-            return _write(folders, out)
+            return _write(folders, out, export)
         except _PackageRemovedError:
             out.seek(0)
             out.truncate()
-    return _write(folders, out)
+    return _write(folders, out, export)
 
 
-def _write(folders: Mapping[str, Path], out: IO[bytes]) -> Copy:
+def _write(folders: Mapping[str, Path], out: IO[bytes], export: Export) -> Copy:
     hashes: dict[str, str] = {}
     size = 0
     with (
-        _snapshot(folders[MASTER] / FILE_NAME) as store,
+        export() as store,
         tarfile.open(fileobj=out, mode="w", format=tarfile.PAX_FORMAT) as tar,
     ):
         for name, path in _files(folders, store):
@@ -172,8 +177,11 @@ def _write(folders: Mapping[str, Path], out: IO[bytes]) -> Copy:
                 with path.open("rb") as source:
                     size += _add(tar, name, source, hashes)
             except FileNotFoundError as error:
-                if path.parent.name == BUNDLES:
-                    raise _PackageRemovedError(f"{path} was removed while it was copied") from error
+                if path.parent.name == ARCHIVES:
+                    raise _PackageRemovedError(
+                        f"{path} is not there: it was removed while it was copied, or another master has it;"
+                        " then run this on the machine of the leading master"
+                    ) from error
                 # A file that was removed meanwhile: the master does not need it.
         created = time.time()
         manifest = {
@@ -233,7 +241,7 @@ def _snapshot(store: Path) -> Iterator[Path]:
                 copy.execute("PRAGMA journal_mode = DELETE")
         except sqlite3.Error as error:
             raise BackupError(f"cannot copy the store {store}: {error}") from error
-        _check_store(path)
+        check_store(path)
         yield path
 
 
@@ -241,8 +249,8 @@ def _files(folders: Mapping[str, Path], store: Path) -> Iterator[tuple[str, Path
     """Return the files of a copy: the store, the packages that it names, and other files of the folders."""
     yield f"{MASTER}/{FILE_NAME}", store
     master = folders[MASTER]
-    for sha256 in sorted({package.sha256 for package in _packages(store)}):
-        yield f"{MASTER}/{BUNDLES}/{sha256}", master / BUNDLES / sha256
+    for sha256 in sorted({package.sha256 for package in packages_in(store)}):
+        yield f"{MASTER}/{ARCHIVES}/{sha256}", master / ARCHIVES / sha256
     for part, folder in folders.items():
         for path in sorted(folder.rglob("*")):
             inside = path.relative_to(folder)
@@ -251,14 +259,15 @@ def _files(folders: Mapping[str, Path], store: Path) -> Iterator[tuple[str, Path
                 yield f"{part}/{inside.as_posix()}", path
 
 
-def _packages(store: Path) -> Iterator[UserPackage]:
+def packages_in(store: Path) -> Iterator[UserPackage]:
+    """Return the packages that a store names."""
     with closing(sqlite3.connect(f"{store.as_uri()}?mode=ro", uri=True)) as database:
         rows = database.execute("SELECT key, body FROM record WHERE kind = ?", (Tables().packages.name,))
         for _, body in rows:
             yield msgspec.json.decode(body, type=UserPackage)
 
 
-def _check_store(path: Path) -> None:
+def check_store(path: Path) -> None:
     """Check a store's integrity, and that this program knows its version."""
     try:
         with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as database:
@@ -275,7 +284,7 @@ def _check_store(path: Path) -> None:
         )
 
 
-def _extract(file: Path, target: Path) -> Copy:
+def extract(file: Path, target: Path) -> Copy:
     """Extract a copy's files into a folder, and check all of them."""
     hashes: dict[str, str] = {}
     manifest: dict[str, Any] | None = None

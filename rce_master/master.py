@@ -27,7 +27,7 @@ from rce_master.executions import Executions
 from rce_master.http.entry import Entry, refusal
 from rce_master.http.forwarded import PURPOSE, ForwardingKey
 from rce_master.http.routes import Services
-from rce_master.packages.contents import BUNDLES, ContentStore
+from rce_master.packages.contents import ARCHIVES, ContentStore
 from rce_master.packages.service import PackageService
 from rce_master.quotas import Quotas
 from rce_master.reconciler import Reconciler
@@ -140,7 +140,7 @@ class Master:
             state_service, reconciler, authenticator, tokens, quotas, audit, self._fence
         )
         lifetime = self._settings.token_lifetime
-        contents = ContentStore(self._settings.state_dir / BUNDLES)
+        contents = ContentStore(self._settings.state_dir / ARCHIVES)
         copies = None if self._copies is None else self._copies(contents)
         packages = PackageService(state_service, contents, copies=copies)
         services = Services(

@@ -22,9 +22,9 @@ from rce_master.leadership import LeaseSettings
 from rce_master.leadership.keeper import LeadershipKeeper
 from rce_master.leadership.registry import MasterRegistry
 from rce_master.master import Master
-from rce_master.packages.contents import BUNDLES, ContentStore
+from rce_master.packages.contents import ARCHIVES, ContentStore
 from rce_master.packages.copies import ArchiveCopies
-from rce_master.packages.request_key import PURPOSE as ARCHIVES
+from rce_master.packages.request_key import PURPOSE as ARCHIVE_PURPOSE
 from rce_master.packages.request_key import RequestKey
 from rce_master.packages.transfer import CONNECT_S, ArchiveClient
 from rce_master.store.etcd import EtcdClient
@@ -128,8 +128,8 @@ class ReplicatedMaster:
         settings = self._settings
         for_clients = settings.tls.for_clients()
         names = ServerNames(settings.bind, settings.names)
-        key = RequestKey(self._secret.derive(ARCHIVES))
-        archives = ArchiveRoutes(ContentStore(settings.state_dir / BUNDLES), key, keeper.newest_term)
+        key = RequestKey(self._secret.derive(ARCHIVE_PURPOSE))
+        archives = ArchiveRoutes(ContentStore(settings.state_dir / ARCHIVES), key, keeper.newest_term)
         async with AsyncExitStack() as waiting, self._session() as session:
             forwarder = await waiting.enter_async_context(self._forwarder())
             server = HttpServer(

@@ -106,6 +106,16 @@ def find_state(state_dir: Path) -> Path:
     return state_dir if is_outer or is_own else inner
 
 
+def find_folder(state_dir: Path) -> Path:
+    """Return the folder of a master whose store is in etcd.
+
+    It is the folder itself (``rce-master --state-dir``), or ``master`` in it, if that is there: there is no
+    store by which to tell them apart.
+    """
+    inner = state_dir / MASTER_FOLDER
+    return inner if inner.is_dir() else state_dir
+
+
 class OfflineState:
     """The state of a master that does not run. Its store is locked.
 

@@ -19,10 +19,10 @@ from rce.config import (
 from rce.tls.choice import TlsChoice
 from rce_master.cli.client import run
 from rce_master.cli.exceptions import CliError
-from rce_master.cli.offline import find_state, open_store
+from rce_master.cli.offline import find_folder, find_state, open_store
 from rce_master.exceptions import StoreBusyError
 from rce_master.packages.carrying import carry, packages_of
-from rce_master.packages.contents import BUNDLES
+from rce_master.packages.contents import ARCHIVES
 from rce_master.state_service import load_converted
 from rce_master.store.copying import copy_rows
 
@@ -48,7 +48,7 @@ def copy(
     ] = None,
 ) -> None:
     """Copy the state of a master to an empty store, while no master runs on either."""
-    run(_copy(source, target, None if state_dir is None else find_state(state_dir.absolute())))
+    run(_copy(source, target, None if state_dir is None else find_folder(state_dir.absolute())))
 
 
 async def _copy(source: str, target: str, state_dir: Path | None) -> None:
@@ -77,7 +77,7 @@ async def _copy(source: str, target: str, state_dir: Path | None) -> None:
     typer.echo(f"copied {count} records to {there}; start no master on {here} any more")
     if archives and isinstance(there, EtcdAddress):
         typer.echo(
-            f"{archives} archives of packages are in {new_folder / BUNDLES}: start a master of this machine"
+            f"{archives} archives of packages are in {new_folder / ARCHIVES}: start a master of this machine"
             f" on that folder (--state-dir {new_folder}); the others get them from it"
         )
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rce_master.exceptions import StoreError
-from rce_master.packages.contents import BUNDLES
+from rce_master.packages.contents import ARCHIVES
 from rce_master.state.records import UserPackage
 from rce_master.state.tables import Tables
 
@@ -47,16 +47,16 @@ def carry(packages: Iterable[UserPackage], source: Path, target: Path) -> int:
     """
     names = {package.sha256: f"{package.user}/{package.name}@{package.version}" for package in packages}
     try:
-        missing = [name for sha256, name in names.items() if _hash(source / BUNDLES / sha256) != sha256]
+        missing = [name for sha256, name in names.items() if _hash(source / ARCHIVES / sha256) != sha256]
         if missing:
             shown = ", ".join([*missing[:_SHOWN], *(["..."] if len(missing) > _SHOWN else [])])
             raise StoreError(
-                f"{source / BUNDLES} lacks the archives of {shown}, or they are damaged; name the state"
+                f"{source / ARCHIVES} lacks the archives of {shown}, or they are damaged; name the state"
                 " folder of a master that has them, or remove these packages first: rce package remove"
             )
         for sha256 in names:
-            if not (target / BUNDLES / sha256).exists():
-                _copy(source / BUNDLES / sha256, target / BUNDLES)
+            if not (target / ARCHIVES / sha256).exists():
+                _copy(source / ARCHIVES / sha256, target / ARCHIVES)
     except OSError as error:
         raise StoreError(f"cannot copy packages from {source} to {target}: {error}") from error
     return len(names)

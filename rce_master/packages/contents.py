@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from rce.packages.contents import Contents
 
-BUNDLES = "bundles"
+ARCHIVES = "bundles"
 """Name of the folder in a master's state folder."""
 _HASH = re.compile(r"[0-9a-f]{64}")
 _INCOMING = "incoming"

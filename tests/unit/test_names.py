@@ -147,7 +147,6 @@ KEPT = {
     ("rce_container/settings.py", "bundle_space"): "a key of settings files",
     ("rce_container/settings.py", "BUNDLE_SPACE"): "the default of a key of settings files",
     ("rce_container/runtimes/namespace.py", "BUNDLES"): "a path that nodes of users see",
-    ("rce_master/backup.py", "BUNDLES"): "a name in backup files",
 }
 
 

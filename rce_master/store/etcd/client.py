@@ -116,7 +116,7 @@ class EtcdClient:
         except EtcdAwayError as error:
             raise NoQuorumError(
                 f"etcd has no quorum: more than half of its members must run and reach each other ({error})."
-                " If they are lost for good, restore a snapshot: etcdctl snapshot restore"
+                " If they are lost for good, restore a backup to a new etcd: rce restore, or etcdctl snapshot"
             ) from error
 
     async def _check_version(self, endpoint: str) -> None:

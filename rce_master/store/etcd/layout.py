@@ -92,14 +92,33 @@ async def prepare(client: EtcdClient, prefix: str) -> None:
         absent = Condition(keys.schema, Subject.CREATED, 0)
         found = (await client.transact([absent], [mark], [keys.schema])).found
         schema = found[0] if found else None
-    if schema is not None and schema.value != str(SCHEMA_VERSION).encode():
+    if schema is not None:
+        _check_version(keys, schema)
+    # Without a condition these reads are never done, but etcd counts them.
+    await client.transact([], [], [keys.schema] * MAX_OPERATIONS)
+
+
+async def check_state(client: EtcdClient, prefix: str) -> None:
+    """Check that there is a state below a prefix that this program can read; nothing is written.
+
+    Raises:
+        StoreError: There is none, or etcd cannot be used.
+    """
+    await client.check_members()
+    keys = Keys(prefix)
+    schema = await client.get(keys.schema)
+    if schema is None:
+        raise StoreError(f"etcd has no state of an engine below {keys.root}")
+    _check_version(keys, schema)
+
+
+def _check_version(keys: Keys, schema: Record) -> None:
+    if schema.value != str(SCHEMA_VERSION).encode():
         version = schema.value.decode(errors="replace")
         raise StoreError(
             f"the store in etcd below {keys.root} has version {version}, this program reads version"
             f" {SCHEMA_VERSION}"
         )
-    # Without a condition these reads are never done, but etcd counts them.
-    await client.transact([], [], [keys.schema] * MAX_OPERATIONS)
 
 
 def write_number(term: int, number: int) -> bytes:

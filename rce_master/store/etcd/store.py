@@ -114,6 +114,15 @@ class EtcdStore:
         found = await self._client.get(self._keys.leader)
         return None if found is None else read_leader(found)
 
+    async def newest_term(self) -> int:
+        """Tell the newest term that any master began; 0: none.
+
+        Raises:
+            StoreError: etcd cannot be asked.
+        """
+        found = await self._client.get(self._keys.term)
+        return 0 if found is None else read_term(found)
+
     async def holds_lead(self) -> bool:
         """Tell whether the leader key is still the one of this store's term.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import sys
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -15,9 +14,10 @@ import pytest_asyncio
 from support.engine import Program, until
 from support.etcd import Cluster, cluster
 from support.master_program import environment
-from support.masters import DEV_USER, MasterProcess, Masters, masters
+from support.masters import MasterProcess, Masters, masters
 from support.ports import free_port
-from support.user_packages import KEY, pack, sign, write_package
+from support.pushed import Pushed
+from support.user_packages import KEY
 
 from rce_master.leadership.registry import MasterRegistry
 from rce_master.store.etcd import EtcdClient
@@ -26,7 +26,6 @@ pytestmark = [pytest.mark.needs("etcd"), pytest.mark.asyncio(loop_scope="module"
 
 LEASE_S = 4.0
 WAIT_S = 120.0
-NODE = "import time\nprint('{text}', flush=True)\ntime.sleep(3600)\n"
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
@@ -61,39 +60,6 @@ async def call(made: Masters, method: str, path: str, *, status: int, **options:
         text = await reply.text()
         assert reply.status == status, text
         return text
-
-
-class Pushed:
-    """A package as the user has it."""
-
-    def __init__(self, folder: Path, name: str) -> None:
-        self.name = name
-        self.archive = pack(write_package(folder, name, nodes__run=NODE.format(text=name)))
-        self.sha256 = hashlib.sha256(self.archive).hexdigest()
-        self.spec = sign(self.archive, name, "1.0", DEV_USER)
-
-    async def push(self, made: Masters, at: MasterProcess, status: int = 200) -> str:
-        """Push it to a master."""
-        url = f"{at.url}api/v1/packages/{self.name}/1.0"
-        query = {"key": self.spec.key, "signature": self.spec.signature}
-        async with (
-            made.session(WAIT_S) as session,
-            session.put(url, params=query, data=self.archive) as reply,
-        ):
-            text = await reply.text()
-            assert reply.status == status, text
-            return text
-
-    def path(self, master: MasterProcess) -> Path:
-        return master.log.parent / master.name / "bundles" / self.sha256
-
-    def holders(self, made: Masters) -> list[MasterProcess]:
-        found = [master for master in made.all if self.path(master).exists()]
-        assert all(self.path(master).read_bytes() == self.archive for master in found)
-        return found
-
-    async def until_held(self, made: Masters, count: int) -> None:
-        await until(lambda: len(self.holders(made)) == count, timeout=WAIT_S, what=f"{count} have it")
 
 
 async def restart(master: MasterProcess) -> None:

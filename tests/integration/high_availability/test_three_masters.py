@@ -157,6 +157,7 @@ async def test_the_leader_knows_who_asked_a_stand_by(shared_masters: Masters) ->
     async with shared_masters.session(20.0) as session, session.get(f"{leader.url}api/v1/audit") as reply:
         records = (await reply.json())["records"]
     refused = [record["address"] for record in records if record["outcome"] == "refused"]
+    refused = [address for address in refused if address != "127.0.0.1"]  # of the test before
     assert refused == ["127.0.0.8", "127.0.0.9"]
 
 
