@@ -17,6 +17,7 @@ from itertools import pairwise
 from math import ceil
 from typing import TYPE_CHECKING, NamedTuple
 
+from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.bench import CLIENT, SERVER, Bench
 from rce_fleet.experiments.experiment import START_S, Experiment, Measured, Options, Trial
 from rce_fleet.experiments.measures import Value
@@ -38,7 +39,7 @@ from rce_fleet.experiments.workloads.watcher import CALL, CALL_PERIOD_S, NEW, NU
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from rce_fleet.experiments.systems.base import System
+    from rce_fleet.experiments.systems.base import RunningWorkload, System
 
 CORE, MASTER, CUT = "core_killed", "master_killed", "machine_cut"
 RUNS = 3
@@ -50,6 +51,8 @@ SLACK_S = 1.0
 """What was sent less than so long before the end does not count as lost."""
 LATE_S = 5.0
 """What arrives so long after the end is late, and not lost."""
+TOLD_S = 60.0
+"""How long the provider may take to tell what it sent."""
 POLL_S = 0.3
 
 
@@ -137,7 +140,7 @@ class Robustness(Experiment):
                 seen = Seen.of(reports(await watcher.lines()))
                 if seen.is_steady(steady):
                     break
-            sent = list(reports(await provider.lines()))
+            sent = await _told(provider)
             late = time.monotonic() + LATE_S
             while missing(seen, sent, begin, end) and time.monotonic() < late:
                 await asyncio.sleep(POLL_S)
@@ -242,6 +245,20 @@ def faults(system: str, *, is_quick: bool) -> tuple[str, ...]:
 def times_of(setup: Condition, options: Options) -> Times:
     """Return how long parts of a run take."""
     return (QUICK_TIMES if options.quick else TIMES)[dict(setup.factors)["fault"]]
+
+
+async def _told(provider: RunningWorkload) -> list[dict[str, object]]:
+    """Return what the provider told; in CRS that is read by the master, which may have to start again.
+
+    Raises:
+        ExperimentError: It told nothing in time.
+    """
+    deadline = time.monotonic() + TOLD_S
+    while not (found := list(reports(await provider.lines()))):
+        if time.monotonic() > deadline:
+            raise ExperimentError(f"the provider did not tell what it had sent within {TOLD_S:g} s")
+        await asyncio.sleep(POLL_S)
+    return found
 
 
 async def _break(system: System, fault: str) -> None:
