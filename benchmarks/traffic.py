@@ -36,7 +36,7 @@ from rce_fleet.nodes.state_publisher import changes_fields
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map
 from rce_fleet.planning.planner import load_planner
-from rce_fleet.planning.rerouting_loops import reroute_robots
+from rce_fleet.planning.rerouting import REROUTING_KERNELS
 
 TICK_LIMIT_MS = 100
 """99 of 100 ticks of 1000 robots take at most this."""
@@ -81,7 +81,7 @@ class Traffic:
         effort = COMPILED_EFFORT if is_available() else FleetSettings().effort
         settings = FleetSettings(planner=planner, effort=effort)
         self.fleet = Fleet(FleetPlanner(grid, settings))
-        compile_kernels([reroute_robots])
+        compile_kernels(REROUTING_KERNELS)
         self.made_by = load_planner(settings.planner)
         self._progress = dict.fromkeys((f"Robot{number}" for number in range(count)), 0.0)
         self._lists = _MESSAGES.message("std_msgs/Int32MultiArray")

@@ -42,15 +42,20 @@ class MapError(FleetError):
 
     Attributes:
         line: Number of the faulty line, from 1; 0 if the file as a whole is at fault.
+        file: Its name, if it is known.
     """
 
-    def __init__(self, reason: str, *, line: int = 0) -> None:
+    def __init__(self, reason: str, *, line: int = 0, file: str = "") -> None:
         self.reason = reason
         self.line = line
-        super().__init__(reason, line)
+        self.file = file
+        super().__init__(reason, line, file)
 
     def __str__(self) -> str:
-        return f"line {self.line}: {self.reason}" if self.line else self.reason
+        place = [self.file] if self.file else []
+        if self.line:
+            place.append(f"line {self.line}")
+        return ": ".join((", ".join(place), self.reason)) if place else self.reason
 
 
 class PlanningError(FleetError, ValueError):

@@ -18,10 +18,12 @@ queue, and the ledger records what became possible (:meth:`CellLedger.take_freed
 
 from __future__ import annotations
 
+from array import array
+from bisect import bisect_right
 from collections import deque
 from typing import TYPE_CHECKING
 
-from rce_fleet.coordination.ledger_view import Account, LedgerView
+from rce_fleet.coordination.ledger_view import AFTER_ALL, CELLS, STEPS, Account, LedgerView, QueuedVisit
 from rce_fleet.exceptions import InvariantError
 
 if TYPE_CHECKING:
@@ -65,10 +67,10 @@ class CellLedger(LedgerView):
         self._withdraw(robot, account)
         account.passed += len(account.route)
         account.version = next(self._versions)
-        account.route, account.granted, account.extra = [cell], 1, frozenset(wanted - {cell})
+        account.route, account.granted, account.extra = array(CELLS, (cell,)), 1, frozenset(wanted - {cell})
         following = [enters for enters, _ in self.occupied(cell, robot)]
-        account.steps = [min([self.clock, *(enters - 1.0 for enters in following)])]
-        self._queues.setdefault(cell, deque()).appendleft((robot, account.passed))
+        account.steps = array(STEPS, (min([self.clock, *(enters - 1.0 for enters in following)]),))
+        self._queues.setdefault(cell, deque()).appendleft(account.visit(robot, 0))
         self._changed.add(robot)
         self._settle_owners(robot, account)
 
@@ -84,7 +86,7 @@ class CellLedger(LedgerView):
         """Remove a robot; its cells are free."""
         account = self._account(robot)
         self._withdraw(robot, account)
-        account.route, account.steps, account.granted, account.extra = [], [], 0, frozenset()
+        account.clear()
         self._changed.add(robot)
         self._settle_owners(robot, account)
         del self._accounts[robot]
@@ -95,7 +97,7 @@ class CellLedger(LedgerView):
         self._withdraw(robot, account)
         account.passed += len(account.route)
         account.version = next(self._versions)
-        account.route, account.steps, account.granted, account.extra = [], [], 0, frozenset()
+        account.clear()
         self._changed.add(robot)
         self._settle_owners(robot, account)
 
@@ -108,7 +110,7 @@ class CellLedger(LedgerView):
         if keep >= len(account.route):
             return
         for index in range(keep, len(account.route)):
-            self._drop_visit(account.route[index], (robot, account.passed + index))
+            self._drop_visit(account.route[index], account.visit(robot, index))
         del account.route[keep:], account.steps[keep:]
         account.version = next(self._versions)
         self._changed.add(robot)
@@ -142,7 +144,7 @@ class CellLedger(LedgerView):
                 account.version = next(self._versions)
                 self._changed.add(robot)
             for index, cell in enumerate(account.route):
-                self._queues[cell] = deque(((robot, account.passed + index),))
+                self._queues[cell] = deque((account.visit(robot, index),))
 
     def extend_plan(self, visits: Iterable[tuple[str, int, int]]) -> None:
         """Add to a plan that was begun.
@@ -157,7 +159,7 @@ class CellLedger(LedgerView):
         for robot, cell, step in visits:
             account = accounts[robot]
             route = account.route
-            visit = robot, account.passed + len(route)
+            visit = begin + step, robot, account.passed + len(route)
             queue = queues.get(cell)
             if queue is None:
                 queues[cell] = deque((visit,))
@@ -187,7 +189,7 @@ class CellLedger(LedgerView):
                 raise InvariantError(
                     f"{robot} enters cell {cell} at step {step}, not after {account.steps[-1]}"
                 )
-            visit = robot, account.passed + len(account.route)
+            visit = step, robot, account.passed + len(account.route)
             queue = self._queues.setdefault(cell, deque())
             queue.insert(self._position(queue, step), visit)
             account.route.append(cell)
@@ -197,22 +199,15 @@ class CellLedger(LedgerView):
         self._changed.add(robot)
         self._ripe.add(robot)
 
-    def _position(self, queue: deque[tuple[str, int]], step: float) -> int:
+    def _position(self, queue: deque[QueuedVisit], step: float) -> int:
         """Return the place in a queue of a visit at ``step``: behind granted and earlier ones."""
-        if not self.ordered:
+        if not self.ordered or not queue:
             return len(queue)
-        # By bisection: the granted visit is the first one, and the steps behind it grow.
-        low, high = 0, len(queue)
-        while low < high:
-            middle = (low + high) // 2
-            robot, number = queue[middle]
-            account = self._accounts[robot]
-            index = number - account.passed
-            if index >= account.granted and account.steps[index] > step:
-                high = middle
-            else:
-                low = middle + 1
-        return low
+        _, robot, number = queue[0]
+        account = self._accounts[robot]
+        # Only the first visit can be granted, whatever its step is; the steps behind it grow.
+        is_granted = number - account.passed < account.granted
+        return bisect_right(queue, (step, AFTER_ALL, 0), lo=int(is_granted))
 
     def grant(self, robot: str, ahead: int) -> bool:
         """Grant a robot the next cells of its route, at most ``ahead`` beyond its own.
@@ -225,7 +220,7 @@ class CellLedger(LedgerView):
         while self._may_enter_next(robot, account, ahead):
             cell = account.route[account.granted]
             if not self.ordered:
-                visit = robot, account.passed + account.granted
+                visit = account.visit(robot, account.granted)
                 self._queues[cell].remove(visit)
                 self._queues[cell].appendleft(visit)
             account.granted += 1
@@ -251,9 +246,9 @@ class CellLedger(LedgerView):
             raise InvariantError(f"{robot} arrived in a cell that it was not granted")
         if index == 0 and account.extra <= still:
             return
-        for cell in account.route[:index]:
+        for cell, step in zip(account.route[:index], account.steps[:index], strict=True):
             queue = self._queues[cell]
-            if queue.popleft() != (robot, account.passed):
+            if queue.popleft() != (step, robot, account.passed):
                 raise InvariantError(f"{robot} left cell {cell} out of turn")
             if not queue:
                 del self._queues[cell]
@@ -276,16 +271,16 @@ class CellLedger(LedgerView):
         cell = account.route[account.granted]
         if not self.ordered:
             return cell not in self._owners
-        is_first = self._queues[cell][0] == (robot, account.passed + account.granted)
+        is_first = self._queues[cell][0] == account.visit(robot, account.granted)
         # A robot can drive over a cell twice; it is granted it again once it has left it.
         return is_first and self._owners.get(cell, robot) == robot
 
     def _withdraw(self, robot: str, account: Account) -> None:
         """Remove all visits of a robot from the queues."""
         for index, cell in enumerate(account.route):
-            self._drop_visit(cell, (robot, account.passed + index))
+            self._drop_visit(cell, account.visit(robot, index))
 
-    def _drop_visit(self, cell: int, visit: tuple[str, int]) -> None:
+    def _drop_visit(self, cell: int, visit: QueuedVisit) -> None:
         queue = self._queues[cell]
         was_first = queue[0] == visit
         queue.remove(visit)
@@ -298,9 +293,9 @@ class CellLedger(LedgerView):
         """Note the robots that may be granted a cell now."""
         queue = self._queues.get(cell)
         if queue and self.ordered:
-            self._ripe.add(queue[0][0])
+            self._ripe.add(queue[0][1])
         elif queue:
-            self._ripe.update(robot for robot, _ in queue)
+            self._ripe.update(robot for _, robot, _ in queue)
 
     def _settle_owners(self, robot: str, account: Account) -> None:
         """Make a robot the owner of exactly the cells that it claims."""

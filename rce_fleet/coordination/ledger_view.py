@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import dataclass, field
 from itertools import count, pairwise
 from math import inf
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from rce_fleet.exceptions import InvariantError
 
 if TYPE_CHECKING:
     from collections import deque
+
+QueuedVisit: TypeAlias = tuple[float, str, int]
+"""Its step, the robot, and its number among the robot's visits. Tuples, so that a queue is searched fast."""
+AFTER_ALL = "\U0010ffff"
+"""In place of a robot: behind all visits of the same step."""
+CELLS: Literal["i"] = "i"
+"""Type of an array of cells: parts of it are copied as bytes, for plans."""
+STEPS: Literal["d"] = "d"
+"""Type of an array of steps."""
 
 
 @dataclass(slots=True)
@@ -27,8 +37,8 @@ class Account:
         version: Changes whenever the route changes otherwise than by a plan, or by the robot's progress.
     """
 
-    route: list[int] = field(default_factory=list)
-    steps: list[float] = field(default_factory=list)
+    route: array[int] = field(default_factory=lambda: array(CELLS))
+    steps: array[float] = field(default_factory=lambda: array(STEPS))
     granted: int = 0
     extra: frozenset[int] = frozenset()
     passed: int = 0
@@ -39,6 +49,14 @@ class Account:
     def claims(self) -> set[int]:
         """The cells that it may use or overlaps."""
         return {*self.route[: self.granted], *self.extra}
+
+    def visit(self, robot: str, index: int) -> QueuedVisit:
+        """Return the visit of cell number ``index`` of the route, as it is in the cell's queue."""
+        return self.steps[index], robot, self.passed + index
+
+    def clear(self) -> None:
+        """Have no cells any more."""
+        self.route, self.steps, self.granted, self.extra = array(CELLS), array(STEPS), 0, frozenset()
 
 
 class LedgerView:
@@ -63,7 +81,7 @@ class LedgerView:
         self._last_step = 0.0
         self._accounts: dict[str, Account] = {}
         self._owners: dict[int, str] = {}
-        self._queues: dict[int, deque[tuple[str, int]]] = {}
+        self._queues: dict[int, deque[QueuedVisit]] = {}
         self._changed: set[str] = set()
         self._freed: set[int] = set()
         self._ripe: set[str] = set()
@@ -90,11 +108,11 @@ class LedgerView:
     def granted(self, robot: str) -> list[int]:
         """Return the robot's cell and the cells that it may enter now."""
         account = self._accounts.get(robot)
-        return account.route[: account.granted] if account else []
+        return account.route[: account.granted].tolist() if account else []
 
     def visitors(self, cell: int) -> set[str]:
         """Return the robots whose routes lead through a cell or begin there."""
-        return {robot for robot, _ in self._queues.get(cell, ())}
+        return {robot for _, robot, _ in self._queues.get(cell, ())}
 
     def horizon(self, robot: str) -> list[tuple[int, float]]:
         """Return the last granted cell and those after it, each with its step."""
@@ -121,7 +139,7 @@ class LedgerView:
             infinity; a robot at the end of its route leaves at infinity.
         """
         found = []
-        for robot, number in self._queues.get(cell, ()):
+        for _, robot, number in self._queues.get(cell, ()):
             if robot == but:
                 continue
             account = self._accounts[robot]
@@ -158,11 +176,11 @@ class LedgerView:
         """
         owners: dict[int, str] = {}
         for robot, account in self._accounts.items():
-            granted = account.route[: account.granted]
+            granted = account.route[: account.granted].tolist()
             if len(set(granted)) != len(granted):
                 raise InvariantError(f"{robot} was granted a cell twice: {granted}")
             for index, cell in enumerate(granted):
-                if self._queues[cell][0] != (robot, account.passed + index):
+                if self._queues[cell][0] != account.visit(robot, index):
                     raise InvariantError(f"{robot} was granted cell {cell} out of turn")
             for cell in account.claims:
                 if owners.setdefault(cell, robot) != robot:
@@ -172,7 +190,7 @@ class LedgerView:
         if owners != self._owners:
             raise InvariantError(f"the owners {self._owners} are not the claims {owners}")
         visits = {
-            (cell, (robot, account.passed + index))
+            (cell, account.visit(robot, index))
             for robot, account in self._accounts.items()
             for index, cell in enumerate(account.route)
         }
@@ -188,7 +206,7 @@ class LedgerView:
             InvariantError: They do not.
         """
         for robot, account in self._accounts.items():
-            if len(account.steps) != len(account.route) or account.steps != sorted(set(account.steps)):
+            if len(account.steps) != len(account.route) or list(account.steps) != sorted(set(account.steps)):
                 raise InvariantError(f"the steps of {robot} do not grow: {account.steps}")
         for cell in self._queues if self.ordered else ():
             entries = [enters for enters, _ in self.occupied(cell, "") if enters > -inf]

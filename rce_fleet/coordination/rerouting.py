@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rce_fleet.coordination.ledger_view import CELLS, STEPS
 from rce_fleet.coordination.robot import Phase
 from rce_fleet.planning.graph import PlanningGraph
 from rce_fleet.planning.grid import GridMap
@@ -86,22 +87,22 @@ def copy_ledger(state: FleetState, robots: Sequence[str], members: Sequence[str]
         members: Those of them that need new paths, in order.
     """
     places = {robot: index for index, robot in enumerate(robots)}
-    # Arrays that take lists do so in half the time that numpy needs, and the planner stands meanwhile.
-    begins, steps, leaves = array("d"), array("d"), array("d")
-    lengths, cells, granted = array("i"), array("i"), array("i")
+    begins, lengths = list[float](), list[int]()
+    cells, steps = array(CELLS), array(STEPS)
+    granted, leaves = array(CELLS), array(STEPS)
     for robot in robots:
         account = state.ledger.account(robot)
         end = account.granted
         begins.append(account.steps[end - 1])
         lengths.append(len(account.route) - end)
-        cells.fromlist(account.route[end:])
-        steps.fromlist(account.steps[end:])
-        granted.fromlist(account.route[: end - 1])
-        leaves.fromlist(account.steps[1:end])
+        cells.extend(account.route[end:])  # Bytes are copied: the planner stands meanwhile.
+        steps.extend(account.steps[end:])
+        granted.extend(account.route[: end - 1])
+        leaves.extend(account.steps[1:end])
     return LedgerCopy(
         members=tuple(places[robot] for robot in members),
-        begins=begins.tobytes(),
-        lengths=lengths.tobytes(),
+        begins=array(STEPS, begins).tobytes(),
+        lengths=array(CELLS, lengths).tobytes(),
         cells=cells.tobytes(),
         steps=steps.tobytes(),
         granted=granted.tobytes(),

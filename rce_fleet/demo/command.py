@@ -297,7 +297,9 @@ async def _with_page(config: DemoConfig, show: Callable[[str], None], *, auto: b
         station = StationClient(session, demo.page)
         rng = Random(config.seed)  # noqa: S311 - for goals, not for secrets
         await demo.group.run_while_alive(
-            send_random_goals(station, rng, say) if auto else _wait_until_cancelled()
+            send_random_goals(station, rng, say, has_manager=config.mode is Mode.CLOUD)
+            if auto
+            else _wait_until_cancelled()
         )
     return 0
 

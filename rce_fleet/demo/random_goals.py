@@ -1,4 +1,4 @@
-"""Sends robots to random goals until the operator sets a goal for them."""
+"""Sends robots to random goals until the operator sets a goal for them, and never beside open tasks."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class RandomGoals:
         return goals
 
     def on_refused(self, robot: str) -> None:
-        """Forget the goal that was sent to a robot: the planner refused it."""
+        """Forget the goal of a robot that did not get it: the planner refused it, or there are tasks."""
         self._sent.pop(robot, None)
 
     def _choose(self, fleet: FleetModel, goals: dict[str, int]) -> int | None:
@@ -79,22 +79,48 @@ class RandomGoals:
         return self._rng.choice(free) if free else None
 
 
-async def send_random_goals(station: StationClient, rng: Random, say: Callable[[str], None]) -> None:
+async def send_goals(station: StationClient, chooser: RandomGoals, *, has_manager: bool) -> list[str]:
+    """Send the goals that are due; return the robots that got one.
+
+    Args:
+        station: The station's API.
+        chooser: Chooses the goals.
+        has_manager: Whether a fleet manager gives tasks to the robots.
+
+    Raises:
+        StationUnavailableError: Station, planner or fleet manager cannot be reached.
+        RequestRefusedError: The station does not tell the fleet's state.
+    """
+    sent = []
+    for robot, cell in chooser.update(await station.fleet(), time.monotonic()).items():
+        # Asked each time: a goal that is set by hand would hold the task that a robot has just got.
+        if has_manager and await station.has_open_tasks():
+            chooser.on_refused(robot)
+            continue
+        try:
+            await station.set_goal(robot, cell)
+        except RequestRefusedError:
+            chooser.on_refused(robot)
+        else:
+            sent.append(robot)
+    return sent
+
+
+async def send_random_goals(
+    station: StationClient, rng: Random, say: Callable[[str], None], *, has_manager: bool
+) -> None:
     """Send random goals until cancelled.
 
     Args:
         station: The station's API.
         rng: Source of the goals.
         say: Prints a line for the user.
+        has_manager: Whether a fleet manager gives tasks to the robots.
     """
     chooser, told = RandomGoals(rng), frozenset[str]()
     while True:
         with contextlib.suppress(StationUnavailableError):
-            for robot, cell in chooser.update(await station.fleet(), time.monotonic()).items():
-                try:
-                    await station.set_goal(robot, cell)
-                except RequestRefusedError:
-                    chooser.on_refused(robot)
+            await send_goals(station, chooser, has_manager=has_manager)
         for robot in sorted(chooser.taken_over - told):
             say(f"{robot} is yours now: it gets no more random goals")
         told = chooser.taken_over

@@ -34,7 +34,7 @@ from rce_fleet.coordination.settings import COMPILED_EFFORT
 from rce_fleet.exceptions import PlanWorkerError
 from rce_fleet.nodes.known_robots import VOLUME_VARIABLE
 from rce_fleet.planning.planner import DEFAULT_PLANNER, Planner, load_planner
-from rce_fleet.planning.rerouting_loops import reroute_robots
+from rce_fleet.planning.rerouting import REROUTING_KERNELS
 
 if TYPE_CHECKING:
     import logging
@@ -212,7 +212,7 @@ def serve(requests: BinaryIO, results: BinaryIO) -> None:
 
 def load_compiled() -> Planner:
     """Compile the loops, and return the default planner."""
-    compile_kernels([reroute_robots])
+    compile_kernels(REROUTING_KERNELS)
     return load_planner(DEFAULT_PLANNER)
 
 

@@ -48,7 +48,8 @@ class GridMap:
             raise ValueError(f"cell_size must be positive, not {self.cell_size}")
         if not isfinite(self.yaw):
             raise ValueError(f"yaw must be a finite number, not {self.yaw}")
-        outside = [cell for cell in self.blocked if cell not in self]
+        size = len(self)
+        outside = [cell for cell in self.blocked if not 0 <= cell < size]
         if outside:
             raise ValueError(f"blocked cells {sorted(outside)} are outside the map")
 

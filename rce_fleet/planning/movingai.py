@@ -6,6 +6,7 @@ right and y downwards, which is column and row of :class:`~rce_fleet.planning.gr
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from rce_fleet.exceptions import MapError
 from rce_fleet.planning.grid import GridMap
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 _FREE = frozenset(".GS")
@@ -117,16 +119,27 @@ def read_map(path: Path, *, cell_size: float = 1.0) -> GridMap:
         MapError: The file is not such a map.
         OSError: The file cannot be opened.
     """
-    return parse_map(_text(path), cell_size=cell_size)
+    with _named(path):
+        return parse_map(_text(path), cell_size=cell_size)
 
 
 def read_scenario(path: Path, grid: GridMap, *, limit: int | None = None) -> list[ScenarioRow]:
     """Read a ``.scen`` file; see :func:`parse_scenario`."""
-    return parse_scenario(_text(path), grid, limit=limit)
+    with _named(path):
+        return parse_scenario(_text(path), grid, limit=limit)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Put the file's name before errors of its content."""
+    try:
+        yield
+    except MapError as error:
+        raise MapError(error.reason, line=error.line, file=str(path)) from error
 
 
 def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="ascii")
     except UnicodeDecodeError as error:
-        raise MapError(f"{path} is not ASCII text") from error
+        raise MapError("the file is not ASCII text") from error

@@ -5,14 +5,13 @@ See :mod:`rce_fleet.planning.rerouting_loops` for the search, and :mod:`rce_flee
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rce_fleet.planning.rerouting_loops import PLANNED, reroute_robots
-from rce_fleet.planning.visits import DWELL, ENTER, LEAVE, NEXT, ROBOT
+from rce_fleet.planning.visit_lists import fill_lists, list_visits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -24,12 +23,11 @@ if TYPE_CHECKING:
     Ints = NDArray[np.int32]
     Floats = NDArray[np.float64]
 
+REROUTING_KERNELS = (reroute_robots, fill_lists)
 TOUCHED = 128
 """Robots that may lose their paths beside those that need new ones."""
 LONGEST = 2048
 """Most nodes of a new path."""
-_LISTED = 32
-"""Visits that are added to a node at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +95,9 @@ def reroute(
     """
     size, count = len(graph), len(robots.starts)
     routes_at = np.concatenate(([0], np.cumsum(robots.lengths))).astype(np.int32)
-    counts, times, tags = _listed(size, robots, routes_at)
+    counts, times, tags = list_visits(
+        size, robots.starts, robots.goals, routes_at, robots.nodes, robots.steps, robots.fixed
+    )
     closed_of = [sorted((forbidden or {}).get(robot, ())) for robot in range(count)] if forbidden else []
     closed_at = np.zeros(count + 1, np.int32)
     closed_at[1:] = np.cumsum([len(closed) for closed in closed_of]) if closed_of else 0
@@ -122,69 +122,3 @@ def reroute(
     }
     unreachable = frozenset(robot for robot in paths if robots.goals[robot] >= 0 > targets[robot])
     return Rerouted(paths, unreachable)
-
-
-class _Buffers(threading.local):
-    """Memory that is used again with the next call: the pages of new memory cost more than the lists."""
-
-    def __init__(self) -> None:
-        self._times = np.empty(0)
-        self._tags = np.empty(0, np.int32)
-
-    def times(self, size: int, room: int) -> Floats:
-        """Return an array of shape (size, room, 2); its content is undefined."""
-        needed = size * room * 2
-        if len(self._times) < needed:
-            self._times = np.empty(needed + needed // 4)
-        return self._times[:needed].reshape(size, room, 2)
-
-    def tags(self, size: int, room: int) -> Ints:
-        """Return an array of shape (size, room, 2); its content is undefined."""
-        needed = size * room * 2
-        if len(self._tags) < needed:
-            self._tags = np.empty(needed + needed // 4, np.int32)
-        return self._tags[:needed].reshape(size, room, 2)
-
-
-_buffers = _Buffers()
-
-
-def _listed(size: int, robots: RoutedRobots, routes_at: Ints) -> tuple[Ints, Floats, Ints]:
-    """Return the number, times and tags of each node's visits, in order."""
-    count, total = len(robots.starts), len(robots.nodes)
-    first, last = routes_at[:-1], routes_at[1:]
-    has_path = robots.lengths > 0
-    leaves, ahead = np.full(total, np.inf), np.full(total, -1, np.int32)
-    if total:
-        leaves[:-1], ahead[:-1] = robots.steps[1:], robots.nodes[1:]
-        ends = last[has_path] - 1
-        is_rest = robots.nodes[ends] == robots.goals[has_path]
-        leaves[ends], ahead[ends] = np.where(is_rest, robots.steps[ends] + DWELL, np.inf), -1
-    starts_leave, starts_ahead = np.full(count, np.inf), np.full(count, -1, np.int32)
-    starts_leave[has_path] = robots.steps[first[has_path]]
-    starts_ahead[has_path] = robots.nodes[first[has_path]]
-    others, others_leave = robots.fixed
-    none = np.full(len(others), -1, np.int32)
-    node = np.concatenate((robots.starts, others, robots.nodes))
-    enter = np.concatenate((np.full(count + len(others), -np.inf), robots.steps))
-    leave = np.concatenate((starts_leave, others_leave, leaves))
-    robot = np.concatenate(
-        (np.arange(count, dtype=np.int32), none, np.repeat(np.arange(count, dtype=np.int32), robots.lengths))
-    )
-    following = np.concatenate((starts_ahead, none, ahead))
-    order = np.argsort(enter)
-    # By node, then by step: a stable sort of numbers of 16 bits is a radix sort.
-    short = np.uint16 if size <= 1 << 16 else np.int32
-    order = order[np.argsort(node[order].astype(short), kind="stable")]
-    node = node[order]
-    counts = np.bincount(node, minlength=size).astype(np.int32)
-    begins = np.concatenate(([0], np.cumsum(counts)[:-1]))
-    place = np.arange(len(node)) - begins[node]
-    room = int(counts.max(initial=0)) + _LISTED
-    times, tags = _buffers.times(size, room), _buffers.tags(size, room)
-    enter, leave = enter[order], leave[order]
-    is_followed = np.append(node[1:] == node[:-1], False) & (following[order] < 0) & (leave < np.inf)
-    leave[:-1] = np.where(is_followed[:-1], np.minimum(leave[:-1], enter[1:]), leave[:-1])
-    times[node, place, ENTER], times[node, place, LEAVE] = enter, leave
-    tags[node, place, ROBOT], tags[node, place, NEXT] = robot[order], following[order]
-    return counts, times, tags

@@ -40,6 +40,16 @@ class StationClient:
         except ValidationError as error:
             raise RequestRefusedError(f"the station's answer is not a fleet's state: {error}") from error
 
+    async def has_open_tasks(self) -> bool:
+        """Return whether a task is open at the fleet manager.
+
+        Raises:
+            StationUnavailableError: Station or fleet manager cannot be reached.
+            RequestRefusedError: The request was refused.
+        """
+        answer = await self._request("GET", "tasks", query={"state": "open", "limit": "1"})
+        return bool(answer["tasks"])
+
     async def set_goal(self, robot: str, cell: int | None) -> None:
         """Send a robot to a cell, or stop it (None).
 
@@ -68,9 +78,16 @@ class StationClient:
         method, path = ("POST", "grid/preview") if preview else ("PUT", "grid")
         return GridAnswer.model_validate(await self._request(method, path, grid.model_dump()))
 
-    async def _request(self, method: str, path: str, body: dict[str, Any] | None = None) -> Any:
+    async def _request(
+        self,
+        method: str,
+        path: str,
+        body: dict[str, Any] | None = None,
+        query: dict[str, str] | None = None,
+    ) -> Any:
+        url = (self._api / path).with_query(query)
         try:
-            async with self._session.request(method, self._api / path, json=body, timeout=TIMEOUT) as reply:
+            async with self._session.request(method, url, json=body, timeout=TIMEOUT) as reply:
                 answer = await reply.json(content_type=None)
                 if reply.ok:
                     return answer

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from random import Random
 
 from support.fleet_states import fleet, robot
 
-from rce_fleet.demo.random_goals import PAUSE_AT_GOAL, RandomGoals
+from rce_fleet.demo.random_goals import PAUSE_AT_GOAL, RandomGoals, send_goals
+from rce_fleet.station.api import FleetModel
+from rce_fleet.station.client import StationClient
 
 
 def test_a_robot_without_a_goal_gets_one_that_is_free() -> None:
@@ -79,3 +82,28 @@ def test_unreported_goal_is_sent_again_not_taken_as_operators() -> None:
 
 def test_full_map_gives_no_goal() -> None:
     assert RandomGoals(Random(0)).update(fleet(robot("a", cell=0), blocked=[1, 2, 3], size=2), 0.0) == {}
+
+
+class OneRobotStation(StationClient):
+    """A station with one idle robot, without HTTP."""
+
+    def __init__(self, *, has_tasks: bool) -> None:
+        self._has_tasks = has_tasks
+        self.goals: list[str] = []
+
+    async def fleet(self) -> FleetModel:
+        return fleet(robot("a", cell=0))
+
+    async def has_open_tasks(self) -> bool:
+        return self._has_tasks
+
+    async def set_goal(self, robot: str, cell: int | None) -> None:
+        self.goals.append(robot)
+
+
+def test_no_random_goal_is_sent_while_tasks_are_open() -> None:
+    """A goal that is set by hand would hold the task of its robot."""
+    for has_tasks, has_manager, expected in ((True, True, []), (False, True, ["a"]), (True, False, ["a"])):
+        station = OneRobotStation(has_tasks=has_tasks)
+        assert asyncio.run(send_goals(station, RandomGoals(Random(0)), has_manager=has_manager)) == expected
+        assert station.goals == expected

@@ -14,8 +14,7 @@ from rce_fleet.planning.graph import PlanningGraph
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.lacam import LacamPlanner
 from rce_fleet.planning.planner import PlanningProblem
-from rce_fleet.planning.rerouting import Rerouted, RoutedRobots, reroute
-from rce_fleet.planning.rerouting_loops import reroute_robots
+from rce_fleet.planning.rerouting import REROUTING_KERNELS, Rerouted, RoutedRobots, reroute
 
 Route = list[tuple[int, float]]
 
@@ -166,7 +165,8 @@ def test_compiled_and_plain_loops_find_the_same_paths() -> None:
     if not is_available():
         pytest.skip("numba is not installed")
     plain = [find(seed)[-1] for seed in range(6)]
-    reroute_robots.use_compiled()
+    for loop in REROUTING_KERNELS:
+        loop.use_compiled()
     compiled = [find(seed)[-1] for seed in range(6)]
     for one, other in zip(plain, compiled, strict=True):
         assert (one is None) == (other is None)
