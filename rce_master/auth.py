@@ -7,12 +7,14 @@ import hashlib
 import hmac
 import secrets
 import time
+from base64 import b64encode
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
+from argon2.low_level import ARGON2_VERSION
 
 from rce.guard import CrowdedError, Turns
 from rce_master.exceptions import TooManyFailuresError, TooManyLoginsError, WrongCredentialsError
@@ -92,7 +94,7 @@ class Authenticator:
         self.checks = 0
         """Passwords that were hashed to check them."""
         # Checked for unknown users, so that the time does not reveal which users exist.
-        self._unknown_user = self._hasher.hash(secrets.token_hex())
+        self._unknown_user = _random_hash(self._hasher)
 
     async def verify(self, name: str, digest: str, address: str = "") -> User:
         """Check a password.
@@ -219,3 +221,16 @@ class Authenticator:
         self._known[name] = mark
         if self._remember is not None:
             await self._remember(KnownLogin(user=name, mark=mark))
+
+
+def _random_hash(hasher: PasswordHasher) -> str:
+    """Return what looks like the hash of a password; a check of it takes as long as any other, and fails.
+
+    To hash a random one would hold up the event loop of a master that takes over and has to renew its lease.
+    """
+    salt, digest = (
+        b64encode(secrets.token_bytes(size)).rstrip(b"=").decode()
+        for size in (hasher.salt_len, hasher.hash_len)
+    )
+    costs = f"m={hasher.memory_cost},t={hasher.time_cost},p={hasher.parallelism}"
+    return f"$argon2{hasher.type.name.lower()}$v={ARGON2_VERSION}${costs}${salt}${digest}"

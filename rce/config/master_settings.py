@@ -26,7 +26,7 @@ class MasterSettings(Section, frozen=True, kw_only=True):
         Store,
         Setting(
             "Where users and desired state are: `sqlite:FOLDER`, or for several masters"
-            " `etcd://HOST:2379,HOST:2379,...[/PREFIX]` (`etcds://` with TLS).",
+            " `etcd://HOST:2379,HOST:2379,...` (`etcds://` with TLS; `/PREFIX` may follow).",
             unset="SQLite in `state_dir`",
         ),
     ] = ""

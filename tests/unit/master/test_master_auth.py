@@ -5,7 +5,8 @@ from collections.abc import Iterator
 from typing import Literal
 
 import pytest
-from argon2 import PasswordHasher
+from argon2 import PasswordHasher, extract_parameters
+from argon2.exceptions import VerifyMismatchError
 from support.master_world import World
 
 from rce_master.auth import Authenticator, client_digest
@@ -67,6 +68,14 @@ async def test_a_login_that_is_given_up_takes_no_other_with_it(gate: Gate) -> No
     first.cancel()
     assert (await second).name == "zoe"
     assert gate.hasher.verified == 1
+
+
+async def test_the_hash_of_an_unknown_user_costs_what_another_does(gate: Gate) -> None:
+    """It is not computed: a master that takes over must not be held up."""
+    made = gate.auth._unknown_user
+    assert extract_parameters(made) == extract_parameters(gate.password)
+    with pytest.raises(VerifyMismatchError):
+        gate.hasher.verify(made, RIGHT)
 
 
 async def test_an_unknown_user_takes_a_hash_too(gate: Gate) -> None:
