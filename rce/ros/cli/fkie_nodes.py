@@ -20,8 +20,10 @@ from urllib.parse import urlsplit
 from rce.ros.cli.discovery import run_discovery
 from rce.ros.cli.sync import read_lists, run_sync
 from rce.ros.errors import MasterRefusedError, MasterUnreachableError, RosError
+from rce.ros.multimaster.announcements import URI_PARAMETER
 from rce.ros.multimaster.errors import MultimasterError
 from rce.ros.multimaster.filters import SyncLists
+from rce.ros.multimaster.registrar import RECORD
 from rce.ros.multimaster.settings import DiscoverySettings, local_master
 from rce.ros.multimaster.sync import SyncSettings
 from rce.ros.names import parse_arguments
@@ -37,6 +39,8 @@ _OWN = ("master_uri", "node_name")
 _DISCOVERY = {field.name: field.type for field in fields(DiscoverySettings) if field.name not in _OWN}
 _NO_EFFECT = ("resync_on_reconnect", "resync_on_reconnect_timeout", "sync_topics_on_demand")
 """Parameters of master_sync that ours does not need: it always syncs again."""
+_WRITTEN = frozenset(name.removeprefix("~") for name in (URI_PARAMETER, RECORD))
+"""What the nodes write among their own parameters. It stays at the master when they are killed."""
 
 
 def master_discovery() -> int:
@@ -167,7 +171,7 @@ def _base_name(settings: NodeSettings) -> str:
 
 
 async def private_parameters(name: str, argv: Sequence[str]) -> tuple[NodeSettings, dict[str, Any]]:
-    """Return a node's settings and its private parameters, once its master answers.
+    """Return a node's settings and the private parameters that a user set, once its master answers.
 
     Args:
         name: The node's name, unless ``__name:=`` gives another one.
@@ -195,4 +199,5 @@ async def private_parameters(name: str, argv: Sequence[str]) -> tuple[NodeSettin
             except MasterUnreachableError:
                 await asyncio.sleep(MASTER_POLL)
     stored = found if isinstance(found, dict) else {}
-    return settings, {**stored, **settings.parameters}
+    given = {key: value for key, value in stored.items() if key not in _WRITTEN}
+    return settings, {**given, **settings.parameters}

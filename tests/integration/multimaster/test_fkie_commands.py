@@ -65,3 +65,27 @@ async def test_command_lines_and_launch_files_of_fkie(tmp_path: Path) -> None:
         assert topics(here.graph) == {"/Robot1/amcl_pose", "/Robot1/goalNodesList", "/fleet/state"}
         assert topics(there.graph) == {"/Robot1/goalNodesList", "/Robot1/amcl_pose", "/scan"}
         assert here.graph.parameters.get("/master_sync/sync_topics") == ["/Robot1/amcl_pose"]
+
+
+async def test_killed_nodes_of_fkie_start_again_at_the_same_master(tmp_path: Path) -> None:
+    """What a killed discovery and sync wrote to the master's parameters does not stop their successors."""
+    port, here_rpc, there_rpc = free_ports(3)
+    common = (f"_mcast_port:={port}", "_mcast_group:=224.0.0.1", "_heartbeat_hz:=10", "_rosmaster_hz:=10")
+    find = ("run", "master_discovery_fkie", "master_discovery", *common)
+    sync = ("run", "master_sync_fkie", "master_sync", "_sync_topics:=[/first, /second]")
+    async with (
+        Core(port=0) as here,
+        Core(port=0) as there,
+        node("robot", there.uri) as robot,
+        started(there, tmp_path, *find, f"_rpc_port:={there_rpc}", "_name:=robot"),
+    ):
+        await robot.advertise("/first", STRING)
+        own = (*find, f"_rpc_port:={here_rpc}", "_name:=planner")
+        async with started(here, tmp_path, *own) as finding, started(here, tmp_path, *sync) as syncing:
+            await here.wait_until(lambda graph: "/first" in graph.topic_types, timeout=120)
+            for killed in (finding, syncing):
+                killed.kill()
+                await killed.wait()
+        async with started(here, tmp_path, *own), started(here, tmp_path, *sync):
+            await robot.advertise("/second", STRING)
+            await here.wait_until(lambda graph: "/second" in graph.topic_types, timeout=120)
