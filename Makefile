@@ -10,13 +10,14 @@ PARALLEL := -n auto --dist loadgroup --durations=25
 # Tests start thousands of programs; without bytecode each of them compiles all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help packages install demo test test-all test-quick fuzz lint format docs reference bench lock clean
+.PHONY: help packages install demo test test-all test-quick fuzz faults lint format docs reference bench lock clean
 
 help:
 	@echo "make demo    engine, containers and a simulated fleet, with its web page"
 	@echo "make test    everything: linters, types, docs, unit, integration and end-to-end tests"
 	@echo "make test-all  make test without linters and types        make test-quick  the unit tests"
 	@echo "make fuzz    send the servers what no client would; EXAMPLES=5000 of each kind"
+	@echo "make faults  kill, cut off and slow down masters and etcd; ARGS=\"--only kill --rounds 100 --seed 7\""
 	@echo "make lint    ruff and mypy        make format   rewrite the layout"
 	@echo "make bench   measure              make lock     pin the dependencies anew"
 	@echo "make docs    the documentation as a site, in build/docs; needs no network"
@@ -50,6 +51,9 @@ test-all: install
 fuzz: install
 	RCE_FUZZ_EXAMPLES=$(or $(EXAMPLES),5000) $(BIN)/python -m pytest --timeout 3600 \
 		$(wildcard tests/integration/*/test_*_fuzz.py tests/integration/*/test_openapi.py) $(ARGS)
+
+faults: install
+	PYTHONPATH=tests $(BIN)/python -m faults $(ARGS)
 
 test-quick: install
 	$(BIN)/python -m pytest -n logical --hypothesis-profile=quick --durations=5 tests/unit $(ARGS)

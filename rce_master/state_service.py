@@ -73,6 +73,7 @@ class StateService:
 
     Attributes:
         listeners: Called with the changes of each command after they were stored; must not block or raise.
+        reverts: How often changes were taken back, because they could not be stored.
     """
 
     def __init__(
@@ -87,6 +88,9 @@ class StateService:
         self._fence = fence
         self._term = term
         self.listeners: list[Callable[[Changes], None]] = []
+        self.reverts = 0
+        self._settled = asyncio.Event()
+        self._settled.set()
         self._store = store
         self._clock = clock
         self._jobs: asyncio.Queue[_Job] = asyncio.Queue(MAX_WAITING)
@@ -147,6 +151,16 @@ class StateService:
     def copy_spec(self, endpoint: str) -> tuple[str, EndpointSpec] | None:
         """Tell where a container is being handed over to, and what is desired there; None if it is not."""
         return self.state.copy_spec(endpoint)
+
+    async def settled(self) -> None:
+        """Wait until all that the tables show now is stored, or is taken back, which :attr:`reverts` tells.
+
+        Raises:
+            FencedError: This master leads no more; some of it may have been stored or not.
+        """
+        await self._settled.wait()
+        if self._end is not None:
+            raise self._end
 
     async def check_store(self) -> None:
         """Tell whether the store works: what was last written was kept, and it is still where it was.
@@ -218,6 +232,7 @@ class StateService:
             continues: Whether to do more of what was left over, after the jobs.
         """
         done: list[Changes] = []
+        self._settled.clear()
         try:
             await self._apply_all(jobs, done, takes_more=takes_more, continues=continues)
             self._check_fence()
@@ -226,14 +241,17 @@ class StateService:
         except StoreError as error:
             if self._fence is not None and isinstance(error, FencedError):
                 raise  # the state ends with the leadership; no request is answered from it
-            _revert(done)
+            self._revert(done)
+            self._settled.set()
             # The next tick does what was left over: a store that fails is not asked again at once.
             self._is_unfinished = False
             await self._stand_alone(jobs, error)
             return
         except BaseException:
-            _revert(done)
+            self._revert(done)
             raise
+        finally:
+            self._settled.set()
         self._is_unfinished = any(changes.unfinished for changes in done)
         _touch_once(done)
         turn = _Turn()
@@ -310,16 +328,16 @@ class StateService:
             job.outcomes = [error for _ in job.commands]
         self._answer(jobs, error)
 
+    def _revert(self, done: Sequence[Changes]) -> None:
+        self.reverts += 1
+        for changes in reversed(done):
+            changes.revert()
+
     @staticmethod
     def _answer(jobs: list[_Job], error: StoreError | None) -> None:
         for job in jobs:
             if not job.done.done():
                 job.done.set_result([outcome or error for outcome in job.outcomes])
-
-
-def _revert(done: Sequence[Changes]) -> None:
-    for changes in reversed(done):
-        changes.revert()
 
 
 async def load_converted(store: Store, term: int) -> Snapshot:

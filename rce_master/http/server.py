@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from rce_master.http.entry import Entry
     from rce_master.http.routes import Services
     from rce_master.leadership import Fence
+    from rce_master.state_service import StateService
 
     Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -54,7 +55,8 @@ def make_app(
         names: The allowed host names of the server.
     """
     guard = origin_guard(frozenset(allowed_origins), names or ServerNames())
-    inner = [] if services.fence is None else [_fencing(services.fence)]
+    fence = services.fence
+    inner = [] if fence is None else [_fencing(fence), settling(services.state_service, fence)]
     app = web.Application(middlewares=[guard, _errors, *inner], client_max_size=MAX_BODY)
     app.router.add_get("/", _at_entry(entry))
     app.router.add_get("/healthz", Health(services.state_service, services.fence).handle)
@@ -118,6 +120,34 @@ def _fencing(fence: Fence) -> Any:
         return response
 
     return check
+
+
+def settling(state_service: StateService, fence: Fence) -> Any:
+    """Make the middleware by which no reader sees what is not stored, and may be lost with the lead."""
+
+    @web.middleware
+    async def settle(request: web.Request, handler: Handler) -> web.StreamResponse:
+        if request.method != hdrs.METH_GET or not request.path.startswith(PREFIX):
+            return await handler(request)
+        while True:
+            reverts = state_service.reverts
+            response, refusal = None, None
+            try:
+                response = await handler(request)
+            except MasterError as error:
+                refusal = error
+            if response is not None and response.prepared:  # a stream, of what was stored
+                return response
+            await state_service.settled()
+            fence.check()
+            if state_service.reverts == reverts:
+                break
+        if response is None:
+            assert refusal is not None
+            raise refusal
+        return response
+
+    return settle
 
 
 def _status(error: MasterError) -> int:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import asyncio
 
 import pytest
+from aiohttp import web
+from aiohttp.test_utils import make_mocked_request
 from support.master_cloud import FragileStore
 
-from rce_master.exceptions import FencedError
+from rce_master.exceptions import FencedError, StoreError
+from rce_master.http.server import settling
 from rce_master.leadership.core import Fence, LeadershipCore, LeaseSettings
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
@@ -67,3 +70,64 @@ async def test_a_save_that_outlives_the_lease_is_not_answered() -> None:
         with pytest.raises(FencedError):
             await task
     assert heard == []
+
+
+async def test_readers_wait_until_what_they_see_is_stored() -> None:
+    leading = Leading()
+    service = await leading.open()
+    running = asyncio.create_task(service.run())
+    await service.settled()
+    leading.store.free.clear()
+    adding = asyncio.create_task(service.submit(new_user("anna")))
+    while service.tables.users.get("anna") is None:
+        await asyncio.sleep(0)
+    reading = asyncio.create_task(service.settled())
+    await asyncio.sleep(0)
+    assert not reading.done()
+    leading.store.free.set()
+    await reading
+    await adding
+    assert service.reverts == 0
+    running.cancel()
+
+
+async def test_readers_learn_that_what_they_saw_was_taken_back() -> None:
+    leading = Leading()
+    service = await leading.open()
+    running = asyncio.create_task(service.run())
+    answers = []
+
+    async def handler(_: web.Request) -> web.StreamResponse:
+        answers.append(sorted(user.name for user in service.tables.users))
+        return web.Response(text=",".join(answers[-1]))
+
+    read = settling(service, leading.fence)
+    leading.store.free.clear()
+    leading.store.broken = True
+    adding = asyncio.create_task(service.submit(new_user("anna")))
+    while service.tables.users.get("anna") is None:
+        await asyncio.sleep(0)
+    reading = asyncio.create_task(read(make_mocked_request("GET", "/api/v1/users"), handler))
+    await asyncio.sleep(0)
+    leading.store.free.set()
+    with pytest.raises(StoreError):
+        await adding
+    assert (await reading).text == ""
+    assert answers == [["anna"], []]
+    running.cancel()
+
+
+async def test_readers_are_refused_when_the_lead_is_lost_meanwhile() -> None:
+    leading = Leading()
+    service = await leading.open()
+    running = asyncio.create_task(service.run())
+    leading.store.free.clear()
+    adding = asyncio.create_task(service.submit(new_user("anna")))
+    while service.tables.users.get("anna") is None:
+        await asyncio.sleep(0)
+    reading = asyncio.create_task(service.settled())
+    leading.now += 3.0
+    leading.store.free.set()
+    for task in (reading, adding, running):
+        with pytest.raises(FencedError):
+            await task

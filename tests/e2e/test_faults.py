@@ -1,0 +1,33 @@
+"""The fault suite, its short form; ``make faults`` is the long one."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from faults.catalogue import SCENARIOS, Scenario
+from faults.goals import Times
+from faults.world import world
+
+pytestmark = [pytest.mark.e2e, pytest.mark.needs("root", "netns", "etcd"), pytest.mark.xdist_group("faults")]
+
+SEED = 1
+SHORT = [each for each in SCENARIOS if each.short]
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    yield path
+    shutil.rmtree(path)
+
+
+@pytest.mark.parametrize("scenario", SHORT, ids=[each.name for each in SHORT])
+async def test_nothing_is_lost_and_no_link_is_cut(scenario: Scenario, folder: Path) -> None:
+    times = Times()
+    async with world(folder, SEED, times, robot=scenario.robot) as made:
+        await scenario.run(made)
+    print("\n".join(times.table()))  # noqa: T201 - beside the goals

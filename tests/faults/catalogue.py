@@ -1,0 +1,42 @@
+"""The scenarios."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+from faults.scenarios import etcd, kill, network
+from faults.world import World
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """A kind of fault.
+
+    Attributes:
+        robot: Whether task sets and a robot run meanwhile.
+        short: Whether it belongs to the short form, which all tests contain.
+    """
+
+    name: str
+    run: Callable[[World], Awaitable[None]]
+    robot: bool = True
+    short: bool = False
+
+
+SCENARIOS = (
+    Scenario("kill", kill.kill, short=True),
+    Scenario("stop", kill.stop, short=True),
+    Scenario("cut", network.cut),
+    Scenario("cut-from-task-sets", network.cut_from_task_sets),
+    Scenario("cut-etcd-apart", network.cut_etcd_apart, short=True),
+    Scenario("flap", network.flap),
+    Scenario("delay", network.delay, robot=False),
+    Scenario("away", etcd.away),
+    Scenario("clocks", etcd.clocks, robot=False),
+    Scenario("slow-disk", etcd.slow_disk, robot=False),
+    Scenario("full-disk", etcd.full_disk, robot=False),
+    Scenario("full-database", etcd.full_database, robot=False, short=True),
+    Scenario("replace-member", etcd.replace_member, robot=False),
+    Scenario("upgrade", kill.terminate),
+)

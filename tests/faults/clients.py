@@ -1,0 +1,163 @@
+"""Clients of the masters' REST API that write down what they asked for and what they were answered."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import random
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import aiohttp
+from support.engine import until
+
+from faults.history import Fate, History
+from faults.machines import PATIENCE_S, Cluster
+from rce_master.leadership.core import STANDBY_HEADER
+
+USER = "testUser"
+REGISTER_USERS = ("registers1", "registers2")
+KINDS = ("containers", "slots", "packages")
+INITIAL = 1_000_000
+"""Of all registers, which are limits of users."""
+TIMEOUT_S = 3.0
+PAUSE_S = 0.05
+TOKENS = 1500
+"""A user may have 2000."""
+_FAILURES = (aiohttp.ClientError, TimeoutError, OSError)
+
+
+class Clients:
+    """Several clients, each of which asks the next master when one does not answer.
+
+    Args:
+        cluster: The masters.
+        history: Takes what happens.
+        rng: Chooses what they do.
+    """
+
+    def __init__(self, cluster: Cluster, history: History, rng: random.Random) -> None:
+        self._urls = [machine.url for machine in cluster.machines]
+        self._cluster = cluster
+        self._history = history
+        self._rng = rng
+        self._token = ""
+        self._numbers = itertools.count(1)
+
+    async def prepare(self) -> None:
+        """Log in, and make the users whose limits are the registers."""
+        url = (await self._cluster.leader()).url
+        credentials = {"userID": USER, "password": USER}
+        self._token = (await self._asked("POST", f"{url}api/v1/login", credentials))["token"]
+        for name in REGISTER_USERS:
+            user = {"name": name, "password": "a password of theirs"}
+            await self._asked("POST", f"{url}api/v1/users", user)
+            limits = dict.fromkeys(KINDS, INITIAL)
+            await self._asked("PATCH", f"{url}api/v1/users/{name}/limits", limits)
+
+    def session(self, timeout: float = TIMEOUT_S) -> aiohttp.ClientSession:
+        """Return a session of the logged-in user."""
+        headers = {"Authorization": f"Bearer {self._token}"} if self._token else {}
+        return aiohttp.ClientSession(headers=headers, timeout=aiohttp.ClientTimeout(total=timeout))
+
+    async def _asked(self, method: str, url: str, body: object = None) -> dict[str, Any]:
+        async with self.session(PATIENCE_S) as session, session.request(method, url, json=body) as reply:
+            assert reply.status < 300, await reply.text()
+            found: dict[str, Any] = await reply.json() if reply.content_length else {}
+            return found
+
+    @asynccontextmanager
+    async def under_load(self) -> AsyncIterator[None]:
+        """Write and read all the time."""
+        users = [(name, number) for number, name in enumerate(REGISTER_USERS)]
+        tasks = [
+            asyncio.create_task(self._make_tokens(0)),
+            *(asyncio.create_task(self._write(name, number)) for name, number in users),
+            *(asyncio.create_task(self._read(name, number)) for name, number in users),
+        ]
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+            results = await asyncio.gather(*tasks, return_exceptions=True)
+        for result in results:
+            if isinstance(result, Exception):
+                raise result
+
+    async def wait_for_writes(self, count: int = 3, *, since: float = 0.0) -> None:
+        """Wait until so many more writes are acknowledged that were asked for after a time."""
+        since = since or time.monotonic()
+
+        def enough() -> bool:
+            return sum(start >= since for start, _ in self._history.acknowledged) >= count
+
+        await until(enough, timeout=PATIENCE_S, what=f"{count} writes are acknowledged")
+
+    async def stored(self) -> list[str]:
+        """Return the robots of all tokens."""
+        url = (await self._cluster.leader()).url
+        found = await self._asked("GET", f"{url}api/v1/robot-tokens")
+        return [token["robot"] for token in found["tokens"]]
+
+    async def machines(self) -> dict[str, bool]:
+        """Return the task sets, and whether they are connected."""
+        url = (await self._cluster.leader()).url
+        found = await self._asked("GET", f"{url}api/v1/machines")
+        return {each["process"]: each["connected"] for each in found["machines"]}
+
+    async def _make_tokens(self, used: int) -> None:
+        async with self.session() as session:
+            for number in range(TOKENS):
+                robot, start = f"robot{number}", time.monotonic()
+                self._history.made[robot] = Fate.UNKNOWN
+                url = f"{self._url(used)}api/v1/robot-tokens"
+                fate, _ = await self._ask(session, "POST", url, {"robot": robot})
+                self._history.made[robot] = fate
+                if fate is Fate.DONE:
+                    self._history.acknowledged.append((start, time.monotonic()))
+                else:
+                    used += 1
+                await asyncio.sleep(PAUSE_S)
+
+    async def _write(self, user: str, used: int) -> None:
+        async with self.session() as session:
+            while True:
+                kind, value, start = self._rng.choice(KINDS), next(self._numbers), time.monotonic()
+                url, fate = f"{self._url(used)}api/v1/users/{user}/limits", Fate.UNKNOWN
+                try:
+                    fate, _ = await self._ask(session, "PATCH", url, {kind: value})
+                finally:  # also when the test ends meanwhile
+                    self._history.wrote(f"{user}/{kind}", start, time.monotonic(), value, fate)
+                used += fate is not Fate.DONE
+                await asyncio.sleep(PAUSE_S)
+
+    async def _read(self, user: str, used: int) -> None:
+        async with self.session() as session:
+            while True:
+                start = time.monotonic()
+                fate, found = await self._ask(session, "GET", f"{self._url(used)}api/v1/users/{user}")
+                if fate is Fate.DONE:
+                    for kind in KINDS:
+                        value = int(found["limits"][kind]["limit"])
+                        self._history.read(f"{user}/{kind}", start, time.monotonic(), value)
+                used += 1  # each master in turn, so that one that leads no more is asked too
+                await asyncio.sleep(PAUSE_S)
+
+    def _url(self, used: int) -> str:
+        return self._urls[used % len(self._urls)]
+
+    async def _ask(
+        self, session: aiohttp.ClientSession, method: str, url: str, body: object = None
+    ) -> tuple[Fate, dict[str, Any]]:
+        with contextlib.suppress(*_FAILURES):
+            async with session.request(method, url, json=body) as reply:
+                if reply.status < 300:
+                    return Fate.DONE, await reply.json()
+                assert reply.status in {500, 502, 503}, (reply.status, await reply.text())
+                if STANDBY_HEADER in reply.headers:
+                    return Fate.NOT_DONE, {}
+        return Fate.UNKNOWN, {}

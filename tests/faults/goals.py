@@ -1,0 +1,37 @@
+"""The times that the suite measures, and what they should be. Pure."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterator
+
+GOALS = {
+    "kill -9 of the leading master": 5.0,
+    "kill -9 of etcd's leader": 4.0,
+    "kill -9 of both": 8.0,
+    "kill -9 of a stand-by": 4.0,
+    "SIGTERM of the leading master": 1.0,
+    "stop of the leading master": 5.0,
+    "machine cut off": 8.0,
+    "task sets are back": 10.0,
+}
+"""The longest time until the next write, or until the event, in seconds."""
+
+
+class Times:
+    """Measured times by what they are of."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, list[float]] = {}
+
+    def add(self, what: str, value: float) -> None:
+        """Note a time, seconds."""
+        self._found.setdefault(what, []).append(value)
+
+    def table(self) -> Iterator[str]:
+        """Return lines with what was measured beside the goals."""
+        yield f"{'until the next write, seconds':42} {'n':>4} {'p50':>7} {'max':>7} {'goal':>7}"
+        for what, values in self._found.items():
+            goal = f"< {GOALS[what]:g}" if what in GOALS else ""
+            middle, most = statistics.median(values), max(values)
+            yield f"{what:42} {len(values):4} {middle:7.2f} {most:7.2f} {goal:>7}"

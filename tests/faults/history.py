@@ -1,0 +1,107 @@
+"""What clients asked for and were answered, and what must be true of it. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from enum import Enum
+
+from faults.linearizability import Operation, is_linearizable, unexplained
+
+DELIVERY_S = 0.5
+"""How long a message of a term may be on its way when the next term has begun."""
+
+
+class Fate(Enum):
+    """What a client knows of a request."""
+
+    DONE = "done"
+    NOT_DONE = "not done"
+    """The master said that nothing was done."""
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A master's message to a task set, in seconds since the start of the machine."""
+
+    at: float
+    master: str
+    term: int
+    message: str
+
+
+@dataclass
+class History:
+    """All that clients and task sets saw.
+
+    Attributes:
+        made: The fate of each request that makes a robot's token, by the robot.
+        registers: Reads and writes of each register.
+        heard: What masters told task sets, in the order in which it came.
+        acknowledged: Start and end of each write that was acknowledged.
+        lost_links: What robots saw of links that were interrupted.
+    """
+
+    made: dict[str, Fate] = field(default_factory=dict)
+    registers: dict[str, list[Operation]] = field(default_factory=dict)
+    heard: list[Heard] = field(default_factory=list)
+    acknowledged: list[tuple[float, float]] = field(default_factory=list)
+    lost_links: list[str] = field(default_factory=list)
+
+    def wrote(self, register: str, start: float, end: float, value: int, fate: Fate) -> None:
+        """Note a write."""
+        if fate is not Fate.NOT_DONE:
+            known = end if fate is Fate.DONE else math.inf
+            self.registers.setdefault(register, []).append(Operation(start, known, True, value))
+        if fate is Fate.DONE:
+            self.acknowledged.append((start, end))
+
+    def read(self, register: str, start: float, end: float, value: int) -> None:
+        """Note a read."""
+        self.registers.setdefault(register, []).append(Operation(start, end, False, value))
+
+    def first_write_after(self, at: float) -> float | None:
+        """Return when the first write was acknowledged that was asked for after a time."""
+        return min((end for start, end in self.acknowledged if start >= at), default=None)
+
+    def violations(self, stored: Iterable[str], initial: int) -> list[str]:
+        """Return what went wrong; nothing may.
+
+        Args:
+            stored: The robots of the tokens that the masters know at the end, once for each token.
+            initial: What registers held at the start.
+        """
+        return [
+            *self._lost(Counter(stored)),
+            *(
+                f"{name} is not linearizable: {' '.join(map(str, unexplained(operations, initial)))}"
+                for name, operations in self.registers.items()
+                if not is_linearizable(operations, initial)
+            ),
+            *self._of_older_terms(),
+            *self.lost_links,
+        ]
+
+    def _lost(self, stored: Counter[str]) -> Iterable[str]:
+        for robot, fate in self.made.items():
+            if fate is Fate.DONE and not stored[robot]:
+                yield f"{robot} was acknowledged and is lost"
+            if fate is Fate.NOT_DONE and stored[robot]:
+                yield f"{robot} was refused and was done"
+            if stored[robot] > 1:
+                yield f"{robot} was done {stored[robot]} times"
+
+    def _of_older_terms(self) -> Iterable[str]:
+        begun: dict[int, float] = {}
+        leaders: dict[int, str] = {}
+        for each in self.heard:
+            begun.setdefault(each.term, each.at)
+            if leaders.setdefault(each.term, each.master) != each.master:
+                yield f"{leaders[each.term]} and {each.master} both led in term {each.term}"
+        for each in self.heard:
+            newer = min((at for term, at in begun.items() if term > each.term), default=math.inf)
+            if each.at > newer + DELIVERY_S:
+                yield f"{each} came {each.at - newer:.1f} s after a newer term had begun"

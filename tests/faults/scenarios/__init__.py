@@ -1,0 +1,1 @@
+"""What is done to the masters and to etcd."""

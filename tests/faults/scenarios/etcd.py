@@ -1,0 +1,264 @@
+"""All of etcd away, a member that is replaced, a restored copy, full and slow disks, and other clocks."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+from support.engine import until
+
+from faults.machines import PATIENCE_S, PEER_PORT, Machine
+from faults.world import World
+from rce_master.store.etcd import EtcdClient
+from rce_master.store.etcd.exceptions import EtcdAwayError, EtcdRefusedError
+from rce_master.store.etcd.wire import Delete, Put
+
+AWAY_S = 8.0
+LONG_AWAY_S = 120.0
+FSYNC_S = 0.5
+SLOW_S = 6.0
+LONG_SLOW_S = 60.0
+QUOTA = 16 << 20
+"""Bytes of a database that is soon full."""
+BALLAST = 1 << 20
+DISK = "200m"
+FAKETIME = "/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1"
+CLOCKS = ("+1h", "-1h")
+_SOURCE = Path(__file__).parent.parent / "slow_fsync.c"
+
+
+async def away(world: World) -> None:
+    """End all members of etcd, forget the revisions of before, and start them again."""
+    for machine in world.cluster.machines:
+        await machine.member.kill()
+    await asyncio.sleep(AWAY_S if world.scale == 1 else LONG_AWAY_S)
+    await world.until_no_master_leads()
+    since = time.monotonic()
+    for machine in world.cluster.machines:
+        await machine.start_etcd(world.cluster.machines)
+    end = await world.until_written("etcd away, and back", since)
+    await world.until_task_sets_are_back(end)
+    await compact(world.cluster.machines)
+    await world.clients.wait_for_writes()
+
+
+async def compact(machines: list[Machine]) -> None:
+    """Let etcd forget all revisions but the newest."""
+    async with EtcdClient([each.etcd for each in machines], attempt=10.0) as client:
+        revision = (await client.range("/", limit=1)).revision
+    await post(machines[0], "v3/kv/compaction", {"revision": str(revision), "physical": True})
+
+
+async def clocks(world: World) -> None:
+    """Let one master's clock be an hour ahead, and another one's an hour behind; both lead in turn."""
+    for jump in CLOCKS:
+        leader = await world.cluster.leader()
+        right = [each for each in world.cluster.machines if each is not leader and not each.master_env]
+        machine = world.rng.choice(right)
+        machine.master_env = {"LD_PRELOAD": FAKETIME, "FAKETIME": jump, "FAKETIME_DONT_FAKE_MONOTONIC": "1"}
+        await machine.master.stop()
+        await world.whole()
+    wrong = [machine for machine in world.cluster.machines if machine.master_env]
+    for machine in [each for each in world.cluster.machines if each not in wrong]:
+        await machine.master.stop()  # so that one with a wrong clock leads
+    leader = await world.cluster.leader()
+    assert leader in wrong
+    await world.clients.wait_for_writes(10)
+    await leader.master.kill()
+    other = await world.cluster.leader(but=leader)
+    assert other in wrong
+    await world.clients.wait_for_writes(10)
+    for machine in wrong:
+        machine.master_env = {}
+        await machine.master.kill()
+        await world.whole()
+
+
+async def slow_disk(world: World) -> None:
+    """Let each fsync take half a second: at a member that follows, then at the one that leads.
+
+    The others are more than half without a slow follower. A slow leader may delay all; it must lose nothing.
+    """
+    launcher, flag = world.cluster.folder / "slow_fsync", world.cluster.folder / "slow"
+    subprocess.run(["gcc", "-O1", "-o", launcher, _SOURCE], check=True)
+    leader = await world.cluster.etcd_leader()
+    follower = world.rng.choice([each for each in world.cluster.machines if each is not leader])
+    async with slowed(world, follower, launcher, flag):
+        since = time.monotonic()
+        await world.until_written(f"fsync of {FSYNC_S:g} s at a follower of etcd", since)
+        await asyncio.sleep(SLOW_S if world.scale == 1 else LONG_SLOW_S)
+        await world.clients.wait_for_writes()
+    async with slowed(world, follower, launcher, flag, leads=True):
+        await asyncio.sleep(SLOW_S if world.scale == 1 else LONG_SLOW_S)
+        since = time.monotonic()
+    await world.until_written(f"fsync of {FSYNC_S:g} s at etcd's leader, and back", since)
+
+
+@asynccontextmanager
+async def slowed(
+    world: World, machine: Machine, launcher: Path, flag: Path, *, leads: bool = False
+) -> AsyncIterator[None]:
+    """Let a member's disk be slow until it is left."""
+    machine.etcd_launcher = (str(launcher), str(flag), f"{FSYNC_S * 1e3:g}")
+    await machine.member.kill()
+    await world.whole()
+    if leads:
+        await lead_etcd(world, machine)
+    flag.touch()
+    yield
+    flag.unlink()
+    machine.etcd_launcher = ()
+
+
+async def lead_etcd(world: World, chosen: Machine) -> None:
+    """Let a member of etcd lead."""
+
+    async def leads() -> bool:
+        leader = await world.cluster.etcd_leader()
+        if leader is not chosen:
+            await leader.member.kill()
+            await leader.start_etcd(world.cluster.machines)
+        return leader is chosen
+
+    await until(leads, timeout=PATIENCE_S, what=f"the member of {chosen.name} leads")
+
+
+async def replace_member(world: World) -> None:
+    """Lose the data of a member for good, and put an empty one in its place."""
+    lost, *others = world.rng.sample(world.cluster.machines, len(world.cluster.machines))
+    await lost.member.kill()
+    shutil.rmtree(lost.data / "data")
+    members = (await post(others[0], "v3/cluster/member/list", {}))["members"]
+    (number,) = [each["ID"] for each in members if each.get("name") == lost.name]
+    await post(others[0], "v3/cluster/member/remove", {"ID": number})
+    url, body = (
+        f"http://{others[0].etcd}/v3/cluster/member/add",
+        {"peerURLs": [f"http://{lost.address}:{PEER_PORT}"]},
+    )
+
+    async def added() -> bool:
+        """etcd refuses it until the others have been connected for some seconds."""
+        async with aiohttp.ClientSession() as session, session.post(url, json=body) as reply:
+            return reply.status == 200
+
+    await until(added, timeout=PATIENCE_S, what="the new member is accepted")
+    lost.cluster_state = "existing"
+    await lost.start_etcd(world.cluster.machines)
+    await world.whole()
+
+
+async def full_disk(world: World) -> None:
+    """Fill the disk of a member, which ends then; then of a second one; and make room again.
+
+    Segments of etcd's log are reserved in advance, so a member ends when the next one or its database grows.
+    """
+    first, second, _ = world.rng.sample(world.cluster.machines, 3)
+    with small_disk(world, first) as one, small_disk(world, second) as two:
+        ballast = {first: one / "ballast", second: two / "ballast"}
+        await move_data(world, first, one)
+        await move_data(world, second, two)
+        fill(ballast[first])
+        await grow(world, first)
+        await world.clients.wait_for_writes(10)
+        fill(ballast[second])
+        await grow(world, second)
+        await world.until_no_master_leads()
+        since = time.monotonic()
+        for machine, file in ballast.items():
+            file.unlink()
+            await machine.start_etcd(world.cluster.machines)
+        await world.until_written("two full disks, and room again", since)
+        await move_data(world, first, world.cluster.folder / "moved-first")
+        await move_data(world, second, world.cluster.folder / "moved-second")
+
+
+async def full_database(world: World) -> None:
+    """Let etcd's database reach its quota: the masters say so, and work again once there is room."""
+    for machine in world.cluster.machines:
+        machine.etcd_options = ("--quota-backend-bytes", str(QUOTA))
+        await machine.member.kill()
+        await world.cluster.repair()
+    leader = await world.cluster.leader()
+    async with EtcdClient([each.etcd for each in world.cluster.machines], attempt=10.0) as client:
+        number = 0
+        with contextlib.suppress(EtcdRefusedError):
+            while True:
+                number += 1
+                await client.transact([], [Put(f"/ballast/{number}", b"x" * BALLAST)])
+
+        async def told() -> bool:
+            url = f"{leader.url}api/v1/robot-tokens"
+            body = {"robot": "no_room"}
+            async with world.clients.session(10.0) as session, session.post(url, json=body) as reply:
+                return reply.status == 503 and "etcdctl alarm disarm" in await reply.text()
+
+        await until(told, timeout=PATIENCE_S, what="the master says that etcd's database is full")
+        await compact(world.cluster.machines)
+        deletes = [Delete(f"/ballast/{each}") for each in range(1, number + 1)]
+        await client.transact([], deletes)
+        await compact(world.cluster.machines)
+    for machine in world.cluster.machines:
+        await post(machine, "v3/maintenance/defragment", {})
+        machine.etcd_options = ()
+    for alarm in (await post(world.cluster.machines[0], "v3/maintenance/alarm", {"action": "GET"}))["alarms"]:
+        await post(world.cluster.machines[0], "v3/maintenance/alarm", {**alarm, "action": "DEACTIVATE"})
+    since = time.monotonic()
+    await world.until_written("etcd's database full, and emptied", since)
+
+
+async def post(machine: Machine, path: str, body: object) -> dict[str, Any]:
+    """Ask a member of etcd."""
+    url, timeout = f"http://{machine.etcd}/{path}", aiohttp.ClientTimeout(total=60.0)
+    async with aiohttp.ClientSession(timeout=timeout) as session, session.post(url, json=body) as reply:
+        found: dict[str, Any] = await reply.json(content_type=None)
+        assert reply.status == 200, found
+        return found
+
+
+@contextmanager
+def small_disk(world: World, machine: Machine) -> Iterator[Path]:
+    """Make a small disk for a machine, which nothing may use at the end."""
+    path = world.cluster.folder / f"disk-{machine.name}"
+    path.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={DISK}", "tmpfs", path], check=True)
+    try:
+        yield path
+    finally:
+        subprocess.run(["umount", "-l", path], check=True)
+
+
+async def move_data(world: World, machine: Machine, folder: Path) -> None:
+    """Move a member's data to another folder."""
+    await machine.member.kill()
+    shutil.copytree(machine.data, folder / "etcd")
+    machine.data = folder / "etcd"
+    await world.whole()
+
+
+async def grow(world: World, machine: Machine) -> None:
+    """Write to etcd until a member that has no room for it ends."""
+    others = [each.etcd for each in world.cluster.machines if each is not machine]
+    async with EtcdClient(others, attempt=10.0) as client:
+
+        async def ended() -> bool:
+            with contextlib.suppress(EtcdAwayError):
+                await client.transact([], [Put("/ballast/grow", os.urandom(BALLAST))])
+            return not machine.member.running
+
+        await until(ended, timeout=PATIENCE_S, what=f"the member of {machine.name} ends for its full disk")
+
+
+def fill(file: Path) -> None:
+    """Fill a disk to the last byte."""
+    with file.open("wb", buffering=0) as ballast, contextlib.suppress(OSError):
+        while True:
+            ballast.write(bytes(1 << 12))

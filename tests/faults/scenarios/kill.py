@@ -1,0 +1,86 @@
+"""Processes that end: kill -9, SIGTERM, SIGSTOP, and an upgrade."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import time
+
+from faults.machines import send
+from faults.world import World
+
+ROUNDS = 2
+LONG_ROUNDS = 25
+"""Of each kind."""
+STOP_S = 6.0
+LONG_STOP_S = 30.0
+
+
+async def kill(world: World) -> None:
+    """Kill the leading master, etcd's leader, both, or a stand-by, in turn, at any moment of a save."""
+    rounds = ROUNDS if world.scale == 1 else round(LONG_ROUNDS * world.scale / 100)
+    kinds = (_kill_leader, _kill_etcd, _kill_both, _kill_standby) * max(1, rounds)
+    for kind in kinds if world.scale > 1 else kinds[:5]:
+        await asyncio.sleep(world.rng.uniform(0, 0.5))  # at which moment of a save is left to chance
+        since = await kind(world)
+        await world.until_task_sets_are_back(since)
+        await world.whole()
+
+
+async def _kill_leader(world: World) -> float:
+    leader = await world.cluster.leader()
+    since = time.monotonic()
+    await leader.master.kill()
+    return await world.until_written("kill -9 of the leading master", since)
+
+
+async def _kill_etcd(world: World) -> float:
+    leader = await world.cluster.etcd_leader()
+    since = time.monotonic()
+    await leader.member.kill()
+    return await world.until_written("kill -9 of etcd's leader", since)
+
+
+async def _kill_both(world: World) -> float:
+    leader, member = await world.cluster.leader(), await world.cluster.etcd_leader()
+    since = time.monotonic()
+    await asyncio.gather(leader.master.kill(), member.member.kill())
+    return await world.until_written("kill -9 of both", since)
+
+
+async def _kill_standby(world: World) -> float:
+    standby = await world.standby()
+    since = time.monotonic()
+    await standby.master.kill()
+    return await world.until_written("kill -9 of a stand-by", since)
+
+
+async def stop(world: World) -> None:
+    """Stop the leading master so long that its lease ends, and let it go on: under load, and without."""
+    seconds = STOP_S if world.scale == 1 else LONG_STOP_S
+    leader = await world.cluster.leader()
+    said = len(leader.master.output())
+    since = time.monotonic()
+    send(leader.master, signal.SIGSTOP)
+    try:
+        end = await world.until_written("stop of the leading master", since)
+        await world.until_task_sets_are_back(end)
+        await world.cluster.leader(but=leader)
+        await asyncio.sleep(max(0.0, since + seconds - time.monotonic()))
+    finally:
+        send(leader.master, signal.SIGCONT)
+    await world.whole()
+    assert "leads no more" in leader.master.output()[said:]
+
+
+async def terminate(world: World) -> None:
+    """End masters and members of etcd in order, one after the other, as an upgrade does."""
+    for machine in world.cluster.machines:
+        leads = machine is await world.cluster.leader()
+        since = time.monotonic()
+        assert await machine.master.stop() == 0
+        if leads:
+            await world.until_written("SIGTERM of the leading master", since)
+        await machine.member.stop()
+        await world.clients.wait_for_writes()
+        await world.whole()

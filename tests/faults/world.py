@@ -1,0 +1,108 @@
+"""Masters, etcd, task sets and clients that run while faults are made, and the check at the end."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from support.engine import until
+
+from faults.clients import INITIAL, Clients
+from faults.goals import Times
+from faults.history import History
+from faults.machines import PATIENCE_S, Cluster, Machine, cluster
+from faults.task_sets import Prober, Robot, task_sets
+
+
+@dataclass
+class World:
+    """What a scenario works with.
+
+    Attributes:
+        scale: 1: as long as in a test run; more: the long run.
+        robot: The robot whose links must not be interrupted; None: there are no task sets.
+    """
+
+    cluster: Cluster
+    clients: Clients
+    history: History
+    times: Times
+    rng: random.Random
+    scale: float = 1.0
+    robot: Robot | None = None
+
+    async def until_written(self, what: str, since: float) -> float:
+        """Note how long it took until a write was acknowledged that was asked for after a fault."""
+
+        def written() -> float | None:
+            return self.history.first_write_after(since)
+
+        end = await until(written, timeout=PATIENCE_S, what=f"a write is acknowledged after: {what}")
+        self.times.add(what, end - since)
+        return end
+
+    async def until_task_sets_are_back(self, since: float) -> None:
+        """Note how long it took until all task sets are connected to the leading master."""
+        if self.robot is None:
+            return
+
+        async def back() -> bool:
+            found = await self.clients.machines()
+            real = [there for name, there in found.items() if not name.startswith("prober-")]
+            return len(real) == 2 and all(real)
+
+        await until(back, timeout=PATIENCE_S, what="all task sets are back")
+        self.times.add("task sets are back", time.monotonic() - since)
+
+    async def until_no_master_leads(self) -> None:
+        """Wait until no master says that it leads, and all say why."""
+
+        async def none_leads() -> bool:
+            told = [await machine.health() for machine in self.cluster.machines]
+            return all(each.get("role") == "standby" and "etcd" in each["status"] for each in told)
+
+        await until(none_leads, timeout=PATIENCE_S, what="no master leads")
+
+    async def whole(self) -> None:
+        """Repair everything, and wait until it works."""
+        await self.cluster.repair()
+        await self.clients.wait_for_writes()
+
+    async def standby(self) -> Machine:
+        """Return a machine whose master does not lead."""
+        leader = await self.cluster.leader()
+        return self.rng.choice([each for each in self.cluster.machines if each is not leader])
+
+
+@asynccontextmanager
+async def world(
+    folder: Path, seed: int, times: Times, *, scale: float = 1.0, robot: bool = True
+) -> AsyncIterator[World]:
+    """Run everything until it is left; check then what happened.
+
+    Raises:
+        AssertionError: Something was lost, done twice or by a master that led no more, or a link was cut.
+    """
+    rng, history = random.Random(seed), History()
+    async with AsyncExitStack() as stack:
+        machines = await stack.enter_async_context(cluster(folder))
+        await machines.start()
+        clients = Clients(machines, history, rng)
+        await clients.prepare()
+        made = World(machines, clients, history, times, rng, scale)
+        async with AsyncExitStack() as running:
+            if robot:
+                made.robot = await running.enter_async_context(task_sets(machines, history))
+            await running.enter_async_context(Prober(machines, history).running())
+            await running.enter_async_context(clients.under_load())
+            yield made
+            await made.whole()
+        violations = history.violations(await clients.stored(), INITIAL)
+        if made.robot is not None:
+            times.add("longest gap of the robot's echo", made.robot.longest_gap)
+        assert not violations, f"seed {seed}:\n" + "\n".join(violations)
+        assert history.heard, "no master told a task set anything"

@@ -1,0 +1,147 @@
+"""The checker of the fault suite: histories that are right, and histories that are not."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+from faults.history import Fate, Heard, History
+from faults.linearizability import Operation, is_linearizable, unexplained
+from hypothesis import given
+from hypothesis import strategies as st
+
+INF = math.inf
+
+
+def write(start: float, end: float, value: int) -> Operation:
+    return Operation(start, end, True, value)
+
+
+def read(start: float, end: float, value: int) -> Operation:
+    return Operation(start, end, False, value)
+
+
+@pytest.mark.parametrize(
+    "operations",
+    [
+        [],
+        [write(0, 1, 1), read(2, 3, 1)],
+        [write(0, 5, 1), read(1, 2, 0), read(3, 4, 1)],
+        [write(0, 5, 1), write(0, 5, 2), read(1, 2, 2), read(3, 4, 1)],
+        [write(0, INF, 1), read(50, 51, 1)],
+        [write(0, INF, 1), read(50, 51, 0)],
+        [write(0, INF, 1), write(2, 3, 2), read(4, 5, 2), read(6, 7, 1)],
+    ],
+)
+def test_histories_that_can_be_explained(operations: list[Operation]) -> None:
+    assert is_linearizable(operations, 0)
+
+
+@pytest.mark.parametrize(
+    "operations",
+    [
+        [write(0, 1, 1), read(2, 3, 0)],
+        [read(0, 1, 7)],
+        [write(0, 5, 1), read(1, 2, 1), read(3, 4, 0)],
+        [write(0, 1, 1), write(2, 3, 2), read(4, 5, 1)],
+        [write(0, 5, 1), write(0, 5, 2), read(1, 2, 2), read(3, 4, 1), read(4.5, 4.6, 2)],
+        [write(9, INF, 1), read(1, 2, 1)],
+    ],
+)
+def test_histories_that_cannot(operations: list[Operation]) -> None:
+    assert not is_linearizable(operations, 0)
+
+
+def test_a_report_ends_at_what_cannot_be_explained() -> None:
+    wrong = [write(0, 1, 1), read(2, 3, 0), read(4, 5, 1)]
+    assert unexplained(wrong, 0) == wrong[:2]
+    assert unexplained(wrong[2:] + wrong[:1], 0) == []
+
+
+@st.composite
+def histories(draw: st.DrawFn) -> list[Operation]:
+    """A register that does one operation after the other, as clients see it that wait before and after."""
+    found, value = [], 0
+    slack = st.floats(0, 4)
+    for number in range(1, draw(st.integers(1, 25))):
+        is_write, before, after = draw(st.booleans()), draw(slack), draw(slack)
+        value = number if is_write else value
+        found.append(Operation(number - before, number + after, is_write, value))
+        if is_write and draw(st.integers(0, 3)) == 0:
+            found[-1] = replace(found[-1], end=INF)
+    return draw(st.permutations(found))
+
+
+@given(histories())
+def test_what_a_register_did_can_be_explained(operations: list[Operation]) -> None:
+    assert is_linearizable(operations, 0)
+
+
+@given(histories())
+def test_the_search_agrees_with_trying_every_order(operations: list[Operation]) -> None:
+    """Also when one read is falsified."""
+    few = sorted(operations, key=lambda each: each.start)[:5]
+    reads = [index for index, each in enumerate(few) if not each.is_write]
+    if reads:
+        few[reads[-1]] = replace(few[reads[-1]], value=1)
+    assert is_linearizable(few, 0) == by_trying(few)
+
+
+def by_trying(operations: list[Operation]) -> bool:
+    optional = [each for each in operations if not each.is_certain]
+    certain = [each for each in operations if each.is_certain]
+    return any(
+        explains(order)
+        for count in range(len(optional) + 1)
+        for chosen in itertools.combinations(optional, count)
+        for order in itertools.permutations([*certain, *chosen])
+    )
+
+
+def explains(order: tuple[Operation, ...]) -> bool:
+    value = 0
+    for index, each in enumerate(order):
+        if any(later.end < each.start for later in order[index:]):
+            return False
+        if each.is_write:
+            value = each.value
+        elif each.value != value:
+            return False
+    return True
+
+
+def test_losses_and_repetitions_are_told() -> None:
+    history = History(made={"a": Fate.DONE, "b": Fate.NOT_DONE, "c": Fate.UNKNOWN, "d": Fate.UNKNOWN})
+    assert history.violations(["b", "c", "c"], 0) == [
+        "a was acknowledged and is lost",
+        "b was refused and was done",
+        "c was done 2 times",
+    ]
+    assert history.violations(["a", "d"], 0) == []
+
+
+def test_messages_of_an_older_term_are_told() -> None:
+    history = History(
+        heard=[Heard(1, "m1", 1, "Sync"), Heard(5, "m2", 2, "Sync"), Heard(5.1, "m1", 1, "Sync")]
+    )
+    assert history.violations([], 0) == []
+    history.heard.append(Heard(7, "m1", 1, "Sync"))
+    assert [text.partition(" came ")[2] for text in history.violations([], 0)] == [
+        "2.0 s after a newer term had begun"
+    ]
+
+
+def test_two_leaders_of_one_term_are_told() -> None:
+    history = History(heard=[Heard(1, "m1", 4, "Sync"), Heard(2, "m2", 4, "Sync")])
+    assert history.violations([], 0) == ["m1 and m2 both led in term 4"]
+
+
+def test_the_first_write_after_a_fault_is_one_that_was_asked_for_after_it() -> None:
+    history = History()
+    history.wrote("x", 1, 3, 1, Fate.DONE)
+    history.wrote("x", 2.5, 4, 2, Fate.DONE)
+    history.wrote("x", 2.2, 3, 3, Fate.UNKNOWN)
+    assert history.first_write_after(2) == 4
+    assert history.first_write_after(5) is None
