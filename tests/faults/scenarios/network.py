@@ -42,6 +42,7 @@ async def _cut(world: World, what: str, make: Callable[[Machine], AbstractContex
         end = await world.until_written(what, since)
         await world.until_task_sets_are_back(end)
         await asyncio.sleep(max(0.0, since + _seconds(world) - time.monotonic()))
+    world.history.cuts.append((leader.name, since, time.monotonic()))
     await world.whole()
 
 

@@ -133,6 +133,13 @@ def test_messages_of_an_older_term_are_told() -> None:
     ]
 
 
+def test_what_a_cut_held_up_is_no_act_of_an_older_term() -> None:
+    heard = [Heard(1, "m1", 1, "Sync"), Heard(5, "m2", 2, "Sync"), Heard(12, "m1", 1, "Sync")]
+    assert History(heard=heard, cuts=[("m1", 2, 10)]).violations([], 0) == []
+    assert History(heard=heard, cuts=[("m2", 2, 10)]).violations([], 0) != []
+    assert History(heard=heard, cuts=[("m1", 2, 5)]).violations([], 0) != []
+
+
 def test_two_leaders_of_one_term_are_told() -> None:
     history = History(heard=[Heard(1, "m1", 4, "Sync"), Heard(2, "m2", 4, "Sync")])
     assert history.violations([], 0) == ["m1 and m2 both led in term 4"]
