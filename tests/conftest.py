@@ -152,6 +152,7 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         "the folder of public maps and logs is absent (set RCE_DATA)",
     ),
     "etcd": (lambda: shutil.which("etcd") is not None, "etcd is missing (Debian: etcd-server)"),
+    "iptables": (lambda: shutil.which("iptables") is not None, "iptables is missing (Debian: iptables)"),
     "curl": (lambda: shutil.which("curl") is not None, "curl is missing (Debian: curl)"),
     "openssl": (lambda: shutil.which("openssl") is not None, "openssl is missing (Debian: openssl)"),
     "systemd": (

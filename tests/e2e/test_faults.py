@@ -12,7 +12,11 @@ from faults.catalogue import SCENARIOS, Scenario
 from faults.goals import Times
 from faults.world import world
 
-pytestmark = [pytest.mark.e2e, pytest.mark.needs("root", "netns", "etcd"), pytest.mark.xdist_group("faults")]
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.needs("root", "netns", "etcd", "iptables"),
+    pytest.mark.xdist_group("faults"),
+]
 
 SEED = 1
 SHORT = [each for each in SCENARIOS if each.short]

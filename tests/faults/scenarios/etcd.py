@@ -31,7 +31,8 @@ QUOTA = 16 << 20
 """Bytes of a database that is soon full."""
 BALLAST = 1 << 20
 DISK = "200m"
-FAKETIME = "/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1"
+FAKETIME = "faketime/libfaketime.so.1"
+"""In the folder of an architecture's libraries."""
 CLOCKS = ("+1h", "-1h")
 _SOURCE = Path(__file__).parent.parent / "slow_fsync.c"
 
@@ -59,12 +60,19 @@ async def compact(machines: list[Machine]) -> None:
 
 
 async def clocks(world: World) -> None:
-    """Let one master's clock be an hour ahead, and another one's an hour behind; both lead in turn."""
+    """Let one master's clock be an hour ahead, and another one's an hour behind; both lead in turn.
+
+    Raises:
+        FileNotFoundError: libfaketime is missing; a preloaded library that is missing would change no clock.
+    """
+    faketime = next((str(path) for path in Path("/usr/lib").glob(f"*/{FAKETIME}")), None)
+    if faketime is None:
+        raise FileNotFoundError("libfaketime.so.1 is missing (Debian: faketime)")
     for jump in CLOCKS:
         leader = await world.cluster.leader()
         right = [each for each in world.cluster.machines if each is not leader and not each.master_env]
         machine = world.rng.choice(right)
-        machine.master_env = {"LD_PRELOAD": FAKETIME, "FAKETIME": jump, "FAKETIME_DONT_FAKE_MONOTONIC": "1"}
+        machine.master_env = {"LD_PRELOAD": faketime, "FAKETIME": jump, "FAKETIME_DONT_FAKE_MONOTONIC": "1"}
         await machine.master.stop()
         await world.whole()
     wrong = [machine for machine in world.cluster.machines if machine.master_env]
