@@ -24,7 +24,7 @@ from pathlib import Path
 
 from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.floor import FLOOR
-from rce_fleet.exceptions import FleetError
+from rce_fleet.exceptions import FleetError, MapError
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map
 
@@ -104,5 +104,7 @@ def find_world(name: str) -> NamedWorld:
         raise DemoError(f"--world: there is no world {name!r} ({known}), and no file of this name")
     try:
         return NamedWorld(read_map(path))
+    except MapError as error:  # it names the file
+        raise DemoError(str(error)) from error
     except (FleetError, OSError) as error:
         raise DemoError(f"{name}: {error}") from error

@@ -13,7 +13,12 @@ import typer
 from rce_fleet.compiled import INSTALLED, compile_for_all, is_available
 
 MODULES = (
-    ("rce_fleet.planning.lacam", "rce_fleet.planning.lifelong", "rce_fleet.planning.rerouting_loops"),
+    (
+        "rce_fleet.planning.lacam",
+        "rce_fleet.planning.lifelong",
+        "rce_fleet.planning.rerouting_loops",
+        "rce_fleet.planning.visit_lists",
+    ),
     (
         "rce_fleet.localization.clusters",
         "rce_fleet.localization.likelihood",

@@ -8,6 +8,7 @@ import os
 import socket
 from typing import TYPE_CHECKING
 
+from rce.dialing import open_socket
 from rce_master.cluster.client import ClusterClient, ask_all, healthy
 from rce_master.cluster.members import ClusterError, Member, advice, check_new, check_removal, find
 from rce_master.store.etcd.exceptions import EtcdAwayError, EtcdError, EtcdRefusedError
@@ -223,10 +224,10 @@ async def _check_reach(member: Member) -> None:
     host, _, port = member.peer.rpartition(":")
     try:
         async with asyncio.timeout(_REACH_S):
-            _, writer = await asyncio.open_connection(host.strip("[]"), int(port))
+            connected = await open_socket(host.strip("[]"), int(port))
     except (OSError, TimeoutError) as error:
         raise ClusterError(
             f"{member.shown} cannot be reached from here at {member.peer}, its address for members: {error};"
             " open this port between the machines"
         ) from error
-    writer.close()
+    connected.close()
