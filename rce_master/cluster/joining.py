@@ -23,6 +23,7 @@ START_S = 120.0
 """How long etcd may take until it answers, and a learner until it has the state."""
 _REACH_S = 5.0
 _PAUSE_S = 0.3
+_UNHEALTHY = "unhealthy cluster"
 
 
 def check_place(machine: Machine) -> None:
@@ -77,7 +78,7 @@ async def request_membership(client: ClusterClient, machine: Machine, tls: Conte
         if member is not own:
             await _check_reach(member)
     if own is None:
-        members = await client.add_learner(machine.peer_url)
+        members = await _add_learner(client, machine.peer_url)
     scheme = machine.scheme
     return {each.name or machine.name: f"{scheme}://{each.peer}" for each in members}
 
@@ -118,6 +119,19 @@ async def wait_for_vote(
         " log, then run the"
         " same command again"
     )
+
+
+async def _add_learner(client: ClusterClient, peer_url: str) -> tuple[Member, ...]:
+    """Add a learner; etcd takes none before all members have been connected for some seconds."""
+    clock = asyncio.get_running_loop().time
+    end = clock() + START_S
+    while True:
+        try:
+            return await client.add_learner(peer_url)
+        except EtcdAwayError as error:
+            if _UNHEALTHY not in str(error) or clock() >= end:
+                raise
+        await asyncio.sleep(_PAUSE_S)
 
 
 async def remove_member(
