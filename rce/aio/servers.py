@@ -1,12 +1,41 @@
-"""End listening without losing a connection that is being accepted."""
+"""Begin to listen without leaving a socket open; end without losing a connection that is being accepted."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 _NEXT_TIMERS_S = 1e-9
 """A sleep that ends when the event loop next runs its timers; zero would end it before."""
+
+
+async def open_server(
+    accept: Callable[[], asyncio.BaseProtocol], host: str | None, port: int, *, backlog: int
+) -> asyncio.Server:
+    """Accept TCP connections of the running event loop.
+
+    Two programs can bind one port at the same moment; the second is refused only when it begins to listen.
+    ``loop.create_server`` leaves its socket open then.
+
+    Args:
+        accept: Makes the protocol of a connection.
+        host: Address to bind; None is every address.
+        port: Zero takes a free one.
+        backlog: Connections that the system keeps until they are accepted.
+
+    Raises:
+        OSError: The port cannot be bound.
+    """
+    loop = asyncio.get_running_loop()
+    server = await loop.create_server(
+        accept, host, port, backlog=backlog, reuse_address=True, start_serving=False
+    )
+    try:
+        await server.start_serving()
+    except BaseException:
+        server.close()
+        raise
+    return server
 
 
 async def close_servers(servers: Collection[asyncio.Server]) -> None:

@@ -10,7 +10,7 @@ import socket
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rce.aio.servers import close_servers
+from rce.aio.servers import close_servers, open_server
 from rce.aio.tasks import BackgroundTasks
 from rce.dialing import open_socket
 from rce.guard import Guest, Lobby, address_of
@@ -121,9 +121,7 @@ class LinkHub:
         Returns:
             The port taken.
         """
-        server = await self.loop.create_server(
-            self._accept, host or None, port, backlog=512, reuse_address=True
-        )
+        server = await open_server(self._accept, host or None, port, backlog=512)
         self._servers.append(server)
         taken: int = server.sockets[0].getsockname()[1]
         return taken

@@ -7,7 +7,7 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self, cast
 
-from rce.aio.servers import close_servers
+from rce.aio.servers import close_servers, open_server
 from rce.aio.tasks import BackgroundTasks
 from rce.guard import Guest, Lobby, address_of
 from rce.guard.plain import PlainPort
@@ -93,7 +93,7 @@ class HttpServer:
         if not isinstance(self._app, LateApplication):
             self._running = await self._start(self._app)
         try:
-            self._server = await asyncio.get_running_loop().create_server(
+            self._server = await open_server(
                 self._make_arrival, self._host or None, self._port, backlog=_BACKLOG
             )
         except BaseException:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
-from rce.aio.servers import close_servers
+from rce.aio.servers import close_servers, open_server
 from rce.ros.closing import OpenConnections
 from rce.ros.errors import HandshakeRefusedError
 from rce.ros.tcpros.connection import Connection
@@ -48,8 +48,7 @@ class Listener:
         self._server: asyncio.Server | None = None
 
     async def __aenter__(self) -> Self:
-        loop = asyncio.get_running_loop()
-        self._server = await loop.create_server(self._accept, self._host, 0, backlog=512)
+        self._server = await open_server(self._accept, self._host, 0, backlog=512)
         self.port = self._server.sockets[0].getsockname()[1]
         return self
 

@@ -14,7 +14,7 @@ from typing import Self, cast
 
 import h11
 
-from rce.aio.servers import close_servers
+from rce.aio.servers import close_servers, open_server
 from rce.ros.closing import OpenConnections
 from rce.ros.xmlrpc.dispatch import Dispatcher
 
@@ -50,9 +50,8 @@ class RpcServer:
         self._server: asyncio.Server | None = None
 
     async def __aenter__(self) -> Self:
-        loop = asyncio.get_running_loop()
         host = self._host or "0.0.0.0"  # noqa: S104 - nodes of other machines must reach it
-        self._server = await loop.create_server(self._accept, host, self.port, backlog=512)
+        self._server = await open_server(self._accept, host, self.port, backlog=512)
         self.port = self._server.sockets[0].getsockname()[1]
         return self
 

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from rce.aio.backoff import Backoff
-from rce.aio.servers import close_servers
+from rce.aio.servers import close_servers, open_server
 from rce.aio.tasks import TaskScope
 from rce.dialing import open_socket
 from rce.guard import Lobby, LogThrottle
@@ -105,7 +105,8 @@ class RelayLinks:
             OSError: The port cannot be bound.
         """
         check_listening(host or "", self._identity.token)
-        return await asyncio.get_running_loop().create_server(self._accept, host or "0.0.0.0", port)  # noqa: S104
+        every = "0.0.0.0"  # noqa: S104
+        return await open_server(self._accept, host or every, port, backlog=100)
 
     async def serve(self, server: asyncio.Server) -> None:
         """Take links of other sides, until cancelled."""
