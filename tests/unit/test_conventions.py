@@ -21,7 +21,6 @@ TYPER = "loads typer, which a program that gets its settings from another one do
 TINY = {
     "rce/packages/limits.py": BASE,
     "rce/protocol/limits.py": BASE,
-    "rce/aio/servers.py": "about one fault of the event loop, which five servers avoid by it",
     "rce/printable.py": "below five packages, which have nothing else in common",
     "rce/ros/actions/topics.py": BASE,
     "rce/ros/tf/frames.py": BASE,
