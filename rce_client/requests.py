@@ -85,7 +85,7 @@ class Requests(ABC):
             special_features: Labels that the machine must have: a sequence, or one text of words.
             volumes: Folders that outlive the container: ``{"name": "journal", "path": "/data", "size":
                 "64M"}`` each. They are mounted read-write at ``path``; nodes also find it in the variable
-                ``RCE_VOLUME_JOURNAL``.
+                ``RCE_VOLUME_JOURNAL``. With ``"snapshots": 60``, a snapshot is kept every 60 s.
             wait: Wait if no machine has room; otherwise ``on_error`` gets an error text, and no container is
                 created.
 

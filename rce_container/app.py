@@ -16,8 +16,9 @@ from rce.config import Secret, ShippedFileError, configs_dir, default_state_dir,
 from rce.control import MachineInfo, VolumeLimit
 from rce.control_channel.channel import TaskSetChannel
 from rce.control_channel.contents import ContentClient
-from rce.control_channel.dialing import RunDialer
+from rce.control_channel.dialing import Dialer, RunDialer
 from rce.control_channel.terms import Terms
+from rce.control_channel.uploads import Uploader
 from rce.link import LinkAcceptor, in_url, is_any, listen_on, own_address
 from rce.masters import Masters, split_addresses, split_port
 from rce.model import MEMORY_PER_SLOT
@@ -139,7 +140,8 @@ class App:
                 stack.callback(limiter.close)
                 for one in runtimes.values():
                     stack.callback(one.close)
-                library = await asyncio.to_thread(self._library, state, masters, tls)
+                client = ContentClient(masters, self.secret, tls=tls)
+                library = await asyncio.to_thread(self._library, state, client)
                 reach = self.host
                 if is_any(reach):
                     first = split_port(split_addresses(self.master)[0], self.control_port)
@@ -156,6 +158,8 @@ class App:
                     limiter=limiter,
                     library=library,
                     dialer=RunDialer(masters, self.secret, tls=tls),
+                    uploader=Uploader(Dialer(masters, self.secret, tls=tls)),
+                    fetch=client.piece,
                 )
                 terms = Terms(state.term, state.keep_term)
                 channel = TaskSetChannel(
@@ -168,9 +172,8 @@ class App:
         places = (split_port(address, self.control_port) for address in split_addresses(self.master))
         return Masters(f"{scheme}://{in_url(host)}:{port}" for host, port in places)
 
-    def _library(self, state: StateFolder, masters: Masters, tls: Context | None) -> Library:
+    def _library(self, state: StateFolder, client: ContentClient) -> Library:
         """Return the source of the packages that users bring. Blocks."""
-        client = ContentClient(masters, self.secret, tls=tls)
         cache = PackageCache(state.library, client.piece, space=self.settings.bundle_space)
         requested = self.settings.requirements
         library = Library(

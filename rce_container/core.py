@@ -27,6 +27,7 @@ from rce.control import (
     SpecWanted,
     Status,
     StatusPatch,
+    VolumePlacement,
 )
 from rce.model import Resources
 from rce_container.events import (
@@ -111,6 +112,11 @@ class ManagerCore:
         """Return the resources that a desired container requests."""
         desired = self.containers[id_].desired
         return desired.contents.resources if desired is not None else Resources()
+
+    def placements(self, id_: str) -> tuple[VolumePlacement, ...]:
+        """Return which files the volumes of a desired container are to have."""
+        desired = self.containers[id_].desired
+        return desired.contents.volumes if desired is not None else ()
 
     def validate(self) -> None:
         """Check the invariants; for tests."""

@@ -136,7 +136,7 @@ class Incarnation:
         """Give the environment its desired state."""
         self._desired = DesiredState(spec)
         user = EndpointId.parse(self.id).user
-        self._context.volumes.note_sizes(user, self.incarnation_id, spec.resources.volumes)
+        self._context.volumes.note(user, self.incarnation_id, spec.resources.volumes, spec.volumes)
         self._note_revision(spec.revision)
         self._supply.want(spec.packages)
         if self._channel is not None:
@@ -358,6 +358,10 @@ class Incarnation:
     def _report_patch(self, patch: StatusPatch, pace: intake.Pace) -> None:
         if (outer := self._observed.patch(patch, pace)) is not None:
             self._context.feed(events.Changed(self.id, self.incarnation_id, outer))
+
+    def pids(self) -> Iterable[int]:
+        """Return its processes, as the machine sees them."""
+        return self._outer_pids()
 
     def _outer_pids(self) -> Iterable[int]:
         return self.enforcer.control_group.pids() or [one.pid for one in self.handle.members(proc.table())]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import resource
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from rce.model import EndpointId, Network, Resources
@@ -17,6 +17,7 @@ from rce_container.limits import ControlGroup, Limiter, limits_of
 from rce_container.runtimes.base import Handle, Order, Runtime
 
 if TYPE_CHECKING:
+    from rce.control import VolumePlacement
     from rce_container.network import Networks
     from rce_container.network.networks import Membership
     from rce_container.settings import ContainerSettings
@@ -75,15 +76,29 @@ class Launcher:
         """Return the runtime that runs a container of an earlier manager."""
         return self._runtimes.get(record.runtime, self._runtime)
 
-    def launch(self, id_: str, folder: ContainerFolder, resources: Resources) -> Launched:
+    def launch(
+        self,
+        id_: str,
+        folder: ContainerFolder,
+        resources: Resources,
+        placements: Sequence[VolumePlacement] = (),
+    ) -> Launched:
         """Start a container's first process, and write its record to its folder.
+
+        Args:
+            id_: The container.
+            folder: Of its incarnation.
+            resources: What it asks for.
+            placements: Which files its volumes are to have.
 
         Raises:
             ContainerError: It cannot be started. :meth:`undo` removes what was made of it.
             OSError: A resource of the machine is exhausted.
         """
         runtime = self._runtime_for(resources)
-        mounts = self._volumes.claim(EndpointId.parse(id_).user, folder.incarnation_id, resources.volumes)
+        mounts = self._volumes.claim(
+            EndpointId.parse(id_).user, folder.incarnation_id, resources.volumes, placements
+        )
         if not runtime.isolated and any(mount.image for mount in mounts):
             raise VolumeError(f"its volumes are file systems, which the runtime {runtime.name} cannot mount")
         control_group = self._limiter.create(folder.incarnation_id, limits_of(resources, self._settings))

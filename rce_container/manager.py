@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, assert_never
 from rce.control import (
     CONTROL_VERSION,
     PATCHES,
+    SNAPSHOTS,
     VOLUMES,
     ClientReply,
     Drop,
@@ -32,6 +33,8 @@ from rce.control import (
     ReadLog,
     Refused,
     RemoveVolume,
+    RestoreVolume,
+    SaveVolume,
     Status,
     StatusWanted,
     Sync,
@@ -64,10 +67,12 @@ from rce_container.reading import read_for
 from rce_container.runtimes.base import Handle, Runtime
 from rce_container.usage import Subject, UsageMeter
 from rce_container.volumes.keeper import VolumeKeeper
+from rce_container.volumes.snapshots import FetchPiece, SnapshotKeeper
 from rce_container.volumes.store import VolumeStore
 
 if TYPE_CHECKING:
     from rce.control_channel.dialing import RunDialer
+    from rce.control_channel.uploads import Uploader
     from rce.link import LinkAcceptor
     from rce_container.settings import ContainerSettings
 
@@ -89,6 +94,8 @@ class Manager:
         limiter: Enforces the containers' limits.
         library: Provides packages that users bring.
         dialer: Connects to the master for commands that users run; without it users cannot run commands.
+        uploader: Sends snapshots of volumes to the master.
+        fetch: Fetches contents from the master. Without these two, volumes stay on this machine.
 
     Attributes:
         send: Sends a message to the master, or drops it while no master is connected.
@@ -108,6 +115,8 @@ class Manager:
         limiter: Limiter,
         library: Library,
         dialer: RunDialer | None = None,
+        uploader: Uploader | None = None,
+        fetch: FetchPiece | None = None,
     ) -> None:
         self._name = name
         self._info = info
@@ -122,6 +131,16 @@ class Manager:
         images = info.volumes == VolumeLimit.IMAGE.value
         self._volumes = VolumeStore(state.volumes, images=images)
         self._keeper = VolumeKeeper(self._volumes, lambda m: self.send(m), self._spawn)  # noqa: PLW0108 - set later
+        self._snapshots: SnapshotKeeper | None = None
+        if uploader is not None and fetch is not None:
+            self._snapshots = SnapshotKeeper(
+                self._volumes,
+                lambda m: self.send(m),  # noqa: PLW0108 - set later
+                self._spawn,
+                self._keeper.release,
+                uploader=uploader,
+                fetch=fetch,
+            )
         self._launcher = Launcher(
             settings=settings,
             runtimes=runtimes,
@@ -163,7 +182,12 @@ class Manager:
             process=self._name,
             machine=self._info,
             endpoints=self._core.statuses,
-            features=(PATCHES, VOLUMES, *([EXEC] if self._executions is not None else [])),
+            features=(
+                PATCHES,
+                VOLUMES,
+                *([EXEC] if self._executions is not None else []),
+                *([SNAPSHOTS] if self._snapshots is not None else []),
+            ),
         )
 
     async def handle(self, message: ToTaskSet) -> None:
@@ -171,15 +195,31 @@ class Manager:
         match message:
             case Welcome(features=features):
                 self._master_features = frozenset(features)
+                if self._snapshots is not None:
+                    self._snapshots.is_wanted = SNAPSHOTS in features
             case Put() | PatchSpec() | StatusWanted() | Drop() | Sync():
                 self._feed(_event_of(message))
             case ReadLog():
                 self._log_reads.take(message)
             case RemoveVolume(volume=volume):
                 self._keeper.remove(volume)
+            case SaveVolume() if self._snapshots is not None:
+                self._snapshots.save(message)
+            case RestoreVolume() if self._snapshots is not None:
+                self._snapshots.restore(message)
             case Execute(id=id_) if self._executions is not None:
                 self._tasks.create_task(self._executions.execute(message), name=f"command in {id_}")
-            case Execute() | Notify() | Probe() | Welcome() | Refused() | LoginReply() | ClientReply():
+            case (
+                Execute()
+                | SaveVolume()
+                | RestoreVolume()
+                | Notify()
+                | Probe()
+                | Welcome()
+                | Refused()
+                | LoginReply()
+                | ClientReply()
+            ):
                 _log.debug("not for a container task set: %s", type(message).__name__)
             case _:
                 assert_never(message)
@@ -209,11 +249,13 @@ class Manager:
         """
         with contextlib.closing(self._networks):
             async with asyncio.TaskGroup() as self._tasks:
+                await asyncio.to_thread(self._volumes.clear_scratch)
                 await self._former.take_over(self, self._tasks)
                 ready()
                 usage = self._tasks.create_task(self._report_usage(), name="usage")
                 measuring = self._keeper.run(self._incarnations, self._settings.usage_interval)
                 volumes = self._tasks.create_task(measuring, name="volumes")
+                snapshots = self._tasks.create_task(self._take_snapshots(), name="snapshots")
                 pruning = self._tasks.create_task(self._former.prune_logs(), name="old logs")
                 await quit_.wait()
                 self._feed(events.Quit())
@@ -223,6 +265,7 @@ class Manager:
                 usage.cancel()
                 pruning.cancel()
                 volumes.cancel()
+                snapshots.cancel()
                 await self._log_reads.close()
 
     def kill_all(self) -> None:
@@ -304,7 +347,9 @@ class Manager:
             self._feed(events.Lost(id_, "", str(error)))
             return
         try:
-            handle, control_group, isolated = self._launcher.launch(id_, folder, self._core.resources(id_))
+            handle, control_group, isolated = self._launcher.launch(
+                id_, folder, self._core.resources(id_), self._core.placements(id_)
+            )
         except (
             ContainerError,
             OSError,
@@ -321,6 +366,10 @@ class Manager:
 
     def _spawn(self, work: Coroutine[None, None, None], name: str) -> None:
         self._tasks.create_task(work, name=name)
+
+    async def _take_snapshots(self) -> None:
+        if self._snapshots is not None:
+            await self._snapshots.run(self._incarnations)
 
     async def _undo(self, incarnation_id: str) -> None:
         await self._launcher.undo(incarnation_id)

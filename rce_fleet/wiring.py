@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 
 FLEET_CONTAINER = "cTag_fleet"
 OPERATOR = "fleetOperator"
-VOLUME = {"name": "fleet", "path": "/volumes/fleet", "size": "128M"}
-"""The volume with the journal of the fleet manager, which finds it by its name."""
+VOLUME = {"name": "fleet", "path": "/volumes/fleet", "size": "128M", "snapshots": 30}
+"""The volume with the journal of the fleet manager, which finds it by its name. If its machine is lost, the
+fleet continues on another one, without what happened since the last snapshot."""
 FLOOR_PARAMETERS: dict[str, bool | int | float | str | list[Any]] = {
     "rows": 8,
     "columns": 8,

@@ -25,6 +25,8 @@ from rce.control import (
     ToMaster,
     Usage,
     VolumeRemoved,
+    VolumeRestored,
+    VolumeSaved,
 )
 from rce_master import requests
 from rce_master.audit import AuditLog, describe
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
     from rce_master.auth import Authenticator
     from rce_master.leadership import Fence
     from rce_master.reconciler import Peer, Reconciler
+    from rce_master.snapshots.service import SnapshotService
     from rce_master.state_service import Outcome, StateService
 
 _log = logging.getLogger(__name__)
@@ -92,7 +95,9 @@ class ControlHandler:
         quotas: Quotas | None = None,
         audit: AuditLog | None = None,
         fence: Fence | None = None,
+        snapshots: SnapshotService | None = None,
     ) -> None:
+        self._snapshots = snapshots
         self._audit = audit
         self._fence = fence
         self._tokens = Tokens(state_service.tables) if tokens is None else tokens
@@ -131,6 +136,9 @@ class ControlHandler:
                 self._take_login(peer, message)
             case ClientRequest():
                 await self._request(peer, message)
+            case VolumeSaved():
+                if self._snapshots is not None:
+                    await self._spawn(self._snapshots.accept(process, message))
             case (
                 Status()
                 | PatchStatus()
@@ -139,6 +147,7 @@ class ControlHandler:
                 | Fault()
                 | Usage()
                 | VolumeRemoved()
+                | VolumeRestored()
                 | Left()
                 | Hello()
                 | LogChunk()

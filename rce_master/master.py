@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from rce.control import PATCHES, TYPED_REQUESTS
+from rce.control import PATCHES, SNAPSHOTS, TYPED_REQUESTS
 from rce.control_channel.server import ControlServer
 from rce.guard import TrustedProxies
 from rce.own_process import listening
@@ -29,8 +29,11 @@ from rce_master.http.forwarded import PURPOSE, ForwardingKey
 from rce_master.http.routes import Services
 from rce_master.packages.contents import ARCHIVES, ContentStore
 from rce_master.packages.service import PackageService
+from rce_master.packages.transfer import PATH, SNAPSHOTS_PATH
 from rce_master.quotas import Quotas
 from rce_master.reconciler import Reconciler
+from rce_master.snapshots.service import SNAPSHOT, SnapshotService
+from rce_master.snapshots.service import SNAPSHOTS as SNAPSHOTS_FOLDER
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
 from rce_master.state_service import StateService
@@ -78,7 +81,8 @@ class Master:
         store: Keeps the desired state; the caller closes it.
         hasher: How passwords are hashed.
         fence: Tells whether this master leads, if there may be others; the store is one of its term.
-        copies: Makes what copies packages' archives to the other masters, if there may be any.
+        copies: Makes what copies contents to the other masters, if there may be any: of a folder, where
+            the others are asked for them, and what they are part of.
     """
 
     def __init__(
@@ -89,7 +93,7 @@ class Master:
         *,
         hasher: PasswordHasher | None = None,
         fence: Fence | None = None,
-        copies: Callable[[ContentStore], ArchiveCopies] | None = None,
+        copies: Callable[[ContentStore, str, str], ArchiveCopies] | None = None,
     ) -> None:
         self._fence = fence
         self._copies = copies
@@ -136,13 +140,16 @@ class Master:
         tokens = Tokens(state_service.tables)
         quotas = Quotas(self._settings.quotas)
         audit = AuditLog(self._settings.state_dir / "audit", time.time)
-        control_handler = ControlHandler(
-            state_service, reconciler, authenticator, tokens, quotas, audit, self._fence
-        )
         lifetime = self._settings.token_lifetime
         contents = ContentStore(self._settings.state_dir / ARCHIVES)
-        copies = None if self._copies is None else self._copies(contents)
+        copies = None if self._copies is None else self._copies(contents, PATH, "package")
         packages = PackageService(state_service, contents, copies=copies)
+        kept = ContentStore(self._settings.state_dir / SNAPSHOTS_FOLDER, noun=SNAPSHOT)
+        copies = None if self._copies is None else self._copies(kept, SNAPSHOTS_PATH, SNAPSHOT)
+        snapshots = SnapshotService(state_service, kept, copies=copies)
+        control_handler = ControlHandler(
+            state_service, reconciler, authenticator, tokens, quotas, audit, self._fence, snapshots
+        )
         services = Services(
             state_service=state_service,
             reconciler=reconciler,
@@ -168,12 +175,13 @@ class Master:
                         state_service.run(),
                         control_handler.run(),
                         packages.run(),
+                        snapshots.run(),
                         services.tokens.run(state_service),
                         _tick(state_service, audit),
                     )
                 ]
                 try:
-                    await self._serve(services, control_handler, on_ready)
+                    await self._serve(services, control_handler, snapshots, on_ready)
                 finally:
                     # Last: task sets that leave while the servers close still need the state service.
                     for worker in workers:
@@ -183,7 +191,11 @@ class Master:
             audit.close()
 
     async def _serve(
-        self, services: Services, control_handler: ControlHandler, on_ready: Callable[[RunningMaster], None]
+        self,
+        services: Services,
+        control_handler: ControlHandler,
+        snapshots: SnapshotService,
+        on_ready: Callable[[RunningMaster], None],
     ) -> None:
         settings = self._settings
         if settings.dev:
@@ -207,11 +219,12 @@ class Master:
             master="rce-master",
             host=settings.bind,
             port=settings.control_port,
-            contents=services.packages.read,
+            contents=partial(_read, services.packages, snapshots),
             tls=for_task_sets.mutual_server if for_task_sets else None,
             is_revoked=for_task_sets.is_revoked if for_task_sets else None,
             on_execution=services.executions.arrived,
-            features=(PATCHES, TYPED_REQUESTS),
+            on_upload=snapshots.take,
+            features=(PATCHES, TYPED_REQUESTS, SNAPSHOTS),
             is_fenced=None if fence is None else lambda: fence.is_closed,
             term=0 if fence is None else fence.term,
         )
@@ -247,6 +260,14 @@ async def make_dev_user(services: Services) -> None:
 
 def _answer_fenced(fence: Fence, entry: Entry, query: str) -> EntryAnswer:
     return refusal(FENCED) if fence.is_closed else entry.answer(query)
+
+
+async def _read(
+    packages: PackageService, snapshots: SnapshotService, sha256: str, offset: int, count: int
+) -> tuple[bytes, int] | None:
+    """Read a piece of a content for a task set; None if it does not exist."""
+    found = await packages.read(sha256, offset, count)
+    return found if found is not None else await snapshots.read(sha256, offset, count)
 
 
 async def _tick(state_service: StateService, audit: AuditLog) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Protocol, assert_never
 
 from rce.control import (
     PATCHES,
+    SNAPSHOTS,
     VOLUMES,
     ClientRequest,
     Drop,
@@ -32,10 +33,12 @@ from rce.control import (
     ToTaskSet,
     Usage,
     VolumeRemoved,
+    VolumeRestored,
+    VolumeSaved,
 )
 from rce_master.exceptions import NotFoundError, RefusedError, TaskSetAwayError
 from rce_master.logs import LogReader, LogRequest, read_log
-from rce_master.state import commands
+from rce_master.state import commands, volume_moves
 from rce_master.state.lifecycle import RobotSession
 from rce_master.usage import UsageBook
 
@@ -118,15 +121,15 @@ class Reconciler:
                 command = commands.EndpointGone(process=process, id=message.id)
             case Fault():
                 command = commands.FaultReported(id=message.id, text=message.text, robot=message.robot)
-            case VolumeRemoved():
-                command = commands.VolumeRemoved(process=process, volume=message.volume)
+            case VolumeRemoved() | VolumeRestored():
+                command = _command_of(process, message)
             case Left():
                 command = commands.RobotLeft(process=process, id=message.id, reason=message.reason)
             case Usage():
                 placed = {e.id for e in self._state_service.tables.endpoints.by("task_set", process)}
                 self.book.note(process, message, placed)
                 return
-            case Hello() | Login() | ClientRequest() | LogChunk():
+            case Hello() | Login() | ClientRequest() | LogChunk() | VolumeSaved():
                 _log.warning("%s sent a %s, which means nothing here", process, type(message).__name__)
                 return
             case _:
@@ -206,8 +209,7 @@ class Reconciler:
             self._ask_status(process, id_)
         if changes.arrived:
             self._sync(changes.arrived)
-        for removal in changes.volume_removals:
-            self._remove_volume(removal)
+        self._send_orders(changes)
         for notice in changes.notices:
             self._notify(notice)
 
@@ -219,6 +221,9 @@ class Reconciler:
 
     def _send_change(self, process: str, id_: str, touched: Touched) -> None:
         """Send the changes of an endpoint to its task set, and to the one it moves to."""
+        if self._state_service.is_held(id_):
+            self._sent.get(process, {}).pop(id_, None)
+            return
         peer = self._peers.get(process)
         if peer is not None and self._sent[process].get(id_) == touched.since and PATCHES in peer.features:
             patch = self._state_service.patch(id_, touched)
@@ -232,7 +237,7 @@ class Reconciler:
 
     def _send_whole(self, process: str, id_: str) -> None:
         peer = self._peers.get(process)
-        if peer is not None:
+        if peer is not None and not self._state_service.is_held(id_):
             spec = self._state_service.spec(id_)
             self._sent[process][id_] = spec.revision
             peer.send(Put(endpoint=spec))
@@ -248,11 +253,31 @@ class Reconciler:
         self._forget(process)
         peer = self._peers[process] = self._arriving[process]
         placed = self._state_service.tables.endpoints.by("task_set", process)
-        specs = tuple(self._state_service.spec(endpoint.id) for endpoint in placed)
+        is_held = self._state_service.is_held
+        specs = tuple(self._state_service.spec(one.id) for one in placed if not is_held(one.id))
         self._sent[process] = {spec.id: spec.revision for spec in specs}
         peer.send(Sync(endpoints=specs))
         for removal in self._state_service.tables.volume_removals.by("process", process):
             self._remove_volume(removal)
+        if SNAPSHOTS in peer.features:
+            for order in self._state_service.state.orders(process):
+                peer.send(order)
+
+    def _send_orders(self, changes: Changes) -> None:
+        """Tell task sets what they have to do with volumes."""
+        for removal in changes.volume_removals:
+            self._remove_volume(removal)
+        for id_ in changes.volume_moves:
+            self._order_for_move(id_)
+
+    def _order_for_move(self, id_: str) -> None:
+        """Tell task sets what a container's move with its volumes has come to."""
+        tables = self._state_service.tables
+        move = tables.volume_moves.get(id_)
+        for process, message in [] if move is None else volume_moves.orders(tables, move):
+            peer = self._peers.get(process)
+            if peer is not None and SNAPSHOTS in peer.features:
+                peer.send(message)
 
     def _remove_volume(self, removal: VolumeRemoval) -> None:
         peer = self._peers.get(removal.process)
@@ -281,3 +306,11 @@ class Reconciler:
         peer = self._peers.get(process)
         if peer is not None:
             peer.send(message)
+
+
+def _command_of(process: str, message: VolumeRemoved | VolumeRestored) -> commands.Command:
+    if isinstance(message, VolumeRemoved):
+        return commands.VolumeRemoved(process=process, volume=message.volume)
+    return commands.VolumeRestored(
+        process=process, volume=message.volume, placement=message.placement, error=message.error
+    )

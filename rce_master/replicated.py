@@ -26,7 +26,8 @@ from rce_master.packages.contents import ARCHIVES, ContentStore
 from rce_master.packages.copies import ArchiveCopies
 from rce_master.packages.request_key import PURPOSE as ARCHIVE_PURPOSE
 from rce_master.packages.request_key import RequestKey
-from rce_master.packages.transfer import CONNECT_S, ArchiveClient
+from rce_master.packages.transfer import CONNECT_S, PATH, SNAPSHOTS_PATH, ArchiveClient
+from rce_master.snapshots.service import SNAPSHOT, SNAPSHOTS
 from rce_master.store.etcd import EtcdClient
 from rce_master.store.etcd.exceptions import EtcdAwayError, NoQuorumError
 from rce_master.store.etcd.layout import prepare
@@ -129,7 +130,10 @@ class ReplicatedMaster:
         for_clients = settings.tls.for_clients()
         names = ServerNames(settings.bind, settings.names)
         key = RequestKey(self._secret.derive(ARCHIVE_PURPOSE))
-        archives = ArchiveRoutes(ContentStore(settings.state_dir / ARCHIVES), key, keeper.newest_term)
+        archives = [
+            ArchiveRoutes(ContentStore(settings.state_dir / folder, noun=noun), key, keeper.newest_term, path)
+            for folder, noun, path in ((ARCHIVES, "package", PATH), (SNAPSHOTS, SNAPSHOT, SNAPSHOTS_PATH))
+        ]
         async with AsyncExitStack() as waiting, self._session() as session:
             forwarder = await waiting.enter_async_context(self._forwarder())
             server = HttpServer(
@@ -148,10 +152,12 @@ class ReplicatedMaster:
             on_standby(server.url)
             store, fence = await keeper.acquire()
             _log.info("this master leads in term %d", fence.term)
-            client = ArchiveClient(session, key, fence, self._masters_tls())
+            tls = self._masters_tls()
 
-            def copies(contents: ContentStore) -> ArchiveCopies:
-                return ArchiveCopies(contents, registry, client)
+            def copies(contents: ContentStore, path: str, noun: str) -> ArchiveCopies:
+                return ArchiveCopies(
+                    contents, registry, ArchiveClient(session, key, fence, tls, path), noun=noun
+                )
 
             try:
                 master = Master(

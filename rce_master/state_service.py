@@ -152,6 +152,10 @@ class StateService:
         """Tell where a container is being handed over to, and what is desired there; None if it is not."""
         return self.state.copy_spec(endpoint)
 
+    def is_held(self, endpoint: str) -> bool:
+        """Tell whether an endpoint is a container that is to run nowhere now (:meth:`State.is_held`)."""
+        return self.state.is_held(endpoint)
+
     async def settled(self) -> None:
         """Wait until all that the tables show now is stored, or is taken back, which :attr:`reverts` tells.
 

@@ -35,6 +35,8 @@ from rce.control import (
     ReadLog,
     Refused,
     RemoveVolume,
+    RestoreVolume,
+    SaveVolume,
     SpecPatch,
     SpecWanted,
     Status,
@@ -162,7 +164,15 @@ class RobotTaskSet:
             case Probe():
                 self._probe(EndpointId.parse(message.id))
             case (
-                Welcome() | Refused() | LoginReply() | ClientReply() | ReadLog() | RemoveVolume() | Execute()
+                Welcome()
+                | Refused()
+                | LoginReply()
+                | ClientReply()
+                | ReadLog()
+                | RemoveVolume()
+                | SaveVolume()
+                | RestoreVolume()
+                | Execute()
             ):
                 _log.debug("not for a robot task set: %s", type(message).__name__)
             case _:

@@ -58,6 +58,12 @@ CYCLES = (
         rce_master.state.lifecycle.CONTAINER_LIFE,
     ),
     Cycle(
+        "Move of a container with volumes",
+        "volume-move",
+        "Its container is ended first; see [volumes](containers.md#volumes-that-move).",
+        rce_master.state.lifecycle.VOLUME_MOVE_LIFE,
+    ),
+    Cycle(
         "Container, as its machine sees it",
         "container",
         "What `rce-container` does to make and remove a container; *cleaning* is *failed* for the master.",

@@ -103,6 +103,7 @@ class DesiredState:
             nodes=contents.nodes,
             parameters=contents.parameters,
             packages=contents.packages,
+            volumes=contents.volumes,
         )
 
     def connections_at(self, interface: str) -> tuple[int, ...]:
@@ -180,7 +181,11 @@ class DesiredState:
 
 def _contents(spec: EndpointSpec) -> EndpointContents:
     return EndpointContents(
-        resources=spec.resources, nodes=spec.nodes, parameters=spec.parameters, packages=spec.packages
+        resources=spec.resources,
+        nodes=spec.nodes,
+        parameters=spec.parameters,
+        packages=spec.packages,
+        volumes=spec.volumes,
     )
 
 

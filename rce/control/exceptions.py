@@ -6,6 +6,7 @@
     +-- MasterUnavailableError   the master did not answer in time
     +-- UnsendableError          a message is too long, or holds what no frame can hold
     +-- ContentError             a content cannot be fetched from the master
+    +-- SnapshotError            a snapshot of a volume cannot be used, made or sent
     +-- PeerGoneError            a task set left before it answered
     +-- PeerTimeoutError         a task set did not answer in time
     +-- PeerRefusedError         raised by the master's ``on_hello``: the task set is not taken
@@ -58,6 +59,18 @@ class ContentError(ControlError):
     def __init__(self, problem: str, *, missing: bool = False) -> None:
         super().__init__(problem)
         self.missing = missing
+
+
+class SnapshotError(ControlError):
+    """A snapshot of a volume cannot be used, made or sent; the text says why.
+
+    Attributes:
+        is_temporary: Whether the master could not be reached, so that another attempt may help.
+    """
+
+    def __init__(self, problem: str, *, is_temporary: bool = False) -> None:
+        super().__init__(problem)
+        self.is_temporary = is_temporary
 
 
 class PeerGoneError(ControlError):

@@ -46,6 +46,11 @@ VOLUMES = "volumes"
 """A feature of container task sets: they take :class:`RemoveVolume`."""
 
 
+SNAPSHOTS = "snapshots"
+"""A feature. Container task sets: they take :class:`SaveVolume` and :class:`RestoreVolume`. Masters: they
+take snapshots (:mod:`rce.control.snapshots`)."""
+
+
 class VolumeLimit(Enum):
     """How a machine keeps volumes within their size."""
 
@@ -174,6 +179,29 @@ class VolumeRemoved(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Answer to :class:`RemoveVolume`: the files are gone."""
 
     volume: str
+
+
+class VolumeSaved(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """A snapshot of a volume was sent to the master; or, as the answer to :class:`SaveVolume`, it was not."""
+
+    volume: str
+    placement: int
+    """The number of the placement whose files these are."""
+    snapshot: str = ""
+    """SHA-256 of its manifest, in hex; empty if there is an error."""
+    is_last: bool = False
+    """Whether it is the answer to :class:`SaveVolume`: its container has ended."""
+    error: str = ""
+    """Why there is none."""
+
+
+class VolumeRestored(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """Answer to :class:`RestoreVolume`."""
+
+    volume: str
+    placement: int
+    error: str = ""
+    """Why it was not restored; empty if it was."""
 
 
 class Login(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -352,6 +380,31 @@ class RemoveVolume(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """``user/name``."""
 
 
+class SaveVolume(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """Send a snapshot of a volume whose container has ended.
+
+    Sent again after each ``Sync`` until it is answered, as is :class:`RestoreVolume`.
+
+    Only to task sets with the feature :data:`SNAPSHOTS`; so is :class:`RestoreVolume`.
+    """
+
+    volume: str
+    """``user/name``."""
+    placement: int
+
+
+class RestoreVolume(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """Make a volume's files of a snapshot, in place of those of an earlier placement."""
+
+    volume: str
+    placement: int
+    """The number that the files belong to from then on."""
+    snapshot: str
+    """SHA-256 of its manifest, in hex."""
+    size: int
+    """Bytes that the volume may hold."""
+
+
 class Execute(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Run a command in a container, and dial for it (:mod:`rce.control.execution`)."""
 
@@ -371,6 +424,8 @@ ToMaster = (
     | Fault
     | Usage
     | VolumeRemoved
+    | VolumeSaved
+    | VolumeRestored
     | Login
     | Left
     | ClientRequest
@@ -390,6 +445,8 @@ ToTaskSet = (
     | ClientReply
     | ReadLog
     | RemoveVolume
+    | SaveVolume
+    | RestoreVolume
     | Execute
 )
 

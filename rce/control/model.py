@@ -68,6 +68,16 @@ class PackageSpec(Struct, frozen=True, kw_only=True):
     """The public key that made the signature, in hex."""
 
 
+class VolumePlacement(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Which files of a volume a container is to have: a machine may hold those of an earlier placement."""
+
+    name: str
+    number: int
+    """Grows each time that the volume is placed on another machine."""
+    is_new: bool = False
+    """Whether this placement began without files; else the machine must hold those that were restored."""
+
+
 class EndpointKind(Enum):
     """The kind of an endpoint."""
 
@@ -88,6 +98,8 @@ class EndpointSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     nodes: tuple[NodeSpec, ...] = ()
     parameters: tuple[ParameterSpec, ...] = ()
     packages: tuple[PackageSpec, ...] = field(default=(), name="bundles")
+    volumes: tuple[VolumePlacement, ...] = ()
+    """Of those in :attr:`resources`; what a task set of an earlier release passes over."""
 
 
 class EndpointContents(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -97,6 +109,7 @@ class EndpointContents(Struct, frozen=True, kw_only=True, omit_defaults=True):
     nodes: tuple[NodeSpec, ...] = ()
     parameters: tuple[ParameterSpec, ...] = ()
     packages: tuple[PackageSpec, ...] = ()
+    volumes: tuple[VolumePlacement, ...] = ()
 
 
 class SpecPatch(Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -34,6 +34,8 @@ from rce.control import (
     ReadLog,
     Refused,
     RemoveVolume,
+    RestoreVolume,
+    SaveVolume,
     StatusWanted,
     Sync,
     ToMaster,
@@ -373,6 +375,8 @@ class TaskSetChannel:
                 | Probe()
                 | ReadLog()
                 | RemoveVolume()
+                | SaveVolume()
+                | RestoreVolume()
                 | Execute()
             ):
                 await self._inbox.put(message)

@@ -1,4 +1,4 @@
-"""A task set's connections to the master for single runs (:mod:`rce.control.execution`)."""
+"""A task set's connections to the master beside the control channel: for runs, and to send snapshots."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from rce.tls import Context
 
 
-class RunDialer:
-    """Dials the master for runs.
+class Dialer:
+    """Dials the master beside the control channel.
 
     Args:
         masters: Where the masters are, as for :class:`~rce.control_channel.channel.TaskSetChannel`,
@@ -48,8 +48,12 @@ class RunDialer:
         self._timeouts = timeouts
 
     @contextlib.asynccontextmanager
-    async def dial(self, run: str) -> AsyncIterator[ClientConnection]:
-        """Connect for a run.
+    async def connect(self, path: str, max_size: int) -> AsyncIterator[ClientConnection]:
+        """Connect to a path of the control port.
+
+        Args:
+            path: What the connection is for.
+            max_size: Bytes of the longest message that is taken.
 
         Raises:
             OSError: The master cannot be reached; ``TimeoutError`` if it does not answer.
@@ -59,7 +63,7 @@ class RunDialer:
         async with asyncio.timeout(self._timeouts.open):
             sock = await open_url_socket(url)
         async with connect(
-            url + path_of(run),
+            url + path,
             sock=sock,
             additional_headers={"Authorization": f"Bearer {self._secret.reveal()}"},
             ssl=None if self._tls is None else self._tls(),
@@ -69,8 +73,18 @@ class RunDialer:
             ping_interval=self._timeouts.ping_interval,
             ping_timeout=None,
             close_timeout=self._timeouts.close,
-            max_size=MAX_DATA + 2,
+            max_size=max_size,
             max_queue=4,
             create_connection=TlsClientConnection,
         ) as master:
+            yield master
+
+
+class RunDialer(Dialer):
+    """Dials the master for runs (:mod:`rce.control.execution`)."""
+
+    @contextlib.asynccontextmanager
+    async def dial(self, run: str) -> AsyncIterator[ClientConnection]:
+        """Connect for a run; the errors are those of :meth:`connect`."""
+        async with self.connect(path_of(run), MAX_DATA + 2) as master:
             yield master

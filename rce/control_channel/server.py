@@ -31,11 +31,14 @@ from rce.control import (
     Unknown,
     Usage,
     VolumeRemoved,
+    VolumeRestored,
+    VolumeSaved,
     Welcome,
     decode_to_master,
     encode,
 )
 from rce.control.execution import run_of
+from rce.control.snapshots import UPLOADS
 from rce.control_channel.contents import ReadContent, answer, is_for_contents
 from rce.control_channel.peer import Peer
 from rce.control_channel.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, ControlTimeouts
@@ -89,6 +92,7 @@ class ControlServer:
         is_revoked: Tells by its serial number whether a task set's certificate was revoked.
         on_execution: Takes a connection that a task set dialed for a run (:mod:`rce.control.execution`), and
             returns when it is done with it.
+        on_upload: The same for a connection to send a snapshot (:mod:`rce.control.snapshots`).
         is_fenced: Tells that another master may lead by now. Then nothing is sent to task sets any more.
         term: The term of leadership in which this master talks; 0: there are no other masters.
     """
@@ -108,6 +112,7 @@ class ControlServer:
         tls: Context | None = None,
         is_revoked: Callable[[int], bool] | None = None,
         on_execution: Callable[[str, ServerConnection], Awaitable[None]] | None = None,
+        on_upload: Callable[[ServerConnection], Awaitable[None]] | None = None,
         features: tuple[str, ...] = (),
         is_fenced: Callable[[], bool] | None = None,
         term: int = 0,
@@ -121,6 +126,7 @@ class ControlServer:
         self._gate: TlsGate | None = None
         self._contents = contents
         self._on_execution = on_execution
+        self._on_upload = on_upload
         self._on_hello = on_hello
         self._on_message = on_message
         self._on_gone = on_gone
@@ -219,6 +225,9 @@ class ControlServer:
         run = run_of(socket.request.path) if socket.request is not None else None
         if run is not None and self._on_execution is not None:
             await self._on_execution(run, socket)
+            return
+        if socket.request is not None and socket.request.path == UPLOADS and self._on_upload is not None:
+            await self._on_upload(socket)
             return
         try:
             hello = await self._greet(socket)
@@ -328,6 +337,8 @@ class ControlServer:
                     | Fault()
                     | Usage()
                     | VolumeRemoved()
+                    | VolumeSaved()
+                    | VolumeRestored()
                     | Login()
                     | Left()
                     | ClientRequest()

@@ -18,6 +18,9 @@ MIN_VOLUME = 4 * MEGABYTE
 MAX_VOLUME = 2**44
 MAX_VOLUMES = 16
 """Of one container."""
+MIN_SNAPSHOTS = 5
+MAX_SNAPSHOTS = 86400
+"""Seconds between two snapshots of a volume."""
 HOME = "/home/rce"
 """A container's home; volumes may be mounted below it."""
 
@@ -29,7 +32,7 @@ _PATH = re.compile(r"(/(?!\.\.?(?:/|\Z))[A-Za-z0-9._+@-]+)+")
 _MAX_PATH = 255
 
 
-class Volume(Struct, frozen=True, kw_only=True):
+class Volume(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A volume of a container."""
 
     name: str
@@ -38,6 +41,8 @@ class Volume(Struct, frozen=True, kw_only=True):
     """Where the container sees it; absolute."""
     size: int
     """Bytes."""
+    snapshots: int = 0
+    """Seconds between two snapshots while its container runs; 0: none."""
 
     @property
     def variable(self) -> str:
@@ -51,6 +56,7 @@ class WrittenVolume(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     name: written.Name
     path: written.Text
     size: written.Quantity
+    snapshots: float = 0
 
 
 def read_volumes(volumes: Sequence[WrittenVolume]) -> tuple[Volume, ...]:
@@ -66,7 +72,12 @@ def read_volumes(volumes: Sequence[WrittenVolume]) -> tuple[Volume, ...]:
         problem = _path_problem(one.path)
         if problem:
             raise ValueError(f"[{number}].path {problem}, not {one.path!r:.60}")
-        volume = Volume(name=one.name, path=one.path, size=_read_size(number, one.size))
+        volume = Volume(
+            name=one.name,
+            path=one.path,
+            size=_read_size(number, one.size),
+            snapshots=_read_snapshots(number, one.snapshots),
+        )
         _check_pair(number, volume, found)
         found.append(volume)
     return tuple(found)
@@ -100,6 +111,15 @@ def _read_size(number: int, size: written.Quantity) -> int:
         least, most = MIN_VOLUME // MEGABYTE, MAX_VOLUME // MEGABYTE
         raise ValueError(f"[{number}].size must be {least} to {most} MB, not {about(read)}")
     return read
+
+
+def _read_snapshots(number: int, seconds: float) -> int:
+    if seconds and not MIN_SNAPSHOTS <= seconds <= MAX_SNAPSHOTS:
+        raise ValueError(
+            f"[{number}].snapshots must be {MIN_SNAPSHOTS} to {MAX_SNAPSHOTS} seconds, or 0 for none, "
+            f"not {seconds:g}"
+        )
+    return int(seconds)
 
 
 def _check_pair(number: int, volume: Volume, others: Iterable[Volume]) -> None:

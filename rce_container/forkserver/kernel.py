@@ -34,6 +34,7 @@ class Mount(IntFlag):
     REMOUNT = 32
     BIND = 4096
     RECURSIVE = 16384
+    PRIVATE = 1 << 18
 
 
 class _Prctl(IntEnum):
@@ -92,6 +93,11 @@ def mount(target: str, flags: Mount, *, source: str = "none", kind: str = "", op
 def unmount(target: str) -> None:
     """Take a mount out of the tree; descriptors that are open below it stay good."""
     _check(_libc.umount2, os.fsencode(target), _MNT_DETACH)
+
+
+def sync_file_system(fd: int) -> None:
+    """Write all data of the file system of an open file to its disk. Blocks."""
+    _check(_libc.syncfs, fd)
 
 
 def set_dumpable(dumpable: bool) -> None:

@@ -23,7 +23,8 @@ _AUTOCLEAR = 4
 _CONFIG = struct.Struct("=II 5Q 4I 64s 64s 32s 2Q 8Q")
 _ATTEMPTS = 64
 _FLAGS = Mount.NO_SUID | Mount.NO_DEV
-_OPTIONS = "noinit_itable"  # the kernel would free space of the image that is reserved for inodes
+OPTIONS = "noinit_itable"
+"""Options of a mount; without it the kernel would free space of the image that is reserved for inodes."""
 
 
 @contextlib.contextmanager
@@ -39,7 +40,7 @@ def attached(volumes: Sequence[VolumeOrder]) -> Iterator[list[tuple[VolumeOrder,
     with contextlib.ExitStack() as stack:
         found: list[tuple[VolumeOrder, int]] = []
         for volume in volumes:
-            device = _attach(volume.image) if volume.image else -1
+            device = attach(volume.image) if volume.image else -1
             if device >= 0:
                 stack.callback(os.close, device)
             found.append((volume, device))
@@ -61,7 +62,7 @@ def mount_volumes(volumes: Sequence[tuple[VolumeOrder, int]], procfs: int, owner
         if device >= 0:
             os.fchdir(procfs)  # the container's own /proc does not know this process
             try:
-                mount(volume.path, _FLAGS, source=f"self/fd/{device}", kind="ext4", options=_OPTIONS)
+                mount(volume.path, _FLAGS, source=f"self/fd/{device}", kind="ext4", options=OPTIONS)
             except OSError as error:
                 raise OSError(error.errno, f"volume at {volume.path}: {error.strerror}") from error
             finally:
@@ -71,8 +72,12 @@ def mount_volumes(volumes: Sequence[tuple[VolumeOrder, int]], procfs: int, owner
         _give(volume.path, owner)
 
 
-def _attach(image: str) -> int:
-    """Attach an image to a free loop device; return a descriptor of the device."""
+def attach(image: str) -> int:
+    """Attach an image to a free loop device; return a descriptor of the device.
+
+    Raises:
+        OSError: It cannot be attached.
+    """
     file = os.open(image, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
     control = os.open("/dev/loop-control", os.O_RDWR | os.O_CLOEXEC)
     try:

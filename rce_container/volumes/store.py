@@ -1,7 +1,9 @@
 """The volumes on a machine: ``STATE/volumes/USER/NAME.img``, or a folder ``NAME`` where images do not work.
 
 One container at a time has a volume: it is *claimed* from the start of a container until its last process has
-ended, also across restarts of the manager.
+ended, also across restarts of the manager. While its files are saved or restored, it is claimed too.
+
+``STATE/volumes/.placements/USER/NAME`` holds the number of the placement that the files belong to.
 """
 
 from __future__ import annotations
@@ -11,18 +13,21 @@ import logging
 import os
 import secrets
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from rce.control import VolumePlacement
 from rce.model import Volume, about, is_name
 from rce_container.exceptions import VolumeError
-from rce_container.files import remove
+from rce_container.files import remove, write_whole
 from rce_container.folder import make_accessible
 from rce_container.volumes import images
+from rce_container.volumes.mounted import open_image, open_inside
 
 _log = logging.getLogger(__name__)
 
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
 _SETTLE_S = 10.0
 """Seconds that a former container's mount may take to end."""
 
@@ -39,11 +44,19 @@ class VolumeMount(NamedTuple):
     image: bool
 
 
-class _Claim(NamedTuple):
+class Claim(NamedTuple):
+    """A volume that a container has."""
+
     id: str
     """``user/name``."""
     path: str
+    """Where the container sees it."""
     size: int
+    """Bytes; 0 if it is not known."""
+    snapshots: int = 0
+    """Seconds between two snapshots; 0: none."""
+    placement: int = 0
+    """Number of the placement that its files belong to."""
 
 
 class VolumeStore:
@@ -60,8 +73,11 @@ class VolumeStore:
     def __init__(self, folder: Path, *, images: bool) -> None:
         self._folder = folder
         self._trash = folder / ".removed"
+        self._scratch = folder / ".scratch"
+        """What is being copied or restored, and what a killed manager left of that."""
+        self._placements = folder / ".placements"
         self._images = images
-        self._claims: dict[str, tuple[_Claim, ...]] = {}
+        self._claims: dict[str, tuple[Claim, ...]] = {}
         """By incarnation."""
         self._doomed: set[str] = set()
         """Volumes to be removed when their container has ended."""
@@ -69,18 +85,35 @@ class VolumeStore:
 
     # Claims
 
-    def claim(self, user: str, incarnation_id: str, volumes: Iterable[Volume]) -> tuple[VolumeMount, ...]:
+    def claim(
+        self,
+        user: str,
+        incarnation_id: str,
+        volumes: Iterable[Volume],
+        placements: Sequence[VolumePlacement] = (),
+    ) -> tuple[VolumeMount, ...]:
         """Give volumes to a container that is about to start; make their folders. Quick.
 
+        Args:
+            user: The container's user.
+            incarnation_id: Its incarnation.
+            volumes: What it asks for.
+            placements: Which files it is to have; none from a master of an earlier release.
+
         Raises:
-            VolumeError: One belongs to a container that has not ended yet, is too full, or cannot be used.
+            VolumeError: One belongs to a container that has not ended yet, is too full, or cannot be used;
+                or this machine has not the files that count.
         """
+        numbers = {placement.name: placement for placement in placements}
         claims, mounts = [], []
         for volume in volumes:
             id_ = f"{user}/{volume.name}"
             self._check_free(id_, volume)
+            placement = numbers.get(volume.name)
+            if placement is not None:
+                self._check_placement(id_, placement)
             mounts.append(self._mount_of(id_, volume))
-            claims.append(_Claim(id_, volume.path, volume.size))
+            claims.append(_claim_of(id_, volume, placement))
         if claims:
             self._claims[incarnation_id] = tuple(claims)
         return tuple(mounts)
@@ -94,17 +127,42 @@ class VolumeStore:
             volumes: Their paths in the container, by name.
         """
         if volumes:
-            claims = (_Claim(f"{user}/{name}", path, 0) for name, path in volumes.items())
+            claims = (Claim(f"{user}/{name}", path, 0) for name, path in volumes.items())
             self._claims[incarnation_id] = tuple(claims)
 
-    def note_sizes(self, user: str, incarnation_id: str, volumes: Iterable[Volume]) -> None:
-        """Note the sizes of an adopted container's volumes, which its record does not hold."""
-        sizes = {f"{user}/{volume.name}": volume.size for volume in volumes}
+    def note(
+        self,
+        user: str,
+        incarnation_id: str,
+        volumes: Iterable[Volume],
+        placements: Iterable[VolumePlacement] = (),
+    ) -> None:
+        """Note what is desired of the volumes of an adopted container, which its record does not hold."""
+        numbers = {placement.name: placement for placement in placements}
+        desired = {
+            claim.id: claim
+            for volume in volumes
+            for claim in (_claim_of(f"{user}/{volume.name}", volume, numbers.get(volume.name)),)
+        }
         known = self._claims.get(incarnation_id, ())
         if known:
-            self._claims[incarnation_id] = tuple(
-                claim._replace(size=sizes.get(claim.id, claim.size)) for claim in known
-            )
+            self._claims[incarnation_id] = tuple(desired.get(claim.id, claim) for claim in known)
+
+    def claims(self, incarnation_id: str) -> tuple[Claim, ...]:
+        """Return the volumes of a container."""
+        return self._claims.get(incarnation_id, ())
+
+    def hold(self, id_: str) -> str:
+        """Keep a volume from being given to a container; return what :meth:`release` takes.
+
+        Raises:
+            VolumeError: A container has it, or it is being removed.
+        """
+        if id_ in self._doomed or self._holder(id_) is not None:
+            raise VolumeError(f"volume {id_!r} belongs to a container that has not ended yet")
+        holder = f"hold {id_}"
+        self._claims[holder] = (Claim(id_, "", 0),)
+        return holder
 
     def release(self, incarnation_id: str) -> list[str]:
         """Take the volumes of a container that has ended; return those that are to be deleted now."""
@@ -128,6 +186,136 @@ class VolumeStore:
                 continue
             images.wait_until_unused(image, deadline)
             images.grow(image, claim.size)
+
+    # Files of one placement
+
+    def placement(self, id_: str) -> int:
+        """Return the number of the placement that a volume's files belong to; 0 if it is not known."""
+        if not self._exists(id_):
+            return 0
+        try:
+            return int(self._marker(id_).read_text())
+        except (OSError, ValueError):
+            return 0
+
+    def open(self, id_: str) -> int:
+        """Open a volume that is held; return a descriptor of its folder, which the caller closes. Blocks.
+
+        Raises:
+            VolumeError: It is not there, or cannot be opened.
+        """
+        if not self._exists(id_):
+            raise VolumeError("its files are not on this machine")
+        image = self._image(id_)
+        try:
+            if self._place(id_).is_dir():
+                return os.open(self._place(id_), _FOLDER)
+            images.wait_until_unused(image, time.monotonic() + _SETTLE_S)
+            return open_image(image, self._point(), read_only=True)
+        except OSError as error:
+            raise VolumeError(f"its files cannot be read: {error}") from error
+
+    def open_running(self, claim: Claim, pid: int) -> int:
+        """Open a volume that a running container has; otherwise as :meth:`open`.
+
+        Args:
+            claim: The volume.
+            pid: A process in the container's namespaces; 0 without namespaces.
+        """
+        try:
+            if self._place(claim.id).is_dir():
+                return os.open(self._place(claim.id), _FOLDER)
+            return open_inside(pid, claim.path)
+        except OSError as error:
+            raise VolumeError(f"its files cannot be read: {error}") from error
+
+    def make_scratch(self) -> Path:
+        """Make a folder for a copy of a volume. Blocks.
+
+        Raises:
+            OSError: It cannot be made.
+        """
+        path = self._scratch / secrets.token_hex(8)
+        path.mkdir(mode=0o700, parents=True)
+        return path
+
+    def make_new(self, size: int) -> tuple[Path, int]:
+        """Make an empty volume, to be filled and put in place. Blocks.
+
+        Returns:
+            The volume, and a descriptor of its folder.
+
+        Raises:
+            VolumeError: It cannot be made.
+        """
+        try:
+            if not self._images:
+                path = self.make_scratch()
+                return path, os.open(path, _FOLDER)
+            self._scratch.mkdir(mode=0o700, parents=True, exist_ok=True)
+            path = self._scratch / f"{secrets.token_hex(8)}.img"
+            images.make(path, size)
+            root = open_image(path, self._point(), read_only=False)
+            with contextlib.suppress(OSError):
+                os.rmdir("lost+found", dir_fd=root)
+        except OSError as error:
+            raise VolumeError(f"its files cannot be made: {error}") from error
+        return path, root
+
+    def replace(self, id_: str, new: Path, placement: int) -> None:
+        """Put a filled volume in the place of a former one, which is discarded. Blocks.
+
+        Raises:
+            VolumeError: It cannot be put there.
+        """
+        place = self._image(id_) if new.suffix == ".img" else self._place(id_)
+        try:
+            if new.suffix == ".img":
+                images.wait_until_unused(new, time.monotonic() + _SETTLE_S)
+            place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if self._exists(id_) and not self._discard(id_):
+                raise VolumeError("the former files are in the way")
+            new.rename(place)
+            self._note_placement(id_, placement)
+            sync_folder(place.parent)
+        except OSError as error:
+            raise VolumeError(f"its files cannot be put in place: {error}") from error
+
+    def clear_scratch(self) -> None:
+        """Remove what a killed manager left. Blocks."""
+        make_accessible(self._scratch)
+        remove(self._scratch)
+
+    def _check_placement(self, id_: str, placement: VolumePlacement) -> None:
+        if self._exists(id_) and self.placement(id_) >= placement.number:
+            return
+        if not placement.is_new:
+            raise VolumeError(
+                f"the files of volume {placement.name!r} are not on this machine any more; move the "
+                "container to the machine that has them, or remove the volume"
+            )
+        if placement.number:
+            try:
+                self._note_placement(id_, placement.number)
+            except OSError as error:
+                raise VolumeError(f"cannot write {error.filename}: {error.strerror}") from error
+
+    def _note_placement(self, id_: str, number: int) -> None:
+        marker = self._marker(id_)
+        marker.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        write_whole(marker, str(number).encode())
+        sync_folder(marker.parent)
+
+    def _exists(self, id_: str) -> bool:
+        return self._place(id_).is_dir() or self._image(id_).exists()
+
+    def _marker(self, id_: str) -> Path:
+        return self._placements / self._place(id_).relative_to(self._folder)
+
+    def _point(self) -> Path:
+        point = self._scratch / "point"
+        point.mkdir(mode=0o700, parents=True, exist_ok=True)
+        return point
 
     # Removal
 
@@ -159,6 +347,7 @@ class VolumeStore:
                 if path.exists():
                     self._trash.mkdir(mode=0o700, parents=True, exist_ok=True)
                     path.rename(self._trash / f"{secrets.token_hex(8)}{path.suffix}")
+            self._marker(id_).unlink(missing_ok=True)
         except OSError as error:
             _log.error("volume %s cannot be removed: %s", id_, error)
             return False
@@ -246,6 +435,20 @@ class VolumeStore:
 
     def _image(self, id_: str) -> Path:
         return self._place(id_).with_suffix(".img")
+
+
+def _claim_of(id_: str, volume: Volume, placement: VolumePlacement | None) -> Claim:
+    number = 0 if placement is None else placement.number
+    return Claim(id_, volume.path, volume.size, volume.snapshots, number)
+
+
+def sync_folder(folder: Path) -> None:
+    """Write to the disk which files a folder holds. Blocks."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
 
 
 def _too_full(id_: str, used: int, size: int) -> str:

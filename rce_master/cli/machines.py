@@ -165,7 +165,7 @@ def move(
     """Hand a container over to another machine while it runs; administrators only.
 
     It is started there first and then dropped here, with the containers that share a private network with
-    it. Its memory and files are not moved.
+    it. One with volumes is ended first, and its volumes move with it. All else that it holds is lost.
     """
     run(_move(container, machine, user, wait=wait))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Annotated, Any
 
 import typer
@@ -27,15 +28,22 @@ async def _list(user: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
         found = await client.items("/volumes", query=_of(user))
     several = len({one["user"] for one in found}) > 1
-    table = Table("volume", "used", "size", "machine", "container", "path", box=None)
+    table = Table("volume", "used", "size", "machine", "container", "path", "snapshot", box=None)
     for one in found:
         name = f"{one['user']}/{one['name']}" if several else one["name"]
         used = "-" if one["used"] is None else about(one["used"])
-        table.add_row(name, used, about(one["size"]), *(_or_dash(one, *_PLACE)))
+        table.add_row(name, used, about(one["size"]), *(_or_dash(one, *_PLACE)), _snapshot(one))
     Console().print(table)
 
 
 _PLACE = ("machine", "container", "path")
+
+
+def _snapshot(volume: dict[str, Any]) -> str:
+    taken = "-"
+    if volume["snapshot"] is not None:
+        taken = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(volume["snapshot"]))
+    return f"{taken}; {volume['fault']}" if volume["fault"] else taken
 
 
 def _or_dash(one: dict[str, Any], *keys: str) -> list[str]:

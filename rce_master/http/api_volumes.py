@@ -37,6 +37,14 @@ class VolumeOut(Model):
     """Tag of the container that has it; empty if none."""
     path: str
     """Where that container sees it."""
+    snapshots: int
+    """Seconds between two snapshots; 0: none are taken."""
+    snapshot: float | None
+    """When the newest snapshot was taken that the masters hold, in seconds since the epoch; null: none."""
+    kept: int
+    """Bytes of that snapshot."""
+    fault: str
+    """Why the last snapshot failed; empty if it did not."""
 
 
 class VolumesOut(Page):

@@ -1,4 +1,7 @@
-"""Archives of packages at a stand-by, for the leading master: ``/archives`` and ``/archives/SHA256``."""
+"""Archives of packages at a stand-by, for the leading master: ``/archives`` and ``/archives/SHA256``.
+
+Parts of snapshots are below ``/snapshots``.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ if TYPE_CHECKING:
     from rce_master.packages.contents import ContentStore
     from rce_master.packages.request_key import RequestKey
 
-_ONE = PATH + "/{sha256:[0-9a-f]{64}}"
+_ONE = "/{sha256:[0-9a-f]{64}}"
 
 
 class ArchiveRoutes:
@@ -27,19 +30,23 @@ class ArchiveRoutes:
         store: Where this master keeps archives.
         key: Tells whether a master asks.
         term: Returns the newest term that this master knows.
+        path: Where they are asked for.
     """
 
-    def __init__(self, store: ContentStore, key: RequestKey, term: Callable[[], int]) -> None:
+    def __init__(
+        self, store: ContentStore, key: RequestKey, term: Callable[[], int], path: str = PATH
+    ) -> None:
+        self._path = path
         self._store = store
         self._key = key
         self._term = term
 
     def add_to(self, app: web.Application) -> None:
         """Add the routes to an application."""
-        app.router.add_get(PATH, self._list)
-        app.router.add_get(_ONE, self._give)
-        app.router.add_put(_ONE, self._take)
-        app.router.add_delete(_ONE, self._remove)
+        app.router.add_get(self._path, self._list)
+        app.router.add_get(self._path + _ONE, self._give)
+        app.router.add_put(self._path + _ONE, self._take)
+        app.router.add_delete(self._path + _ONE, self._remove)
 
     async def _list(self, request: web.Request) -> web.Response:
         self._check(request)

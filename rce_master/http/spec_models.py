@@ -9,7 +9,8 @@ from __future__ import annotations
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from msgspec import Struct, to_builtins
+from msgspec import NODEFAULT, Struct, to_builtins
+from msgspec.structs import fields
 from pydantic import Field as Option
 from pydantic import create_model
 
@@ -116,9 +117,13 @@ def _item(kind: Any) -> Any:
     spec = next(iter(get_args(kind)), None)
     if not (isinstance(spec, type) and issubclass(spec, Struct)):
         return None
-    members = get_type_hints(spec).items()
+    members = get_type_hints(spec)
     types: dict[str, Any] = {
-        name: (Amount if len(get_args(hint)) > 1 else hint, ...) for name, hint in members
+        one.name: (
+            Amount if len(get_args(members[one.name])) > 1 else members[one.name],
+            ... if one.default is NODEFAULT else one.default,
+        )
+        for one in fields(spec)
     }
     return create_model(spec.__name__, __base__=Body, __doc__=spec.__doc__, **types)
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def make_standby_app(
     keeper: LeadershipKeeper,
     forwarder: Forwarder,
-    archives: ArchiveRoutes,
+    archives: Iterable[ArchiveRoutes],
     names: ServerNames | None = None,
     allowed_origins: Iterable[str] = (),
 ) -> web.Application:
@@ -33,7 +33,7 @@ def make_standby_app(
     Args:
         keeper: Knows who leads.
         forwarder: Sends requests on to that master; it is open.
-        archives: Of packages, for the leading master.
+        archives: Of packages and snapshots, for the leading master.
         names: The allowed host names of the server.
         allowed_origins: Origins of other sites whose pages may use the server.
     """
@@ -41,7 +41,8 @@ def make_standby_app(
     app = web.Application(middlewares=[origin_guard(frozenset(allowed_origins), names or ServerNames())])
     app.router.add_get("/healthz", standby.health)
     app.router.add_get("/metrics", standby.metrics)
-    archives.add_to(app)
+    for one in archives:
+        one.add_to(app)
     app.router.add_route("*", "/{rest:.*}", standby.forward)
     return app
 

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 from rce.control import EndpointUsage, InterfaceUsage, NodeStatus, Usage
 from rce_master.http import models, spec_models
 from rce_master.http.spec_models import shown
-from rce_master.state import capacity
+from rce_master.state import capacity, volume_moves
+from rce_master.state.lifecycle import ContainerPhase
 from rce_master.state.records import Container, Endpoint, Robot, TaskSet, User, UserVolume
-from rce_master.state.volumes import holder_of
+from rce_master.state.volumes import holder_of, volumes_of
 from rce_master.state.wiring_records import Connection, Interface, open_end_key
 
 if TYPE_CHECKING:
@@ -72,6 +73,10 @@ class Views:
             "limit": "" if task_set is None else task_set.machine.volumes,
             "container": "" if holder is None else holder.tag,
             "path": next((volume.path for volume in volumes if volume.name == known.name), ""),
+            "snapshots": known.snapshots,
+            "snapshot": known.taken or None,
+            "kept": known.kept,
+            "fault": known.fault,
         }
 
     def container(self, container: Container) -> spec_models.ContainerOut:
@@ -84,7 +89,7 @@ class Views:
             user=container.user,
             tag=container.tag,
             state=live.phase.value,
-            detail=(live.status.detail if live.status else "") or live.stays,
+            detail=self._moving(container) or (live.status.detail if live.status else "") or live.stays,
             task_set=container.task_set,
             machine=task_set.machine.name if task_set else "",
             revision=container.revision,
@@ -94,7 +99,7 @@ class Views:
             cpu_s=usage.cpu_s,
             memory=usage.memory,
             wish=spec_models.RequestedOut(**shown(container.resources)),
-            moving_to=move.to if (move := self._tables.moves.get(container.id)) else "",
+            moving_to=self._moves_to(container),
         )
 
     def node_states(self, container: Container) -> list[str]:
@@ -188,7 +193,22 @@ class Views:
             if isinstance(container, Container)
         ]
 
+    def _moves_to(self, container: Container) -> str:
+        move = self._tables.moves.get(container.id) or self._tables.volume_moves.get(container.id)
+        if move is not None:
+            return move.to
+        phase = self._tables.container_live(container.id).phase
+        starts = phase in (ContainerPhase.PLACED, ContainerPhase.STARTING)
+        former = any(known.former for known in volumes_of(self._tables, container))
+        return container.task_set if starts and former else ""
+
+    def _moving(self, container: Container) -> str:
+        move = self._tables.volume_moves.get(container.id)
+        return "" if move is None else volume_moves.describe(move)
+
     def _why_it_stays(self, container: Container) -> str:
+        if moving := self._moving(container):
+            return moving
         move = self._tables.moves.get(container.id)
         if move is not None:
             return f"is being handed over to {move.to}"

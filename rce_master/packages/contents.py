@@ -1,4 +1,7 @@
-"""Archives by their hash, in a folder: ``FOLDER/SHA256``, and ``FOLDER/incoming`` for running uploads."""
+"""Contents by their hash, in a folder: ``FOLDER/SHA256``, and ``FOLDER/incoming`` for running uploads.
+
+They are archives of packages, or parts of snapshots of volumes.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import os
 import re
 import shutil
 import tempfile
+import time
 from typing import TYPE_CHECKING
 
 from rce.packages import DEFAULT_LIMITS, ArchiveLimits, BadArchiveError
@@ -61,9 +65,13 @@ class ContentStore:
     Args:
         folder: Made with the first archive.
         limits: How large each may be.
+        noun: What they are part of, for errors.
     """
 
-    def __init__(self, folder: Path, limits: ArchiveLimits = DEFAULT_LIMITS) -> None:
+    def __init__(
+        self, folder: Path, limits: ArchiveLimits = DEFAULT_LIMITS, *, noun: str = "package"
+    ) -> None:
+        self._noun = noun
         self._folder = folder
         self._limits = limits
 
@@ -82,7 +90,7 @@ class ContentStore:
             finally:
                 path.unlink(missing_ok=True)
         except OSError as error:
-            raise StoreError(f"the master cannot keep the package: {error.strerror or error}") from error
+            raise StoreError(f"the master cannot keep the {self._noun}: {error.strerror or error}") from error
 
     async def keep(self, incoming: Incoming) -> None:
         """Keep an archive; when this returns, it survives a crash.
@@ -93,7 +101,7 @@ class ContentStore:
         try:
             await asyncio.to_thread(self._keep, incoming)
         except OSError as error:
-            raise StoreError(f"the master cannot keep the package: {error.strerror or error}") from error
+            raise StoreError(f"the master cannot keep the {self._noun}: {error.strerror or error}") from error
 
     async def read(self, sha256: str, offset: int, count: int) -> tuple[bytes, int] | None:
         """Read a piece of an archive.
@@ -116,12 +124,30 @@ class ContentStore:
         except FileNotFoundError:
             return set()
 
-    def sweep(self, known: Collection[str]) -> None:
-        """Remove all archives except those with known hashes. Blocks."""
+    def sweep(self, known: Collection[str], spared: float = 0.0) -> None:
+        """Remove all archives except those with known hashes. Blocks.
+
+        Args:
+            known: The hashes.
+            spared: Keep also those that were written, or touched, within so many seconds.
+        """
+        newest = time.time() - spared
         with contextlib.suppress(FileNotFoundError):
             for path in self._folder.iterdir():
-                if _HASH.fullmatch(path.name) and path.name not in known:
+                if not _HASH.fullmatch(path.name) or path.name in known:
+                    continue
+                if not spared or path.stat().st_mtime <= newest:
                     path.unlink(missing_ok=True)
+
+    def touch(self, sha256: str) -> bool:
+        """Return whether an archive exists, which :meth:`sweep` spares for a while then. Blocks."""
+        if _HASH.fullmatch(sha256) is None:
+            return False
+        try:
+            os.utime(self._folder / sha256)
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        return True
 
     def forget_incoming(self) -> None:
         """Remove unfinished uploads of an earlier master. Blocks."""

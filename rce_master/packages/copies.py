@@ -1,5 +1,7 @@
 """Copies of packages' archives at the other masters: a package is accepted once a majority holds it.
 
+Parts of snapshots of volumes are copied in the same way.
+
 Only the leading master acts. It sends archives to the stand-bys, fetches those that it lacks from them, and
 lets them remove those that no package has.
 """
@@ -17,7 +19,7 @@ from rce_master.exceptions import FencedError, StoreError
 from rce_master.packages.transfer import TransferError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Collection
 
     from rce_master.leadership.registry import MasterRegistry
     from rce_master.packages.contents import ContentStore
@@ -39,9 +41,13 @@ class ArchiveCopies:
         store: Where this master keeps archives.
         registry: Knows the other masters.
         client: Asks them.
+        noun: What archives are part of, for errors.
     """
 
-    def __init__(self, store: ContentStore, registry: MasterRegistry, client: ArchiveClient) -> None:
+    def __init__(
+        self, store: ContentStore, registry: MasterRegistry, client: ArchiveClient, *, noun: str = "package"
+    ) -> None:
+        self._noun = noun
         self._store = store
         self._registry = registry
         self._client = client
@@ -61,11 +67,14 @@ class ArchiveCopies:
         """Compare with the other masters soon."""
         self._wanted.set()
 
-    async def run(self, needed: Callable[[], set[str]]) -> None:
+    async def run(
+        self, needed: Callable[[], set[str]], is_complete: Callable[[], bool] = lambda: True
+    ) -> None:
         """Compare with the other masters now and then, until cancelled.
 
         Args:
             needed: Returns the hashes of all packages' archives.
+            is_complete: Tells whether that is all; else nothing is removed.
 
         Raises:
             FencedError: This master leads no more.
@@ -73,7 +82,7 @@ class ArchiveCopies:
         try:
             while True:
                 self._wanted.clear()
-                await self._compare(needed)
+                await self._compare(needed, is_complete)
                 try:
                     async with asyncio.timeout(LOOK_S):
                         await self._wanted.wait()
@@ -85,25 +94,31 @@ class ArchiveCopies:
     # Pushing
 
     @asynccontextmanager
-    async def spread(self, sha256: str) -> AsyncIterator[None]:
-        """Copy an archive of this master to others; while the block runs, none of them removes it.
+    async def spread(self, *archives: str) -> AsyncIterator[None]:
+        """Copy archives of this master to others; while the block runs, none of them removes any.
+
+        Args:
+            archives: Their hashes.
 
         Raises:
             StoreError: Too few masters have it; it has to be pushed again.
         """
         async with self._removal:
-            self._pushed.append(sha256)
+            self._pushed += archives
         try:
-            await self._send_to_majority(sha256)
+            await self._send_to_majority(archives)
             yield
         finally:
-            self._pushed.remove(sha256)
+            for sha256 in archives:
+                self._pushed.remove(sha256)
             self.look()
 
-    async def _send_to_majority(self, sha256: str) -> None:
+    async def _send_to_majority(self, archives: Collection[str]) -> None:
         others = await self._registry.others()
         missing = (len(others) + 1) // 2  # beside this master
-        sent = {self._tasks.spawn(self._send(other, sha256), name=f"send {sha256}") for other in others}
+        sent = {
+            self._tasks.spawn(self._send(other, archives), name=f"send to {other.name}") for other in others
+        }
         reasons = []
         while missing > 0 and sent:
             done, sent = await asyncio.wait(sent, return_when=asyncio.FIRST_COMPLETED)
@@ -114,20 +129,23 @@ class ArchiveCopies:
                     missing -= 1
         if missing > 0:
             raise StoreError(
-                f"a package must be on more than half of the {len(others) + 1} masters, and {missing} more"
-                f" must take it: {'; '.join(reasons)}; push it again later"
+                f"a {self._noun} must be on more than half of the {len(others) + 1} masters, and {missing}"
+                f" more must take it: {'; '.join(reasons)}; push it again later"
             )
 
-    async def _send(self, other: OtherMaster, sha256: str) -> str:
-        """Send an archive to a master that may have it; return why it does not."""
-        self._sending.add((other.name, sha256))
+    async def _send(self, other: OtherMaster, archives: Collection[str]) -> str:
+        """Send archives to a master that may have them; return why it does not."""
+        sending = {(other.name, sha256) for sha256 in archives}
+        self._sending |= sending
         try:
-            if sha256 not in await self._client.held(other):
-                await self._client.send(other, sha256, self._store)
+            held = await self._client.held(other)
+            for sha256 in archives:
+                if sha256 not in held:
+                    await self._client.send(other, sha256, self._store)
         except (TransferError, FencedError) as error:
             return str(error)
         finally:
-            self._sending.discard((other.name, sha256))
+            self._sending -= sending
         return ""
 
     # Fetching
@@ -174,13 +192,14 @@ class ArchiveCopies:
 
     # Comparing
 
-    async def _compare(self, needed: Callable[[], set[str]]) -> None:
+    async def _compare(self, needed: Callable[[], set[str]], is_complete: Callable[[], bool]) -> None:
         try:
             others = await self._registry.others()
             own = await asyncio.to_thread(self._store.held)
-            for sha256 in needed() - own:
-                await self._fetch(sha256)
-                own.add(sha256)
+            while missing := needed() - own:  # what is fetched may name more
+                for sha256 in missing:
+                    await self._fetch(sha256)
+                    own.add(sha256)
         except FencedError:
             raise
         except (StoreError, TransferError) as error:
@@ -190,13 +209,19 @@ class ArchiveCopies:
             self._note("this master", "")
         for other in others:
             try:
-                await self._complete(other, needed, own)
+                await self._complete(other, needed, own, is_complete)
             except TransferError as error:
                 self._note(other.name, f"its packages are not compared: {error}")
             else:
                 self._note(other.name, "")
 
-    async def _complete(self, other: OtherMaster, needed: Callable[[], set[str]], own: set[str]) -> None:
+    async def _complete(
+        self,
+        other: OtherMaster,
+        needed: Callable[[], set[str]],
+        own: set[str],
+        is_complete: Callable[[], bool],
+    ) -> None:
         """Send another master what it lacks, and let it remove what no package has."""
         held = await self._client.held(other)
         for sha256 in (needed() & own) - held:
@@ -204,7 +229,7 @@ class ArchiveCopies:
                 await self._client.send(other, sha256, self._store)
         for sha256 in held:
             async with self._removal:
-                if sha256 not in needed() and sha256 not in self._pushed:
+                if sha256 not in needed() and sha256 not in self._pushed and is_complete():
                     await self._client.remove(other, sha256)
 
     def _note(self, name: str, fault: str) -> None:

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from rce_master.store.etcd.layout import OtherMaster
 
 PATH = "/archives"
+SNAPSHOTS_PATH = "/snapshots"
+"""The same for parts of snapshots of volumes."""
 CONNECT_S = 2.0
 ANSWER_S = 15.0
 """How long a stand-by may take for an answer, beside the transfer."""
@@ -46,11 +48,18 @@ class ArchiveClient:
         key: Proves that this is a master.
         fence: Of the leadership; nothing is sent after its end.
         tls: Gives the TLS context of each connection to a master that uses TLS.
+        path: Where they have them.
     """
 
     def __init__(
-        self, session: aiohttp.ClientSession, key: RequestKey, fence: Fence, tls: Context | None = None
+        self,
+        session: aiohttp.ClientSession,
+        key: RequestKey,
+        fence: Fence,
+        tls: Context | None = None,
+        path: str = PATH,
     ) -> None:
+        self._path = path
         self._session = session
         self._key = key
         self._fence = fence
@@ -63,7 +72,7 @@ class ArchiveClient:
             TransferError: It does not say.
             FencedError: This master leads no more.
         """
-        async with self._ask(master, hdrs.METH_GET, PATH) as reply:
+        async with self._ask(master, hdrs.METH_GET, self._path) as reply:
             return set((await reply.text()).split())
 
     async def send(self, master: OtherMaster, sha256: str, store: ContentStore) -> None:
@@ -80,7 +89,7 @@ class ArchiveClient:
         except OSError as error:
             raise TransferError(f"this master cannot read the archive: {error.strerror}") from error
         with file:
-            async with self._ask(master, hdrs.METH_PUT, f"{PATH}/{sha256}", size, data=file):
+            async with self._ask(master, hdrs.METH_PUT, f"{self._path}/{sha256}", size, data=file):
                 pass
 
     async def fetch(self, master: OtherMaster, sha256: str, store: ContentStore) -> None:
@@ -92,7 +101,7 @@ class ArchiveClient:
             FencedError: This master leads no more.
         """
         async with (
-            self._ask(master, hdrs.METH_GET, f"{PATH}/{sha256}", DEFAULT_LIMITS.archive) as reply,
+            self._ask(master, hdrs.METH_GET, f"{self._path}/{sha256}", DEFAULT_LIMITS.archive) as reply,
             store.receive(reply.content.iter_any()) as incoming,
         ):
             if incoming.sha256 != sha256:
@@ -106,7 +115,7 @@ class ArchiveClient:
             TransferError: It did not.
             FencedError: This master leads no more.
         """
-        async with self._ask(master, hdrs.METH_DELETE, f"{PATH}/{sha256}"):
+        async with self._ask(master, hdrs.METH_DELETE, f"{self._path}/{sha256}"):
             pass
 
     @asynccontextmanager

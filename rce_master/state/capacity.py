@@ -55,17 +55,22 @@ def tied_to(tables: Tables, container: Container) -> Collection[str] | None:
     return mates or None
 
 
-def admission(tables: Tables, container: Container) -> Callable[[str], bool]:
+def admission(tables: Tables, container: Container, *, moves: bool = False) -> Callable[[str], bool]:
     """Return what tells of a process whether its machine may have a container, whatever its room is.
 
     It may not where the container, or one of the same name before it, or its volume, is still ending.
+
+    Args:
+        tables: The tables.
+        container: The container.
+        moves: Whether its volumes may be moved there.
     """
     has_volumes = bool(container.resources.volumes)
 
     def admits(process: str) -> bool:
         if tombstone_key(process, container.id) in tables.tombstones:
             return False
-        return not has_volumes or volumes.admits(tables, container, process)
+        return not has_volumes or volumes.admits(tables, container, process, moves=moves)
 
     return admits
 

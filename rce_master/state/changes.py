@@ -26,6 +26,7 @@ from rce_master.state.records import (
     UserLimits,
     UserPackage,
     UserVolume,
+    VolumeMove,
     VolumeRemoval,
 )
 from rce_master.state.wiring_records import ActiveInterface, Connection, Interface, Link, OpenEnd
@@ -115,6 +116,8 @@ class Changes:
     events: list[StateEvent] = field(default_factory=list)
     volume_removals: list[VolumeRemoval] = field(default_factory=list)
     """Volumes that task sets are to remove."""
+    volume_moves: list[str] = field(default_factory=list)
+    """Containers whose moves have reached another phase: task sets are told to save or to restore volumes."""
     arrived: str = ""
     """Process name of the task set that is to be synchronised."""
     answered: str = ""
@@ -182,6 +185,7 @@ class Transaction:
         | UserPackage
         | UserVolume
         | VolumeRemoval
+        | VolumeMove
         | Endpoint
         | Interface
         | Link
@@ -312,6 +316,7 @@ _TABLES: dict[type, str] = {
     UserPackage: "packages",
     UserVolume: "volumes",
     VolumeRemoval: "volume_removals",
+    VolumeMove: "volume_moves",
     Robot: "endpoints",
     Container: "endpoints",
     Interface: "interfaces",

@@ -166,6 +166,43 @@ class VolumeRemoved:
     """``user/name``."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SnapshotTaken:
+    """A task set took a snapshot of a volume; the sender of this command has seen that masters hold it."""
+
+    process: str
+    volume: str
+    """``user/name``."""
+    placement: int
+    is_last: bool
+    """Whether its container has ended."""
+    snapshot: str = ""
+    """SHA-256 of the manifest, in hex; empty if there is an error."""
+    size: int = 0
+    """Bytes."""
+    taken: float = 0.0
+    """Seconds since 1970."""
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SnapshotLost:
+    """The masters do not hold a snapshot of a volume that the state names, as after a backup was restored."""
+
+    volume: str
+    snapshot: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VolumeRestored:
+    """A task set has made the files of a volume's snapshot, or could not."""
+
+    process: str
+    volume: str
+    placement: int
+    error: str = ""
+
+
 # Task sets
 
 
@@ -413,6 +450,9 @@ Command: TypeAlias = (
     | RemovePackage
     | RemoveVolume
     | VolumeRemoved
+    | SnapshotTaken
+    | SnapshotLost
+    | VolumeRestored
     | TaskSetArrived
     | TaskSetLeft
     | StatusReported

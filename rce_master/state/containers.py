@@ -10,7 +10,17 @@ from msgspec.structs import replace
 from rce.control import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
 from rce.model import NodeSpec, ParameterValue, find_circle
 from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
-from rce_master.state import activity, capacity, draining, endpoints, limits, packages, placing, volumes
+from rce_master.state import (
+    activity,
+    capacity,
+    draining,
+    endpoints,
+    limits,
+    packages,
+    placing,
+    volume_moves,
+    volumes,
+)
 from rce_master.state.lifecycle import ContainerEvent, ContainerPhase
 from rce_master.state.records import Container, ContainerLive
 
@@ -36,6 +46,8 @@ _EVENTS = {
     EndpointState.FAILED: ContainerEvent.FAILED,
 }
 
+
+_UP = (EndpointState.RUNNING, EndpointState.DEGRADED)
 
 # Requests of users
 
@@ -179,6 +191,7 @@ def lose(tx: Transaction, container: Container) -> None:
     """Give up a container at a task set that stayed away."""
     if draining.promote(tx, container):
         return
+    volume_moves.lost(tx, container)
     text = f"container {container.tag!r} was lost with its machine {container.task_set!r}"
     _unbind(tx, container, ContainerEvent.LOSE)
     tx.notify(container.user, text)
@@ -189,12 +202,15 @@ def ended(tx: Transaction, container: Container) -> None:
     """Note that a container's task set ended it although it is desired; it is placed again."""
     if draining.promote(tx, container):
         return
+    if (move := tx.tables.volume_moves.get(container.id)) is not None:
+        volume_moves.stopped(tx, container, move)
+        return
     _unbind(tx, container, ContainerEvent.WITHDRAW)
     tx.happen("container_gone", container.id, "its task set ended it; it is placed again")
 
 
 def _unbind(tx: Transaction, container: Container, event: ContainerEvent) -> None:
-    _move(tx, container, LinkAddress())
+    endpoints.note_address(tx, container.id, LinkAddress())
     tx.put(replace(tx.tables.endpoints[container.id], task_set=""))
     placing.happened(tx, container.id, event)
     _forget_status(tx, container)
@@ -202,11 +218,14 @@ def _unbind(tx: Transaction, container: Container, event: ContainerEvent) -> Non
 
 def missing(tx: Transaction, container: Container) -> None:
     """Note that a task set came back without a container that is placed there; it makes it again."""
+    if (move := tx.tables.volume_moves.get(container.id)) is not None:
+        volume_moves.stopped(tx, container, move)
+        return
     live = tx.tables.container_live(container.id)
     if live.phase is not ContainerPhase.PLACED:
         placing.happened(tx, container.id, ContainerEvent.PLACE)
     _forget_status(tx, container)
-    _move(tx, container, LinkAddress())
+    endpoints.note_address(tx, container.id, LinkAddress())
 
 
 def _forget_status(tx: Transaction, container: Container) -> None:
@@ -225,7 +244,9 @@ def reported(tx: Transaction, container: Container, status: EndpointStatus) -> N
         tx.happen("container_restarted", container.id, status.detail)
     _compare_nodes(tx, container.id, before.status, status)
     tx.put(replace(tx.tables.container_live(container.id), status=status))
-    _move(tx, container, status.address)
+    endpoints.note_address(tx, container.id, status.address)
+    failed = status.detail or "no reason was given" if status.state is EndpointState.FAILED else ""
+    volume_moves.reported(tx, container, is_up=status.state in _UP, failed=failed)
 
 
 def _compare_nodes(tx: Transaction, id_: str, before: EndpointStatus | None, now: EndpointStatus) -> None:
@@ -248,11 +269,3 @@ def _node_text(node: NodeStatus) -> str:
         how = f"signal {-node.exit_code}" if node.exit_code < 0 else f"exit code {node.exit_code}"
         return f"ended by {how}"
     return node.detail
-
-
-def _move(tx: Transaction, container: Container, address: LinkAddress) -> None:
-    current = tx.tables.endpoints[container.id]
-    assert isinstance(current, Container)
-    if current.address != address:
-        tx.put(replace(current, address=address))
-        endpoints.touch_dialers(tx, container.id)

@@ -22,6 +22,7 @@ from rce_master.state import (
     task_sets,
     tokens,
     users,
+    volume_moves,
     volumes,
     wiring,
 )
@@ -35,7 +36,7 @@ from rce_master.state.tables import Tables
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rce.control import EndpointSpec, SpecPatch
+    from rce.control import EndpointSpec, SpecPatch, ToTaskSet
     from rce_master.store.base import Snapshot
 
 _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
@@ -55,6 +56,8 @@ _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
     commands.AddPackage: packages.add_package,
     commands.RemovePackage: packages.remove_package,
     commands.RemoveVolume: volumes.remove,
+    commands.SnapshotTaken: volume_moves.snapshot_taken,
+    commands.SnapshotLost: volumes.forget_snapshot,
     commands.TaskSetArrived: task_sets.arrived,
     commands.TaskSetLeft: task_sets.left,
     commands.StatusReported: task_sets.status_reported,
@@ -91,6 +94,12 @@ def _remove_and_place(tx: Transaction, command: commands.VolumeRemoved) -> None:
     placing.place_waiting(tx)
 
 
+def _restored_and_advance(tx: Transaction, command: commands.VolumeRestored) -> None:
+    volume_moves.restored(tx, command)
+    draining.advance(tx)
+
+
+_HANDLERS[commands.VolumeRestored] = _restored_and_advance
 _HANDLERS[commands.CreateContainer] = _create_and_place
 _HANDLERS[commands.VolumeRemoved] = _remove_and_place
 
@@ -197,6 +206,15 @@ class State:
         if move is None:
             return None
         return move.to, build_spec(self.tables, endpoint, with_wiring=False)
+
+    def is_held(self, endpoint: str) -> bool:
+        """Return whether an endpoint is a container that is to run nowhere, since it moves with volumes."""
+        return endpoint in self.tables.volume_moves
+
+    def orders(self, process: str) -> list[ToTaskSet]:
+        """Return what a task set has to do for containers that move with their volumes."""
+        found = (volume_moves.orders(self.tables, move) for move in self.tables.volume_moves)
+        return [message for one in found for to, message in one if to == process]
 
     def patch(self, endpoint: str, touched: Touched) -> SpecPatch:
         """Return the desired state of the changed parts of an endpoint.

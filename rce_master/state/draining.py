@@ -8,12 +8,13 @@ An operator may have a single container handed over, too.
 A container is *handed over* by a move: a copy of it, with its nodes and parameters but without interfaces and
 connections, is made at another machine while the container continues; once the copy's nodes are up, the copy
 becomes the container, gets the interfaces and connections, and the former one is dropped. A node that is not
-up in the container need not be up in the copy: a node without ROS never registers. One container at a time
+up in the container need not be up in the copy: a node without ROS never registers. A container with volumes
+is ended first, and moves with its files (:mod:`rce_master.state.volume_moves`). One container at a time
 moves away from a machine; those in the network of one group move together. A container without room elsewhere
 stays where it is, and is tried again at every tick.
 
-A drain outlives a restart of the master. A move does not: the copy is dropped, and the move starts again if
-the machine is draining.
+A drain outlives a restart of the master, and so does a move with volumes. Another move does not: the copy is
+dropped, and the move starts again if the machine is draining.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from msgspec.structs import replace
 
 from rce.control import EndpointState, EndpointStatus, NodeState, TaskSetKind, without_wiring
 from rce_master.exceptions import ConflictError, NoRoomError, NotFoundError
-from rce_master.state import activity, capacity, endpoints, placing, robots, volumes
+from rce_master.state import activity, capacity, endpoints, placing, robots, volume_moves
 from rce_master.state.lifecycle import ContainerEvent
 from rce_master.state.placement import Room, best_of, refusals
 from rce_master.state.records import Container, Drain, Move
@@ -79,14 +80,20 @@ def move_container(tx: Transaction, command: MoveContainer) -> None:
         raise ConflictError(f"container {command.tag!r} waits for a machine; rce ps shows why")
     if container.task_set in processes:
         raise ConflictError(f"container {command.tag!r} is at {command.machine} already")
-    if (move := next((tables.moves[each.id] for each in unit if each.id in tables.moves), None)) is not None:
-        raise ConflictError(f"container {command.tag!r} moves to {move.to} already")
+    if (to := next((to for each in unit if (to := _moves_to(tables, each))), "")) != "":
+        raise ConflictError(f"container {command.tag!r} moves to {to} already")
     search = _Search(tx)
     target = search.target(unit, processes)
     if not target:
         raise NoRoomError(f"container {command.tag!r} stays: {search.obstacle(unit, processes)}")
     for each in unit:
         _begin(tx, each, target)
+
+
+def _moves_to(tables: Tables, container: Container) -> str:
+    """Return where a container is being moved to; empty if it is not."""
+    move = tables.moves.get(container.id) or tables.volume_moves.get(container.id)
+    return "" if move is None else move.to
 
 
 def _processes(tables: Tables, name: str) -> list[str]:
@@ -131,6 +138,7 @@ def continue_round(tx: Transaction) -> None:
                 return
             tx.spend(_MOVE)
             give_up(tx, move, f"did not come up there within {tx.settings.move_timeout:.0f} s")
+    volume_moves.expire(tx)
     waiting, draining = tx.tables.drain_round, set(tx.tables.rooms.draining)
     search = _Search(tx)
     while waiting and not tx.is_out_of_work():
@@ -142,7 +150,7 @@ def continue_round(tx: Transaction) -> None:
 def _advance(tx: Transaction, process: str, search: _Search) -> bool:
     """Begin the next move from a machine; return whether it is done with, for now."""
     here = [e for e in tx.tables.endpoints.by("task_set", process) if isinstance(e, Container)]
-    if any(container.id in tx.tables.moves for container in here):
+    if any(_moves_to(tx.tables, container) for container in here):
         return True
     reached = tx.tables.drain_round[process]
     for container in sorted((one for one in here if one.number > reached), key=lambda c: c.number):
@@ -187,10 +195,12 @@ class _Search:
             return ""
 
         def admits(process: str) -> bool:
-            return all(capacity.admission(tables, each)(process) for each in unit) and _takes_all(
+            return all(capacity.admission(tables, each, moves=True)(process) for each in unit) and _takes_all(
                 tables.rooms.get(process), unit
             )
 
+        if any(each.resources.volumes and volume_moves.why_not(tables, each) for each in unit):
+            return ""
         company = capacity.company(tables, first)
         near = company if among is None else company.keys() & set(among)
         found = tables.rooms.candidates(requested, admits, among=among, near=near)
@@ -204,9 +214,9 @@ class _Search:
     def obstacle(self, unit: list[Container], among: Collection[str] | None = None) -> str:
         """Report why containers cannot be handed over; the arguments are those of :meth:`target`."""
         tables, first = self._tx.tables, unit[0]
-        bound = next((each for each in unit if volumes.tied_to(tables, each)), None)
-        if bound is not None:
-            return f"the volumes of container {bound.tag!r} are on this machine and stay there"
+        with_volumes = [each for each in unit if each.resources.volumes]
+        if why := next((why for each in with_volumes if (why := volume_moves.why_not(tables, each))), ""):
+            return why
         mates = len(unit) - 1
         whole = f"it moves with {mates} others of its group; " if mates else ""
         key = (first.task_set, first.resources)
@@ -220,6 +230,8 @@ class _Search:
             none = "there is no other machine" if among is None else "that machine is away"
             self._texts[key] = refusals(rooms, first.resources) if rooms else none
         ending = "it is about to move" if among is None else "a container of its name is still ending there"
+        if with_volumes:
+            ending = "its former files are still being removed there, or that machine runs an earlier release"
         said = "no machine has room for all of them" if mates else ending
         return whole + (self._texts[key] or said)
 
@@ -243,6 +255,9 @@ def _unit(tables: Tables, container: Container) -> list[Container]:
 
 
 def _begin(tx: Transaction, container: Container, to: str) -> None:
+    if container.resources.volumes:
+        volume_moves.begin(tx, container, to)
+        return
     tx.put(Move(id=container.id, to=to, since=tx.now))
     tx.put(replace(tx.tables.container_live(container.id), stays=""))
     tx.touch(container.id)
@@ -348,6 +363,7 @@ def left(tx: Transaction, process: str) -> None:
     """End the moves to a task set that disconnected; it drops its copies when it comes back."""
     for move in list(tx.tables.moves.by("to", process)):
         give_up(tx, move, "went away")
+    volume_moves.left(tx, process)
 
 
 def _call_back(tx: Transaction, process: str) -> None:
@@ -355,4 +371,5 @@ def _call_back(tx: Transaction, process: str) -> None:
     for container in tx.tables.endpoints.by("task_set", process):
         endpoints.drop_copy(tx, container.id, "its machine is not drained any more")
         if isinstance(container, Container):
+            volume_moves.call_back(tx, container)
             tx.put(replace(tx.tables.container_live(container.id), stays=""))

@@ -49,6 +49,8 @@ def remove(tx: Transaction, id_: str, reason: str) -> None:
     """Remove an endpoint with its links and have its task set drop it."""
     endpoint = tx.tables.endpoints[id_]
     drop_copy(tx, id_, reason)
+    if isinstance(endpoint, Container):
+        volumes.end_move(tx, endpoint)
     for connection in tx.tables.connections.by("endpoint", id_):
         remove_connection(tx, connection)
     for interface in tx.tables.interfaces.by("endpoint", id_):
@@ -112,6 +114,15 @@ def address(tables: Tables, id_: str) -> LinkAddress:
         task_set = tables.task_sets.get(endpoint.task_set)
         return task_set.address if task_set else LinkAddress()
     return endpoint.address
+
+
+def note_address(tx: Transaction, id_: str, address: LinkAddress) -> None:
+    """Note where a container accepts links."""
+    container = tx.tables.endpoints[id_]
+    assert isinstance(container, Container)
+    if container.address != address:
+        tx.put(msgspec.structs.replace(container, address=address))
+        touch_dialers(tx, id_)
 
 
 def touch_dialers(tx: Transaction, id_: str) -> None:

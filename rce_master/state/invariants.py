@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from rce.control import TaskSetKind
 from rce.model import EndpointId, Form, InterfaceType, Resources, Role
 from rce_master.state import capacity, endpoints
-from rce_master.state.lifecycle import RobotSession
+from rce_master.state.lifecycle import RobotSession, VolumeMovePhase
 from rce_master.state.placement import Room
 from rce_master.state.promises import Promises
 from rce_master.state.records import Container, ContainerLive, Endpoint, Robot, RobotLive
@@ -34,6 +34,7 @@ def validate(tables: Tables) -> None:
     _check_connections(tables)
     _check_observed(tables)
     _check_moves(tables)
+    _check_volumes(tables)
     for record in (*tables.packages, *tables.package_keys, *tables.known_logins, *tables.user_limits):
         assert record.user in tables.users, f"{record}: its user is unknown"
 
@@ -58,9 +59,9 @@ def _check_rooms(tables: Tables) -> None:
         if container.task_set:
             promised.add(container.task_set, container.resources)
             of_users.setdefault(container.user, Counter())[container.task_set] += 1
-    for move in tables.moves:
+    for move in (*tables.moves, *tables.volume_moves):
         coming = tables.container(move.id)
-        if coming is not None:
+        if coming is not None and move.to:
             promised.add(move.to, coming.resources)
     assert tables.rooms.promises.sums == promised.sums, "promises of machines are out of date"
     assert tables.requested.sums == requested.sums, "what users ask for is out of date"
@@ -209,6 +210,23 @@ def _check_moves(tables: Tables) -> None:
         assert tables.is_connected(move.to), f"{move.id}: moves to {move.to}, which is away"
         assert tables.task_sets[move.to].kind is TaskSetKind.CONTAINER, f"{move.id}: moves to robots"
         assert f"{move.to} {move.id}" not in tables.tombstones, f"{move.id}: moves to where it still ends"
+
+
+def _check_volumes(tables: Tables) -> None:
+    for known in tables.volumes:
+        assert known.process not in known.former, f"{known.id}: its newest folder would be removed"
+        assert bool(known.placement) == bool(known.process), f"{known.id}: placement {known.placement}"
+    for move in tables.volume_moves:
+        container = tables.container(move.id)
+        assert container is not None, f"{move.id}: moves and is not a container"
+        assert container.resources.volumes, f"{move.id}: moves with volumes and has none"
+        assert move.id not in tables.moves, f"{move.id}: moves in two ways"
+        is_early = move.phase in (VolumeMovePhase.STOPPING, VolumeMovePhase.SAVING)
+        assert container.task_set or not is_early, f"{move.id}: {move.phase} and placed nowhere"
+        assert bool(move.to) != (move.phase is VolumeMovePhase.RESTING), (
+            f"{move.id}: {move.phase} to {move.to!r}"
+        )
+        assert not move.to or move.to != container.task_set, f"{move.id}: moves to where it is"
 
 
 def _counter(tables: Tables, name: str) -> int:

@@ -1,4 +1,4 @@
-"""The life cycles of a robot's session and of a container, each a transition table."""
+"""The life cycles of a robot's session, a container, and a move with volumes, each a transition table."""
 
 from __future__ import annotations
 
@@ -80,6 +80,42 @@ class ContainerEvent(Enum):
     """Its task set was away for longer than the grace time."""
 
 
+class VolumeMovePhase(Enum):
+    """The states of a container that moves with its volumes."""
+
+    STOPPING = "stopping"
+    """Its machine ends it, so that its files are closed."""
+    SAVING = "saving"
+    """Its machine sends its volumes to the master. Or it was lost, and their last snapshots are used."""
+    RESTORING = "restoring"
+    """The next machine makes the files of the snapshots."""
+    RESTING = "resting"
+    """A container without a machine could not be restored on one; one is searched for after a pause."""
+    DONE = "done"
+    """There is no move: the container belongs to its machine, the next one or the former one."""
+
+
+class VolumeMoveEvent(Enum):
+    """What can happen to such a move."""
+
+    BEGIN = "begin"
+    """An operator moves the container, or empties its machine."""
+    RESTORE = "restore"
+    """Its machine is lost, and another one can have it."""
+    STOPPED = "stopped"
+    """The container has ended."""
+    SAVED = "saved"
+    """The masters hold a snapshot of each of its volumes."""
+    RESTORED = "restored"
+    """The next machine holds the files of all volumes."""
+    GIVE_UP = "give up"
+    """It failed, or is not wanted any more; the container stays at its machine."""
+    FAIL = "fail"
+    """It failed, and the container has no machine to stay at."""
+    RETRY = "retry"
+    """The pause is over."""
+
+
 ROBOT_LIFE: LifeCycle[RobotSession, RobotEvent] = LifeCycle(
     "robot",
     {
@@ -120,6 +156,34 @@ CONTAINER_LIFE: LifeCycle[ContainerPhase, ContainerEvent] = LifeCycle(
         ContainerPhase.STOPPING: _REPORTED,
         ContainerPhase.STOPPED: {ContainerEvent.PLACE: ContainerPhase.PLACED},
         ContainerPhase.LOST: {ContainerEvent.PLACE: ContainerPhase.PLACED},
+    },
+    error=TransitionError,
+)
+
+VOLUME_MOVE_LIFE: LifeCycle[VolumeMovePhase, VolumeMoveEvent] = LifeCycle(
+    "move with volumes",
+    {
+        VolumeMovePhase.DONE: {
+            VolumeMoveEvent.BEGIN: VolumeMovePhase.STOPPING,
+            VolumeMoveEvent.RESTORE: VolumeMovePhase.RESTORING,
+        },
+        VolumeMovePhase.STOPPING: {
+            VolumeMoveEvent.STOPPED: VolumeMovePhase.SAVING,
+            VolumeMoveEvent.GIVE_UP: VolumeMovePhase.DONE,
+        },
+        VolumeMovePhase.SAVING: {
+            VolumeMoveEvent.SAVED: VolumeMovePhase.RESTORING,
+            VolumeMoveEvent.GIVE_UP: VolumeMovePhase.DONE,
+        },
+        VolumeMovePhase.RESTORING: {
+            VolumeMoveEvent.RESTORED: VolumeMovePhase.DONE,
+            VolumeMoveEvent.GIVE_UP: VolumeMovePhase.DONE,
+            VolumeMoveEvent.FAIL: VolumeMovePhase.RESTING,
+        },
+        VolumeMovePhase.RESTING: {
+            VolumeMoveEvent.RETRY: VolumeMovePhase.DONE,
+            VolumeMoveEvent.GIVE_UP: VolumeMovePhase.DONE,
+        },
     },
     error=TransitionError,
 )

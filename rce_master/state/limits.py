@@ -74,8 +74,13 @@ def used_of(tables: Tables, user: str) -> dict[str, float]:
         **{kind: _asked(requested, kind) for kind in _OF_MACHINES},
         "packages": len(packages),
         "disk": sum(package.size for package in packages)
-        + sum(volume.size for volume in tables.volumes.by("user", user)),
+        + sum(disk_of(volume.size, volume.snapshots) for volume in tables.volumes.by("user", user)),
     }
+
+
+def disk_of(size: int, snapshots: int) -> int:
+    """Return how many bytes of disk a volume counts as: one with snapshots is at the masters, too."""
+    return 2 * size if snapshots else size
 
 
 def check_containers(tx: Transaction, user: str) -> None:

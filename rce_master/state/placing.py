@@ -93,6 +93,9 @@ def place_waiting(tx: Transaction) -> None:
         if room is None:
             continue
         told = tx.tables.container_live(container.id).told
+        if volumes.come_from_elsewhere(tx.tables, container, room.process):
+            volumes.begin_restore(tx, container, room.process)
+            continue
         bind(tx, container, room.process)
         tx.spend(_PLACING)
         if told:
@@ -178,8 +181,7 @@ def _why_nowhere(tx: Transaction, container: Container, texts: dict[Resources, s
     place, tied = volumes.tied_to(tables, container), capacity.tied_to(tables, container)
     connected = rooms.connected
     if place and all(room.process != place for room in connected):
-        names = ", ".join(volume.name for volume in requested.volumes)
-        return f"the machine with its volumes ({names}) is away: {place}"
+        return volumes.why_away(tables, container)
     if tied is None and requested in texts:
         return texts[requested]
     tx.spend(2 * len(connected))

@@ -21,6 +21,7 @@ from rce_master.state.lifecycle import (
     ContainerPhase,
     RobotEvent,
     RobotSession,
+    VolumeMovePhase,
 )
 
 
@@ -185,6 +186,23 @@ class UserVolume(Struct, frozen=True, kw_only=True):
     """Bytes that it may hold."""
     process: str = ""
     """Of the container task set on whose machine it is; empty until its first container is placed."""
+    placement: int = 0
+    """Grows each time that it gets another machine: of the folders on several machines, the one of the newest
+    placement counts."""
+    is_restored: bool = False
+    """Whether this placement began with the files of a snapshot."""
+    former: tuple[str, ...] = ()
+    """Task sets with folders of earlier placements, which are kept until its container is up at this one."""
+    snapshots: int = 0
+    """Seconds between two snapshots, as its newest container asked for; 0: none."""
+    snapshot: str = ""
+    """SHA-256 of the manifest of the newest snapshot, which the masters hold; empty: there is none."""
+    kept: int = 0
+    """Bytes of that snapshot."""
+    taken: float = 0.0
+    """When it was taken; seconds since 1970."""
+    fault: str = ""
+    """Why there was no snapshot when one was due; empty: there was."""
 
     @property
     def id(self) -> str:
@@ -195,6 +213,20 @@ class UserVolume(Struct, frozen=True, kw_only=True):
 def user_volume_key(user: str, name: str) -> str:
     """Tell the key of a volume."""
     return f"{user}/{name}"
+
+
+class VolumeMove(Struct, frozen=True, kw_only=True):
+    """A container that moves with its volumes to another machine; it runs nowhere meanwhile."""
+
+    id: str
+    """Of the container. Its task set is still the former one; empty if that was lost."""
+    to: str
+    """Process name of the task set that gets it; empty while it rests."""
+    phase: VolumeMovePhase
+    done: tuple[str, ...] = ()
+    """Names of the volumes that this phase is done with."""
+    since: float = 0.0
+    """When this phase began; seconds of the clock that commands are applied with, set anew by each master."""
 
 
 class VolumeRemoval(Struct, frozen=True, kw_only=True):
@@ -285,6 +317,8 @@ class TaskSet(Struct, frozen=True, kw_only=True):
     address: LinkAddress = LinkAddress()
     bearer: bool = False
     """Whether its robots may show their credential in the header ``Authorization``."""
+    snapshots: bool = False
+    """Whether it saves and restores volumes."""
 
 
 class Drain(Struct, frozen=True, kw_only=True):

@@ -20,7 +20,7 @@ from rce_master.state.records import Container
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
-    from rce_master.state.records import Drain, Endpoint, Move, Presence, TaskSet
+    from rce_master.state.records import Drain, Endpoint, Move, Presence, TaskSet, VolumeMove
     from rce_master.state.table import Table
 
 CANDIDATES = 16
@@ -56,6 +56,7 @@ class Rooms:
     Args:
         endpoints: The containers.
         moves: The containers that move.
+        volume_moves: Those that move with volumes.
         task_sets: The machines; with the index ``machine`` of container machines by the machine's name.
         presence: Which are connected.
         drains: Which are being drained.
@@ -67,6 +68,7 @@ class Rooms:
         *,
         endpoints: Table[Endpoint],
         moves: Table[Move],
+        volume_moves: Table[VolumeMove],
         task_sets: Table[TaskSet],
         presence: Table[Presence],
         drains: Table[Drain],
@@ -74,6 +76,7 @@ class Rooms:
     ) -> None:
         self._endpoints = endpoints
         self._moves = moves
+        self._volume_moves = volume_moves
         self._task_sets = task_sets
         self._presence = presence
         self._drains = drains
@@ -88,6 +91,7 @@ class Rooms:
         self._offered: Offer | None = None
         endpoints.watch(self._endpoint_changed)
         moves.watch(self._move_changed)
+        volume_moves.watch(self._move_changed)
         task_sets.watch(self._task_set_changed)
         presence.watch(self._presence_changed)
         drains.watch(self._drain_changed)
@@ -214,23 +218,23 @@ class Rooms:
         if now is not None and now.task_set:
             self._enter(now.task_set, now)
             self._count(now.user, now.task_set, 1)
-        move = self._moves.get(known.id)
-        if move is not None:
+        move = self._moves.get(known.id) or self._volume_moves.get(known.id)
+        if move is not None and move.to:
             if was is not None:
                 self._leave(move.to, was)
             if now is not None:
                 self._enter(move.to, now)
 
-    def _move_changed(self, before: Move | None, after: Move | None) -> None:
+    def _move_changed(self, before: Move | VolumeMove | None, after: Move | VolumeMove | None) -> None:
         if before is not None and after is not None and before.to == after.to:
             return
         known = before or after
         container = self._endpoints.get(known.id) if known is not None else None
         if not isinstance(container, Container):
             return
-        if before is not None:
+        if before is not None and before.to:
             self._leave(before.to, container)
-        if after is not None:
+        if after is not None and after.to:
             self._enter(after.to, container)
 
     def _task_set_changed(self, before: TaskSet | None, after: TaskSet | None) -> None:

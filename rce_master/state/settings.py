@@ -19,6 +19,8 @@ class StateSettings:
     """How long a robot that was let in may take until its task set reports it; then it counts as away."""
     move_timeout: float = 60.0
     """How long a container's copy at another machine may take to come up, when its machine is drained."""
+    volume_move_timeout: float = 1800.0
+    """How long each phase of a move with volumes may take: to end, to save, to restore."""
     move_rest: float = 30.0
     """How long a container stays after a move of it failed, until the next is tried."""
     max_work: int = 10_000

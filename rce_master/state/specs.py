@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from rce.control import ConnectionSpec, EndpointContents, EndpointSpec, LinkAddress, LinkSpec, SpecPatch
 from rce.model import ParameterSpec
-from rce_master.state import endpoints, packages
+from rce_master.state import endpoints, packages, volumes
 from rce_master.state.records import Container, Endpoint
 from rce_master.state.wiring_records import Connection, Link
 
@@ -58,6 +58,7 @@ def _with_contents(tables: Tables, spec: EndpointSpec, endpoint: Endpoint) -> En
         nodes=contents.nodes,
         parameters=contents.parameters,
         packages=contents.packages,
+        volumes=contents.volumes,
     )
 
 
@@ -69,6 +70,7 @@ def _contents(tables: Tables, endpoint: Endpoint) -> EndpointContents:
         nodes=tuple(endpoint.nodes.values()),
         parameters=tuple(ParameterSpec(name=n, value=v) for n, v in endpoint.parameters.items()),
         packages=packages.package_specs(tables, endpoint),
+        volumes=volumes.placements(tables, endpoint),
     )
 
 

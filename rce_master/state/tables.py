@@ -27,6 +27,7 @@ from rce_master.state.records import (
     UserLimits,
     UserPackage,
     UserVolume,
+    VolumeMove,
     VolumeRemoval,
     user_volume_key,
 )
@@ -67,6 +68,7 @@ class Tables:
     - ``tombstones``: only of connected task sets.
     - ``drains``: also of container task sets that are gone: they may come back.
     - ``moves``: only of containers that are placed, to task sets that are connected.
+    - ``volume_moves``: only of containers with volumes.
     """
 
     def __init__(self) -> None:
@@ -86,7 +88,11 @@ class Tables:
             sha256=lambda b: [b.sha256],
         )
         self.volumes = Table[UserVolume](
-            "volumes", type_=UserVolume, key=lambda v: v.id, user=lambda v: [v.user]
+            "volumes",
+            type_=UserVolume,
+            key=lambda v: v.id,
+            user=lambda v: [v.user],
+            process=lambda v: [v.process],
         )
         self.volume_removals = Table[VolumeRemoval](
             "volume_removals", type_=VolumeRemoval, key=lambda r: r.id, process=lambda r: [r.process]
@@ -137,6 +143,9 @@ class Tables:
         )
         self.counters = Table[Counter]("counters", type_=Counter, key=lambda c: c.name)
         self.drains = Table[Drain]("drains", type_=Drain, key=lambda d: d.process)
+        self.volume_moves = Table[VolumeMove](
+            "volume_moves", type_=VolumeMove, key=lambda m: m.id, to=lambda m: [m.to]
+        )
         self.live = Table[Live](
             "live", type_=Any, key=lambda o: o.id, persistent=False, untold=_untold, unsettled=_unsettled
         )
@@ -159,6 +168,7 @@ class Tables:
         self.rooms = Rooms(
             endpoints=self.endpoints,
             moves=self.moves,
+            volume_moves=self.volume_moves,
             task_sets=self.task_sets,
             presence=self.presence,
             drains=self.drains,
@@ -189,6 +199,7 @@ class Tables:
             self.task_sets,
             self.counters,
             self.drains,
+            self.volume_moves,
             self.live,
             self.active,
             self.open_ends,

@@ -5,9 +5,27 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from rce.control import EndpointState, EndpointStatus, Hello, StatusPatch, TaskSetKind, without_wiring
+from rce.control import (
+    SNAPSHOTS,
+    EndpointState,
+    EndpointStatus,
+    Hello,
+    StatusPatch,
+    TaskSetKind,
+    without_wiring,
+)
 from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError
-from rce_master.state import activity, capacity, containers, draining, endpoints, placing, robots
+from rce_master.state import (
+    activity,
+    capacity,
+    containers,
+    draining,
+    endpoints,
+    placing,
+    robots,
+    volume_moves,
+    volumes,
+)
 from rce_master.state.lifecycle import ContainerPhase, RobotSession
 from rce_master.state.records import (
     Container,
@@ -57,6 +75,7 @@ def arrived(tx: Transaction, command: TaskSetArrived) -> None:
     for status in hello.endpoints:
         if not _is_given(tx, status):
             _complain(tx, hello.process, status)
+    volume_moves.found_again(tx, hello.process)
     tx.changes.arrived = hello.process
     placing.place_waiting(tx)
 
@@ -81,6 +100,7 @@ def _register(tx: Transaction, hello: Hello) -> None:
             url=hello.url,
             address=hello.address,
             bearer=hello.bearer,
+            snapshots=SNAPSHOTS in hello.features,
         )
     )
     tx.put(Presence(process=hello.process, connected=True, since=tx.now))
@@ -114,7 +134,12 @@ def _find_again(tx: Transaction, process: str, container: Container, status: End
         return
     if status.revision < container.born or not _is_given(tx, status):
         tx.put(Tombstone(process=process, id=container.id))
+    elif volumes.come_from_elsewhere(tx.tables, container, process):
+        tx.put(
+            Tombstone(process=process, id=container.id)
+        )  # its files count no more, or are another machine's
     elif not capacity.room_at(tx.tables, task_set).shortages(container.resources):
+        volumes.end_move(tx, container)
         placing.bind(tx, container, process)
 
 
@@ -286,6 +311,7 @@ def _expire(tx: Transaction, presence: Presence) -> None:
         tx.delete(tx.tables.presence, presence.process)
         if task_set.kind is TaskSetKind.ROBOT and presence.process in tx.tables.drains:
             tx.delete(tx.tables.drains, presence.process)  # its next process has another name
+        volume_moves.gone(tx, presence.process)
         tx.happen("task_set_gone", presence.process, f"away for {grace:.0f} s", user="")
 
 
@@ -301,6 +327,7 @@ def restart(tx: Transaction, revision: int) -> None:
         tx.put(Presence(process=task_set.process, connected=False, since=tx.now))
     for endpoint in tx.tables.endpoints:
         tx.put(_restarted(tx, endpoint))
+    volume_moves.restart(tx)
 
 
 def _restarted(tx: Transaction, endpoint: Container | Robot) -> ContainerLive | RobotLive:

@@ -1,9 +1,12 @@
 """Volumes: folders of users on container machines, which outlive the containers that write to them.
 
 A volume is reserved with the first container that asks for it. It is on the machine where that container is
-placed, and stays there: containers with it are placed only there, and are not handed over. One container has
-it at a time. It is removed when its user asks for that; the machine then removes the folder, at once or when
-it comes back.
+placed, and containers with it are placed only there. One container has it at a time. It is removed when its
+user asks for that; the machine then removes the folder, at once or when it comes back.
+
+It gets another machine when its container is moved (:mod:`rce_master.state.volume_moves`), or when its
+machine is lost and the masters hold a snapshot of it. Each time its *placement* gets the next number. A
+folder of an earlier placement is removed when its container is up at the new one, not before.
 """
 
 from __future__ import annotations
@@ -12,14 +15,24 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
+from rce.control import VolumePlacement
 from rce.model import MEGABYTE, Resources
 from rce_master.exceptions import ConflictError, LimitReachedError, NotFoundError
 from rce_master.state import limits
-from rce_master.state.records import Container, UserVolume, VolumeRemoval, user_volume_key, volume_removal_key
+from rce_master.state.lifecycle import VOLUME_MOVE_LIFE, VolumeMoveEvent, VolumeMovePhase
+from rce_master.state.records import (
+    Container,
+    Endpoint,
+    UserVolume,
+    VolumeMove,
+    VolumeRemoval,
+    user_volume_key,
+    volume_removal_key,
+)
 
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
-    from rce_master.state.commands import RemoveVolume, VolumeRemoved
+    from rce_master.state.commands import RemoveVolume, SnapshotLost, VolumeRemoved
     from rce_master.state.tables import Tables
 
 
@@ -48,11 +61,12 @@ def check(tx: Transaction, user: str, id_: str, requested: Resources) -> None:
             )
         if there is not None and there.process:
             places[there.process] = volume.name
-        more += volume.size - (there.size if there is not None else 0)
+        more += limits.disk_of(volume.size, volume.snapshots)
+        more -= limits.disk_of(there.size, there.snapshots) if there is not None else 0
     if len(places) > 1:
         names = " and ".join(map(repr, places.values()))
         raise ConflictError(f"volumes {names} are on different machines; a container can have one of them")
-    if more:
+    if more > 0:
         _check_disk(tx, user, more)
 
 
@@ -72,16 +86,85 @@ def reserve(tx: Transaction, container: Container) -> None:
     for volume in container.resources.volumes:
         there = tx.tables.volumes.get(user_volume_key(container.user, volume.name))
         known = there or UserVolume(user=container.user, name=volume.name, size=volume.size)
-        tx.put(replace(known, size=volume.size))
+        tx.put(replace(known, size=volume.size, snapshots=volume.snapshots))
         if there is None:
             tx.happen("volume_requested", known.id, _megabytes(volume.size))
 
 
 def bind(tx: Transaction, container: Container, process: str) -> None:
-    """Note that the volumes of a container are on its machine."""
-    for volume in container.resources.volumes:
-        known = tx.tables.volumes[user_volume_key(container.user, volume.name)]
-        tx.put(replace(known, process=process))
+    """Note that the volumes of a container are on its machine, where those of a snapshot were restored."""
+    for known in volumes_of(tx.tables, container):
+        if known.process == process:
+            continue
+        former = (*known.former, *((known.process,) if known.process else ()))
+        tx.put(
+            replace(
+                known,
+                process=process,
+                placement=known.placement + 1,
+                is_restored=bool(known.process),
+                former=tuple(one for one in dict.fromkeys(former) if one != process),
+            )
+        )
+
+
+def placements(tables: Tables, endpoint: Endpoint) -> tuple[VolumePlacement, ...]:
+    """Return which files a container is to have."""
+    if not isinstance(endpoint, Container) or not endpoint.resources.volumes:
+        return ()
+    return tuple(
+        VolumePlacement(name=known.name, number=known.placement, is_new=not known.is_restored)
+        for known in volumes_of(tables, endpoint)
+    )
+
+
+def begin_restore(tx: Transaction, container: Container, process: str) -> None:
+    """Have a machine make the files of a container's volumes, whose machine is lost; then place it there."""
+    phase = VOLUME_MOVE_LIFE.advance(VolumeMovePhase.DONE, VolumeMoveEvent.RESTORE, container.id, ())
+    tx.put(VolumeMove(id=container.id, to=process, phase=phase, since=tx.now))
+    tx.changes.volume_moves.append(container.id)
+    tx.happen("container_moving", container.id, f"to {process}, with the last snapshots of its volumes")
+
+
+def end_move(tx: Transaction, container: Container) -> None:
+    """End a container's move with its volumes, if there is one; what the next machine has made is removed."""
+    move = tx.tables.volume_moves.get(container.id)
+    if move is None:
+        return
+    discard_restored(tx, container, move)
+    tx.delete(tx.tables.volume_moves, move.id)
+
+
+def discard_restored(tx: Transaction, container: Container, move: VolumeMove) -> None:
+    """Have the next machine of a move remove what it has made of the volumes."""
+    if move.phase is VolumeMovePhase.RESTORING:
+        for known in volumes_of(tx.tables, container):
+            _remove_files(tx, known, move.to)
+
+
+def remove_former(tx: Transaction, container: Container) -> bool:
+    """Have the folders of earlier placements removed, since the container is up at the newest one.
+
+    Returns:
+        Whether there were any.
+    """
+    moved = False
+    for known in volumes_of(tx.tables, container):
+        if not known.former:
+            continue
+        for process in known.former:
+            _remove_files(tx, known, process)
+        moved = True
+        kept = replace(known, former=())
+        # What is not declared is not kept: this snapshot was made for the move.
+        tx.put(kept if known.snapshots else replace(kept, snapshot="", kept=0, taken=0.0))
+    return moved
+
+
+def _remove_files(tx: Transaction, known: UserVolume, process: str) -> None:
+    removal = VolumeRemoval(process=process, volume=known.id)
+    tx.put(removal)
+    tx.changes.volume_removals.append(removal)
 
 
 def release(tx: Transaction, container: Container) -> None:
@@ -118,10 +201,9 @@ def forget_user(tx: Transaction, user: str) -> None:
 
 def _remove(tx: Transaction, known: UserVolume) -> None:
     tx.delete(tx.tables.volumes, known.id)
-    if known.process:
-        removal = VolumeRemoval(process=known.process, volume=known.id)
-        tx.put(removal)
-        tx.changes.volume_removals.append(removal)
+    for process in (known.process, *known.former):
+        if process:
+            _remove_files(tx, known, process)
     tx.happen("volume_removed", known.id)
 
 
@@ -131,40 +213,80 @@ def removed(tx: Transaction, command: VolumeRemoved) -> None:
     tx.delete(tx.tables.volume_removals, key)
 
 
+def forget_snapshot(tx: Transaction, command: SnapshotLost) -> None:
+    """Forget a snapshot of a volume that the masters do not hold."""
+    known = tx.tables.volumes.get(command.volume)
+    if known is not None and known.snapshot == command.snapshot:
+        tx.put(replace(known, snapshot="", kept=0, taken=0.0))
+        tx.happen("snapshot_lost", known.id, "the master does not hold it")
+
+
 def holder_of(tables: Tables, user: str, name: str) -> Container | None:
     """Return the container that has a volume; None if none has."""
     found = tables.endpoints.by("volume", user_volume_key(user, name))
     return next((one for one in found if isinstance(one, Container)), None)
 
 
-def tied_to(tables: Tables, container: Container) -> str:
-    """Return the process of the machine where a container's volumes are; empty if it can be anywhere."""
-    return next((known.process for known in _known(tables, container) if known.process), "")
-
-
-def admits(tables: Tables, container: Container, process: str) -> bool:
-    """Whether a machine may have a container, as far as its volumes are concerned."""
-    volumes = container.resources.volumes
-    if not volumes:
-        return True
-    ending = any(
-        volume_removal_key(process, user_volume_key(container.user, volume.name)) in tables.volume_removals
-        for volume in volumes
-    )
-    return not ending and tied_to(tables, container) in ("", process)
-
-
-def why_tied(tables: Tables, container: Container, process: str) -> str:
-    """Say why a container's volumes keep it away from a machine; empty if they do not."""
-    if admits(tables, container, process):
-        return ""
-    known = next((known for known in _known(tables, container) if known.process not in ("", process)), None)
-    return f"has not its volume {known.name!r}" if known is not None else "still removes its former volume"
-
-
-def _known(tables: Tables, container: Container) -> list[UserVolume]:
+def volumes_of(tables: Tables, container: Container) -> list[UserVolume]:
+    """Return what is known of a container's volumes."""
     keys = (user_volume_key(container.user, volume.name) for volume in container.resources.volumes)
     return [known for key in keys if (known := tables.volumes.get(key)) is not None]
+
+
+def tied_to(tables: Tables, container: Container) -> str:
+    """Return the process of the machine where a container's volumes are; empty if it can be anywhere."""
+    if not container.resources.volumes:
+        return ""
+    found = volumes_of(tables, container)
+    return next((one.process for one in found if one.process and not _is_abandoned(tables, one)), "")
+
+
+def _is_abandoned(tables: Tables, known: UserVolume) -> bool:
+    """Whether the machine of a volume is lost, so that its last snapshot counts."""
+    return bool(known.snapshot) and known.process not in tables.task_sets
+
+
+def admits(tables: Tables, container: Container, process: str, *, moves: bool = False) -> bool:
+    """Whether a machine may have a container, as far as its volumes are concerned.
+
+    Args:
+        tables: The tables.
+        container: The container.
+        process: Of the machine.
+        moves: Whether its volumes may be moved there.
+    """
+    if not container.resources.volumes:
+        return True
+    found = volumes_of(tables, container)
+    if container.id in tables.volume_moves:
+        return False
+    if any(volume_removal_key(process, known.id) in tables.volume_removals for known in found):
+        return False
+    if not come_from_elsewhere(tables, container, process):
+        return True
+    task_set = tables.task_sets.get(process)
+    if task_set is None or not task_set.snapshots:
+        return False
+    return moves or not tied_to(tables, container)
+
+
+def come_from_elsewhere(tables: Tables, container: Container, process: str) -> bool:
+    """Whether a machine would need the files of a container's volumes from another one."""
+    return any(known.process not in ("", process) for known in volumes_of(tables, container))
+
+
+def why_away(tables: Tables, container: Container) -> str:
+    """Say why a container waits for the machine of its volumes, which is away, and what can be done."""
+    found = [known for known in volumes_of(tables, container) if known.process]
+    names = ", ".join(known.name for known in found)
+    text = f"the machine with its volumes ({names}) is away: {found[0].process}"
+    without = ", ".join(known.name for known in found if not known.snapshot)
+    if not without:
+        return text
+    return (
+        f"{text}; there is no snapshot of {without}, so start that machine again, or give the files up: "
+        "destroy the container and run rce volume remove; later, ask for snapshots of the volume"
+    )
 
 
 def _megabytes(count: float) -> str:

@@ -91,6 +91,11 @@ class PlacementQueue:
         if self._line:
             self._gained[process] = None
 
+    def retry(self, container: Container) -> None:
+        """Look at a container again that waits: machines may take it that did not before."""
+        if not container.task_set:
+            self._unseen[container.id] = container.number
+
     def looks(self) -> Iterator[Look]:
         """Iterate over the containers that have to be looked at, until none has.
 

@@ -34,6 +34,7 @@ from rce.control.model import (
     NodeStatus,
 )
 from rce.control_channel.contents import Piece
+from rce.control_channel.uploads import Uploader
 from rce.link.handover import LinkAcceptor
 from rce_container.environment import proc
 from rce_container.folder import Record, StateFolder
@@ -47,6 +48,7 @@ from rce_container.runtimes.namespace import HOME_BYTES, NamespaceRuntime
 from rce_container.runtimes.podman import PodmanRuntime
 from rce_container.runtimes.process import ProcessRuntime
 from rce_container.settings import ContainerSettings
+from rce_container.volumes.snapshots import FetchPiece
 from support.container_nodes import NODES
 from support.container_specs import MACHINE, ContainerParts, container
 
@@ -111,6 +113,9 @@ class Machine:
         self.marks: set[str] = set()
         self.pids: dict[int, int] = {}
         self.volume_limit = VolumeLimit.WATCHED
+        self.uploader: Uploader | None = None
+        """Sends snapshots to its master; without it, volumes stay."""
+        self.fetch_content: FetchPiece | None = None
         self.cgroups = folder / "none"
         """The file that says where the cgroups of this machine's containers are."""
 
@@ -147,6 +152,8 @@ class Machine:
                 links=("127.0.0.1", port),
                 limiter=limiter,
                 library=self.library,
+                uploader=self.uploader,
+                fetch=self.fetch_content,
             )
             self.manager.send = self._tell
             ready, self.quit = asyncio.Event(), asyncio.Event()

@@ -121,6 +121,7 @@ class EngineOptions(TypedDict, total=False):
     robots: int
     apart: bool
     packages: Path | None
+    machines: int
     robot_options: tuple[str, ...]
 
 
@@ -135,6 +136,7 @@ class Engine:
         robots: int = 1,
         apart: bool = False,
         packages: Path | None = None,
+        machines: int = 1,
         robot_options: tuple[str, ...] = (),
     ) -> None:
         """Prepare an engine.
@@ -145,10 +147,11 @@ class Engine:
             robots: How many robot task sets.
             apart: Every task set takes itself to be on a machine of its own, so that links go over TCP.
             packages: A folder with more packages.
+            machines: How many container task sets; several are on machines of their own, ``machine0``, ...
             robot_options: Options of the robot task sets.
         """
         self.folder = folder
-        self.http_port, self.control_port, *rest = free_ports(3 + 2 * robots)
+        self.http_port, self.control_port, *rest = free_ports(3 + 2 * robots + machines - 1)
         self.runtime = runtime
         self._token = ""
         self.container_link_port = rest[0]
@@ -176,12 +179,25 @@ class Engine:
             )
             for number, (ws, link) in enumerate(self.robot_ports)
         ]
-        self.container = self._program(
+        self.container = self._container(folder / "container", self.container_link_port, apart=apart)
+        self.machines = [self.container]
+        if machines > 1:
+            ports = [self.container_link_port, *rest[1 + 2 * robots :]]
+            self.machines = [
+                self._container(folder / f"machine{number}", port, name=f"machine{number}")
+                for number, port in enumerate(ports)
+            ]
+            self.container = self.machines[0]
+
+    def _container(self, state: Path, link_port: int, *, name: str = "", apart: bool = False) -> Program:
+        machine = name or ("containers" if apart else "")
+        return self._program(
             "rce-container",
             "127.0.0.1",
-            *("--control-port", self.control_port, "--link-port", self.container_link_port),
-            *("--state-dir", folder / "container", "--runtime", runtime, "--dev"),
-            *(("--machine", "containers") if apart else ()),
+            *("--control-port", self.control_port, "--link-port", link_port),
+            *("--state-dir", state, "--runtime", self.runtime, "--dev"),
+            *(("--machine", machine) if machine else ()),
+            name=name,
         )
 
     def _program(self, program: str, *args: object, name: str = "") -> Program:
@@ -194,7 +210,7 @@ class Engine:
 
     @property
     def programs(self) -> list[Program]:
-        return [self.master, *self.robots, self.container]
+        return [self.master, *self.robots, *self.machines]
 
     async def start(self) -> None:
         for program in self.programs:

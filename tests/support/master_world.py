@@ -56,6 +56,7 @@ class World:
         name: str = "m",
         *,
         draining: bool = False,
+        features: tuple[str, ...] = (),
         **machine: Unpack[MachineParts],
     ) -> Changes:
         return self.do(
@@ -66,6 +67,7 @@ class World:
                     process=process,
                     machine=MachineInfo(name=name, draining=draining, **machine),
                     endpoints=endpoints,
+                    features=features,
                 )
             )
         )

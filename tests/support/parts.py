@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from typing import TypedDict
 
-from rce.control.model import ConnectionSpec, LinkAddress, LinkSpec, NodeStatus, PackageSpec
+from rce.control.model import (
+    ConnectionSpec,
+    LinkAddress,
+    LinkSpec,
+    NodeStatus,
+    PackageSpec,
+    VolumePlacement,
+)
 from rce.model import Volume
 from rce.model.specs import InterfaceSpec, Network, NodeSpec, ParameterSpec, Resources, RestartPolicy
 
@@ -19,6 +26,7 @@ class SpecParts(TypedDict, total=False):
     resources: Resources
     parameters: tuple[ParameterSpec, ...]
     packages: tuple[PackageSpec, ...]
+    volumes: tuple[VolumePlacement, ...]
 
 
 class NodeLife(TypedDict, total=False):

@@ -11,7 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from msgspec.structs import replace
 
 from rce.control.desired import DesiredState, Fit
-from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
+from rce.control.messages import CONTROL_VERSION, SNAPSHOTS, Hello, MachineInfo, TaskSetKind
 from rce.control.model import EndpointSpec, EndpointState, EndpointStatus, LinkAddress
 from rce.model.specs import InterfaceSpec, Network, NodeSpec, ResourceChanges, Resources
 from rce.model.volumes import Volume
@@ -21,6 +21,7 @@ from rce_master.state.changes import Changes
 from rce_master.state.core import State
 from rce_master.state.records import User, UserRole
 from rce_master.state.settings import StateSettings
+from rce_master.state.volumes import volumes_of
 
 USERS = st.sampled_from(["ann", "bob"])
 TAGS = st.sampled_from(["a", "b", "c", "d"])
@@ -46,6 +47,7 @@ SLOTS = 3
 LIMITS = StateSettings(
     move_timeout=3,
     move_rest=2,
+    volume_move_timeout=6,
     robot_grace=3,
     container_grace=2,
     placement_timeout=1,
@@ -182,6 +184,7 @@ class Histories(RuleBasedStateMachine):
             machine=MachineInfo(name=process, slots=SLOTS, networks=("none", "group"), volumes="image"),
             address=address,
             endpoints=tuple(endpoints),
+            features=(SNAPSHOTS,) if kind is TaskSetKind.CONTAINER and process != "c3" else (),
         )
         self.do(commands.TaskSetArrived(hello=hello))
 
@@ -225,6 +228,43 @@ class Histories(RuleBasedStateMachine):
     def volume_is_removed(self, first: bool) -> None:
         for removal in list(self.state.tables.volume_removals)[: 1 if first else None]:
             self.do(commands.VolumeRemoved(process=removal.process, volume=removal.volume))
+
+    @rule(fails=st.booleans(), is_last=st.booleans())
+    def snapshots_are_taken(self, fails: bool, is_last: bool) -> None:
+        for known in list(self.state.tables.volumes):
+            if known.process:
+                command = commands.SnapshotTaken(
+                    process=known.process,
+                    volume=known.id,
+                    placement=known.placement,
+                    is_last=is_last,
+                    snapshot="" if fails else "5" * 64,
+                    error="the disk is full" if fails else "",
+                )
+                self.do(command)
+
+    @rule(fails=st.booleans())
+    def volumes_are_restored(self, fails: bool) -> None:
+        for move in list(self.state.tables.volume_moves):
+            container = self.state.tables.container(move.id)
+            assert container is not None
+            for known in volumes_of(self.state.tables, container):
+                command = commands.VolumeRestored(
+                    process=move.to,
+                    volume=known.id,
+                    placement=known.placement + 1,
+                    error="a wrong hash" if fails else "",
+                )
+                self.do(command)
+
+    @invariant()
+    def volumes_never_run_twice(self) -> None:
+        """A container runs nowhere while its volumes move, and later only where their newest files are."""
+        for container in self.state.tables.containers():
+            if container.id in self.state.tables.volume_moves or not container.task_set:
+                continue
+            for known in volumes_of(self.state.tables, container):
+                assert known.process == container.task_set
 
     @rule(user=USERS, tag=TAGS, size=st.sampled_from([1, 2, 3, 4]))
     def resize(self, user: str, tag: str, size: int) -> None:

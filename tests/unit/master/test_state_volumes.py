@@ -54,7 +54,7 @@ def remove(world: World, name: str = "journal") -> list[str]:
 
 
 def test_a_volume_stays_on_its_machine(two: World) -> None:
-    assert known(two) == [UserVolume(user="anna", name="journal", size=SIZE, process="c1")]
+    assert known(two) == [UserVolume(user="anna", name="journal", size=SIZE, process="c1", placement=1)]
     destroy(two)
     for number in range(3):  # the first machine is fuller than the second one
         two.container(f"other{number}")
@@ -81,11 +81,14 @@ def test_a_new_container_is_refused_while_its_volume_is_away(two: World) -> None
         two.container("again", volumes=(volume(),))
 
 
-def test_it_is_not_handed_over(two: World) -> None:
+def test_it_stays_on_a_machine_of_the_release_before(two: World) -> None:
     two.run("c", "c1")
     two.do(commands.SetDraining(machine="c1", draining=True))
     assert not list(two.state.tables.moves)
-    assert "volumes of container 'c' are on this machine" in two.state.tables.container_live("anna/c").stays
+    assert not list(two.state.tables.volume_moves)
+    text = two.state.tables.container_live("anna/c").stays
+    assert "volumes of container 'c' are on this machine" in text
+    assert "it runs an earlier release" in text
 
 
 def test_one_container_at_a_time_has_it(two: World) -> None:

@@ -1,0 +1,343 @@
+"""Saves volumes as snapshots at the master, and restores them: when they move, and now and then."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import logging
+import os
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, TypeAlias
+
+from rce.control import (
+    ContentError,
+    RestoreVolume,
+    SaveVolume,
+    SnapshotError,
+    ToMaster,
+    VolumeRestored,
+    VolumeSaved,
+)
+from rce.control.snapshots import MAX_MANIFEST, Manifest, Offer, decode_manifest
+from rce_container.exceptions import VolumeError
+from rce_container.files import remove
+from rce_container.folder import make_accessible
+from rce_container.volumes import tree
+from rce_container.volumes.freezing import frozen
+from rce_container.volumes.tree import Pieces
+
+if TYPE_CHECKING:
+    from rce.control_channel.contents import Piece
+    from rce.control_channel.uploads import Uploader
+    from rce_container.runtimes.base import Handle
+    from rce_container.volumes.store import Claim, VolumeStore
+
+_log = logging.getLogger(__name__)
+
+FetchPiece: TypeAlias = "Callable[[str, int], Awaitable[Piece]]"
+"""Fetches a piece of a content, by its hash and offset."""
+
+_ATTEMPTS = 8
+"""Of a transfer, while the master is away or another one takes its place."""
+_PAUSE_S = 1.0
+_RELEASE_S = 30.0
+"""How long the container that has a volume may take to end completely."""
+_LOOK_S = 0.5
+"""How often it is looked which volume's next snapshot is due."""
+
+
+class Subject(Protocol):
+    """A running container, as far as its volumes are concerned."""
+
+    @property
+    def handle(self) -> Handle:
+        """Its outermost process."""
+
+    def pids(self) -> Iterable[int]:
+        """All of its processes, as the machine sees them."""
+
+
+class SnapshotKeeper:
+    """Saves and restores volumes.
+
+    Args:
+        store: The volumes.
+        send: Sends a message to the master.
+        spawn: Runs a task as long as the manager runs.
+        release: Called with what :meth:`VolumeStore.hold` returned.
+        uploader: Sends snapshots.
+        fetch: Fetches a piece of a content, by its hash and offset.
+
+    Attributes:
+        is_wanted: Whether the master takes snapshots.
+        longest_pause: For how many seconds a container was stopped for a snapshot, at most.
+    """
+
+    def __init__(
+        self,
+        store: VolumeStore,
+        send: Callable[[ToMaster], None],
+        spawn: Callable[..., object],
+        release: Callable[[str], None],
+        *,
+        uploader: Uploader,
+        fetch: FetchPiece,
+    ) -> None:
+        self._store = store
+        self._send = send
+        self._spawn = spawn
+        self._release = release
+        self._uploader = uploader
+        self._fetch = fetch
+        self._busy: set[tuple[str, str]] = set()
+        """Kind and volume of the orders that are being carried out."""
+        self._due: dict[tuple[str, str], float] = {}
+        """When the next snapshot is taken, by incarnation and volume; seconds of the monotonic clock."""
+        self.is_wanted = False
+        self.longest_pause = 0.0
+
+    # Orders of the master
+
+    def save(self, order: SaveVolume) -> None:
+        """Send a volume whose container has ended; answers with ``VolumeSaved``."""
+        self._begin("save", order.volume, self._save(order))
+
+    def restore(self, order: RestoreVolume) -> None:
+        """Make a volume from a snapshot; answers with ``VolumeRestored``."""
+        self._begin("restore", order.volume, self._restore(order))
+
+    def _begin(self, kind: str, id_: str, work: Coroutine[None, None, None]) -> None:
+        async def carry_out() -> None:
+            try:
+                await work
+            finally:
+                self._busy.discard((kind, id_))
+
+        if (kind, id_) in self._busy:  # it was asked for again after a pause, and is answered at its end
+            work.close()
+            return
+        self._busy.add((kind, id_))
+        self._spawn(carry_out(), name=f"{kind} volume {id_}")
+
+    async def _save(self, order: SaveVolume) -> None:
+        saved = VolumeSaved(volume=order.volume, placement=order.placement, is_last=True)
+        try:
+            snapshot = await self._save_held(order)
+        except (SnapshotError, VolumeError, OSError) as error:
+            _log.warning("volume %s is not saved: %s", order.volume, error)
+            self._send(_with(saved, error=str(error)))
+        else:
+            self._send(_with(saved, snapshot=snapshot))
+
+    async def _save_held(self, order: SaveVolume) -> str:
+        async with self._held(order.volume):
+            if self._store.placement(order.volume) < order.placement:
+                raise SnapshotError("its files are not on this machine")
+            root = await asyncio.to_thread(self._store.open, order.volume)
+            try:
+                return await self._send_tree(order.volume, root)
+            finally:
+                os.close(root)
+
+    async def _restore(self, order: RestoreVolume) -> None:
+        error = ""
+        try:
+            if self._store.placement(order.volume) < order.placement:
+                await self._restore_held(order)
+        except (SnapshotError, VolumeError, OSError) as fault:
+            error = str(fault)
+            _log.warning("volume %s is not restored: %s", order.volume, error)
+        self._send(VolumeRestored(volume=order.volume, placement=order.placement, error=error))
+
+    async def _restore_held(self, order: RestoreVolume) -> None:
+        async with self._held(order.volume):
+            manifest = decode_manifest(await self._whole(order.snapshot, MAX_MANIFEST))
+            new, root = await asyncio.to_thread(self._store.make_new, order.size)
+            try:
+                try:
+                    async with self._former(order.volume) as former:
+                        await tree.write(manifest, root, lambda sha256: self._piece(sha256, former))
+                finally:
+                    os.close(root)
+                await asyncio.to_thread(self._store.replace, order.volume, new, order.placement)
+            finally:
+                await asyncio.to_thread(_remove, new)
+
+    @contextlib.asynccontextmanager
+    async def _former(self, id_: str) -> AsyncIterator[Pieces | None]:
+        """Open the files of an earlier placement, to use pieces of them again; None if there are none."""
+        try:
+            root = await asyncio.to_thread(self._store.open, id_)
+        except VolumeError:
+            yield None
+            return
+        try:
+            pieces = None
+            try:
+                pieces = Pieces(root, await asyncio.to_thread(tree.scan, root))
+            except (SnapshotError, OSError) as error:
+                _log.info("former files of volume %s are of no use: %s", id_, error)
+            yield pieces
+        finally:
+            os.close(root)
+
+    async def _piece(self, sha256: str, former: Pieces | None) -> bytes:
+        if former is not None and sha256 in former:
+            with contextlib.suppress(SnapshotError, OSError):  # then it is fetched
+                return await asyncio.to_thread(former.read, sha256)
+        return await self._whole(sha256, MAX_MANIFEST)
+
+    async def _whole(self, sha256: str, most: int) -> bytes:
+        """Fetch a content.
+
+        Raises:
+            SnapshotError: The master does not give it, or it is not what its hash says.
+        """
+        data = bytearray()
+        failures = 0
+        while True:
+            try:
+                piece = await self._fetch(sha256, len(data))
+            except ContentError as error:
+                failures += 1
+                if error.missing or failures >= _ATTEMPTS:
+                    raise SnapshotError(str(error)) from error
+                await asyncio.sleep(_PAUSE_S)
+                continue
+            data += piece.data
+            if len(data) >= piece.size or len(data) > most:
+                break
+        if hashlib.sha256(data).hexdigest() != sha256:
+            raise SnapshotError(f"the content {sha256[:12]} is not what its hash says")
+        return bytes(data)
+
+    @contextlib.asynccontextmanager
+    async def _held(self, id_: str) -> AsyncIterator[None]:
+        """Keep containers from having a volume; wait until the one that has it has ended.
+
+        Raises:
+            VolumeError: It does not end.
+        """
+        deadline = time.monotonic() + _RELEASE_S
+        while True:
+            try:
+                holder = self._store.hold(id_)
+            except VolumeError:
+                if time.monotonic() > deadline:
+                    raise
+                await asyncio.sleep(_LOOK_S)
+            else:
+                break
+        try:
+            yield
+        finally:
+            self._release(holder)
+
+    # Sending
+
+    async def _send_tree(self, id_: str, root: int) -> str:
+        """Send a snapshot; return its hash, in hex."""
+        manifest = await asyncio.to_thread(tree.scan, root)
+        listed = manifest.encode()
+        name = hashlib.sha256(listed).hexdigest()
+        failures = 0
+        while True:
+            try:
+                await self._upload(id_, manifest, listed, name, root)
+            except SnapshotError as error:
+                failures += 1
+                if not error.is_temporary or failures >= _ATTEMPTS:
+                    raise
+                await asyncio.sleep(_PAUSE_S)
+            else:
+                return name
+
+    async def _upload(self, id_: str, manifest: Manifest, listed: bytes, name: str, root: int) -> None:
+        pieces = Pieces(root, manifest)
+        offer = Offer(volume=id_, contents=[name, *sorted(manifest.contents)])
+        async with self._uploader.upload(offer) as upload:
+            for sha256 in sorted(upload.wanted & manifest.contents):
+                await upload.send(await asyncio.to_thread(pieces.read, sha256))
+            if name in upload.wanted:
+                await upload.send(listed)
+            await upload.finish()
+
+    # Snapshots of running containers
+
+    async def run(self, subjects: Mapping[str, Subject]) -> None:
+        """Take the snapshots that volumes ask for, until cancelled.
+
+        Args:
+            subjects: The running containers, by incarnation.
+        """
+        while True:
+            await asyncio.sleep(_LOOK_S)
+            due = {
+                (incarnation_id, claim.id): claim
+                for incarnation_id in subjects
+                for claim in self._store.claims(incarnation_id)
+                if claim.snapshots
+            }
+            now = time.monotonic()
+            self._due = {key: self._due.get(key, now + claim.snapshots) for key, claim in due.items()}
+            for key, claim in due.items():
+                subject = subjects.get(key[0])
+                if subject is not None and self._due[key] <= now and self.is_wanted:
+                    self._due[key] = now + claim.snapshots
+                    await self._take(subject, claim)
+
+    async def _take(self, subject: Subject, claim: Claim) -> None:
+        saved = VolumeSaved(volume=claim.id, placement=claim.placement)
+        scratch: Path | None = None
+        try:
+            scratch = await asyncio.to_thread(self._store.make_scratch)
+            pause = await asyncio.to_thread(self._copy, subject, claim, scratch)
+            self.longest_pause = max(pause, self.longest_pause)
+            _log.debug("volume %s: its container was stopped for %.1f ms", claim.id, 1e3 * pause)
+            root = os.open(scratch, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            try:
+                saved = _with(saved, snapshot=await self._send_tree(claim.id, root))
+            finally:
+                os.close(root)
+        except (SnapshotError, VolumeError, OSError) as error:
+            _log.warning("there is no snapshot of volume %s: %s", claim.id, error)
+            saved = _with(saved, error=str(error))
+        finally:
+            if scratch is not None:
+                await asyncio.to_thread(_remove, scratch)
+        self._send(saved)
+
+    def _copy(self, subject: Subject, claim: Claim, scratch: Path) -> float:
+        """Copy a volume while its container is stopped; return for how many seconds it was. Blocks."""
+        root = self._store.open_running(claim, subject.handle.namespaces_pid)
+        target = os.open(scratch, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            with frozen(subject.pids):
+                began = time.perf_counter()
+                tree.copy(root, target)
+                return time.perf_counter() - began
+        finally:
+            os.close(root)
+            os.close(target)
+
+
+def _with(saved: VolumeSaved, *, snapshot: str = "", error: str = "") -> VolumeSaved:
+    return VolumeSaved(
+        volume=saved.volume,
+        placement=saved.placement,
+        is_last=saved.is_last,
+        snapshot=snapshot,
+        error=error,
+    )
+
+
+def _remove(path: Path) -> None:
+    """Remove a folder or an image that is not needed any more. Blocks."""
+    if path.suffix == ".img":
+        path.unlink(missing_ok=True)
+    elif path.exists():
+        make_accessible(path)
+        remove(path)

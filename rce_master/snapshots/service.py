@@ -1,0 +1,243 @@
+"""Takes snapshots of volumes from task sets, gives them back, and removes what no volume needs any more."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+from websockets.exceptions import ConnectionClosed
+
+from rce.aio.tasks import TaskScope
+from rce.control import SnapshotError
+from rce.control.snapshots import MAX_MANIFEST, Kept, Offer, Wanted, decode_manifest
+from rce_master.exceptions import FencedError, MasterError, StoreError
+from rce_master.state import commands
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+    from contextlib import AbstractAsyncContextManager
+
+    from websockets.asyncio.server import ServerConnection
+
+    from rce.control import VolumeSaved
+    from rce.control.snapshots import Manifest
+    from rce_master.packages.contents import ContentStore
+    from rce_master.packages.copies import ArchiveCopies
+    from rce_master.state.changes import Changes
+    from rce_master.state_service import StateService
+
+_log = logging.getLogger(__name__)
+
+SNAPSHOTS: Final = "snapshots"
+"""Name of the folder in a master's state folder."""
+SNAPSHOT: Final = "snapshot"
+SPARED_S = 900.0
+"""Contents that no volume needs are kept for so long: a task set may be sending a snapshot that has them."""
+_SLACK = 16 << 20
+"""Bytes that a snapshot may have beyond the size of its volume: sizes of folders are only watched."""
+_CLOSE_CODE = 1008
+
+
+class SnapshotService:
+    """The snapshots of all volumes.
+
+    Args:
+        state_service: Knows the volumes.
+        store: Keeps the contents.
+        clock: Seconds since 1970.
+        copies: Those at other masters, if there may be any.
+    """
+
+    def __init__(
+        self,
+        state_service: StateService,
+        store: ContentStore,
+        clock: Callable[[], float] = time.time,
+        copies: ArchiveCopies | None = None,
+    ) -> None:
+        self._state_service = state_service
+        self._store = store
+        self._clock = clock
+        self._copies = copies
+        self._named: dict[str, frozenset[str]] = {}
+        """The contents that each needed manifest names, as far as this master has read it."""
+        self._lock = asyncio.Lock()
+        """Held while contents are compared with what the state needs."""
+        self._dirty = asyncio.Event()
+        state_service.listeners.append(self._note)
+
+    async def run(self) -> None:
+        """Remove contents that are not needed, and keep the other masters' complete, until cancelled.
+
+        Raises:
+            FencedError: This master leads no more.
+        """
+        await self._forget_lost()
+        async with TaskScope() as tasks:
+            if self._copies is not None:
+                work = self._copies.run(self._needed, self._is_complete)
+                tasks.spawn(work, name="copies of snapshots")
+            await self._sweep()
+
+    async def _forget_lost(self) -> None:
+        """Forget snapshots that no master can have, as after a backup was restored."""
+        if self._copies is not None:
+            return
+        for known in list(self._state_service.tables.volumes):
+            if known.snapshot and not await asyncio.to_thread(self._store.path(known.snapshot).exists):
+                lost = commands.SnapshotLost(volume=known.id, snapshot=known.snapshot)
+                await self._state_service.submit_all([lost])
+
+    async def _sweep(self) -> None:
+        await asyncio.to_thread(self._store.forget_incoming)
+        while True:
+            self._dirty.clear()
+            async with self._lock:
+                needed = self._needed()
+                if self._is_complete():
+                    try:
+                        await asyncio.to_thread(self._store.sweep, needed, SPARED_S)
+                    except OSError as error:
+                        _log.error("snapshots that are needed no more stay on the disk: %s", error)
+            if self._copies is not None:
+                self._copies.look()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(SPARED_S):
+                    await self._dirty.wait()
+
+    # What is needed
+
+    def _needed(self) -> set[str]:
+        snapshots = {known.snapshot for known in self._state_service.tables.volumes if known.snapshot}
+        self._named = {sha256: named for sha256, named in self._named.items() if sha256 in snapshots}
+        for sha256 in snapshots - self._named.keys():
+            with contextlib.suppress(OSError, SnapshotError):  # another master may still have it
+                manifest = decode_manifest(self._store.path(sha256).read_bytes())
+                self._named[sha256] = frozenset(manifest.contents)
+        return snapshots.union(*self._named.values())
+
+    def _is_complete(self) -> bool:
+        """Whether all manifests are known; else it is not known which contents are needed."""
+        volumes = self._state_service.tables.volumes
+        return all(known.snapshot in self._named for known in volumes if known.snapshot)
+
+    def _note(self, changes: Changes) -> None:
+        if any(table == "volumes" for table, _ in changes.written()):
+            self._dirty.set()
+
+    # From and to task sets
+
+    async def read(self, sha256: str, offset: int, count: int) -> tuple[bytes, int] | None:
+        """Read a piece of a content for a task set; one that only another master has is fetched first.
+
+        Returns:
+            The piece and the size of the content; None if it does not exist.
+
+        Raises:
+            OSError: It cannot be read, or not yet.
+        """
+        found = await self._store.read(sha256, offset, count)
+        if found is not None or self._copies is None or sha256 not in self._needed():
+            return found
+        await self._copies.obtain(sha256)
+        return await self._store.read(sha256, offset, count)
+
+    async def take(self, socket: ServerConnection) -> None:
+        """Take the contents of a snapshot that a task set sends; return when it has hung up."""
+        with contextlib.suppress(ConnectionClosed):
+            try:
+                offer = msgspec.json.decode(await socket.recv(), type=Offer)
+            except msgspec.MsgspecError as error:
+                await socket.close(_CLOSE_CODE, f"not an offer: {error}"[:100])
+                return
+            known = self._state_service.tables.volumes.get(offer.volume)
+            if known is None:
+                answer = Wanted(error=f"there is no volume {offer.volume!r}")
+            else:
+                answer = Wanted(contents=await asyncio.to_thread(self._missing, offer.contents))
+            await socket.send(msgspec.json.encode(answer).decode())
+            if known is not None:
+                await self._receive(socket, known.size + _SLACK)
+
+    def _missing(self, contents: list[str]) -> list[str]:
+        return [sha256 for sha256 in contents if not self._store.touch(sha256)]
+
+    async def _receive(self, socket: ServerConnection, most: int) -> None:
+        left = most + MAX_MANIFEST
+        while True:
+            data = await socket.recv()
+            left -= len(data)
+            kept = Kept()
+            if isinstance(data, str) or left < 0:
+                kept = Kept(error=f"it has more than the {most >> 20} MB that its volume may hold")
+            else:
+                try:
+                    async with self._store.receive(_once(data)) as incoming:
+                        await self._store.keep(incoming)
+                except MasterError as error:
+                    kept = Kept(error=str(error))
+            await socket.send(msgspec.json.encode(kept).decode())
+
+    async def accept(self, process: str, message: VolumeSaved) -> None:
+        """Note a snapshot that a task set has sent, once its contents are where they have to be.
+
+        Args:
+            process: Of the task set.
+            message: What it says.
+        """
+        taken = commands.SnapshotTaken(
+            process=process,
+            volume=message.volume,
+            placement=message.placement,
+            is_last=message.is_last,
+            snapshot=message.snapshot,
+            taken=self._clock(),
+            error=message.error,
+        )
+        try:
+            if not message.error:
+                await self._keep(taken)
+                return
+        except FencedError:
+            return  # the next leader is told again
+        except (SnapshotError, StoreError) as error:
+            taken = replace(taken, snapshot="", error=str(error))
+        (outcome,) = await self._state_service.submit_all([taken])
+        if outcome is not None:
+            _log.error("the end of a snapshot was not noted: %s", outcome)
+
+    async def _keep(self, taken: commands.SnapshotTaken) -> None:
+        async with self._lock:
+            manifest = await asyncio.to_thread(self._check, taken.snapshot)
+            self._named[taken.snapshot] = frozenset(manifest.contents)
+            async with self._spread(taken.snapshot, *manifest.contents):
+                await self._state_service.submit(replace(taken, size=manifest.size))
+
+    def _check(self, sha256: str) -> Manifest:
+        """Return the manifest of a snapshot that this master has as a whole. Blocks.
+
+        Raises:
+            SnapshotError: It has not, or the manifest names what may not be made.
+        """
+        if not self._store.touch(sha256):
+            raise SnapshotError("the master does not hold its list of files")
+        try:
+            manifest = decode_manifest(self._store.path(sha256).read_bytes())
+        except OSError as error:
+            raise SnapshotError(f"the master cannot read its list of files: {error.strerror}") from error
+        missing = self._missing(sorted(manifest.contents))
+        if missing:
+            raise SnapshotError(f"the master does not hold {len(missing)} of its contents")
+        return manifest
+
+    def _spread(self, *contents: str) -> AbstractAsyncContextManager[None]:
+        return contextlib.nullcontext() if self._copies is None else self._copies.spread(*contents)
+
+
+async def _once(data: bytes) -> AsyncIterator[bytes]:
+    yield data

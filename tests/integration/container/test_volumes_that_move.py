@@ -1,0 +1,250 @@
+"""Volumes go from one machine to another over a real master's port: saved, restored, and refused."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+from support.containers import Machine, until
+from support.control_ends import SECRET
+
+from rce.control.messages import (
+    CONTROL_VERSION,
+    SNAPSHOTS,
+    RestoreVolume,
+    SaveVolume,
+    ToMaster,
+    VolumeLimit,
+    VolumeRestored,
+    VolumeSaved,
+    Welcome,
+)
+from rce.control.model import VolumePlacement
+from rce.control_channel.contents import ContentClient
+from rce.control_channel.dialing import Dialer
+from rce.control_channel.peer import Peer
+from rce.control_channel.server import ControlServer
+from rce.control_channel.uploads import Uploader
+from rce.masters import Masters
+from rce.model import MEGABYTE, NodeSpec, Resources, Volume
+from rce_container.volumes import images
+from rce_master.packages.contents import ContentStore
+from rce_master.snapshots.service import SNAPSHOT, SnapshotService
+from rce_master.state.records import UserVolume
+from rce_master.state_service import StateService
+from rce_master.store.memory import MemoryStore
+
+BOX = "user/box"
+JOURNAL = "user/journal"
+SIZE = 16 * MEGABYTE
+IMAGES = pytest.mark.skipif(bool(why := images.unavailable()), reason=f"volumes cannot be images: {why}")
+
+
+class Kept:
+    """A master, as far as snapshots are concerned.
+
+    Attributes:
+        folder: Where it keeps them.
+    """
+
+    def __init__(self, folder: Path, state_service: StateService) -> None:
+        self.folder = folder / "snapshots"
+        self.service = SnapshotService(state_service, ContentStore(self.folder, noun=SNAPSHOT))
+        state_service.tables.volumes.assign(
+            JOURNAL, UserVolume(user="user", name="journal", size=SIZE, process="a", placement=1)
+        )
+
+    @property
+    def held(self) -> set[str]:
+        return {path.name for path in self.folder.iterdir() if path.is_file()}
+
+
+@asynccontextmanager
+async def keeping(folder: Path, *machines: Machine) -> AsyncIterator[Kept]:
+    """Run a master that keeps snapshots, and let machines use it."""
+    state_service = await StateService.open(MemoryStore())
+    kept = Kept(folder, state_service)
+
+    async def ignore(_: Peer, __: object = None) -> None:
+        return
+
+    async def ignore_message(_: Peer, __: ToMaster) -> None:
+        return
+
+    server = ControlServer(
+        SECRET,
+        on_hello=ignore,
+        on_message=ignore_message,
+        on_gone=ignore,
+        port=0,
+        contents=kept.service.read,
+        on_upload=kept.service.take,
+    )
+    async with server:
+        masters = Masters([f"ws://127.0.0.1:{server.port}"])
+        for machine in machines:
+            machine.uploader = Uploader(Dialer(masters, SECRET))
+            machine.fetch_content = ContentClient(masters, SECRET).piece
+        yield kept
+
+
+@pytest.fixture
+def pair(folder: Path) -> Iterator[tuple[Machine, Machine]]:
+    """Two machines whose volumes are folders."""
+    machines = (Machine(folder / "a", "process"), Machine(folder / "b", "process"))
+    yield machines
+    for machine in machines:
+        machine.tidy()
+
+
+def placement(number: int, *, is_new: bool = False) -> tuple[VolumePlacement, ...]:
+    return (VolumePlacement(name="journal", number=number, is_new=is_new),)
+
+
+async def put(
+    machine: Machine, revision: int, number: int, *, snapshots: int = 0, is_new: bool = False
+) -> None:
+    volume = Volume(name="journal", path="/data/journal", size=SIZE, snapshots=snapshots)
+    await machine.put(
+        BOX,
+        revision,
+        nodes=(NodeSpec(tag="node", pkg="own", exe="keep.py"),),
+        resources=Resources(volumes=(volume,)),
+        volumes=placement(number, is_new=is_new),
+    )
+
+
+async def save(machine: Machine, number: int = 1) -> VolumeSaved:
+    before = len(machine.of(VolumeSaved))
+    await machine.manager.handle(SaveVolume(volume=JOURNAL, placement=number))
+    await until(lambda: len(machine.of(VolumeSaved)) > before, what="it is saved")
+    return machine.of(VolumeSaved)[-1]
+
+
+async def restore(machine: Machine, snapshot: str, number: int = 2, size: int = SIZE) -> VolumeRestored:
+    before = len(machine.of(VolumeRestored))
+    order = RestoreVolume(volume=JOURNAL, placement=number, snapshot=snapshot, size=size)
+    await machine.manager.handle(order)
+    await until(lambda: len(machine.of(VolumeRestored)) > before, what="it is restored")
+    return machine.of(VolumeRestored)[-1]
+
+
+def files(machine: Machine) -> Path:
+    return machine.folder / "state" / "volumes" / "user" / "journal"
+
+
+async def check_move(a: Machine, b: Machine, folder: Path) -> None:
+    """A volume goes from one machine to the other and back; each has what the one before wrote."""
+    async with keeping(folder, a, b), a.engine(), b.engine():
+        await put(a, 1, 1, is_new=True)
+        await a.log_holds(BOX, "node", "1 runs")
+        await a.drop(BOX)
+        saved = await save(a)
+        assert (saved.error, saved.is_last) == ("", True)
+        assert (await restore(b, saved.snapshot)).error == ""
+        await put(b, 1, 2)
+        await b.log_holds(BOX, "node", "2 runs")
+        await b.drop(BOX)
+        saved = await save(b, 2)
+        assert (await restore(a, saved.snapshot, 3)).error == ""
+        await put(a, 300, 3)
+        await a.log_holds(BOX, "node", "3 runs")
+        await a.drop(BOX, 400)
+
+
+async def test_folders_move(pair: tuple[Machine, Machine], folder: Path) -> None:
+    await check_move(*pair, folder)
+
+
+@pytest.mark.needs("bwrap")
+@IMAGES
+async def test_images_and_folders_move_to_one_another(folder: Path) -> None:
+    machines = Machine(folder / "a", "namespace"), Machine(folder / "b", "namespace")
+    machines[0].volume_limit = VolumeLimit.IMAGE
+    try:
+        await check_move(*machines, folder)
+    finally:
+        for machine in machines:
+            machine.tidy()
+
+
+async def test_only_what_is_missing_is_sent(pair: tuple[Machine, Machine], folder: Path) -> None:
+    a, b = pair
+    async with keeping(folder, a, b) as kept, a.engine(), b.engine():
+        files(a).mkdir(parents=True)
+        (files(a) / "large").write_bytes(os.urandom(4 * MEGABYTE))
+        await put(a, 1, 1, is_new=True)
+        await a.log_holds(BOX, "node", "1 runs")
+        await a.drop(BOX)
+        first = await save(a)
+        before = kept.held
+        (files(a) / "small").write_text("more")
+        second = await save(a)
+        assert len(kept.held - before) == 2, "the list and the new file"
+        await restore(b, first.snapshot)
+        for name in before:
+            (kept.folder / name).unlink()  # what it has need not be fetched
+        assert (await restore(b, second.snapshot, 3)).error == ""
+        assert (files(b) / "small").read_text() == "more"
+        assert (files(b) / "large").read_bytes() == (files(a) / "large").read_bytes()
+
+
+async def test_a_running_volume_is_saved_again_and_again(pair: tuple[Machine, Machine], folder: Path) -> None:
+    a, b = pair
+    async with keeping(folder, a, b), a.engine(), b.engine():
+        await a.manager.handle(Welcome(version=CONTROL_VERSION, master="m", features=(SNAPSHOTS,)))
+        await put(a, 1, 1, snapshots=1, is_new=True)
+        await a.log_holds(BOX, "node", "1 runs")
+        await until(lambda: len(a.of(VolumeSaved)) > 1, what="two snapshots")
+        saved = a.of(VolumeSaved)[-1]
+        assert (saved.is_last, saved.placement, saved.error) == (False, 1, "")
+        assert (await restore(b, saved.snapshot)).error == ""
+        await put(b, 1, 2)
+        await b.log_holds(BOX, "node", "2 runs")
+        assert not list((files(a).parents[1] / ".scratch").iterdir())
+
+
+async def test_damage_is_refused_and_changes_nothing(pair: tuple[Machine, Machine], folder: Path) -> None:
+    a, b = pair
+    async with keeping(folder, a, b) as kept, a.engine(), b.engine():
+        await put(a, 1, 1, is_new=True)
+        await a.log_holds(BOX, "node", "1 runs")
+        await a.drop(BOX)
+        assert "not on this machine" in (await save(a, 2)).error
+        saved = await save(a)
+        assert (await restore(b, saved.snapshot)).error == ""
+        was = (files(b) / "log").read_text()
+        (piece,) = kept.held - {saved.snapshot}
+        shutil.rmtree(files(b))
+        files(b).mkdir()
+        (files(b) / "log").write_text("former")
+        (kept.folder / piece).write_text("damage")
+        assert "is not what its hash says" in (await restore(b, saved.snapshot, 3)).error
+        (kept.folder / piece).unlink()
+        assert "does not have it" in (await restore(b, saved.snapshot, 3)).error
+        assert (files(b) / "log").read_text() == "former"
+        (kept.folder / piece).write_text(was)
+        assert (await restore(b, saved.snapshot, 3)).error == ""
+        assert (files(b) / "log").read_text() == was
+        await put(a, 200, 4)
+        await until(
+            lambda: any("are not on this machine any more" in text for text in a.faults), what="a refusal"
+        )
+
+
+async def test_a_master_that_has_no_room_refuses(pair: tuple[Machine, Machine], folder: Path) -> None:
+    a, b = pair
+    async with keeping(folder, a, b) as kept, a.engine():
+        await put(a, 1, 1, is_new=True)
+        await a.log_holds(BOX, "node", "1 runs")
+        await a.drop(BOX)
+        (files(a) / "large").write_bytes(os.urandom(4 * SIZE + 8 * MEGABYTE))
+        assert "that its volume may hold" in (await save(a)).error
+        (files(a) / "large").unlink()
+        shutil.rmtree(kept.folder)
+        kept.folder.write_text("no folder")
+        assert "cannot keep the snapshot" in (await save(a)).error
