@@ -50,7 +50,7 @@ class Upload:
         await self._master.send(data)
         self._unanswered += 1
         if self._unanswered >= _AHEAD:
-            await self._hear()
+            await self._receive_answer()
 
     async def finish(self) -> None:
         """Wait until the master has all that was sent on its disk.
@@ -59,9 +59,9 @@ class Upload:
             SnapshotError: It does not.
         """
         while self._unanswered:
-            await self._hear()
+            await self._receive_answer()
 
-    async def _hear(self) -> None:
+    async def _receive_answer(self) -> None:
         answer = await _receive(self._master, Kept)
         self._unanswered -= 1
         if answer.error:

@@ -14,7 +14,7 @@ import fcntl
 import os
 import stat
 from collections.abc import Awaitable, Callable, Iterator
-from typing import Self, TypeAlias
+from typing import Self, TypeAlias, assert_never
 
 from rce.control import SnapshotError
 from rce.control.snapshots import (
@@ -258,6 +258,8 @@ async def write(manifest: Manifest, root: int, fetch: Fetch) -> None:
                 os.symlink(entry.target, entry.path, dir_fd=root)
             case FileEntry():
                 await _write_file(entry, root, fetch)
+            case _:
+                assert_never(entry)
     for entry in reversed(manifest.entries):
         if isinstance(entry, FolderEntry):
             os.chmod(entry.path, permissions(entry.mode), dir_fd=root)
