@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import logging
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
 from rce.aio.backoff import Backoff
+from rce.aio.tasks import TaskScope
 from rce.dialing import open_url_socket
 from rce.masters import Masters
 from rce.protocol import (
@@ -29,6 +31,7 @@ from rce.protocol import (
 from rce_client.discovery import VERSION, locate
 from rce_client.exceptions import ClientError, InUseError, LostError, RefusedError, UntrustedError
 from rce_client.failures import judge
+from rce_client.liveness import Liveness, Outflow, Step
 from rce_client.sendqueue import QueuedMessage, QueueLimits, SendQueue
 from rce_client.socket import EngineSocket
 
@@ -98,10 +101,11 @@ class Timing:
     """Seconds for the master's answer."""
     open: float = 25.0
     """Seconds for the WebSocket handshake; the endpoint itself may wait some seconds for the master."""
-    ping_interval: float | None = 10.0
-    """Seconds between two pings; None for no pings."""
-    ping_timeout: float | None = 10.0
-    """Seconds to wait for the answer to a ping; then the connection counts as lost. None for no limit."""
+    ping_interval: float | None = 2.0
+    """Seconds without a sign of life after which the engine is pinged; None for no pings."""
+    ping_timeout: float | None = 4.0
+    """Seconds without a sign of life after a ping; then the connection counts as lost. None for no limit. Any
+    data is a sign of life, so a slow link needs no more (:mod:`rce_client.liveness`)."""
     close: float = 3.0
     """Seconds for the closing handshake."""
     flush: float = 5.0
@@ -135,6 +139,17 @@ class Listener(Protocol):
 
     def on_event(self, event: Event) -> None:
         """Handle an event from the engine."""
+
+
+class _SilentError(Exception):
+    """The engine gives no sign of life."""
+
+
+async def _ping(socket: EngineSocket, outflow: Outflow) -> None:
+    """Send a ping, which waits for its turn if much is being sent."""
+    with contextlib.suppress(ConnectionClosed):
+        await socket.ping()
+        outflow.pinged()
 
 
 class EngineTransport:
@@ -259,8 +274,7 @@ class EngineTransport:
             proxy=None,
             max_size=timing.max_message,
             open_timeout=timing.open,
-            ping_interval=timing.ping_interval,
-            ping_timeout=timing.ping_timeout,
+            ping_interval=None,
             close_timeout=timing.close,
             write_limit=timing.write_buffer,
             create_connection=EngineSocket,
@@ -275,11 +289,13 @@ class EngineTransport:
         self.features = FEATURES & set(told.split(","))
         error = LostError("the connection was closed")
         try:
-            async with asyncio.TaskGroup() as tasks:
-                writer = tasks.create_task(self._write(socket))
+            async with TaskScope() as tasks:
+                tasks.spawn(self._write(socket), name="write to the engine")
+                tasks.spawn(self._watch(socket, tasks), name="watch the engine")
                 self._listener.on_connected()
                 error = await self._read(socket)
-                writer.cancel()
+        except* _SilentError as silent:
+            error = LostError(str(silent.exceptions[0]))
         finally:
             self.connected = False
             self._queue.clear()
@@ -304,6 +320,31 @@ class EngineTransport:
         except ConnectionClosed as closed:
             reason = closed.rcvd.reason if closed.rcvd is not None else ""
             return LostError(reason or f"the connection ended: {closed}")
+
+    async def _watch(self, socket: EngineSocket, tasks: TaskScope) -> None:
+        """Ping the engine if nothing is heard of it.
+
+        Raises:
+            _SilentError: It does not answer.
+        """
+        timing = self._timing
+        if timing.ping_interval is None:
+            return
+        liveness = Liveness(timing.ping_interval, timing.ping_timeout)
+        outflow = Outflow(socket.transport)
+        clock = asyncio.get_running_loop().time
+        looked = clock()
+        while True:
+            await asyncio.sleep(liveness.period)
+            now, heard = clock(), socket.heard
+            socket.heard = False
+            step = liveness.look(now - looked, heard=heard, moved=outflow.moved())
+            looked = now
+            if step is Step.PING:
+                tasks.spawn(_ping(socket, outflow), name="ping the engine")
+            elif step is Step.GIVE_UP:
+                socket.transport.abort()
+                raise _SilentError(f"the engine did not answer within {liveness.silent:.0f} s")
 
     async def _write(self, socket: EngineSocket) -> None:
         while True:

@@ -16,7 +16,18 @@ JOIN_BELOW = 64 << 10
 
 
 class EngineSocket(TlsClientConnection):
-    """A connection; made by ``websockets.asyncio.client.connect(create_connection=EngineSocket)``."""
+    """A connection; made by ``websockets.asyncio.client.connect(create_connection=EngineSocket)``.
+
+    Attributes:
+        heard: Whether data came since this was last set to false.
+    """
+
+    heard = False
+
+    def data_received(self, data: bytes) -> None:
+        """Take note of the data."""
+        self.heard = True
+        super().data_received(data)
 
     async def send_frames(self, frames: Sequence[Frame]) -> None:
         """Send the frames of a message, and wait until the socket's buffer has room again.
