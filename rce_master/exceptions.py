@@ -7,6 +7,7 @@
     |   +-- InvalidRequestError    it can never be done like this
     |   +-- NotFoundError          it names something that is not there
     |   +-- ConflictError          it contradicts what is there
+    |   |   +-- UnderWayError      the same request is under way; wait
     |   +-- LimitReachedError      there are too many already
     |   +-- NoRoomError            no machine, or not its own, has enough of what a container asks for
     |   +-- ForbiddenError         this user may not do it
@@ -67,6 +68,13 @@ class ConflictError(RefusedError):
 
     status = 409
     code = FaultCode.CONFLICT
+
+
+class UnderWayError(ConflictError):
+    """A request with the same ``Idempotency-Key`` is under way."""
+
+    def __str__(self) -> str:
+        return "a request with this Idempotency-Key is under way; repeat it in a moment for its answer"
 
 
 class LimitReachedError(RefusedError):

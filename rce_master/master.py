@@ -18,6 +18,8 @@ from rce.tls.choice import plain_warning
 from rce.tls.expiry import watch_expiry
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer, LateApplication
+from rce_master.answers import PURPOSE as ANSWERS_PURPOSE
+from rce_master.answers import Answers
 from rce_master.audit import AuditLog
 from rce_master.auth import Authenticator, client_digest
 from rce_master.control_handler import ControlHandler
@@ -48,9 +50,11 @@ if TYPE_CHECKING:
     from rce.config import Secret
     from rce.web.entry import EntryAnswer
     from rce_master.leadership import Fence
+    from rce_master.leadership.drains import MasterDrains
     from rce_master.packages.copies import ArchiveCopies
     from rce_master.settings import MasterSettings
     from rce_master.state.changes import Changes
+    from rce_master.state.core import State
     from rce_master.store import Store
 
 _log = logging.getLogger(__name__)
@@ -83,6 +87,8 @@ class Master:
         fence: Tells whether this master leads, if there may be others; the store is one of its term.
         copies: Makes what copies contents to the other masters, if there may be any: of a folder, where
             the others are asked for them, and what they are part of.
+        drains: Of this master and the others, if there may be any; the caller runs them.
+        copy: As :meth:`rce_master.state_service.StateService.open` takes it.
     """
 
     def __init__(
@@ -94,9 +100,13 @@ class Master:
         hasher: PasswordHasher | None = None,
         fence: Fence | None = None,
         copies: Callable[[ContentStore, str, str], ArchiveCopies] | None = None,
+        drains: MasterDrains | None = None,
+        copy: Callable[[], Awaitable[State | None]] | None = None,
     ) -> None:
         self._fence = fence
         self._copies = copies
+        self._drains = drains
+        self._copy = copy
         self._settings = settings
         self._secret = secret
         self._store = store
@@ -119,7 +129,9 @@ class Master:
             MasterError: A port cannot be used.
             CertificateError: A certificate cannot be used.
         """
-        state_service = await StateService.open(self._store, self._settings.state, fence=self._fence)
+        state_service = await StateService.open(
+            self._store, self._settings.state, fence=self._fence, copy=self._copy
+        )
         if before_listening is not None:
             await before_listening()
         if not self._settings.dev and not len(state_service.tables.users):
@@ -164,8 +176,10 @@ class Master:
             quotas=quotas,
             dev=self._settings.dev,
             audit=audit,
+            answers=Answers(state_service.tables, self._secret.derive(ANSWERS_PURPOSE), time.time),
             fence=self._fence,
             forwarding=ForwardingKey(self._secret.derive(PURPOSE)),
+            drains=self._drains,
         )
         try:
             async with asyncio.TaskGroup() as group:
@@ -177,6 +191,7 @@ class Master:
                         packages.run(),
                         snapshots.run(),
                         services.tokens.run(state_service),
+                        services.answers.run(state_service),
                         _tick(state_service, audit),
                     )
                 ]

@@ -6,6 +6,7 @@ import asyncio
 import gc
 import logging
 from contextlib import AsyncExitStack
+from functools import partial
 from typing import TYPE_CHECKING
 
 from rce.aio.tasks import TaskScope
@@ -14,11 +15,16 @@ from rce.guard import TrustedProxies
 from rce.link.address import in_url, is_any, own_address
 from rce.own_process import listening
 from rce.tls.choice import is_loopback
+from rce.tls.expiry import watch_expiry
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
 from rce_master.exceptions import FencedError, MasterError
+from rce_master.follower import StateFollower
 from rce_master.http.forwarded import PURPOSE, ForwardingKey
+from rce_master.http.probe import Probe
 from rce_master.leadership import LeaseSettings
+from rce_master.leadership.drains import MasterDrains
+from rce_master.leadership.engine_mark import EngineMark
 from rce_master.leadership.keeper import LeadershipKeeper
 from rce_master.leadership.registry import MasterRegistry
 from rce_master.master import Master
@@ -104,6 +110,7 @@ class ReplicatedMaster:
             tls = None if identity is None else identity.client
             async with EtcdClient(address.endpoints, tls=tls, attempt=START_S) as client:
                 await _prepare(client, address.prefix)
+                await EngineMark(client, address.prefix, self._secret).check()
             attempt = settings.lease / _ATTEMPTS
             async with EtcdClient(address.endpoints, tls=tls, attempt=attempt) as client:
                 lease = LeaseSettings(ttl=settings.lease)
@@ -111,13 +118,16 @@ class ReplicatedMaster:
                 registry = MasterRegistry(client, address.prefix, settings.name)
                 async with TaskScope() as tasks:
                     tasks.spawn(registry.run(), name="registry of masters")
+                    if identity is not None:
+                        tasks.spawn(watch_expiry([identity.files]), name="certificate for etcd")
                     while not is_stopping():
-                        await self._stand_by_and_lead(keeper, registry, on_ready, on_standby)
+                        await self._stand_by_and_lead(client, keeper, registry, on_ready, on_standby)
         finally:
             lock.close()
 
     async def _stand_by_and_lead(
         self,
+        etcd: EtcdClient,
         keeper: LeadershipKeeper,
         registry: MasterRegistry,
         on_ready: Callable[[RunningMaster], None],
@@ -134,10 +144,15 @@ class ReplicatedMaster:
             ArchiveRoutes(ContentStore(settings.state_dir / folder, noun=noun), key, keeper.newest_term, path)
             for folder, noun, path in ((ARCHIVES, "package", PATH), (SNAPSHOTS, SNAPSHOT, SNAPSHOTS_PATH))
         ]
+        assert settings.etcd is not None
+        follower = StateFollower(etcd, settings.etcd.prefix, settings.state, asyncio.get_running_loop().time)
+        keeper.on_save = follower.saw
         async with AsyncExitStack() as waiting, self._session() as session:
+            beside = await waiting.enter_async_context(TaskScope())
+            beside.spawn(follower.run(), name="copy of the state")
             forwarder = await waiting.enter_async_context(self._forwarder())
             server = HttpServer(
-                make_standby_app(keeper, forwarder, archives, names, settings.allowed_origins),
+                make_standby_app(keeper, follower, forwarder, archives, names, settings.allowed_origins),
                 settings.bind,
                 settings.http_port,
                 for_clients.server if for_clients else None,
@@ -153,6 +168,10 @@ class ReplicatedMaster:
             store, fence = await keeper.acquire()
             _log.info("this master leads in term %d", fence.term)
             tls = self._masters_tls()
+            probe = Probe(session, tls)
+            prefix = settings.etcd.prefix
+            drains = MasterDrains(etcd, prefix, settings.name, registry, probe.stands_by)
+            mark = EngineMark(etcd, prefix, self._secret)
 
             def copies(contents: ContentStore, path: str, noun: str) -> ArchiveCopies:
                 return ArchiveCopies(
@@ -161,12 +180,21 @@ class ReplicatedMaster:
 
             try:
                 master = Master(
-                    settings, self._secret, store, hasher=self._hasher, fence=fence, copies=copies
+                    settings,
+                    self._secret,
+                    store,
+                    hasher=self._hasher,
+                    fence=fence,
+                    copies=copies,
+                    drains=drains,
+                    copy=partial(follower.take, store.begun),
                 )
                 async with asyncio.TaskGroup() as group:
-                    keeping = group.create_task(keeper.keep())
+                    works = (keeper.keep(), drains.run(), mark.run())
+                    keeping = [group.create_task(work) for work in works]
                     await master.run(on_ready, waiting.aclose)
-                    keeping.cancel()
+                    for task in keeping:
+                        task.cancel()
             except* (FencedError, EtcdAwayError) as errors:
                 _log.warning("this master leads no more: %s", _first_of(errors))
             finally:

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 from rce_master.exceptions import FencedError, MasterError, RefusedError, StoreError
 from rce_master.state.changes import Changes, Touched, make_row
 from rce_master.state.commands import Continue
-from rce_master.state.core import State
+from rce_master.state.core import State, without_collections
 from rce_master.state.migration import conversion
 from rce_master.store.copying import check_finished
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Awaitable, Callable, Iterator, Sequence
 
     from rce.control import EndpointSpec, SpecPatch
     from rce_master.leadership import Fence
@@ -108,6 +108,7 @@ class StateService:
         clock: Callable[[], float] = time.monotonic,
         revision: int | None = None,
         fence: Fence | None = None,
+        copy: Callable[[], Awaitable[State | None]] | None = None,
     ) -> StateService:
         """Go on from what a store holds, in a new term of it, or in that of a fence.
 
@@ -117,6 +118,7 @@ class StateService:
             clock: Seconds; never goes back.
             revision: As :meth:`State.load` takes it; None is the time of day.
             fence: Of the leadership in which the store was opened, if there may be other masters.
+            copy: Gives what was read of the store already, if it is still what the store holds.
 
         Raises:
             StoreError: It cannot be read.
@@ -124,7 +126,14 @@ class StateService:
         if revision is None:
             revision = time.time_ns() // 1_000_000
         term = await store.begin_term() if fence is None else fence.term
-        state = State.load(await load_converted(store, term), clock(), settings, revision=revision)
+        state = None if copy is None else await copy()
+        if state is None:
+            state = State(settings)
+            with without_collections():
+                for _ in state.reading(await load_converted(store, term)):
+                    await asyncio.sleep(0)  # the lease is renewed meanwhile
+        with without_collections():
+            state.begin(clock(), revision)
         return cls(state, store, clock, term, fence)
 
     @property

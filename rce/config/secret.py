@@ -59,7 +59,11 @@ class Secret:
 
     def derive(self, purpose: str) -> bytes:
         """Derive a key for one purpose, which reveals nothing of the secret."""
-        return hmac.digest(self._text.encode(), f"rce {purpose}".encode(), "sha256")
+        return _derive(self._text, purpose)
+
+    def derive_all(self, purpose: str) -> tuple[bytes, ...]:
+        """Derive a key from each secret that is accepted, the current one first."""
+        return (_derive(self._text, purpose),)
 
     def __eq__(self, other: object) -> bool:
         return self.matches(other._text) if isinstance(other, Secret) else NotImplemented
@@ -71,6 +75,10 @@ class Secret:
         return "Secret('***')"
 
     __str__ = __repr__
+
+
+def _derive(text: str, purpose: str) -> bytes:
+    return hmac.digest(text.encode(), f"rce {purpose}".encode(), "sha256")
 
 
 class SecretFile(Secret):
@@ -105,6 +113,11 @@ class SecretFile(Secret):
         given = text.encode("utf-8", "surrogateescape")
         found = [hmac.compare_digest(known.encode(), given) for known in self._texts]
         return any(found)
+
+    def derive_all(self, purpose: str) -> tuple[bytes, ...]:
+        """Derive a key from each secret that is accepted, the current one first."""
+        self._look()
+        return tuple(_derive(text, purpose) for text in self._texts)
 
     def was_refused(self, text: str) -> bool:
         """Note that a text that was shown was refused; return whether there is another one to show."""

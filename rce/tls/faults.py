@@ -37,8 +37,8 @@ _AT_CLIENTS = {
     "TLSV1_ALERT_DECRYPT_ERROR": _FOREIGN,
     "SSLV3_ALERT_CERTIFICATE_EXPIRED": _OWN_EXPIRED,
     "SSLV3_ALERT_CERTIFICATE_REVOKED": _OWN_REVOKED,
-    "SSLV3_ALERT_BAD_CERTIFICATE": "the server does not accept our certificate; look at the server's log, and"
-    " at the clocks of both machines",
+    "SSLV3_ALERT_BAD_CERTIFICATE": "the server does not accept our certificate: it may have expired (then"
+    " renew it: rce certificate issue NAME), or the machines' clocks differ; the server's log says which",
 }
 _AT_SERVERS = {
     "HTTP_REQUEST": "it speaks plain HTTP at a TLS port",

@@ -28,6 +28,20 @@ _FAILURES: dict[int, str] = {
     HTTPStatus.SERVICE_UNAVAILABLE: "Something that is needed for it cannot be reached now",
 }
 _REF = "#/components/schemas/{model}"
+_KEY_PARAMETER = {
+    "name": "Idempotency-Key",
+    "in": "header",
+    "required": False,
+    "description": "A new one for each new request, such as a UUID. A repeat with the same key is not done"
+    " again, and gets the answer of the first (409 while that is under way, 422 if it is another request).",
+    "schema": {"type": "string", "pattern": "^[!#-~]+$", "maxLength": 200},
+}
+_REPLAYED = {
+    "Idempotent-Replayed": {
+        "description": "'true': the request was done before, and this is its answer",
+        "schema": {"type": "string"},
+    }
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +80,8 @@ class Operation:
     """Media type of a body that is a file."""
     errors: tuple[int, ...] = ()
     """All other statuses that an answer may have; empty: any."""
+    keyed: bool = False
+    """Whether repeats with the same ``Idempotency-Key`` are done once."""
 
 
 def build_document(
@@ -106,7 +122,8 @@ def _describe(known: Operation, error: type[BaseModel]) -> dict[str, Any]:
         "summary": known.summary,
         "tags": [known.group],
         "parameters": [_path_parameter(name) for name in re.findall(r"{(\w+)}", known.path)]
-        + [_query_parameter(query) for query in known.query],
+        + [_query_parameter(query) for query in known.query]
+        + ([_KEY_PARAMETER] if known.keyed else []),
         "responses": {str(known.status): _success(known)}
         | {str(status): _success(known) for status in known.also}
         | {str(status): _failure(status, error) for status in sorted(known.errors)}
@@ -144,6 +161,8 @@ def _success(known: Operation) -> dict[str, Any]:
         answer["content"] = {known.media: {"schema": {"type": "string"}}}
     for media in known.other_media:
         answer.setdefault("content", {})[media] = {"schema": {"type": "string"}}
+    if known.keyed:
+        answer["headers"] = _REPLAYED
     return answer
 
 

@@ -46,6 +46,8 @@ class Route(Generic[H]):
     """Media type of a body that the handler reads itself."""
     errors: tuple[int, ...] = ()
     """Statuses of answers that are not a success."""
+    keyed: bool = False
+    """Whether repeats with the same ``Idempotency-Key`` are done once."""
 
     @property
     def operation(self) -> Operation:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import uuid
+from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 from urllib.parse import urlsplit
@@ -31,6 +33,9 @@ REQUEST_S = 30.0
 UPLOAD_S = 300.0
 """Seconds to wait for an answer to an upload, which the master checks first."""
 RETRY_S = 1.0
+REPEAT_S = 30.0
+"""How long a POST whose answer was lost is repeated: another master may have to take the lead."""
+IDEMPOTENCY_KEY = "Idempotency-Key"
 PAGE_ITEMS = 1000
 _OK = 400
 _REDIRECTS = 300, 400
@@ -82,7 +87,7 @@ class ApiClient:
         body: dict[str, Any] | None = None,
         query: dict[str, str | int] | None = None,
     ) -> Any:
-        """Make a request.
+        """Make a request. A POST whose answer is lost is repeated, with the key by which it is done once.
 
         Returns:
             What came back, or None if nothing did.
@@ -91,23 +96,33 @@ class ApiClient:
             ApiError: The master refused.
             CliError: The master could not be reached.
         """
-        for number in range(len(self._masters.all), 0, -1):
+        headers = {IDEMPOTENCY_KEY: f'"{uuid.uuid4()}"'} if method == "POST" else {}
+        untried = len(self._masters.all)
+        end: float | None = None
+        """Until when a lost answer is asked for; None: none was lost."""
+        clock = asyncio.get_running_loop().time
+        while True:
             url = self._masters.current
+            untried -= 1
             try:
                 async with self._session.request(
-                    method, self._base + path, json=body, params=query, allow_redirects=False
+                    method, self._base + path, json=body, params=query, headers=headers, allow_redirects=False
                 ) as reply:
-                    if number > 1 and STANDBY_HEADER in reply.headers:
-                        self._masters.failed(url)
-                        continue
-                    return await _result(reply)
+                    if headers and reply.status == HTTPStatus.BAD_GATEWAY and end is None:
+                        end = clock() + REPEAT_S
+                    others = untried > 0 and STANDBY_HEADER in reply.headers
+                    if not others and not (end is not None and _is_undecided(reply) and clock() < end):
+                        return await _result(reply)
             except (aiohttp.ClientError, TimeoutError, ValueError) as error:
                 # Only without a connection it is certain that the request had no effect.
-                if number > 1 and isinstance(error, aiohttp.ClientConnectorError):
-                    self._masters.failed(url)
-                    continue
-                raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
-        raise AssertionError("there is a master at least")
+                unsent = isinstance(error, aiohttp.ClientConnectorError)
+                if headers and not unsent and end is None:
+                    end = clock() + REPEAT_S
+                if not (unsent and untried > 0) and (end is None or clock() >= end):
+                    raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
+            self._masters.failed(url)
+            if untried <= 0:
+                await asyncio.sleep(RETRY_S)
 
     async def items(
         self, path: str, name: str = "", query: dict[str, str | int] | None = None
@@ -253,6 +268,13 @@ class ApiClient:
             async for line in reply.content:
                 if line.startswith(b"data: "):
                     yield msgspec.json.decode(line[6:], type=Event)
+
+
+def _is_undecided(reply: aiohttp.ClientResponse) -> bool:
+    """Return whether an answer leaves open if a request was done that was sent before."""
+    status = reply.status
+    is_under_way = status == HTTPStatus.CONFLICT and "Retry-After" in reply.headers
+    return is_under_way or status in (HTTPStatus.BAD_GATEWAY, HTTPStatus.SERVICE_UNAVAILABLE)
 
 
 def _words(error: Exception) -> str:

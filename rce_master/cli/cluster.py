@@ -17,6 +17,7 @@ import typer
 
 from rce.cli.service import USER, install, is_system, make_service, make_user, systemd_runs
 from rce.config import default_state_dir
+from rce.config.store_address import DEFAULT_PREFIX
 from rce.masters import split_addresses
 from rce.own_process import end_signals
 from rce.services.units import SYSTEM_STATE, Role
@@ -28,6 +29,7 @@ from rce_master.cluster.files import CERTIFICATE, Machine, find_etcd, read_confi
 from rce_master.cluster.joining import (
     check_place,
     cluster_client,
+    forget_masters,
     hint,
     remove_member,
     request_membership,
@@ -139,7 +141,9 @@ def remove(
         endpoints, contexts = _place(etcd, state_dir, tls=tls)
         async with await cluster_client(endpoints, contexts) as client:
             leaving, others = await remove_member(client, name, contexts, force=force)
-        typer.echo(f"removed {leaving.shown}; {hint(others)}")
+            typer.echo(f"removed {leaving.shown}; {hint(others)}")
+            for master in await forget_masters(client, DEFAULT_PREFIX, leaving):
+                typer.echo(f"the other masters do not count {master} any more")
         typer.echo(
             "on that machine, if it is there: rce uninstall-service master; rce uninstall-service etcd; then"
             " remove its folder etcd and the file etcd.yaml"

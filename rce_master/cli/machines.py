@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from http import HTTPStatus
 from typing import Annotated, Any
 
 import typer
@@ -12,10 +13,12 @@ from rich.table import Table
 from rce.model import about, write_cores
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
-from rce_master.cli.exceptions import CliError
+from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.cli.show import console
 
 POLL_S = 0.5
+LOST_POLLS = 60
+"""Polls without an answer, while the lead changes, until a command fails."""
 
 Machine = dict[str, Any]
 
@@ -30,15 +33,40 @@ def machines(
 async def _machines(as_json: bool) -> None:
     async with ApiClient.of(credentials.load()) as client:
         found = await client.items("/machines")
+        masters = [] if as_json else await _masters(client)
     if as_json:
         typer.echo(json.dumps(found, indent=2))
         return
     screen = console()
     screen.print(overview(found))
+    if masters:
+        screen.print(overview_of_masters(masters))
     for machine in found:
         if machine["detail"]:
             screen.print(f"{machine['process']}: {machine['detail']}", markup=False, highlight=False)
         _print_staying(machine)
+
+
+async def _masters(client: ApiClient) -> list[Machine]:
+    """Return the masters; a master of the previous release does not know them."""
+    try:
+        return list((await client.call("GET", "/masters"))["masters"])
+    except ApiError as error:
+        if error.status != HTTPStatus.NOT_FOUND:
+            raise
+        return []
+
+
+def overview_of_masters(found: list[Machine]) -> Table:
+    """Format several masters as a table."""
+    table = Table("master", "role", "url", box=None)
+    for master in found:
+        away = master["role"] == "away"
+        state = f"[red]{master['role']}[/]" if away else master["role"]
+        table.add_row(
+            master["name"], state + (" [yellow]drained[/]" if master["drained"] else ""), master["url"]
+        )
+    return table
 
 
 def overview(found: list[Machine]) -> Table:
@@ -81,7 +109,7 @@ def _print_staying(machine: Machine) -> None:
 
 
 def drain(
-    machine: Annotated[str, typer.Argument(help="Name of the machine, or of one of its task sets.")],
+    machine: Annotated[str, typer.Argument(help="Name of the machine, one of its task sets, or a master.")],
     undo: Annotated[bool, typer.Option("--undo", help="Let it take containers and robots again.")] = False,
     wait: Annotated[bool, typer.Option("--wait", help="Wait until all that it has is elsewhere.")] = False,
 ) -> None:
@@ -89,19 +117,28 @@ def drain(
 
     Each container is started elsewhere first and then dropped here. Robots are disconnected, and connect to
     another robot task set. What finds no place elsewhere stays, and goes as soon as there is one.
+
+    Of several masters, one that is drained hands the lead over, and leads again only if no other one does.
     """
     run(_undrain(machine) if undo else _drain(machine, wait=wait))
 
 
 async def _undrain(machine: str) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        await client.call("DELETE", f"/machines/{machine}/drain")
-    typer.echo(f"{machine} takes containers and robots again")
+        told = await client.call("DELETE", f"/machines/{machine}/drain")
+    for master in told.get("masters", ()):
+        typer.echo(f"{master['name']} may lead again")
+    if not told.get("masters"):
+        typer.echo(f"{machine} takes containers and robots again")
 
 
 async def _drain(machine: str, *, wait: bool) -> None:
     async with ApiClient.of(credentials.load()) as client:
-        found = (await client.call("PUT", f"/machines/{machine}/drain"))["machines"]
+        told = await client.call("PUT", f"/machines/{machine}/drain")
+        if masters := told.get("masters"):
+            await _drain_master(client, masters[0]["name"], wait=wait)
+            return
+        found = told["machines"]
         typer.echo(f"{machine} takes no new containers and robots")
         said: dict[str, str] = {}
         while True:
@@ -113,6 +150,29 @@ async def _drain(machine: str, *, wait: bool) -> None:
             found = [one for one in everything if machine in (one["process"], one["machine"])]
             if not any(one["draining"] for one in found):
                 raise CliError(f"{machine} is not drained any more")
+
+
+async def _drain_master(client: ApiClient, name: str, *, wait: bool) -> None:
+    typer.echo(f"{name} leads only if no other master does")
+    lost = 0
+    while True:
+        try:
+            masters = await _masters(client)
+            lost = 0
+        except CliError as error:  # while the lead changes
+            lost += 1
+            if lost >= LOST_POLLS or getattr(error, "status", 503) != HTTPStatus.SERVICE_UNAVAILABLE:
+                raise
+            masters = []
+        leader = next((one["name"] for one in masters if one["role"] == "leader"), "")
+        others = any(one["role"] == "standby" and not one["drained"] for one in masters)
+        if leader and leader != name:
+            typer.echo(f"{leader} leads")
+            return
+        if not wait and leader and not others:
+            typer.echo(f"{name} leads until another master can")
+            return
+        await asyncio.sleep(POLL_S)
 
 
 def _tell_changes(found: list[Machine], said: dict[str, str]) -> None:

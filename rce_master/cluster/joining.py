@@ -7,11 +7,14 @@ import contextlib
 import os
 import socket
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 from rce.dialing import open_socket
 from rce_master.cluster.client import ClusterClient, ask_all, healthy
 from rce_master.cluster.members import ClusterError, Member, advice, check_new, check_removal, find
 from rce_master.store.etcd.exceptions import EtcdAwayError, EtcdError, EtcdRefusedError
+from rce_master.store.etcd.layout import Keys, read_master
+from rce_master.store.etcd.wire import Delete
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
@@ -176,6 +179,33 @@ async def remove_member(
             f" ({error})"
         ) from error
     return leaving, tuple(each for each in members if each.id != leaving.id)
+
+
+async def forget_masters(client: ClusterClient, prefix: str, leaving: Member) -> list[str]:
+    """Remove what etcd knows of the masters of a machine, so that packages do not wait for them.
+
+    Args:
+        client: A client of all members.
+        prefix: Of the engine's keys.
+        leaving: The machine's member of etcd.
+
+    Returns:
+        Their names.
+
+    Raises:
+        EtcdError: etcd does not answer, or refused.
+    """
+    keys = Keys(prefix)
+    known = [read_master(keys, record) for record in (await client.range(keys.masters)).records]
+    gone = [
+        one.name
+        for one in known
+        if one.name.rpartition(":")[0] == leaving.name or urlsplit(one.url).hostname == leaving.host
+    ]
+    operations = [Delete(key + name) for name in gone for key in (keys.masters, keys.drained)]
+    if operations:
+        await client.transact([], operations)
+    return gone
 
 
 async def cluster_client(endpoints: Sequence[str], tls: Context | None) -> ClusterClient:

@@ -50,6 +50,8 @@ class MasterLine:
     term: int = 0
     lag: float | None = None
     """Seconds that a stand-by is behind; None: it does not say."""
+    drained: bool = False
+    """Whether it leads only if no other one does."""
     version: str = ""
 
 
@@ -84,9 +86,8 @@ class ClusterReport:
         rows = [("MASTER", "URL", "ROLE", "TERM", "LAG", "VERSION", "STATUS")]
         for one in self.masters:
             lag = "-" if one.lag is None else f"{one.lag:.1f} s"
-            rows.append(
-                (one.name, one.url, one.role, str(one.term or "-"), lag, one.version or "-", one.status)
-            )
+            role = f"{one.role}, drained" if one.drained else one.role
+            rows.append((one.name, one.url, role, str(one.term or "-"), lag, one.version or "-", one.status))
         yield from _table(rows)
         for text in self.advice:
             yield f"note: {text}"
@@ -151,6 +152,7 @@ async def _ask_master(
                 status=str(told["status"]),
                 term=term,
                 lag=None if lag is None else float(lag),
+                drained=bool(told.get("drained", False)),
                 version=str(told.get("version", "")),
             )
     except (KeyError, TypeError, ValueError):

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, build_document
+from rce_master.answers import PendingAnswer
 from rce_master.exceptions import InvalidRequestError, MasterError
 from rce_master.http import (
     api_account,
@@ -32,8 +33,9 @@ from rce_master.http import (
 )
 from rce_master.http.access import admit, bearer
 from rce_master.http.auditing import note_done, note_refused
+from rce_master.http.idempotency import keyed_request, replayed
 from rce_master.http.models import Error
-from rce_master.http.routes import Call, Route, Services
+from rce_master.http.routes import Call, Route, Services, body_of
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -96,9 +98,18 @@ def _adapt(route: Route, services: Services) -> Answer:
         call = Call(request, services, user, token, None, parts)
         try:
             admit(route, user)
+            text = await read_whole(request) if route.body else b""
             if route.body:
-                call = replace(call, body=read_body(route.body, await read_whole(request)))
-            reply = await route.handler(call)
+                call = replace(call, body=read_body(route.body, text))
+            keyed = keyed_request(request, user, text) if route.keyed and user is not None else None
+            if keyed is None:
+                reply = await route.handler(call)
+            else:
+                with services.answers.under_way(keyed) as former:
+                    if former is not None:
+                        return replayed(former)
+                    pending = PendingAnswer(services.answers, keyed, route.status)
+                    reply = await route.handler(replace(call, pending=pending))
         except MasterError as error:
             note_refused(route, call, error)
             raise
@@ -107,11 +118,7 @@ def _adapt(route: Route, services: Services) -> Answer:
             return reply
         if reply is None:
             return web.Response(status=route.status)
-        return web.Response(
-            body=reply.model_dump_json(by_alias=True).encode(),
-            status=route.status,
-            content_type="application/json",
-        )
+        return web.Response(body=body_of(reply), status=route.status, content_type="application/json")
 
     return answer
 

@@ -69,7 +69,14 @@ async def list_users(call: Call) -> web.Response:
 
 
 @routes.route(
-    "POST", "/users", "Make a user", body=models.UserIn, reply=models.UserOut, status=201, admin=True
+    "POST",
+    "/users",
+    "Make a user",
+    body=models.UserIn,
+    reply=models.UserOut,
+    status=201,
+    admin=True,
+    keyed=True,
 )
 async def add_user(call: Call) -> models.UserOut:
     """Make a user."""
@@ -82,9 +89,10 @@ async def add_user(call: Call) -> models.UserOut:
         password=await services.authenticator.hash(digest, call.caller.name),
         created=services.clock(),
     )
-    await services.state_service.submit(commands.AddUser(user=user))
+    reply = _views(call).user(user)
+    await call.submit(commands.AddUser(user=user), reply)
     await services.authenticator.know(user.name, user.password, digest)
-    return _views(call).user(user)
+    return reply
 
 
 @routes.route("DELETE", "/users/{name}", "Remove a user and everything it owns", status=204, admin=True)

@@ -45,10 +45,8 @@ async def _do(call: Call, request: Request | Component) -> None:
         Refused: The state does not allow it.
         StoreError: It could not be stored.
     """
-    commands = list(commands_of(request, call.owner))
-    for outcome in await call.services.state_service.submit_all(commands):
-        if outcome is not None:
-            raise outcome
+    (command,) = commands_of(request, call.owner)
+    await call.submit(command)
 
 
 def _read(request: type[T], data: dict[str, Any]) -> T:
@@ -68,7 +66,15 @@ def _sent(body: Model) -> dict[str, Any]:
     return body.model_dump(exclude_unset=True)
 
 
-@routes.route("POST", "/containers", "Make a container", body=models.ContainerIn, status=204, query=_QUERY)
+@routes.route(
+    "POST",
+    "/containers",
+    "Make a container",
+    body=models.ContainerIn,
+    status=204,
+    query=_QUERY,
+    keyed=True,
+)
 async def create_container(call: Call) -> None:
     """Make a container."""
     await _do(call, _read(CreateContainer, _sent(call.read(models.ContainerIn))))
@@ -95,7 +101,13 @@ async def destroy_container(call: Call) -> None:
 
 
 @routes.route(
-    "POST", "/containers/{container}/nodes", "Start a node", body=models.NodeIn, status=204, query=_QUERY
+    "POST",
+    "/containers/{container}/nodes",
+    "Start a node",
+    body=models.NodeIn,
+    status=204,
+    query=_QUERY,
+    keyed=True,
 )
 async def add_node(call: Call) -> None:
     """Start a node."""
@@ -144,6 +156,7 @@ async def delete_parameter(call: Call) -> None:
     body=models.InterfaceIn,
     status=204,
     query=_QUERY,
+    keyed=True,
 )
 async def add_interface(call: Call) -> None:
     """Make an interface."""
@@ -165,7 +178,13 @@ async def remove_interface(call: Call) -> None:
 
 
 @routes.route(
-    "POST", "/connections", "Join two interfaces", body=models.ConnectionIn, status=204, query=_QUERY
+    "POST",
+    "/connections",
+    "Join two interfaces",
+    body=models.ConnectionIn,
+    status=204,
+    query=_QUERY,
+    keyed=True,
 )
 async def connect(call: Call) -> None:
     """Join two interfaces."""

@@ -106,6 +106,7 @@ async def list_package_keys(call: Call) -> models.PackageKeysOut:
     body=models.PackageKeyIn,
     reply=models.PackageKeyOut,
     status=201,
+    keyed=True,
 )
 async def register_package_key(call: Call) -> models.PackageKeyOut:
     """Trust a key."""
@@ -115,8 +116,9 @@ async def register_package_key(call: Call) -> models.PackageKeyOut:
     except BadKeyError as error:
         raise InvalidRequestError(str(error)) from error
     key = PackageKey(user=call.caller.name, key=body.key, label=body.label, created=call.services.clock())
-    await call.services.state_service.submit(commands.AddPackageKey(key=key))
-    return _key_out(key)
+    reply = _key_out(key)
+    await call.submit(commands.AddPackageKey(key=key), reply)
+    return reply
 
 
 @routes.route("DELETE", "/package-keys/{id}", "Trust a key no more", status=204, query=_QUERY)

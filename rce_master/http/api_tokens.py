@@ -30,6 +30,7 @@ async def list_tokens(call: Call) -> models.TokensOut:
     status=201,
     any_role=True,
     query=(OF_USER,),
+    keyed=True,
 )
 async def add_token(call: Call) -> models.TokenOut:
     """Make a token with a scope."""
@@ -70,6 +71,7 @@ async def list_robot_tokens(call: Call) -> models.TokensOut:
     reply=models.TokenOut,
     status=201,
     query=(OF_USER,),
+    keyed=True,
 )
 async def add_robot_token(call: Call) -> models.TokenOut:
     """Make a robot's token."""
@@ -103,10 +105,11 @@ async def _make(
     if owner is None:
         raise ForbiddenError(f"user {user!r} was removed meanwhile")
     token, record = new_token(user, label, services.clock(), days * _DAY_S, scope=scope)
-    await services.state_service.submit(commands.AddToken(token=record, replaces=replaces))
-    return models.TokenOut(
+    reply = models.TokenOut(
         token=token, userID=user, role=owner.role.value, expires=record.expires, id=record.id, scope=scope
     )
+    await call.submit(commands.AddToken(token=record, replaces=replaces), reply)
+    return reply
 
 
 def _of(call: Call) -> list[Token]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from typing import TYPE_CHECKING
 
 import aiohttp
@@ -14,6 +15,7 @@ from rce.web.origin import is_foreign
 from rce_master.http.forwarded import HEADER
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from typing import Self
 
     from multidict import CIMultiDictProxy
@@ -41,6 +43,32 @@ _ADDED = (hdrs.USER_AGENT, hdrs.ACCEPT, hdrs.ACCEPT_ENCODING, hdrs.CONTENT_TYPE)
 """Headers that the library would add."""
 
 
+_SAFE = (hdrs.METH_GET, hdrs.METH_HEAD)
+REPORT_S = 10.0
+"""Shortest time from one line of the log about failures to the next: clients may ask often meanwhile."""
+
+
+class _Failures:
+    """Logs requests that were not answered, at most one line in a while.
+
+    Args:
+        clock: Seconds that never go back.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._next = 0.0
+        self._unsaid = 0
+
+    def note(self, text: str) -> None:
+        """Log a failure, or count it."""
+        if self._clock() < self._next:
+            self._unsaid += 1
+            return
+        _log.info("%s%s", text, f"; so were {self._unsaid} requests before" if self._unsaid else "")
+        self._next, self._unsaid = self._clock() + REPORT_S, 0
+
+
 class NotForwardedError(Exception):
     """A request was not sent to the leading master; another master may do it."""
 
@@ -58,6 +86,7 @@ class Forwarder:
         self._key = key
         self._proxies = proxies
         self._tls = tls
+        self._failures = _Failures()
         self._session: aiohttp.ClientSession
 
     async def __aenter__(self) -> Self:
@@ -109,8 +138,30 @@ class Forwarder:
                     await response.write(piece)
                 await response.write_eof()
         except (aiohttp.ClientError, TimeoutError, ConnectionError) as error:
-            return _broken(request, leader, response, error)
+            return self._broken(request, leader, response, error)
         return response
+
+    def _broken(
+        self,
+        request: web.Request,
+        leader: Leader,
+        response: web.StreamResponse | None,
+        error: Exception,
+    ) -> web.StreamResponse:
+        """Return what a client gets whose request may have been done.
+
+        Raises:
+            NotForwardedError: It was not done, or changes nothing.
+        """
+        if response is not None and response.prepared:
+            if request.transport is not None:
+                request.transport.abort()  # so that the client does not take the part for the whole
+            return response
+        self._failures.note(f"{request.method} {request.path} was not answered by {leader.name}: {error}")
+        if isinstance(error, aiohttp.ClientConnectorError) or request.method in _SAFE:
+            raise NotForwardedError(f"{leader.name}, which led until now, does not answer") from error
+        text = f"{leader.name}, which led until now, did not answer: it may have done this or not; look first"
+        return web.json_response({"error": text}, status=502)
 
     def _headers(self, request: web.Request, leader: Leader) -> CIMultiDict[str]:
         headers = _without(request.headers)
@@ -129,22 +180,3 @@ def _without(headers: CIMultiDictProxy[str]) -> CIMultiDict[str]:
     return CIMultiDict(
         (name, value) for name, value in headers.items() if name.lower() not in _OF_CONNECTION | named
     )
-
-
-def _broken(
-    request: web.Request, leader: Leader, response: web.StreamResponse | None, error: Exception
-) -> web.StreamResponse:
-    """Return what a client gets whose request may have been done.
-
-    Raises:
-        NotForwardedError: It was not done, or changes nothing.
-    """
-    if response is not None and response.prepared:
-        if request.transport is not None:
-            request.transport.abort()  # so that the client does not take the part for the whole
-        return response
-    _log.info("%s %s was not answered by %s: %s", request.method, request.path, leader.name, error)
-    if isinstance(error, aiohttp.ClientConnectorError) or request.method in (hdrs.METH_GET, hdrs.METH_HEAD):
-        raise NotForwardedError(f"{leader.name}, which led until now, does not answer") from error
-    text = f"{leader.name}, which led until now, did not answer: it may have done this or not; look first"
-    return web.json_response({"error": text}, status=502)

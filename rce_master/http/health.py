@@ -12,6 +12,7 @@ from rce_master.exceptions import StoreError
 
 if TYPE_CHECKING:
     from rce_master.leadership import Fence
+    from rce_master.leadership.drains import MasterDrains
     from rce_master.state_service import StateService
 
 
@@ -21,11 +22,15 @@ class Health:
     Args:
         state_service: The owner of the store.
         fence: Of this master's leadership, if there may be other masters; then the answer says that it leads.
+        drains: Tells whether this master is drained, if there may be others.
     """
 
-    def __init__(self, state_service: StateService, fence: Fence | None = None) -> None:
+    def __init__(
+        self, state_service: StateService, fence: Fence | None = None, drains: MasterDrains | None = None
+    ) -> None:
         self._state_service = state_service
         self._fence = fence
+        self._drains = drains
         self._look: asyncio.Task[str] | None = None
         """The running check; concurrent requests wait for its result."""
 
@@ -39,7 +44,10 @@ class Health:
         body: dict[str, object] = {"status": fault or "ok", "task_sets": connected}
         if self._fence is not None:
             self._fence.check()
-            body |= describe_role("leader", self._fence.term, self._fence.name, ready=not fault)
+            drained = self._drains is not None and self._drains.is_drained
+            body |= describe_role(
+                "leader", self._fence.term, self._fence.name, ready=not fault, drained=drained
+            )
         return web.json_response(body, status=503 if fault else 200)
 
     async def _check(self) -> str:
@@ -52,7 +60,7 @@ class Health:
         return ""
 
 
-def describe_role(role: str, term: int, leader: str, *, ready: bool) -> dict[str, object]:
+def describe_role(role: str, term: int, leader: str, *, ready: bool, drained: bool) -> dict[str, object]:
     """Return the part of an answer that tells which master leads.
 
     Args:
@@ -60,6 +68,7 @@ def describe_role(role: str, term: int, leader: str, *, ready: bool) -> dict[str
         term: The newest term that this master knows; 0: none.
         leader: The name of the leading master; empty: none, or unknown.
         ready: Whether this master serves clients.
+        drained: Whether it leads only if no other one does.
     """
     return {
         "live": True,
@@ -67,5 +76,6 @@ def describe_role(role: str, term: int, leader: str, *, ready: bool) -> dict[str
         "role": role,
         "term": term,
         "leader": leader,
+        "drained": drained,
         "version": __version__,
     }

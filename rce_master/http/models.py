@@ -276,6 +276,32 @@ class MachinesOut(Page):
     machines: list[MachineOut]
 
 
+class MasterOut(Model):
+    """One of several masters."""
+
+    name: str
+    """``MACHINE:PORT``."""
+    url: str
+    """Where the others reach it."""
+    role: str
+    """``leader``, ``standby``, or ``away``: it does not answer."""
+    drained: bool
+    """Whether it leads only if no other one does."""
+
+
+class MastersOut(Model):
+    """Masters, the leading one first; none if the engine has one master with a store of its own."""
+
+    masters: list[MasterOut]
+
+
+class DrainOut(Model):
+    """What is drained, or is not any more."""
+
+    machines: list[MachineOut]
+    masters: list[MasterOut]
+
+
 class EventOut(Model):
     """An event."""
 

@@ -20,14 +20,17 @@ if TYPE_CHECKING:
     from aiohttp.web import StreamResponse
     from pydantic import BaseModel
 
+    from rce_master.answers import Answers, PendingAnswer
     from rce_master.audit import AuditLog
     from rce_master.auth import Authenticator
     from rce_master.events import EventLog
     from rce_master.executions import Executions
     from rce_master.leadership import Fence
+    from rce_master.leadership.drains import MasterDrains
     from rce_master.packages.service import PackageService
     from rce_master.quotas import Quotas
     from rce_master.reconciler import Reconciler
+    from rce_master.state.commands import Command
     from rce_master.state_service import StateService
     from rce_master.tokens import Tokens
 
@@ -58,6 +61,7 @@ class Services:
     tokens: Tokens
     quotas: Quotas
     audit: AuditLog
+    answers: Answers
     dev: bool
     """Whether this is development mode."""
     proxies: TrustedProxies = field(default_factory=TrustedProxies)
@@ -65,6 +69,8 @@ class Services:
     """Tells whether this master leads; None if there is no other one."""
     forwarding: ForwardingKey | None = None
     """Of the stand-bys that forward requests to this master; None if there are none."""
+    drains: MasterDrains | None = None
+    """Of this master and the others; None if there are no others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +85,8 @@ class Call:
     body: BaseModel | None
     parts: Mapping[str, str]
     """The parts of the path that the route names, by their names."""
+    pending: PendingAnswer | None = None
+    """Keeps the answer, if the request has an ``Idempotency-Key``."""
 
     @property
     def address(self) -> str:
@@ -154,6 +162,21 @@ class Call:
         """The user whose objects to list; None: all users, the default of callers who may see them."""
         return None if self.caller.role.sees_all and "user" not in self.request.query else self.owner
 
+    async def submit(self, command: Command, reply: BaseModel | None = None) -> None:
+        """Do a command; with an ``Idempotency-Key``, the answer is stored together with what it does.
+
+        Args:
+            command: The command.
+            reply: What the handler returns afterwards.
+
+        Raises:
+            RefusedError: It cannot be done; nothing changed.
+            StoreError: It cannot be stored; nothing changed.
+        """
+        if self.pending is not None:
+            command = self.pending.with_answer(command, body_of(reply))
+        await self.services.state_service.submit(command)
+
     def path(self, name: str) -> str:
         """A part of the path."""
         return self.parts[name]
@@ -184,6 +207,11 @@ class Call:
         """Return the body, which the route declared to be of this model."""
         assert isinstance(self.body, model)
         return self.body
+
+
+def body_of(reply: BaseModel | None) -> bytes:
+    """Return the body of an answer; empty: none."""
+    return b"" if reply is None else reply.model_dump_json(by_alias=True).encode()
 
 
 Handler = Callable[[Call], Awaitable["BaseModel | StreamResponse | None"]]
@@ -217,6 +245,8 @@ class Route(routes.Route[Handler]):
             yield from (408, 413)
         if self.body is not None or self.query:
             yield 422
+        if self.keyed:
+            yield 400
         if self.method != "GET":
             yield from (409, 503)
         yield from self.errors

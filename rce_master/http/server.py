@@ -21,6 +21,7 @@ from rce_master.exceptions import (
     TooManyFailuresError,
     TooManyLoginsError,
     TooMuchError,
+    UnderWayError,
 )
 from rce_master.http.access import check_metrics
 from rce_master.http.health import Health
@@ -59,7 +60,7 @@ def make_app(
     inner = [] if fence is None else [_fencing(fence), settling(services.state_service, fence)]
     app = web.Application(middlewares=[guard, _errors, *inner], client_max_size=MAX_BODY)
     app.router.add_get("/", _at_entry(entry))
-    app.router.add_get("/healthz", Health(services.state_service, services.fence).handle)
+    app.router.add_get("/healthz", Health(services.state_service, services.fence, services.drains).handle)
     app.router.add_get("/metrics", _metrics(services))
     app.router.add_route("*", PREFIX + "/{rest:.*}", LateApi(services).handle)
     return app
@@ -168,7 +169,7 @@ def _headers(error: MasterError) -> dict[str, str]:
     match error:
         case TooManyFailuresError() | TooMuchError():
             return {hdrs.RETRY_AFTER: str(math.ceil(error.retry_after))}
-        case TooManyLoginsError() | FencedError():
+        case TooManyLoginsError() | FencedError() | UnderWayError():
             return {hdrs.RETRY_AFTER: "1"}
         case AuthError():
             return {hdrs.WWW_AUTHENTICATE: "Bearer"}

@@ -16,6 +16,7 @@ from rce_master.leadership.core import LEADER_HEADER, STANDBY_HEADER
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+    from rce_master.follower import StateFollower
     from rce_master.http.archives import ArchiveRoutes
     from rce_master.http.forward import Forwarder
     from rce_master.leadership.keeper import LeadershipKeeper
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 def make_standby_app(
     keeper: LeadershipKeeper,
+    follower: StateFollower,
     forwarder: Forwarder,
     archives: Iterable[ArchiveRoutes],
     names: ServerNames | None = None,
@@ -32,12 +34,13 @@ def make_standby_app(
 
     Args:
         keeper: Knows who leads.
+        follower: Follows the state.
         forwarder: Sends requests on to that master; it is open.
         archives: Of packages and snapshots, for the leading master.
         names: The allowed host names of the server.
         allowed_origins: Origins of other sites whose pages may use the server.
     """
-    standby = _Standby(keeper, forwarder)
+    standby = _Standby(keeper, follower, forwarder)
     app = web.Application(middlewares=[origin_guard(frozenset(allowed_origins), names or ServerNames())])
     app.router.add_get("/healthz", standby.health)
     app.router.add_get("/metrics", standby.metrics)
@@ -50,8 +53,9 @@ def make_standby_app(
 class _Standby:
     """Answers the requests."""
 
-    def __init__(self, keeper: LeadershipKeeper, forwarder: Forwarder) -> None:
+    def __init__(self, keeper: LeadershipKeeper, follower: StateFollower, forwarder: Forwarder) -> None:
         self._keeper = keeper
+        self._follower = follower
         self._forwarder = forwarder
 
     async def health(self, _: web.Request) -> web.Response:
@@ -60,7 +64,9 @@ class _Standby:
         name = "" if keeper.leader is None else keeper.leader.name
         body = {
             "status": keeper.fault or f"stand-by; {f'{name} leads' if name else 'no master leads now'}",
-            **describe_role("standby", self._term, name, ready=False),
+            **describe_role("standby", self._term, name, ready=False, drained=keeper.is_drained),
+            "lag": round(self._follower.seconds_behind, 3),
+            "lag_revisions": self._follower.lag.revisions,
         }
         return web.json_response(body, status=503)
 
@@ -87,4 +93,4 @@ class _Standby:
     def _scraped(self) -> Callable[[], web.Response]:
         from rce_master.http.role_metrics import standby_answer  # only scraped masters spend this memory
 
-        return standby_answer(lambda: self._term)
+        return standby_answer(lambda: self._term, self._follower)

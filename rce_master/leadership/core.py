@@ -77,6 +77,8 @@ class LeaseSettings:
     """How long a lease lasts without a renewal."""
     margin: float = 0.1
     """Part of a lease's time that its holder does not use, so that clocks may differ in speed."""
+    drained_wait: float = 10.0
+    """How long no master leads until one that is drained takes the lead."""
 
     @property
     def renewal(self) -> float:
@@ -109,11 +111,28 @@ class LeadershipCore:
         self.deadline = 0.0
         self.heard = 0
         self._renew_at = 0.0
+        self._free_since: float | None = None
+        """When this stand-by first saw that no master leads; None: one leads, or it does not know."""
 
     @property
     def role(self) -> Role:
         """The present role."""
         return self._machine.state
+
+    def looked(self, *, is_led: bool | None, is_drained: bool, now: float) -> bool:
+        """Take what a stand-by saw at etcd; return whether it is to try to take the lead.
+
+        Args:
+            is_led: Whether a master leads; None: etcd cannot be asked.
+            is_drained: Whether this master is not to lead, unless no other one does.
+            now: The time.
+        """
+        if is_led is not False:
+            self._free_since = None
+            return False
+        if self._free_since is None:
+            self._free_since = now
+        return not is_drained or now - self._free_since >= self.settings.drained_wait
 
     def granted(self, sent: float, ttl: float) -> None:
         """Take a lease that etcd gave.
@@ -172,6 +191,7 @@ class LeadershipCore:
 
     def released(self) -> None:
         """Become a stand-by: nothing of the term is left."""
+        self._free_since = None
         self._machine.advance(LeadershipEvent.RELEASED)
 
     def remaining(self, now: float) -> float:

@@ -45,6 +45,8 @@ class LeadershipKeeper:
         fault: Why etcd cannot be asked; empty if it can.
         url: Where other masters reach this one while it leads.
         lease: The number of the lease by which this master leads; 0: it has none.
+        is_drained: Whether this master is drained, as a stand-by saw it last.
+        on_save: Called by a stand-by with the revision of the last save that it sees.
     """
 
     def __init__(
@@ -66,13 +68,15 @@ class LeadershipKeeper:
         self.core = LeadershipCore(settings or LeaseSettings())
         self.leader: Leader | None = None
         self.fault = ""
+        self.is_drained = False
+        self.on_save: Callable[[int], None] | None = None
 
     def newest_term(self) -> int:
         """Return the newest term that this master knows; 0: none."""
         return 0 if self.leader is None else self.leader.term
 
     async def acquire(self) -> tuple[EtcdStore, Fence]:
-        """Wait until no other master leads, and take the lead.
+        """Wait until no other master leads, and take the lead; a drained master waits longer.
 
         Cancelling gives a lease back that was taken meanwhile.
 
@@ -80,19 +84,23 @@ class LeadershipKeeper:
             The store of the new term, and what tells whether it still lasts.
         """
         while True:
-            if await self._is_free() and await self._campaign():
+            if await self._look() and await self._campaign():
                 assert self._store is not None
                 return self._store, Fence(self.core, self._clock, self._name)
             await asyncio.sleep(self.core.settings.poll)
 
-    async def _is_free(self) -> bool:
+    async def _look(self) -> bool:
+        """Look at etcd; return whether to try to take the lead."""
         try:
-            self.leader = await self._watched.leader()
+            seen = await self._watched.leadership()
         except StoreError as error:
             self._note(str(error))
-            return False
+            return self.core.looked(is_led=None, is_drained=self.is_drained, now=self._clock())
         self._note("")
-        return self.leader is None
+        self.leader, self.is_drained = seen.leader, self._name in seen.drained
+        if self.on_save is not None:
+            self.on_save(seen.last)
+        return self.core.looked(is_led=self.leader is not None, is_drained=self.is_drained, now=self._clock())
 
     async def _campaign(self) -> bool:
         sent = self._clock()

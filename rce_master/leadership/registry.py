@@ -49,6 +49,11 @@ class MasterRegistry:
             self._url, self._lease = url, 0
             self._changed.set()
 
+    @property
+    def url(self) -> str:
+        """Where other masters reach this one; empty: it was not said yet."""
+        return self._url
+
     async def run(self) -> None:
         """Keep the key of this master, until cancelled."""
         level = logging.WARNING

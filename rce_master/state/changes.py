@@ -13,6 +13,7 @@ from rce_master.state.records import (
     Counter,
     Drain,
     Endpoint,
+    KeptAnswer,
     KnownLogin,
     Move,
     PackageKey,
@@ -181,6 +182,7 @@ class Transaction:
         | Token
         | KnownLogin
         | UserLimits
+        | KeptAnswer
         | PackageKey
         | UserPackage
         | UserVolume
@@ -312,6 +314,7 @@ _TABLES: dict[type, str] = {
     Token: "tokens",
     KnownLogin: "known_logins",
     UserLimits: "user_limits",
+    KeptAnswer: "answers",
     PackageKey: "package_keys",
     UserPackage: "packages",
     UserVolume: "volumes",

@@ -13,7 +13,15 @@ from rce.model import InterfaceSpec, NodeSpec, ParameterValue, ResourceChanges, 
 
 if TYPE_CHECKING:
     from rce.control import EndpointStatus, Hello, StatusPatch
-    from rce_master.state.records import KnownLogin, PackageKey, Token, User, UserPackage, UserRole
+    from rce_master.state.records import (
+        KeptAnswer,
+        KnownLogin,
+        PackageKey,
+        Token,
+        User,
+        UserPackage,
+        UserRole,
+    )
 
 
 _NOTHING_REQUESTED = Resources()
@@ -109,6 +117,25 @@ class RememberLogin:
     """Keep the mark of a correct password."""
 
     login: KnownLogin
+
+
+# Requests that are repeated
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Once:
+    """Do a command and keep the answer to its request, both or neither."""
+
+    command: Command
+    answer: KeptAnswer
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ForgetAnswers:
+    """Forget kept answers that are too old, a part of them if there are many."""
+
+    now: float
+    """Seconds since 1970."""
 
 
 # Packages that users bring
@@ -444,6 +471,8 @@ Command: TypeAlias = (
     | RevokeRobotToken
     | RememberLogin
     | SetLimits
+    | Once
+    | ForgetAnswers
     | AddPackageKey
     | RemovePackageKey
     | AddPackage

@@ -11,6 +11,7 @@ import msgspec
 
 from rce_master.exceptions import StoreError
 from rce_master.state import (
+    answers,
     commands,
     containers,
     draining,
@@ -46,6 +47,7 @@ _HANDLERS: dict[type, Callable[[Transaction, Any], None]] = {
     commands.RemoveUser: users.remove_user,
     commands.SetLimits: limits.set_limits,
     commands.RememberLogin: users.remember_login,
+    commands.ForgetAnswers: answers.forget_old,
     commands.AddToken: tokens.add,
     commands.RemoveToken: tokens.remove,
     commands.NoteTokenUses: tokens.note_uses,
@@ -100,8 +102,20 @@ def _restored_and_advance(tx: Transaction, command: commands.VolumeRestored) -> 
 
 
 _HANDLERS[commands.VolumeRestored] = _restored_and_advance
+
+
+def _do_once(tx: Transaction, command: commands.Once) -> None:
+    _HANDLERS[type(command.command)](tx, command.command)
+    answers.keep(tx, command.answer)
+
+
+_HANDLERS[commands.Once] = _do_once
 _HANDLERS[commands.CreateContainer] = _create_and_place
 _HANDLERS[commands.VolumeRemoved] = _remove_and_place
+
+
+PIECE = 500
+"""Rows that are read between two pauses: some milliseconds."""
 
 
 def _new_token() -> str:
@@ -109,7 +123,7 @@ def _new_token() -> str:
 
 
 @contextlib.contextmanager
-def _without_collections() -> Iterator[None]:
+def without_collections() -> Iterator[None]:
     """Make many objects that stay: looking for garbage among them would take as long as making them."""
     was_enabled = gc.isenabled()
     gc.disable()
@@ -136,6 +150,7 @@ class State:
         self.tables = Tables()
         self.settings = settings or StateSettings()
         self._make_token = make_token
+        self._by_name = {table.name: table for table in self.tables.all if table.persistent}
 
     @classmethod
     def load(
@@ -156,15 +171,55 @@ class State:
             StoreError: A record cannot be read.
         """
         state = cls(settings)
-        with _without_collections():
-            try:
-                snapshot = converted(snapshot)
-                for table in state.tables.all:
-                    table.load(snapshot.get(table.name, {}))
-            except msgspec.MsgspecError as error:
-                raise StoreError(f"a record in the store cannot be read: {error}") from error
-            task_sets.restart(state._begin(now), revision)
+        with without_collections():
+            for _ in state.reading(snapshot):
+                pass
+            state.begin(now, revision)
         return state
+
+    def reading(self, snapshot: Snapshot, piece: int = PIECE) -> Iterator[None]:
+        """Read the rows of the store, with a pause after each piece; :meth:`begin` ends it.
+
+        Args:
+            snapshot: As for :meth:`load`.
+            piece: Number of rows.
+
+        Raises:
+            StoreError: A record cannot be read.
+        """
+        try:
+            snapshot = converted(snapshot)
+            for table in self.tables.all:
+                yield from table.reading(snapshot.get(table.name, {}), piece)
+        except msgspec.MsgspecError as error:
+            raise StoreError(f"a record in the store cannot be read: {error}") from error
+
+    def write_row(self, table: str, key: str, body: bytes | None) -> bool:
+        """Write a row as the store has it, before :meth:`begin`; None removes it.
+
+        Returns:
+            Whether there is such a table.
+
+        Raises:
+            StoreError: The record cannot be read.
+        """
+        found = self._by_name.get(table)
+        if found is None:
+            return False
+        try:
+            found.write(key, body)
+        except msgspec.MsgspecError as error:
+            raise StoreError(f"a record in the store cannot be read: {error}") from error
+        return True
+
+    @property
+    def rows(self) -> int:
+        """The number of rows that the store has of it."""
+        return sum(map(len, self._by_name.values()))
+
+    def begin(self, now: float, revision: int) -> None:
+        """Begin to work with what was read; the arguments are those of :meth:`load`."""
+        task_sets.restart(self._begin(now), revision)
 
     def apply(self, command: commands.Command, now: float) -> Changes:
         """Apply a command.

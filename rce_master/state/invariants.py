@@ -35,7 +35,13 @@ def validate(tables: Tables) -> None:
     _check_observed(tables)
     _check_moves(tables)
     _check_volumes(tables)
-    for record in (*tables.packages, *tables.package_keys, *tables.known_logins, *tables.user_limits):
+    _check_users_records(tables)
+
+
+def _check_users_records(tables: Tables) -> None:
+    """Check that what belongs to a user has one."""
+    of_users = (tables.packages, tables.package_keys, tables.known_logins, tables.user_limits, tables.answers)
+    for record in (record for table in of_users for record in table):
         assert record.user in tables.users, f"{record}: its user is unknown"
 
 

@@ -328,6 +328,34 @@ class Drain(Struct, frozen=True, kw_only=True):
     """Its name."""
 
 
+class KeptAnswer(Struct, frozen=True, kw_only=True):
+    """The answer to a request with an ``Idempotency-Key``; a repeat of the request gets it again."""
+
+    user: str
+    """Who made the request."""
+    digest: str
+    """SHA-256, in hex, of the key."""
+    created: float
+    """Seconds since 1970."""
+    status: int
+    mark: str
+    """Tells by which secret of the engine the other fields were made."""
+    request: str
+    """Keyed hash, in hex, of the request."""
+    body: bytes = b""
+    """Encrypted; empty: the answer has none."""
+
+    @property
+    def id(self) -> str:
+        """Its key in the table."""
+        return kept_answer_key(self.user, self.digest)
+
+
+def kept_answer_key(user: str, digest: str) -> str:
+    """Tell the key, in the table, of the answer to a user's request."""
+    return f"{user}/{digest}"
+
+
 class Counter(Struct, frozen=True, kw_only=True):
     """A number that only increases: its values are never reused."""
 

@@ -148,17 +148,38 @@ class Table(Generic[R]):
         """Encode a record for the store."""
         return msgspec.json.encode(record)
 
-    def load(self, rows: Mapping[str, bytes]) -> None:
-        """Fill the table from the store.
+    def reading(self, rows: Mapping[str, bytes], piece: int) -> Iterator[None]:
+        """Fill the table from the store, with a pause after each piece.
+
+        Args:
+            rows: Key to encoded record.
+            piece: Number of rows.
 
         Raises:
             msgspec.ValidationError: A record cannot be read.
         """
-        records = [(key, self._decoder.decode(body)) for key, body in rows.items()]
+        records = []
+        for number, (key, body) in enumerate(rows.items(), 1):
+            records.append((key, self._decoder.decode(body)))
+            if number % piece == 0:
+                yield
         if (order := self._order) is not None:
             records.sort(key=lambda item: order(item[1]))
-        for key, record in records:
+        for number, (key, record) in enumerate(records, 1):
             self.assign(key, record)
+            if number % piece == 0:
+                yield
+
+    def write(self, key: str, body: bytes | None) -> None:
+        """Write a row as the store has it; None removes it.
+
+        Raises:
+            msgspec.ValidationError: The record cannot be read.
+        """
+        if body is not None:
+            self.assign(key, self._decoder.decode(body))
+        elif key in self._rows:
+            self.assign(key, None)
 
     def index_entries(self, index: str) -> dict[str, list[str]]:
         """Show an index: value to keys."""

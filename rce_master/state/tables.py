@@ -13,6 +13,7 @@ from rce_master.state.records import (
     Counter,
     Drain,
     Endpoint,
+    KeptAnswer,
     KnownLogin,
     Live,
     Move,
@@ -56,6 +57,7 @@ class Tables:
     """All tables.
 
     - ``known_logins``, ``user_limits``: at most one for each user.
+    - ``answers``: only of users that are there.
     - ``endpoints``: robots and containers; both in one table, because a tag is unique among both.
     - ``volumes``: every volume of every container, and those that containers left.
     - ``volume_removals``: also of task sets that are gone: they may come back.
@@ -76,6 +78,13 @@ class Tables:
         self.tokens = Table[Token]("tokens", type_=Token, key=lambda t: t.digest, user=lambda t: [t.user])
         self.known_logins = Table[KnownLogin]("known_logins", type_=KnownLogin, key=lambda k: k.user)
         self.user_limits = Table[UserLimits]("user_limits", type_=UserLimits, key=lambda u: u.user)
+        self.answers = Table[KeptAnswer](
+            "answers",
+            type_=KeptAnswer,
+            key=lambda a: a.id,
+            order=lambda a: int(a.created * 1000),
+            user=lambda a: [a.user],
+        )
         self.package_keys = Table[PackageKey](
             "package_keys", type_=PackageKey, key=lambda k: k.id, user=lambda k: [k.user]
         )
@@ -188,6 +197,7 @@ class Tables:
             self.tokens,
             self.known_logins,
             self.user_limits,
+            self.answers,
             self.package_keys,
             self.packages,
             self.volumes,

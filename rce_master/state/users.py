@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from rce.model import is_name
 from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError
-from rce_master.state import endpoints, limits, packages, robots, tokens, volumes
+from rce_master.state import answers, endpoints, limits, packages, robots, tokens, volumes
 from rce_master.state.records import User, UserRole
 
 if TYPE_CHECKING:
@@ -71,6 +71,7 @@ def remove_user(tx: Transaction, command: RemoveUser) -> None:
     packages.forget_user(tx, user.name)
     volumes.forget_user(tx, user.name)
     limits.forget(tx, user.name)
+    answers.forget_user(tx, user.name)
     tx.delete(tx.tables.users, user.name)
     tx.happen("user_removed", user.name, user="")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import io
 import json
 import logging
@@ -17,7 +18,7 @@ from rce_master.store.etcd import wire
 from rce_master.store.etcd.exceptions import EtcdAwayError, EtcdRefusedError, NoQuorumError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import AsyncIterator, Callable, Sequence
     from types import TracebackType
 
     from rce.tls import Context
@@ -28,6 +29,8 @@ _log = logging.getLogger(__name__)
 
 ATTEMPT_S = 1.0
 """How long one member may take for a small request before the next one is asked."""
+WATCH_BUFFER = 1 << 20
+"""Bytes of a watch that are read ahead."""
 LOAD_S = 20.0
 """The same for a page of records."""
 MIN_VERSION = (3, 4)
@@ -47,6 +50,52 @@ class _FailedError(Exception):
     def __init__(self, reason: str, *, maybe_done: bool) -> None:
         super().__init__(reason)
         self.maybe_done = maybe_done
+
+
+class Watch:
+    """What etcd tells of a watch, line by line.
+
+    Attributes:
+        content: Of the answer.
+        is_given_up: Whether the next watch asks another member.
+    """
+
+    content: aiohttp.StreamReader
+
+    def __init__(self) -> None:
+        self.is_given_up = False
+        self._read = bytearray()
+        self._looked = 0
+        """Bytes without the end of a line."""
+
+    def give_up(self) -> None:
+        """Let the next watch ask another member."""
+        self.is_given_up = True
+
+    async def next(self, timeout: float) -> wire.Watched | None:
+        """Return what comes next; None: nothing within a time.
+
+        Args:
+            timeout: Seconds.
+
+        Raises:
+            WireError: The watch has ended.
+            ClientError: The connection broke.
+        """
+        try:
+            async with asyncio.timeout(timeout):
+                while (end := self._read.find(b"\n", self._looked)) < 0:
+                    self._looked = len(self._read)
+                    piece = await self.content.readany()
+                    if not piece:
+                        raise wire.WireError("it ended the watch")
+                    self._read += piece
+        except TimeoutError:
+            return None
+        line = bytes(self._read[: end + 1])
+        del self._read[: end + 1]
+        self._looked = 0
+        return wire.read_watched(line)
 
 
 class EtcdClient:
@@ -144,7 +193,14 @@ class EtcdClient:
         return page.records[0] if page.records else None
 
     async def range(
-        self, prefix: str, *, after: str = "", limit: int = 0, revision: int = 0, keys_only: bool = False
+        self,
+        prefix: str,
+        *,
+        after: str = "",
+        limit: int = 0,
+        revision: int = 0,
+        keys_only: bool = False,
+        written_after: int = 0,
     ) -> wire.Page:
         """Read keys with a prefix, in their order; the arguments are those of :func:`wire.range_request`.
 
@@ -152,7 +208,14 @@ class EtcdClient:
             EtcdRefusedError: etcd refused; with the code ``OUT_OF_RANGE`` the revision was compacted away.
             EtcdAwayError: No member answered.
         """
-        request = wire.range_request(prefix, after=after, limit=limit, revision=revision, keys_only=keys_only)
+        request = wire.range_request(
+            prefix,
+            after=after,
+            limit=limit,
+            revision=revision,
+            keys_only=keys_only,
+            written_after=written_after,
+        )
         return await self._call("v3/kv/range", request, wire.read_page, LOAD_S)
 
     async def transact(
@@ -171,6 +234,40 @@ class EtcdClient:
         """
         request = wire.txn_request(conditions, operations, otherwise)
         return await self._call("v3/kv/txn", request, wire.read_outcome)
+
+    @contextlib.asynccontextmanager
+    async def watch(self, prefix: str, revision: int) -> AsyncIterator[Watch]:
+        """Watch keys with a prefix at the member in use.
+
+        Args:
+            prefix: How they begin.
+            revision: The first one to tell of.
+
+        Raises:
+            EtcdAwayError: It cannot be reached, or ended the watch; the next call asks another member.
+        """
+        assert self._session is not None
+        used = self._current
+        endpoint = self._endpoints[used]
+        watch = Watch()
+        try:
+            async with self._session.post(
+                f"{'http' if self._tls is None else 'https'}://{endpoint}/v3/watch",
+                json=wire.watch_request(prefix, revision),
+                timeout=aiohttp.ClientTimeout(total=None, sock_connect=self._attempt),
+                ssl=True if self._tls is None else self._tls(),
+                allow_redirects=False,
+                read_bufsize=WATCH_BUFFER,
+            ) as response:
+                watch.content = response.content
+                yield watch
+        except (aiohttp.ClientError, OSError, wire.WireError) as error:
+            watch.give_up()
+            text = explain_to_client(error) or str(error) or type(error).__name__
+            raise EtcdAwayError([f"{endpoint}: {text}"], maybe_done=False) from error
+        finally:
+            if watch.is_given_up and used == self._current:
+                self._current = (used + 1) % len(self._endpoints)
 
     # Leases
 
@@ -264,7 +361,7 @@ class EtcdClient:
         except TimeoutError:
             raise _FailedError(f"no answer within {timeout:g} s", maybe_done=True) from None
         except (aiohttp.ClientError, OSError) as error:
-            text = str(error) or type(error).__name__
+            text = explain_to_client(error) or str(error) or type(error).__name__
             if self._tls is None and isinstance(error, aiohttp.ServerDisconnectedError):
                 text += " (if this etcd uses TLS, name it etcds://)"
             raise _FailedError(text, maybe_done=True) from error

@@ -3,9 +3,11 @@
 ::
 
 schema                  version of what the rows hold
+engine                  which engine's they are
 leadership/leader       name and term of the leading master; removed when its lease ends
 leadership/term         the newest term, and a mark of the store that began it
 leadership/last         TERM:NUMBER of the last save
+leadership/drained/NAME a master that is not to lead
 masters/NAME            where other masters reach one; removed a day after it was last seen
 tables/TABLE/KEY        a row
 """
@@ -46,16 +48,30 @@ class OtherMaster:
     """Where other masters reach its HTTP server."""
 
 
+@dataclass(frozen=True, slots=True)
+class LeadershipView:
+    """What etcd knows about the leadership, at one moment."""
+
+    leader: Leader | None
+    """None: no master leads."""
+    drained: frozenset[str]
+    """Names of masters that are not to lead."""
+    last: int
+    """The revision of the last save; 0: none was made."""
+
+
 class Keys:
     """The keys below a prefix."""
 
     def __init__(self, prefix: str) -> None:
         self.root = prefix.rstrip("/") + "/"
         self.schema = self.root + "schema"
+        self.engine = self.root + "engine"
         self.leadership = self.root + "leadership/"
         self.leader = self.leadership + "leader"
         self.term = self.leadership + "term"
         self.last = self.leadership + "last"
+        self.drained = self.leadership + "drained/"
         self.masters = self.root + "masters/"
         self.tables = self.root + "tables/"
 

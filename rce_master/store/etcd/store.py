@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING
 
 from rce_master.exceptions import FencedError, StaleTermError, StoreBusyError, StoreError
 from rce_master.store.etcd.exceptions import OUT_OF_RANGE, EtcdAwayError, EtcdRefusedError
-from rce_master.store.etcd.layout import Keys, read_leader, read_mark, read_term, write_number
+from rce_master.store.etcd.layout import (
+    Keys,
+    LeadershipView,
+    read_leader,
+    read_mark,
+    read_term,
+    write_number,
+)
 from rce_master.store.etcd.wire import Condition, Delete, Put, Record, Subject
 
 if TYPE_CHECKING:
@@ -83,27 +90,12 @@ class EtcdStore:
         Raises:
             StoreError: It cannot be read.
         """
-        while True:
-            try:
-                return await self._load()
-            except EtcdRefusedError as error:
-                if error.fault.code != OUT_OF_RANGE:  # compacted away while it was read
-                    raise
+        return (await load_rows(self._client, self._keys))[0]
 
-    async def _load(self) -> Snapshot:
-        tables: dict[str, dict[str, bytes]] = {}
-        page: Page | None = None
-        revision = 0
-        while page is None or page.more:
-            after = "" if page is None else page.records[-1].key
-            page = await self._client.range(
-                self._keys.tables, after=after, limit=PAGE_ROWS, revision=revision
-            )
-            revision = revision or page.revision
-            for record in page.records:
-                table, key = self._keys.read_row(record.key)
-                tables.setdefault(table, {})[key] = record.value
-        return tables
+    @property
+    def begun(self) -> int:
+        """The revision at which this store's term was begun."""
+        return self._begun
 
     async def leader(self) -> Leader | None:
         """Tell which master leads; None if none does.
@@ -111,8 +103,24 @@ class EtcdStore:
         Raises:
             StoreError: etcd cannot be asked.
         """
-        found = await self._client.get(self._keys.leader)
-        return None if found is None else read_leader(found)
+        return (await self.leadership()).leader
+
+    async def leadership(self) -> LeadershipView:
+        """Tell which master leads, and what stand-bys need to know.
+
+        Raises:
+            StoreError: etcd cannot be asked.
+        """
+        keys = self._keys
+        there = {record.key: record for record in await self._read_leadership()}
+        leader, last = there.get(keys.leader), there.get(keys.last)
+        return LeadershipView(
+            leader=None if leader is None else read_leader(leader),
+            drained=frozenset(
+                key.removeprefix(keys.drained) for key in there if key.startswith(keys.drained)
+            ),
+            last=0 if last is None else last.modified,
+        )
 
     async def newest_term(self) -> int:
         """Tell the newest term that any master began; 0: none.
@@ -273,6 +281,34 @@ class EtcdStore:
 
     async def close(self) -> None:
         """Nothing to let go of: the client is the caller's."""
+
+
+async def load_rows(client: EtcdClient, keys: Keys) -> tuple[Snapshot, int]:
+    """Read all rows as they were at one moment; return them and its revision.
+
+    Raises:
+        StoreError: They cannot be read.
+    """
+    while True:
+        try:
+            return await _load_pages(client, keys)
+        except EtcdRefusedError as error:
+            if error.fault.code != OUT_OF_RANGE:  # compacted away while it was read
+                raise
+
+
+async def _load_pages(client: EtcdClient, keys: Keys) -> tuple[Snapshot, int]:
+    tables: dict[str, dict[str, bytes]] = {}
+    page: Page | None = None
+    revision = 0
+    while page is None or page.more:
+        after = "" if page is None else page.records[-1].key
+        page = await client.range(keys.tables, after=after, limit=PAGE_ROWS, revision=revision)
+        revision = revision or page.revision
+        for record in page.records:
+            table, key = keys.read_row(record.key)
+            tables.setdefault(table, {})[key] = record.value
+    return tables, revision
 
 
 def _countdown() -> Callable[[], float]:

@@ -84,6 +84,30 @@ class Page:
     """The revision of the whole store at which they were read."""
     more: bool
     """Whether the range has further keys."""
+    count: int = 0
+    """All keys of the range, also those that were not asked for by when they were written."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A write that a watch tells of."""
+
+    key: str
+    value: bytes | None
+    """None: the key was removed."""
+    revision: int
+
+
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """An answer of a watch."""
+
+    changes: tuple[Change, ...]
+    """In the order of the writes."""
+    revision: int
+    """Of the last change; 0: there is none."""
+    compacted: int = 0
+    """Not 0: what was to be watched was compacted away, up to this revision."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +141,13 @@ def end_of(prefix: str) -> bytes:
 
 
 def range_request(
-    prefix: str, *, after: str = "", limit: int = 0, revision: int = 0, keys_only: bool = False
+    prefix: str,
+    *,
+    after: str = "",
+    limit: int = 0,
+    revision: int = 0,
+    keys_only: bool = False,
+    written_after: int = 0,
 ) -> Message:
     """Ask for keys with a prefix.
 
@@ -127,6 +157,7 @@ def range_request(
         limit: At most so many; 0: all.
         revision: The state to read; 0: the newest, agreed on by a majority.
         keys_only: Leave the values out.
+        written_after: Only keys that were written after this revision.
     """
     begin = after.encode() + b"\0" if after else prefix.encode()
     message: Message = {"key": _base64(begin), "range_end": _base64(end_of(prefix))}
@@ -136,7 +167,25 @@ def range_request(
         message["revision"] = str(revision)
     if keys_only:
         message["keys_only"] = True
+    if written_after:
+        message["min_mod_revision"] = str(written_after + 1)
     return message
+
+
+def watch_request(prefix: str, revision: int) -> Message:
+    """Ask for what is written to keys with a prefix.
+
+    Args:
+        prefix: How they begin.
+        revision: The first one to tell of.
+    """
+    return {
+        "create_request": {
+            "key": _base64(prefix.encode()),
+            "range_end": _base64(end_of(prefix)),
+            "start_revision": str(revision),
+        }
+    }
 
 
 def get_request(key: str) -> Message:
@@ -178,7 +227,8 @@ def read_page(answer: Message) -> Page:
         WireError: It is not one.
     """
     try:
-        return Page(_records(answer), _revision(answer), bool(answer.get("more", False)))
+        more, count = bool(answer.get("more", False)), int(answer.get("count", 0))
+        return Page(_records(answer), _revision(answer), more, count)
     except _BROKEN as error:
         raise WireError(f"not an answer to a range request: {error!r}") from error
 
@@ -212,6 +262,23 @@ def read_lease(answer: Message) -> tuple[int, int]:
         return int(lease["ID"]), int(lease.get("TTL", 0))
     except _BROKEN as error:
         raise WireError(f"not a lease: {error!r}") from error
+
+
+def read_watched(line: bytes) -> Watched:
+    """Read a line of the answer to a watch.
+
+    Raises:
+        WireError: It is not etcd's answer, or the watch has ended.
+    """
+    try:
+        result = json.loads(line)["result"]
+        compacted = int(result.get("compact_revision", 0))
+        if result.get("canceled") and not compacted:
+            raise WireError(f"etcd ended the watch: {result.get('cancel_reason', 'no reason given')}")
+        changes = tuple(map(_change, result.get("events", [])))
+        return Watched(changes, changes[-1].revision if changes else 0, compacted)
+    except _BROKEN as error:
+        raise WireError("not an answer of etcd to a watch") from error
 
 
 def as_it_is(answer: Message) -> Message:
@@ -287,6 +354,12 @@ def _records(answer: Message) -> tuple[Record, ...]:
         )
         for each in answer.get("kvs", [])
     )
+
+
+def _change(event: Message) -> Change:
+    found = event["kv"]
+    value = None if event.get("type") == "DELETE" else b64decode(found.get("value", ""))
+    return Change(b64decode(found["key"]).decode(), value, int(found["mod_revision"]))
 
 
 def _revision(answer: Message) -> int:

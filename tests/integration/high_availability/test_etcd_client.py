@@ -25,6 +25,8 @@ from rce_master.store.etcd.layout import Keys, prepare
 from rce_master.store.etcd.wire import Put
 
 PATIENT_S = 20.0
+EXPIRES_AT_ONCE = 1 / 86400
+"""Days."""
 
 
 @contextlib.asynccontextmanager
@@ -148,6 +150,40 @@ async def test_etcd_with_client_certificates(tmp_path: Path) -> None:
                 await client.check_members()
         assert "etcds://" in await refusal(etcd.endpoints[0])
         await check_master(tmp_path, f"etcds://{etcd.endpoints[0]}/own", "--certificates", str(folder.path))
+
+
+@pytest.mark.needs("etcd")
+async def test_an_expired_certificate_is_named_and_renewed(tmp_path: Path) -> None:
+    """The client that found it expired uses the new one, and so does etcd."""
+    folder = CertificateFolder(tmp_path / "certificates")
+    folder.make_authority()
+    for name in ("etcd", "long", "short"):
+        folder.issue(name, hosts=[LOOPBACK])
+
+    def identity(name: str) -> TlsIdentity:
+        return TlsIdentity(TlsFiles(folder.certificate(name), folder.key(name), folder.authority))
+
+    options = [
+        *("--cert-file", str(folder.certificate("etcd")), "--key-file", str(folder.key("etcd"))),
+        *("--client-cert-auth", "--trusted-ca-file", str(folder.authority)),
+    ]
+    async with (
+        cluster(tmp_path / "etcd", 1, *options, tls=identity("long").client) as etcd,
+        EtcdClient(etcd.endpoints, tls=identity("short").client, attempt=PATIENT_S) as client,
+    ):
+        for name, said in (
+            ("short", "our certificate: it may have expired"),
+            ("etcd", "the server's certificate has"),
+        ):
+            folder.issue(name, hosts=[LOOPBACK], days=EXPIRES_AT_ONCE)
+            await until(lambda: folder.details(name).days_left() < 0, what="it has expired")  # noqa: B023
+            async with EtcdClient(etcd.endpoints, tls=identity("short").client, attempt=PATIENT_S) as other:
+                with pytest.raises(EtcdAwayError) as caught:
+                    await other.get("/")
+                assert said in str(caught.value)
+                folder.issue(name, hosts=[LOOPBACK])
+                await other.get("/")
+        await client.get("/")
 
 
 async def check_master(folder: Path, store: str, *options: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 from collections.abc import AsyncIterator
+from pathlib import Path
 from typing import Any
 
 import aiohttp
@@ -210,6 +211,27 @@ async def test_nothing_acknowledged_is_lost_when_the_leader_is_killed(shared_mas
     await shared_masters.check_nothing_is_lost()
 
 
+async def test_a_request_repeated_at_the_next_leader_is_done_once(shared_masters: Masters) -> None:
+    """The key and its answer are stored with what the request did, so the next leader knows them."""
+    leader = await shared_masters.leader()
+    standby = next(master for master in shared_masters.all if master is not leader)
+    key = {"Idempotency-Key": '"a key"'}
+    answers = []
+    async with shared_masters.session(20.0) as session:
+        for killed in (None, leader):
+            if killed is not None:
+                await killed.kill()
+                await shared_masters.leader(but=killed)
+            url = f"{standby.url}api/v1/tokens"
+            async with session.post(url, json={"scope": "fleet"}, headers=key) as reply:
+                told = reply.headers.get("Idempotent-Replayed")
+                answers.append((reply.status, await reply.text(), told))
+    await restart(leader)
+    (status, text, _), again = answers
+    assert status == 201, text
+    assert again == (201, text, "true")
+
+
 async def test_sigterm_hands_over_before_the_lease_ends(shared_masters: Masters) -> None:
     leader = await shared_masters.leader()
     term = (await leader.health())["term"]
@@ -222,6 +244,91 @@ async def test_sigterm_hands_over_before_the_lease_ends(shared_masters: Masters)
     assert "left to end by itself" not in leader.output()
     await restart(leader)
     await shared_masters.check_nothing_is_lost()
+
+
+async def drain(shared_masters: Masters, name: str, *, drained: bool = True) -> list[dict[str, Any]]:
+    leader = await shared_masters.leader()
+    url = f"{leader.url}api/v1/machines/{name}/drain"
+    async with (
+        shared_masters.session(20.0) as session,
+        session.request("PUT" if drained else "DELETE", url) as reply,
+    ):
+        assert reply.status == 200, await reply.text()
+        found: list[dict[str, Any]] = (await reply.json())["masters"]
+        return found
+
+
+async def test_a_drained_leader_hands_over(shared_masters: Masters) -> None:
+    leader = await shared_masters.leader()
+    name = f"{leader.name}:{leader.http_port}"
+    async with shared_masters.under_load():
+        await shared_masters.wait_for_writes()
+        (told,) = await drain(shared_masters, name)
+        assert (told["name"], told["role"], told["drained"]) == (name, "leader", True)
+        new = await shared_masters.leader(but=leader)
+        await shared_masters.wait_for_writes()
+    await until(
+        lambda: shows(leader, role="standby", drained=True), timeout=120, what="it stands by, drained"
+    )
+    assert await shows(new, role="leader", drained=False)
+    await shared_masters.check_nothing_is_lost()
+    url = f"{new.url}api/v1/masters"
+    async with shared_masters.session(20.0) as session, session.get(url) as reply:
+        listed = (await reply.json())["masters"]
+    assert {one["name"]: (one["role"], one["drained"]) for one in listed} == {
+        f"{one.name}:{one.http_port}": ("leader" if one is new else "standby", one is leader)
+        for one in shared_masters.all
+    }
+    # It leads only as long as no other one can.
+    others = [one for one in shared_masters.all if one is not leader]
+    for other in others:
+        await other.kill()
+    assert await shared_masters.leader() is leader
+    assert await shows(leader, role="leader", drained=True)
+    for other in others:
+        await restart(other)
+    assert await shared_masters.leader(but=leader) in others
+    (told,) = await drain(shared_masters, name, drained=False)
+    assert not told["drained"]
+    await until(lambda: shows(leader, role="standby", drained=False), timeout=120, what="the drain has ended")
+
+
+async def shows(master: MasterProcess, **expected: object) -> bool:
+    found = await master.health()
+    return all(found.get(key) == value for key, value in expected.items())
+
+
+async def test_a_drain_of_what_is_not_there(shared_masters: Masters) -> None:
+    leader = await shared_masters.leader()
+    url = f"{leader.url}api/v1/machines/nowhere:9000/drain"
+    async with shared_masters.session(20.0) as session, session.put(url) as reply:
+        assert (reply.status, "no machine or task set" in await reply.text()) == (404, True)
+
+
+async def test_the_next_leader_has_followed_the_state(shared_masters: Masters) -> None:
+    leader = await shared_masters.leader()
+    for other in (one for one in shared_masters.all if one is not leader):
+        await until(lambda: shows(other, lag=0.0, lag_revisions=0), timeout=120, what="it has no lag")  # noqa: B023
+        async with shared_masters.session(20.0) as session, session.get(f"{other.url}metrics") as reply:
+            told = await reply.text()
+        assert "rce_master_lag_seconds 0.0" in told
+        assert "rce_master_lag_revisions 0.0" in told
+    assert await leader.stop() == 0
+    new = await shared_masters.leader(but=leader)
+    assert "the state was followed: of " in new.output()
+    await restart(leader)
+    await shared_masters.check_nothing_is_lost()
+
+
+async def test_a_master_of_another_engine_is_refused(
+    shared_masters: Masters, etcd: Cluster, tmp_path: Path
+) -> None:
+    stranger = MasterProcess(tmp_path, "stranger", etcd.store, LEASE_S)
+    stranger.env = {**stranger.env, "RCE_SECRET": "the secret of another engine"}
+    with pytest.raises(AssertionError, match="ended with 1"):
+        await stranger.start(ready="rce-master stand-by: ")
+    assert "below /rce/ of etcd is the state of another engine" in stranger.output()
+    assert (await (await shared_masters.leader()).health())["role"] == "leader"
 
 
 async def test_a_stopped_leader_says_and_does_nothing_when_it_wakes(shared_masters: Masters) -> None:

@@ -38,7 +38,7 @@ def test_a_transaction_has_numbers_as_texts_and_keys_in_base64() -> None:
 
 def test_a_page_with_an_empty_value_is_read() -> None:
     page = wire.read_page({"header": HEADER, "kvs": [KV], "count": "1"})
-    assert page == wire.Page((wire.Record("a", b"", 2, 7),), 2, more=False)
+    assert page == wire.Page((wire.Record("a", b"", 2, 7),), 2, more=False, count=1)
     assert wire.read_page({"header": HEADER, "more": True}).more
 
 
@@ -95,3 +95,32 @@ def test_the_range_of_a_prefix_holds_exactly_its_keys(prefix: str, key: str) -> 
 def test_a_row_is_read_as_it_was_named(table: str, key: str) -> None:
     keys = Keys("/rce")
     assert keys.read_row(keys.row(table, key)) == (table, key)
+
+
+def test_a_watch_tells_writes_and_removals_in_their_order() -> None:
+    removed = {"type": "DELETE", "kv": {"key": "YQ==", "mod_revision": "9"}}
+    line = json.dumps({"result": {"header": HEADER, "events": [{"kv": KV}, removed]}}).encode()
+    assert wire.read_watched(line) == wire.Watched(
+        (wire.Change("a", b"", 7), wire.Change("a", None, 9)), revision=9
+    )
+    assert wire.read_watched(b'{"result": {"created": true}}') == wire.Watched((), 0)
+
+
+def test_a_watch_tells_of_a_compaction() -> None:
+    line = b'{"result": {"canceled": true, "compact_revision": "12"}}'
+    assert wire.read_watched(line) == wire.Watched((), 0, compacted=12)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"",
+        b"[]",
+        b'{"error": {"code": 14}}',
+        b'{"result": {"canceled": true}}',
+        b'{"result": {"events": [{}]}}',
+    ],
+)
+def test_what_is_no_answer_to_a_watch_is_refused(line: bytes) -> None:
+    with pytest.raises(wire.WireError):
+        wire.read_watched(line)

@@ -141,3 +141,28 @@ def test_no_order_of_events_extends_a_lease_beyond_etcds(events: list[tuple[str,
             core.renewed(sent, 0 if sent >= kept else TTL)
             kept = max(kept, sent + TTL) if sent < kept else kept
         assert not core.look(now) or now < kept
+
+
+def test_a_drained_stand_by_waits_for_others() -> None:
+    core = LeadershipCore(LeaseSettings(drained_wait=10.0))
+    assert not core.looked(is_led=True, is_drained=True, now=100.0)
+    assert not core.looked(is_led=False, is_drained=True, now=101.0)
+    assert not core.looked(is_led=False, is_drained=True, now=110.9)
+    assert core.looked(is_led=False, is_drained=True, now=111.0)
+    assert core.looked(is_led=False, is_drained=False, now=111.0)
+
+
+@pytest.mark.parametrize("between", [True, None])
+def test_its_wait_begins_anew(between: bool | None) -> None:
+    """When another one led meanwhile, or etcd could not be asked."""
+    core = LeadershipCore(LeaseSettings(drained_wait=10.0))
+    assert not core.looked(is_led=False, is_drained=True, now=101.0)
+    assert not core.looked(is_led=between, is_drained=True, now=105.0)
+    assert not core.looked(is_led=False, is_drained=True, now=111.0)
+    assert core.looked(is_led=False, is_drained=True, now=121.0)
+
+
+def test_a_stand_by_that_is_not_drained_does_not_wait() -> None:
+    core = LeadershipCore(LeaseSettings(drained_wait=10.0))
+    assert not core.looked(is_led=None, is_drained=False, now=100.0)
+    assert core.looked(is_led=False, is_drained=False, now=101.0)
