@@ -24,7 +24,6 @@ TINY = {
     "rce/printable.py": "below five packages, which have nothing else in common",
     "rce/ros/actions/topics.py": BASE,
     "rce/ros/tf/frames.py": BASE,
-    "rce_client/socket.py": "below asyncio's transport, with a test of its own; its user has 300 lines",
     "rce_container/command.py": TYPER,
     "rce_fleet/experiments/catalogue.py": "the one place where an experiment is added",
     "rce_fleet/experiments/systems/registry.py": BASE,
