@@ -1,7 +1,7 @@
 """The most common WebSocket frames: whole messages without extensions (RFC 6455, section 5.2).
 
 For a small message, the ``websockets`` library takes longer for a frame than the engine for all other work.
-So this module reads and writes these frames; the library reads all others. Pure.
+So this module reads and writes these frames; the library reads all others, and answers pings. Pure.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ _LONG = struct.Struct("!BBQ")
 _TWO_BYTE_LENGTH, _EIGHT_BYTE_LENGTH = 126, 127
 _MASKED = 0x80
 _MASK_SIZE = 4
+_PONG = bytes((0x80 | Opcode.PONG,))
 _WHOLE = {int(FIN_TEXT): Opcode.TEXT, int(FIN_BINARY): Opcode.BINARY}
 
 
@@ -87,3 +88,41 @@ def add_frame(buffers: list[Buffer], first: int, head: bytes, body: Buffer) -> N
     else:
         buffers.append(header + head)
         buffers.append(body)
+
+
+class Pongs:
+    """Answers only the newest of several pings, and none while the robot does not read.
+
+    RFC 6455, section 5.5.3, allows it. Otherwise a robot that sends pings and reads nothing would make the
+    endpoint keep an answer to each.
+    """
+
+    def __init__(self) -> None:
+        self._newest = b""
+
+    def take(self, writes: list[bytes], *, writable: bool) -> list[bytes]:
+        r"""Return what is to be written of the library's frames, in their order.
+
+        Args:
+            writes: Whole frames; an empty one ends the stream.
+            writable: Whether a pong may be written now.
+
+        Example:
+            >>> pongs = Pongs()
+            >>> pongs.take([b"\x8a\x00", b"\x8a\x01x", b"\x88\x00"], writable=True)
+            [b'\x8a\x01x', b'\x88\x00']
+        """
+        pongs = [place for place, frame in enumerate(writes) if frame.startswith(_PONG)]
+        if not pongs:
+            return writes
+        newest = pongs.pop()
+        if not writable:
+            self._newest = writes[newest]
+            pongs.append(newest)
+        dropped = frozenset(pongs)
+        return [frame for place, frame in enumerate(writes) if place not in dropped]
+
+    def pop(self) -> bytes:
+        """Return the pong that waits, and forget it; empty if there is none."""
+        newest, self._newest = self._newest, b""
+        return newest

@@ -28,7 +28,14 @@ from websockets.protocol import State
 
 from rce.buffers import unfilled, write_together
 from rce.guard.websocket import GuardedConnection
-from rce_robot.doors.client.frames import FIN_BINARY, FIN_TEXT, JOIN_BELOW, add_frame, find_message
+from rce_robot.doors.client.frames import (
+    FIN_BINARY,
+    FIN_TEXT,
+    JOIN_BELOW,
+    Pongs,
+    add_frame,
+    find_message,
+)
 from rce_robot.doors.client.steps import LARGE_FRAME, Steps
 
 if TYPE_CHECKING:
@@ -180,6 +187,7 @@ class RobotSocket(GuardedConnection):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Prepare the socket for small and timely messages."""
+        self._pongs = Pongs()
         super().connection_made(transport)
         self._input: deque[bytes] = deque()
         """Data received while it was not this user's turn."""
@@ -250,9 +258,16 @@ class RobotSocket(GuardedConnection):
         else:
             self._collect(event, data)
 
+    def send_data(self) -> None:
+        """Write the library's frames, without answers to pings that nobody will read."""
+        self.protocol.writes = self._pongs.take(self.protocol.writes, writable=not self.paused)
+        super().send_data()
+
     def resume_writing(self) -> None:
-        """Tell the receiver."""
+        """Answer the newest ping, and tell the receiver."""
         super().resume_writing()
+        if (pong := self._pongs.pop()) and self.protocol.state is State.OPEN:
+            self.transport.write(pong)
         if self.receiver is not None:
             self.receiver.on_writable()
 

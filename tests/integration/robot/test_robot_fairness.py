@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import json
 import os
 import struct
@@ -14,8 +15,11 @@ from support.cloud import DIGEST, running_cloud
 from support.engine import until
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
+from websockets.protocol import State
 
 from rce_robot.conversion.pool import ConversionSettings
+from rce_robot.doors.client.session import Session
+from rce_robot.doors.client.websocket import RobotSocket
 from rce_robot.settings import SessionSettings
 
 if TYPE_CHECKING:
@@ -81,6 +85,25 @@ async def test_many_small_frames_of_one_user_leave_room_for_another() -> None:
             counting.cancel()
             async with asyncio.timeout(60):
                 await (await good.ping())
+
+
+async def test_pings_of_a_robot_that_does_not_read_are_not_kept() -> None:
+    """The newest is answered when it reads again."""
+    async with running_cloud(PATIENT) as cloud, dial(cloud, "testUser", "robot") as robot:
+        robot.transport.pause_reading()
+        ping = struct.pack("!BB4x125x", 0x89, 0x80 | 125)
+        for _ in range(60):
+            robot.transport.write(ping * 1000)
+            await robot.drain()
+        robot.transport.write(struct.pack("!BB4x", 0x82, 0x80 | 40) + b"a" * 40)  # a value of no message
+        doors = [each for each in gc.get_objects() if issubclass(type(each), RobotSocket)]
+        (door,) = [each for each in doors if each.protocol.state is State.OPEN]
+        assert isinstance(door.receiver, Session)
+        stream = door.receiver._stream
+        await until(lambda: stream.pending_bytes > 0, timeout=180, what="all pings were handled")
+        assert door.transport.get_write_buffer_size() < 1 << 20
+        robot.transport.resume_reading()
+        await (await robot.ping(b"newest"))
 
 
 async def test_large_message_uses_a_process_that_ends_when_idle() -> None:
