@@ -95,9 +95,9 @@ class MasterSettings(Section, frozen=True, kw_only=True):
     max_packages: Annotated[
         int, Meta(ge=0), Setting("Versions of packages that one user may keep; 0: no limit.")
     ] = 200
-    max_disk: Annotated[Memory, Setting("What the files of one user's packages may take; 0: no limit.")] = (
-        4 << 30
-    )
+    max_disk: Annotated[
+        Memory, Setting("What the packages and volumes of one user may take; 0: no limit.")
+    ] = 4 << 30
     max_slots: Annotated[
         int,
         Meta(ge=0),

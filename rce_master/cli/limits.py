@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from rce.model import write_memory
+from rce.model import about
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import CliError
 from rce_master.cli.offline import StateDir, choose, open_state
@@ -27,11 +27,12 @@ if TYPE_CHECKING:
 
 _SOURCES = {
     "user": "set for this user",
+    "role": "administrators have none unless it is set",
     "all": "as for all users",
     "machines": "a share of what the machines have",
 }
 _BYTES = ("memory", "disk")
-_DEFAULT = "A number; 0: no limit; default: as for all users."
+_DEFAULT = "A number; 0: no limit; default: what users of this role have."
 
 
 def show(
@@ -60,12 +61,13 @@ def _table(limits: Mapping[str, Mapping[str, Any]]) -> Table:
     table = Table("what", "used", "limit", "", box=None)
     for kind, limit in limits.items():
         most = _amount(kind, limit["limit"]) if limit["limit"] else "none"
-        table.add_row(kind, _amount(kind, limit["used"]), most, _SOURCES[limit["source"]])
+        source = limit["source"]
+        table.add_row(kind, _amount(kind, limit["used"]), most, _SOURCES.get(source, source))
     return table
 
 
 def _amount(kind: str, value: float) -> str:
-    return write_memory(round(value)) if kind in _BYTES else f"{value:g}"
+    return about(value) if kind in _BYTES else f"{value:g}"
 
 
 def limit(
@@ -75,7 +77,7 @@ def limit(
     cpu: Annotated[str | None, typer.Option(help="Cores that all containers may ask for.")] = None,
     memory: Annotated[str | None, typer.Option(help="Memory that they may ask for, such as 8G.")] = None,
     packages: Annotated[str | None, typer.Option(help="Versions of packages.")] = None,
-    disk: Annotated[str | None, typer.Option(help="Files of all packages, such as 2G.")] = None,
+    disk: Annotated[str | None, typer.Option(help="Of packages and volumes, such as 2G.")] = None,
     state_dir: StateDir = None,
 ) -> None:
     """Change what a user may have. What is there already stays."""

@@ -105,7 +105,7 @@ class LimitsIn(Body):
     packages: Amount | None = None
     """Number of versions."""
     disk: Amount | None = None
-    """Size of the packages' files: MB, or a text such as ``2G``."""
+    """Size of packages and volumes: MB, or a text such as ``2G``."""
 
 
 # Out
@@ -194,7 +194,8 @@ class LimitOut(Model):
     """0: no limit."""
     used: float
     source: str
-    """``user``: of this user; ``all``: of all users; ``machines``: a share of the machines' resources."""
+    """``user``: of this user; ``role``: of all of this role; ``all``: of all users; ``machines``: a share of
+    the machines' resources."""
 
 
 class UserLimitsOut(UserOut):

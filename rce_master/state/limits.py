@@ -30,7 +30,8 @@ class Limit(NamedTuple):
     most: float
     """0: no limit."""
     source: str
-    """``user``: set for this one; ``all``: for all users; ``machines``: a share of what the machines have."""
+    """``user``: set for this one; ``role``: for all of this role; ``all``: for all users; ``machines``: a
+    share of what the machines have."""
 
 
 def set_limits(tx: Transaction, command: SetLimits) -> None:
@@ -57,7 +58,7 @@ def limit_of(tables: Tables, settings: StateSettings, user: str, kind: str) -> L
     if own is not None and (most := asdict(own)[kind]) is not None:
         return Limit(kind, most, "user")
     if tables.users[user].role is UserRole.ADMIN and kind not in ("packages", "disk"):
-        return Limit(kind, 0, "all")
+        return Limit(kind, 0, "role")
     most = getattr(settings, _SETTINGS[kind])
     share = settings.user_share * _offered(tables, kind) if kind in _OF_MACHINES else 0
     if share and (not most or share < most):

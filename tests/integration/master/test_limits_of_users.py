@@ -61,6 +61,10 @@ async def test_limits_out_of_the_box(
         told = [line.split() for line in capsys.readouterr().out.splitlines()]
         assert ["slots", "0", "5", "set", "for", "this", "user"] in told
         assert any(line[:1] == ["disk"] and "none" in line for line in told)
+        await limits._show("", choose(None))
+        told = [line.split() for line in capsys.readouterr().out.splitlines()]
+        assert ["slots", "31", "none", "administrators", "have", "none", "unless", "it", "is", "set"] in told
+        assert any(line[:1] == ["packages"] and line[-3:] == ["for", "all", "users"] for line in told)
         reply = await site.api("POST", "/containers", {"tag": "a", "size": 6}, token=anna, status=409)
         assert "you may have 5;" in reply["error"]
         await limits._limit("anna", {"slots": "default"}, choose(None))

@@ -76,7 +76,8 @@ def test_limits_of_one_user_win_until_they_are_taken_back() -> None:
 def test_administrators_have_none_unless_it_is_set() -> None:
     world = World(StateSettings(max_containers=1, max_cpu=1, max_packages=5))
     world.user("root", UserRole.ADMIN)
-    assert [limit(world, kind, "root")[0] for kind in ("containers", "cpu", "packages")] == [0, 0, 5]
+    found = [limit(world, kind, "root") for kind in ("containers", "cpu", "packages")]
+    assert found == [(0, "role"), (0, "role"), (5, "all")]
     allow(world, "root", cpu=2)
     assert limit(world, "cpu", "root") == (2, "user")
 
