@@ -59,6 +59,11 @@ CONNECTING = "looking for the engine"
 """The words of the first report of an attempt; the reports of failures tell what went wrong."""
 
 
+def is_failure(state: State, words: str) -> bool:
+    """Return whether a report of a state says that an attempt to connect failed."""
+    return state is State.CONNECTING and words != CONNECTING
+
+
 class Session:
     """Keeps the connection, what was asked of the engine, and the interfaces, until the program closes it.
 

@@ -7,10 +7,10 @@ import contextlib
 import gc
 import socket
 import sys
-from collections.abc import Iterator
 
 import uvloop
 
+from rce.aio.tasks import errors_in
 from rce.config import (
     EngineSettings,
     EtcdAddress,
@@ -50,18 +50,10 @@ def run(engine: EngineSettings, *, verbose: bool = False) -> int:
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
             runner.run(_run(_settings(engine), secret))
     except* (LogFileError, MasterError, SecretError, RunDirError, CertificateError) as group:
-        faults = tuple(_leaves(group))
+        faults = tuple(errors_in(group))
     for fault in faults:
         print(f"rce-master: {fault}", file=sys.stderr)  # noqa: T201 - for the user
     return 1 if faults else 0
-
-
-def _leaves(group: BaseExceptionGroup[BaseException]) -> Iterator[BaseException]:
-    for error in group.exceptions:
-        if isinstance(error, BaseExceptionGroup):
-            yield from _leaves(error)
-        else:
-            yield error
 
 
 def _settings(engine: EngineSettings) -> MasterSettings:

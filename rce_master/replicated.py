@@ -9,7 +9,7 @@ from contextlib import AsyncExitStack
 from functools import partial
 from typing import TYPE_CHECKING
 
-from rce.aio.tasks import TaskScope
+from rce.aio.tasks import TaskScope, errors_in
 from rce.config.store_address import ETCD_PORT
 from rce.guard import TrustedProxies
 from rce.link.address import in_url, is_any, own_address
@@ -196,7 +196,7 @@ class ReplicatedMaster:
                     for task in keeping:
                         task.cancel()
             except* (FencedError, EtcdAwayError) as errors:
-                _log.warning("this master leads no more: %s", _first_of(errors))
+                _log.warning("this master leads no more: %s", next(errors_in(errors)))
             finally:
                 await keeper.step_down()
                 gc.unfreeze()
@@ -251,10 +251,3 @@ async def _prepare(client: EtcdClient, prefix: str) -> None:
         else:
             return
         await asyncio.sleep(_PAUSE_S)
-
-
-def _first_of(errors: BaseExceptionGroup[BaseException]) -> BaseException:
-    first: BaseException = errors
-    while isinstance(first, BaseExceptionGroup):
-        first = first.exceptions[0]
-    return first

@@ -10,10 +10,11 @@ import asyncio
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Coroutine, Iterator
     from types import TracebackType
 
 T = TypeVar("T")
+E = TypeVar("E", bound=BaseException)
 
 
 class TaskScope:
@@ -114,6 +115,21 @@ class BackgroundTasks:
         if not task.cancelled() and (error := task.exception()) is not None:
             context = {"message": f"task {task.get_name()} failed", "exception": error, "task": task}
             task.get_loop().call_exception_handler(context)
+
+
+def errors_in(group: BaseExceptionGroup[E]) -> Iterator[E]:
+    """Iterate over the errors of a group and of the groups in it: each task group adds one around them.
+
+    Example:
+        >>> group = ExceptionGroup("outer", [ExceptionGroup("inner", [OSError("no room")])])
+        >>> next(errors_in(group))
+        OSError('no room')
+    """
+    for error in group.exceptions:
+        if isinstance(error, BaseExceptionGroup):
+            yield from errors_in(error)
+        else:
+            yield error
 
 
 async def cancel_and_wait(*tasks: asyncio.Future[Any]) -> None:

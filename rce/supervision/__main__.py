@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import uvloop
 
+from rce.aio.tasks import errors_in
 from rce.own_process import end_signals
 from rce.supervision.plan import Plan
 from rce.supervision.prefork import Prepared, prepare
@@ -44,7 +45,7 @@ async def run(plan: Plan, prepared: Mapping[str, Prepared]) -> int:
             async with _certificates(plan):
                 await supervisor.run(lambda: _say("\n".join(plan.ready)))
         except* (StartError, OSError, CertificateError) as group:
-            faults = group.exceptions
+            faults = tuple(errors_in(group))
         finally:
             supervisor.drop_unused()
     for fault in faults:

@@ -31,10 +31,10 @@ from rce_client.ros_bridge.bridge import build, joined_graph, wait_ready
 from rce_client.ros_bridge.explain import dot, long_form, picture
 from rce_client.ros_bridge.plan import Plan, make_plan
 from rce_client.ros_bridge.robot_file import RobotFile
-from rce_client.session import CONNECTING
+from rce_client.session import is_failure
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from rce.config.client import ClientConfig
     from rce.ros.node import Node
@@ -87,7 +87,9 @@ def bridge(
 
 
 async def run(file: RobotFile, master_uri: str, tls: Context | None = None) -> None:
-    """Bridge until SIGINT or SIGTERM. A second signal ends the program at once, without removing anything.
+    """Bridge until SIGINT or SIGTERM, or until the robot's graph tells the node to stop.
+
+    A second signal ends the program at once, without removing anything.
 
     Raises:
         ClientError: The engine refuses this robot.
@@ -97,29 +99,58 @@ async def run(file: RobotFile, master_uri: str, tls: Context | None = None) -> N
     task = asyncio.current_task()
     assert task is not None
     loop = asyncio.get_running_loop()
+    stopping = False
 
     def on_signal(number: signal.Signals) -> None:
+        nonlocal stopping
+        stopping = True
         loop.remove_signal_handler(number)
         signal.signal(number, signal.SIG_DFL)
         task.cancel()
 
+    def on_shutdown() -> None:
+        nonlocal stopping
+        if not stopping:
+            stopping = True
+            say("the robot's ROS graph told this program to stop")
+            task.cancel()
+
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, on_signal, number)
     try:
-        await serve(file, master_uri, tls)
+        await serve(file, master_uri, tls, on_shutdown)
     except asyncio.CancelledError:
         task.uncancel()
 
 
-async def serve(file: RobotFile, master_uri: str, tls: Context | None = None) -> None:
-    """Bridge until cancelled or refused, then remove what was made."""
-    async with joined_graph(file.draft.robot, master_uri, file.types, say) as node:
+async def serve(
+    file: RobotFile, master_uri: str, tls: Context | None, on_shutdown: Callable[[], None]
+) -> None:
+    """Bridge until cancelled or refused, then remove what was made.
+
+    Args:
+        file: The robot's file.
+        master_uri: The robot's ROS master.
+        tls: For ``https`` and ``wss``.
+        on_shutdown: Called when the node is told to stop: by ``rosnode kill``, or because another node, such
+            as a second ``rce-ros`` of this robot, took its name. The graph does not know it any more then.
+    """
+    async with (
+        joined_graph(file.draft.robot, master_uri, file.types, say) as node,
+        TaskScope() as watching,
+    ):
+        watching.spawn(_tell_shutdown(node, on_shutdown), name="until the node is told to stop")
         config = await file.complete(node, say)
         plan = make_plan(config)
         for tag in plan.unbridged:
             say(f"interface {tag} has no addr: it is not connected to the robot's ROS graph")
         async with _connection(config, tls) as conn:
             await _serve(config, plan, conn, node)
+
+
+async def _tell_shutdown(node: Node, on_shutdown: Callable[[], None]) -> None:
+    await node.until_shutdown()
+    on_shutdown()
 
 
 def _connection(config: ClientConfig, tls: Context | None) -> Connection:
@@ -186,7 +217,7 @@ def say(text: str) -> None:
 
 
 def _tell_state(reminder: Reminder, state: State, words: str) -> None:
-    failed = state is State.CONNECTING and words != CONNECTING and reminder.is_due(words)
+    failed = is_failure(state, words) and reminder.is_due(words)
     if failed or state in (State.LOST, State.RESTORED):
         say(f"{state.value}: {words}")
 

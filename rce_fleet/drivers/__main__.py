@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 import uvloop
 
+from rce.aio.tasks import errors_in
 from rce.config import ConfigError, start_logging
 from rce.own_process import end_signals
 from rce.ros.core.server import DEFAULT_PORT
@@ -78,7 +79,7 @@ def simulate(
     try:
         uvloop.run(_until_signal(simulation))
     except* RefusedError as group:
-        failure = f"simulation: the engine refused the connection: {group.exceptions[0]}"
+        failure = f"simulation: the engine refused the connection: {next(errors_in(group))}"
     _end_if(failure)
 
 
@@ -161,7 +162,7 @@ def sim(
     try:
         uvloop.run(_until_signal(simulation))
     except* (PortTakenError, MasterError) as group:
-        failure = f"rce sim: {group.exceptions[0]}"
+        failure = f"rce sim: {next(errors_in(group))}"
     _end_if(failure)
 
 

@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 import typer
 import uvloop
 
+from rce.aio.tasks import errors_in
 from rce.cli.options import Authority, CertificateName, Certificates, Tls, TlsCert, TlsKey, tls_of
 from rce.cli.program_files import from_file
 from rce.config.client import ClientConfig, load
@@ -23,6 +24,7 @@ from rce.config.folders import default_state_dir
 from rce.config.logs import start_logging
 from rce.masters import split_addresses
 from rce.own_process import end_signals
+from rce.ros.errors import NodeClosedError
 from rce.ros.names import parse_arguments
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
@@ -136,11 +138,11 @@ def ui(
                 kill_leader=DemoProcess().kill_leader if demo else None,
             )
         )
-    except* RefusedError as group:
-        typer.echo(f"rce ui: {group.exceptions[0]}", err=True)
+    except* (RefusedError, NodeClosedError) as group:
+        typer.echo(f"rce ui: {next(errors_in(group))}", err=True)
         raise typer.Exit(1) from None
     except* OSError as group:
-        typer.echo(f"rce ui: cannot listen on {bind}:{port}: {group.exceptions[0]}", err=True)
+        typer.echo(f"rce ui: cannot listen on {bind}:{port}: {next(errors_in(group))}", err=True)
         raise typer.Exit(1) from None
 
 

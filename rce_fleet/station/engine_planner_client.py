@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -11,7 +12,9 @@ from rce.model import Request
 from rce.tls.identity import Context
 from rce_client.connection import Connection, State
 from rce_client.exceptions import CallError, ClientError
+from rce_client.reminder import Reminder
 from rce_client.services import ServiceClient
+from rce_client.session import is_failure
 from rce_client.topics import Subscriber
 from rce_fleet.station.desired import node_requests
 from rce_fleet.station.planner_client import (
@@ -40,6 +43,8 @@ from rce_fleet.station.planner_client import (
     pose_topic,
 )
 
+_log = logging.getLogger(__name__)
+
 MANAGER_EXECUTABLE = "fleet_manager.py"
 _SERVICES = (("setGoal", SET_GOAL), ("blockCell", BLOCK_CELL))
 _NEWER_SERVICES = (
@@ -67,6 +72,8 @@ class EnginePlannerClient(PlannerClient):
         self.connection: Connection | None = None
         """The connection to the engine, while there is one."""
         self._node_requests: asyncio.Queue[Request] = asyncio.Queue()
+        self._reminder = Reminder()
+        self._failure = ""
         self._listener: PlannerListener
         self._states: Subscriber[dict[str, Any]]
 
@@ -185,11 +192,21 @@ class EnginePlannerClient(PlannerClient):
         await connection.connect(f"{connection.robot_id}/{tag}", f"{self._container}/{tag}")
 
     def _on_state(self, state: State, words: str) -> None:
-        if state is State.LOST:
+        if is_failure(state, words):
+            self._report_failure(words)
+        elif state is State.LOST:
             self._listener.take_event(f"connection to the engine lost: {words}", "bad")
         elif state is State.RESTORED:
             self._listener.take_event("connection to the engine restored", "good")
             self._listener.may_have_missed()
+
+    def _report_failure(self, words: str) -> None:
+        """Log at once and every few seconds why there is no connection; tell the pages once."""
+        if self._reminder.is_due(words):
+            _log.warning("%s is not connected to the engine: %s", self._config.robot, words)
+        if words != self._failure:
+            self._failure = words
+            self._listener.take_event(f"no connection to the engine: {words}", "bad")
 
 
 def _caller(client: ServiceClient[dict[str, Any]]) -> Call:

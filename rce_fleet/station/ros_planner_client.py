@@ -7,7 +7,8 @@ from array import array
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from rce.ros.errors import RosError, ServiceError
+from rce.aio.tasks import TaskScope
+from rce.ros.errors import NodeClosedError, RosError, ServiceError
 from rce.ros.node import Node, ServiceClient
 from rce.ros.types import Duration, Message, Time, TypeRegistry
 from rce_fleet.station.planner_client import (
@@ -55,13 +56,18 @@ class RosPlannerClient(PlannerClient):
         self._heard = asyncio.Event()
 
     async def run(self, listener: PlannerListener, ready: Callable[[], Awaitable[None]]) -> None:
-        """Join the graph and receive messages until cancelled."""
+        """Join the graph and receive messages until cancelled.
+
+        Raises:
+            NodeClosedError: In a group: the graph told the node to stop. It does not know it any more then.
+        """
 
         def take_state(message: Message) -> None:
             listener.take_state(plain(message))
             self._heard.set()
 
-        async with self._node as node:
+        async with self._node as node, TaskScope() as watching:
+            watching.spawn(_fail_on_shutdown(node), name="until the node is told to stop")
             for service in (SET_GOAL, BLOCK_CELL, GET_STATE, SET_GRID, SET_MODE, FLEET_REQUEST):
                 self._calls[service] = _caller(node.service_client(service.name, service.type_name))
             states = await node.subscribe(STATE_TOPIC, STATE, take_state)
@@ -108,6 +114,18 @@ class RosPlannerClient(PlannerClient):
         await self._node.subscribe(
             pose_topic(robot), POSE, lambda message: listener.take_pose(robot, plain(message))
         )
+
+
+async def _fail_on_shutdown(node: Node) -> None:
+    """Wait until the node is told to stop, by ``rosnode kill`` or a second node of its name.
+
+    Raises:
+        NodeClosedError: It was.
+    """
+    await node.until_shutdown()
+    raise NodeClosedError(
+        f"the ROS graph at {node.master_uri} told {node.name} to stop; a graph has room for one station"
+    )
 
 
 def _caller(client: ServiceClient) -> Call:

@@ -11,6 +11,7 @@ import typer
 from rich.console import Console, Group
 from rich.table import Table
 
+from rce.aio.tasks import errors_in
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
 from rce_master.cli.exceptions import ApiError, CliError
@@ -71,7 +72,7 @@ async def fetch(client: ApiClient, *names: str) -> Everything:
         async with asyncio.TaskGroup() as group:
             tasks = {name: group.create_task(_fetch(client, name)) for name in names}
     except* CliError as failures:
-        failure = failures.exceptions[0]
+        failure = next(errors_in(failures))
     if failure is not None:
         raise failure
     return {name: task.result() for name, task in tasks.items()}

@@ -118,7 +118,7 @@ async def wait_for_vote(
                         why = error
                     await asyncio.sleep(_PAUSE_S)
     raise ClusterError(
-        f"etcd on this machine is no member with a vote after {START_S:.0f} s: {why}; look at its"
+        f"etcd on this machine is not a member with a vote after {START_S:.0f} s: {why}; look at its"
         " log, then run the"
         " same command again"
     )

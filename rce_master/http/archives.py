@@ -81,7 +81,7 @@ class ArchiveRoutes:
         return web.Response(status=204)
 
     def _check(self, request: web.Request) -> None:
-        """Refuse whoever is not the leading master.
+        """Refuse a peer that is not the leading master.
 
         Raises:
             HTTPForbidden: It is another program, or a master that led before.

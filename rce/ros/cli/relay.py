@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 import uvloop
 
+from rce.aio.tasks import errors_in
 from rce.cli.program_files import from_file
 from rce.config import start_logging
 from rce.ros.errors import RosError
@@ -53,9 +54,8 @@ def relay(
         _check(node, source, target)
         uvloop.run(_run(node, TopicRelay(source, target, throttle=chosen, lazy=lazy, latch=latch)))
     except* (RosError, ValueError) as errors:
-        error = errors.exceptions[0]
-        typer.echo(f"rce relay: {error}", err=True)
-        raise typer.Exit(1) from error
+        typer.echo(f"rce relay: {next(errors_in(errors))}", err=True)
+        raise typer.Exit(1) from None
 
 
 def _check(node: Node, source: str, target: str) -> None:

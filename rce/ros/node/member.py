@@ -142,6 +142,16 @@ class GraphMember:
         with stop_signals(self.shutdown):
             await self._stop.wait()
 
+    async def until_shutdown(self) -> None:
+        """Wait until the node is told to stop, as :meth:`spin`; signals are left to the program.
+
+        Example:
+            ```python
+            await node.until_shutdown()
+            ```
+        """
+        await self._stop.wait()
+
     async def sleep(self, seconds: float) -> bool:
         """Sleep in ROS time, or wake up early because the node is told to stop or simulated time jumps back.
 
@@ -333,7 +343,7 @@ class GraphMember:
             self._parameters,
             self._service_uri,
             self._private_parameters,
-            self.shutdown,
+            self._stop_for_others,
         )
 
     def _parameter_changed(self, name: str, value: object) -> bool:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import count
 from typing import TYPE_CHECKING, ClassVar
 
+from rce.aio.tasks import errors_in
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.bench import CLIENT, SERVER, client
 
@@ -263,7 +264,7 @@ async def together(*works: Coroutine[object, object, object]) -> None:
             for work in works:
                 tasks.create_task(work)
     except* ExperimentError as errors:
-        raise errors.exceptions[0] from None
+        raise next(errors_in(errors)) from None
 
 
 def core_uri(address: str) -> str:

@@ -17,6 +17,7 @@ from support.processes import finish
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.types import TypeRegistry
+from rce.ros.xmlrpc import RpcClient
 from rce_client.ros_bridge.bridge import joined_graph
 
 if TYPE_CHECKING:
@@ -141,6 +142,36 @@ async def test_messages_and_calls_pass_both_ways(engine: Engine, tmp_path: Path)
 
 def made(engine: Engine) -> list[dict[str, str]]:
     return [item for _, _, data in engine.master.requests for item in data.get("addInterfaces", ())]
+
+
+async def test_another_of_its_name_takes_its_place(engine: Engine, tmp_path: Path) -> None:
+    """The ROS master tells the first to stop: it ends, so that the second gets the robot's place."""
+    path = write(tmp_path, config(engine.door.url))
+    async with (
+        Core(host="127.0.0.1", port=0) as core,
+        program(path, master=core.uri) as first,
+    ):
+        await first.until("rce-ros ready")
+        async with program(path, master=core.uri) as second:
+            await first.until("the robot's ROS graph told this program to stop")
+            assert await first.end() == 0
+            await second.until("rce-ros ready")
+
+
+async def test_ends_when_its_node_is_killed_in_the_graph(engine: Engine, tmp_path: Path) -> None:
+    """As by Ctrl-C, also while it waits for a robotID that is in use."""
+    path = write(tmp_path, config(engine.door.url))
+    async with (
+        engine.connection(),
+        Core(host="127.0.0.1", port=0) as core,
+        program(path, master=core.uri) as bridge,
+    ):
+        await bridge.until("the robotID is in use")
+        async with RpcClient() as rpc:
+            _, _, uri = await rpc.call(core.uri, "lookupNode", ("/test", "/rce_ros_testRobot"))
+            await rpc.call(uri, "shutdown", ("/rosnode-1", "user request"))
+        await bridge.until("the robot's ROS graph told this program to stop")
+        assert await bridge.end() == 0
 
 
 async def test_errors_of_the_engine_are_shown(engine: Engine, tmp_path: Path) -> None:
