@@ -167,7 +167,7 @@ class FleetMapModel(ApiModel):
     origin: list[float] = Field(description="Outer corner of cell 0, metres.", min_length=2, max_length=2)
     yaw: float = Field(description="Direction of the columns, radians counter-clockwise from x.")
     walls: list[int]
-    blocked: list[int] = Field(description="Blocked cells that are no walls, and cells that will be blocked.")
+    blocked: list[int] = Field(description="Blocked cells, walls left out, and cells that will be blocked.")
 
 
 class StatisticsModel(ApiModel):

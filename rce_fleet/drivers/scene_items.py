@@ -23,7 +23,7 @@ Id = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 
 _CELL, _ITEM = "<cell>", "<item>"
 TAGS = (_CELL, _ITEM)
-"""Steps in the paths of pydantic's errors that are no keys."""
+"""Steps in the paths of pydantic's errors that are not keys."""
 
 
 def _form(value: object) -> str:

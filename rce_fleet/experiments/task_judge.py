@@ -187,7 +187,7 @@ class Judge:
         request = {"goal": {"header": header, "pose": pose_fields(goal)}}
         try:
             answer = await self._plans.call(request, timeout=timeout)
-        except ServiceError:  # it is not there yet, or too late: both are no plan
+        except ServiceError:  # it is not there yet, or too late: both mean that there is no plan
             return False
         return len(answer.plan.poses) > 1
 

@@ -268,7 +268,7 @@ class Amcl:
         parameters = self.parameters
         best = parameters.laser_z_hit + parameters.laser_z_rand / beams.range_max
         average = float(weights @ np.cbrt((cubes - 1.0) / count)) / best
-        # The slow average rises as fast as the other one: a bad beginning is no standard for later.
+        # The slow average rises as fast as the other one: a bad beginning is not a standard for later.
         rate = parameters.recovery_alpha_slow if average < self._slow else parameters.recovery_alpha_fast
         self._slow += (average - self._slow) * (rate if self._slow else 1.0)
         self._fast += (average - self._fast) * (parameters.recovery_alpha_fast if self._fast else 1.0)

@@ -61,7 +61,7 @@ def _move_differential(
     way = hypot(dx, dy)
     first = wrap(atan2(dy, dx) - before.yaw) if way >= STANDING else 0.0
     second = wrap(after.yaw - before.yaw - first)
-    # Backwards is no turn of 180 degrees: it errs as little as forwards.
+    # Driving backwards is not a turn of 180 degrees: it errs as little as forwards.
     first2, second2 = (min(abs(turn), pi - abs(turn)) ** 2 for turn in (first, second))
     a1, a2 = parameters.odom_alpha1, parameters.odom_alpha2
     a3, a4 = parameters.odom_alpha3, parameters.odom_alpha4

@@ -29,7 +29,7 @@ class LaserScan:
         ranges: shape (N,), metres; not finite, or ``range_max`` and more: no return.
         angle_min: Direction of beam 0 in the laser's frame, radians.
         angle_increment: Angle from one beam to the next, radians; negative for a laser that is upside down.
-        range_min: Nearer ranges are no measurements, metres.
+        range_min: Nearer ranges are not measurements, metres.
         range_max: Greatest range that is measured, metres.
         laser: Pose of the laser on the robot's base.
     """

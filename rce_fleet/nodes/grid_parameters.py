@@ -119,7 +119,7 @@ async def read_fleet_parameters(node: Node) -> dict[str, Any]:
 
 
 def unknown_parameters(names: Iterable[str], known: Collection[str]) -> list[str]:
-    """Return a remark about each name that is no known parameter, with the nearest known one."""
+    """Return a remark about each name that is not a known parameter, with the nearest known one."""
     unknown = sorted(name for name in names if name not in known)
     return [
         f"unknown parameter {name}; did you mean {difflib.get_close_matches(name, known, 1, 0.0)[0]}?"

@@ -33,7 +33,7 @@ def _spreads(covariance: Sequence[float]) -> tuple[float | None, float | None]:
         covariance: Row by row, of x, y, z and the rotations about them.
 
     Returns:
-        None for numbers that are no covariance: not finite, or negative.
+        None for numbers that are not a covariance: not finite, or negative.
     """
     xx, xy, yy, turn = covariance[0], covariance[1], covariance[7], covariance[35]
     # The larger eigenvalue of the symmetric matrix [[xx, xy], [xy, yy]].

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 REDRAW_S = 0.2
 SHARE = 0.1
-"""Where the output is no terminal, a line is printed after each such share of the scans."""
+"""Where the output is not a terminal, a line is printed after each such share of the scans."""
 SHOWN_FAULTS = 10
 NOTICE_S = 1.0
 """Seconds after which a user wants to know what takes so long."""

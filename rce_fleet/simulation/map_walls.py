@@ -31,7 +31,7 @@ def walls_of_map(grid: OccupancyMap) -> Walls:
     """Return the outlines of a map's occupied cells as thin walls, in the world's frame.
 
     Marching squares give the outlines, and a line replaces the points that it passes within half a cell.
-    Unknown cells are no walls.
+    Unknown cells are not walls.
     """
     solid = np.pad(grid.occupied, 1)  # So that outlines at the map's border are closed.
     found: list[Floats] = []

@@ -1,14 +1,23 @@
-"""An engine with TLS, which the tests of a module share."""
+"""A folder with a short path; an engine with TLS, which the tests of a module share."""
 
 from __future__ import annotations
 
+import shutil
 import tempfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
 import pytest_asyncio
 from support.tls_engine import World
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """For sockets too, whose paths have at most 107 bytes."""
+    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    yield path
+    shutil.rmtree(path)
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import json
 import os
 import shlex
 import shutil
 import sys
-import tempfile
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ from typing import Any
 import pytest
 from support.engine import Program, until
 from support.networks import NetworkMachine, network
+from support.processes import run_to_end
 
 pytestmark = [
     pytest.mark.e2e,
@@ -104,17 +103,7 @@ class Host:
         return Program(f"{self.name}-{name}", [*self.machine.prefix, *words], self.env, self.folder)
 
     async def run(self, *words: str, given: str = "") -> tuple[int, str]:
-        process = await asyncio.create_subprocess_exec(
-            *self.machine.prefix,
-            *words,
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.STDOUT,
-            env=self.env,
-        )
-        output, _ = await process.communicate(given.encode())
-        assert process.returncode is not None
-        return process.returncode, output.decode()
+        return await run_to_end(*self.machine.prefix, *words, env=self.env, text=given)
 
     async def rce(self, *words: str, given: str = "") -> tuple[int, str]:
         return await self.run(str(BIN / "rce"), *words, given=given)
@@ -158,13 +147,6 @@ class Host:
         for program in (self.master, self.etcd):
             if program is not None and program.running:
                 await program.stop()
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
-    yield path
-    shutil.rmtree(path)
 
 
 @asynccontextmanager

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,13 +17,6 @@ pytestmark = [
 
 SEED = 1
 SHORT = [each for each in SCENARIOS if each.short]
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
-    yield path
-    shutil.rmtree(path)
 
 
 @pytest.mark.parametrize("scenario", SHORT, ids=[each.name for each in SHORT])

@@ -9,8 +9,6 @@ import shutil
 import stat
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
 from contextlib import AsyncExitStack
 from pathlib import Path
 
@@ -80,13 +78,6 @@ def blocks() -> dict[str, list[str]]:
 async def _end(program: Program) -> None:
     if program.running:
         await program.stop()
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
-    yield path
-    shutil.rmtree(path)
 
 
 async def test_how_to_for_several_machines(folder: Path) -> None:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import sys
-import tempfile
 from collections import defaultdict
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -86,13 +83,6 @@ LOADED = {
 }
 SHARED = ("msgspec", "asyncio", "uvloop", "websockets.asyncio.client", "rce.link.hub", "rce.control.messages")
 """Loaded once, by ``rce up``, of which the other programs are forks."""
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
-    yield path
-    shutil.rmtree(path)
 
 
 def imports_of(output: str) -> dict[str, set[str]]:

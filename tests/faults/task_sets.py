@@ -29,7 +29,7 @@ DIAL_S = 0.3
 
 
 class Prober:
-    """Says Hello to each master again and again, and believes all: so it hears whoever acts as the leader.
+    """Says Hello to each master again and again, and believes all: so it hears all that act as leaders.
 
     A connection is kept until the master ends it: a master that was stopped has it when it wakes.
     """

@@ -293,7 +293,7 @@ def command_line(process: psutil.Process) -> list[str]:
 
 
 def engine_processes(folder: Path) -> list[psutil.Process]:
-    """All processes that an engine with this folder started, whoever their parent is, and their children."""
+    """All processes that an engine with this folder started, whatever their parent is, and their children."""
     children: dict[int, list[psutil.Process]] = {}
     found: dict[int, psutil.Process] = {}
     for process in psutil.process_iter():

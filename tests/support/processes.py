@@ -53,6 +53,24 @@ async def finish(
     return output or b""
 
 
+async def run_to_end(*argv: object, env: dict[str, str], text: str = "") -> tuple[int, str]:
+    """Run a program to its end, with ``text`` as its input.
+
+    Returns:
+        Its exit code and all that it wrote.
+    """
+    process = await asyncio.create_subprocess_exec(
+        *map(str, argv),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+        env=env,
+    )
+    output, _ = await process.communicate(text.encode())
+    assert process.returncode is not None
+    return process.returncode, output.decode()
+
+
 def _children(pid: int) -> list[psutil.Process]:
     try:
         return psutil.Process(pid).children(recursive=True)

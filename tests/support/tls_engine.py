@@ -20,6 +20,7 @@ import pytest
 from rce.tls.folder import CertificateFolder
 from support.engine import engine_processes, until
 from support.ports import free_ports
+from support.processes import run_to_end
 
 T = TypeVar("T")
 
@@ -97,21 +98,8 @@ class World:
         assert not engine_processes(self.folder)
 
     async def run(self, *argv: object, text: str = "") -> tuple[int, str]:
-        """Run a program to its end.
-
-        Returns:
-            Its exit code and all that it wrote.
-        """
-        process = await asyncio.create_subprocess_exec(
-            *map(str, argv),
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.STDOUT,
-            env=self.env,
-        )
-        output, _ = await process.communicate(text.encode())
-        assert process.returncode is not None
-        return process.returncode, output.decode()
+        """Run a program to its end; return its exit code and all that it wrote."""
+        return await run_to_end(*argv, env=self.env, text=text)
 
     async def curl(self, *arguments: object) -> tuple[int, str]:
         return await self.run("curl", "-sS", "-m", "20", *arguments)

@@ -1,4 +1,4 @@
-"""Name lookups in threads of their own: shared, bounded, and left behind by whoever does not wait."""
+"""Name lookups in threads of their own: shared, bounded, and left behind by programs that do not wait."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ def _thin(points: NDArray[np.float64], cell: float) -> NDArray[np.intp]:
 def _normals(
     ends: NDArray[np.float64], used: NDArray[np.bool_], gaps: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return normals by the main axes of each point's neighbours; zero where these are no line."""
+    """Return normals by the main axes of each point's neighbours; zero where these are not on a line."""
     count = len(ends)
     if count == 0:
         return np.zeros((0, 2))

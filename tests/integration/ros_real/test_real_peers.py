@@ -72,7 +72,7 @@ async def test_topics_services_and_parameters(
             answer = await asking.call({}, timeout=20)
             assert (answer.success, answer.message) == (True, f"{language} got: ü")
 
-        if language == "rospy":  # Debian's roscpp answers and then crashes, whoever asks it and at any core
+        if language == "rospy":  # Debian's roscpp answers and then crashes, for any client and any core
             get = node.service_client(f"{name}/get_loggers", "roscpp/GetLoggers")
             assert (await get.call({}, timeout=20)).loggers
         await node.service_client("peer_set", "std_srvs/SetBool").call({"data": True}, timeout=20)

@@ -367,7 +367,7 @@ def test_boxes_of_another_grid_are_where_its_cells_are() -> None:
     assert list(world.boxes) == [9, 20]
     turned = GridMap(rows=4, columns=4, cell_size=0.5, origin=(6.0, 2.0), yaw=pi / 2)
     keeper.follow([0, 5], turned)
-    assert list(world.boxes) == [9], "cell 20 is no cell of the new grid"
+    assert list(world.boxes) == [9], "cell 20 is not a cell of the new grid"
     placed = {name: box for name, box in world.all_boxes.items() if name != "cell_9"}
     assert [(box.pose.x, box.pose.y) for box in placed.values()] == [
         pytest.approx((5.75, 2.25)),

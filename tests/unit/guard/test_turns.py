@@ -78,7 +78,7 @@ async def test_when_too_many_wait_the_largest_crowd_makes_room() -> None:
 
 
 async def test_member_with_most_makes_room_within_its_crowd() -> None:
-    """Whoever shares an address with a flood finds room in a full queue."""
+    """A client that shares an address with a flood finds room in a full queue."""
     async with asyncio.TaskGroup() as group:
         site = Site(Turns(1, waiting=3), group)
         for number in range(5):

@@ -97,7 +97,7 @@ def test_ambiguous_loop_is_refused() -> None:
 
 
 def test_loop_is_found_in_small_window() -> None:
-    """The same corridor is no riddle where the pose is known to less than a niche."""
+    """The same corridor is not ambiguous where the pose is known to less than a niche."""
     graph, later, earlier = corridor_return()
     graph.poses[later, 0] -= 2.8
     closure = LoopMatcher(graph, PARAMETERS).match(earlier, later, 5.0)

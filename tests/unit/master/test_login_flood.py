@@ -76,7 +76,7 @@ async def door() -> AsyncIterator[Door]:
 
 
 async def test_flood_delays_other_address_by_own_checks_only(door: Door) -> None:
-    """Whoever is known comes in without a turn; who is not has the next one, though the queue is full."""
+    """A known client comes in without a turn; an unknown one has the next turn, though the queue is full."""
     await door.auth.verify("zoe", RIGHT, "home")
     door.hasher.go.clear()
     async with asyncio.TaskGroup() as group:

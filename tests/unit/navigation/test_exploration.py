@@ -154,7 +154,7 @@ def test_long_frontiers_are_split() -> None:
 
 
 def test_a_costmap_is_read_as_move_base_publishes_it() -> None:
-    """Inscribed cells (99) are no way and no frontier, costs below are; unknown is -1."""
+    """Inscribed cells (99) are neither a way nor a frontier, costs below are; unknown is -1."""
     data = np.full((20, 30), 0, np.int8)
     data[:, 25:] = UNKNOWN
     data[:10, 10] = 100

@@ -129,7 +129,7 @@ def test_parallel_aisles_get_opposite_directions() -> None:
     free.reshape(-1)[list(SHELVES.blocked)] = False
     factors = aisle_factors(free, against=3)
     assert factors[4, 5].tolist() == [1, 3, 1, 1]
-    assert factors[2, 7].tolist() == [1, 1, 1, 1]  # two cells are no aisle
+    assert factors[2, 7].tolist() == [1, 1, 1, 1]  # two cells are not an aisle
     wide = np.zeros((7, 9), dtype=bool)
     wide[[1, 3, 5]] = True
     turned = aisle_factors(wide, against=2)

@@ -157,7 +157,7 @@ def _search_files(needles: dict[str, Needle]) -> str:
 
 
 def _search_memory(needles: dict[str, Needle]) -> str:
-    """Search the memory that was inherited from whoever forked this process."""
+    """Search the memory that was inherited from the process that forked this one."""
     found = set()
     with open("/proc/self/mem", "rb", buffering=0) as memory:
         for line in Path("/proc/self/maps").read_text().splitlines():
