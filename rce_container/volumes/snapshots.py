@@ -45,6 +45,7 @@ _ATTEMPTS = 8
 _PAUSE_S = 1.0
 _RELEASE_S = 30.0
 """How long the container that has a volume may take to end completely."""
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 _LOOK_S = 0.5
 """How often it is looked which volume's next snapshot is due."""
 
@@ -73,7 +74,6 @@ class SnapshotKeeper:
 
     Attributes:
         is_wanted: Whether the master takes snapshots.
-        longest_pause: For how many seconds a container was stopped for a snapshot, at most.
     """
 
     def __init__(
@@ -96,8 +96,9 @@ class SnapshotKeeper:
         """Kind and volume of the orders that are being carried out."""
         self._due: dict[tuple[str, str], float] = {}
         """When the next snapshot is taken, by incarnation and volume; seconds of the monotonic clock."""
+        self._copies: dict[tuple[str, str], Path] = {}
+        """Copies of the last snapshots, by incarnation and volume: the next ones write only what differs."""
         self.is_wanted = False
-        self.longest_pause = 0.0
 
     # Orders of the master
 
@@ -275,29 +276,30 @@ class SnapshotKeeper:
         """
         while True:
             await asyncio.sleep(_LOOK_S)
-            due = {
+            asked = {
                 (incarnation_id, claim.id): claim
                 for incarnation_id in subjects
                 for claim in self._store.claims(incarnation_id)
                 if claim.snapshots
             }
             now = time.monotonic()
-            self._due = {key: self._due.get(key, now + claim.snapshots) for key, claim in due.items()}
-            for key, claim in due.items():
+            self._due = {key: self._due.get(key, now + claim.snapshots) for key, claim in asked.items()}
+            for key in self._copies.keys() - asked.keys():
+                await asyncio.to_thread(_remove, self._copies.pop(key))
+            for key, claim in asked.items():
                 subject = subjects.get(key[0])
                 if subject is not None and self._due[key] <= now and self.is_wanted:
                     self._due[key] = now + claim.snapshots
-                    await self._take(subject, claim)
+                    await self._take(key, subject, claim)
 
-    async def _take(self, subject: Subject, claim: Claim) -> None:
+    async def _take(self, key: tuple[str, str], subject: Subject, claim: Claim) -> None:
         saved = VolumeSaved(volume=claim.id, placement=claim.placement)
-        scratch: Path | None = None
         try:
-            scratch = await asyncio.to_thread(self._store.make_scratch)
-            pause = await asyncio.to_thread(self._copy, subject, claim, scratch)
-            self.longest_pause = max(pause, self.longest_pause)
+            if key not in self._copies:
+                self._copies[key] = await asyncio.to_thread(self._store.make_scratch)
+            pause = await asyncio.to_thread(self._copy, subject, claim, self._copies[key])
             _log.debug("volume %s: its container was stopped for %.1f ms", claim.id, 1e3 * pause)
-            root = os.open(scratch, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            root = os.open(self._copies[key], _FOLDER)
             try:
                 saved = _with(saved, snapshot=await self._send_tree(claim.id, root))
             finally:
@@ -305,20 +307,25 @@ class SnapshotKeeper:
         except (SnapshotError, VolumeError, OSError) as error:
             _log.warning("there is no snapshot of volume %s: %s", claim.id, error)
             saved = _with(saved, error=str(error))
-        finally:
-            if scratch is not None:
-                await asyncio.to_thread(_remove, scratch)
         self._send(saved)
 
     def _copy(self, subject: Subject, claim: Claim, scratch: Path) -> float:
-        """Copy a volume while its container is stopped; return for how many seconds it was. Blocks."""
+        """Copy a volume twice: while it is used, and what changed, while its container is stopped. Blocks.
+
+        Returns:
+            For how many seconds it was stopped.
+        """
         root = self._store.open_running(claim, subject.handle.namespaces_pid)
-        target = os.open(scratch, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        target = os.open(scratch, _FOLDER)
         try:
+            with contextlib.suppress(SnapshotError, OSError):  # files vanish meanwhile; the next copy counts
+                tree.copy(root, target)
             with frozen(subject.pids):
                 began = time.perf_counter()
-                tree.copy(root, target)
-                return time.perf_counter() - began
+                copied = tree.copy(root, target)
+                pause = time.perf_counter() - began
+            tree.finish_copy(copied, target)
+            return pause
         finally:
             os.close(root)
             os.close(target)

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
 import fcntl
 import os
+import shutil
 import stat
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Self, TypeAlias, assert_never
@@ -39,6 +39,7 @@ _CLONE = 0x40049409
 _READ = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _FOLDER = _READ | os.O_DIRECTORY
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
+_CHANGED = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 _OWN = 0o700
 
 
@@ -184,63 +185,93 @@ class Pieces:
         return data
 
 
-def copy(root: int, target: int) -> None:
-    """Copy a volume into an empty folder; blocks are shared if the file system can do that.
+def copy(root: int, target: int) -> Manifest:
+    """Make a folder a copy of a volume, and write only what differs from what the folder holds already.
+
+    Returns:
+        What is in the volume, without the hashes of pieces: for :func:`finish_copy`.
 
     Raises:
-        SnapshotError: It has too many files.
+        SnapshotError: It has too many files, or changed meanwhile.
         OSError: It cannot be copied.
     """
-    folders: list[tuple[bytes, os.stat_result]] = []
+    entries: dict[bytes, Entry] = {}
     with _Access(root) as access:
         for path, found in _walk(root, access):
+            mode, modified_ns = permissions(found.st_mode), found.st_mtime_ns
             if stat.S_ISDIR(found.st_mode):
-                os.mkdir(path, _OWN, dir_fd=target)
-                folders.append((path, found))
+                if not _has(target, path, found):
+                    os.mkdir(path, _OWN, dir_fd=target)
+                entries[path] = FolderEntry(path=path, mode=mode, modified_ns=modified_ns)
             elif stat.S_ISLNK(found.st_mode):
-                os.symlink(os.readlink(path, dir_fd=root), path, dir_fd=target)
+                leads = os.readlink(path, dir_fd=root)
+                if not _has(target, path, found) or os.readlink(path, dir_fd=target) != leads:
+                    _discard(target, path)
+                    os.symlink(leads, path, dir_fd=target)
+                entries[path] = LinkEntry(path=path, target=leads)
             elif stat.S_ISREG(found.st_mode):
-                source = access.open(path, found, _READ)
-                try:
-                    _copy_file(source, path, target, found)
-                finally:
-                    os.close(source)
-    for path, found in reversed(folders):
-        os.chmod(path, permissions(found.st_mode), dir_fd=target)
-        os.utime(path, ns=(found.st_mtime_ns, found.st_mtime_ns), dir_fd=target)
+                _has(target, path, found)
+                size = _copy_file(access, path, found, target)
+                entries[path] = FileEntry(path=path, mode=mode, modified_ns=modified_ns, size=size, pieces=())
+    with _Access(target) as access:
+        left = [path for path, _ in _walk(target, access) if path not in entries]
+    for path in reversed(left):
+        _discard(target, path)
+    return Manifest(entries=tuple(entries.values()))
 
 
-def _copy_file(source: int, path: bytes, target: int, found: os.stat_result) -> None:
-    fd = os.open(path, _NEW, 0o600, dir_fd=target)
+def finish_copy(copied: Manifest, target: int) -> None:
+    """Give the files of a copy the permissions and times of what they are copies of."""
+    for entry in reversed(copied.entries):
+        if not isinstance(entry, LinkEntry):
+            os.chmod(entry.path, entry.mode, dir_fd=target)
+            os.utime(entry.path, ns=(entry.modified_ns, entry.modified_ns), dir_fd=target)
+
+
+def _has(target: int, path: bytes, found: os.stat_result) -> bool:
+    """Whether a copy has something of the same kind at a path; what is of another kind is removed."""
     try:
+        there = os.stat(path, dir_fd=target, follow_symlinks=False)
+    except FileNotFoundError:
+        return False
+    if stat.S_IFMT(there.st_mode) == stat.S_IFMT(found.st_mode):
+        if not stat.S_ISLNK(there.st_mode):
+            os.chmod(path, _OWN, dir_fd=target)
+        return True
+    _discard(target, path)
+    return False
+
+
+def _discard(target: int, path: bytes) -> None:
+    """Remove a file, or a folder with what is in it, of a copy."""
+    try:
+        os.unlink(path, dir_fd=target)
+    except FileNotFoundError:
+        return
+    except IsADirectoryError:
+        shutil.rmtree(path, dir_fd=target)
+
+
+def _copy_file(access: _Access, path: bytes, found: os.stat_result, target: int) -> int:
+    """Copy a file; return its size."""
+    source = access.open(path, found, _READ)
+    try:
+        fd = os.open(path, _CHANGED, 0o600, dir_fd=target)
         try:
-            fcntl.ioctl(fd, _CLONE, source)
-        except OSError:  # another file system, or one that cannot share
-            os.ftruncate(fd, found.st_size)
-            _copy_data(source, fd, found.st_size)
-        os.fchmod(fd, permissions(found.st_mode))
-        os.utime(fd, ns=(found.st_mtime_ns, found.st_mtime_ns))
+            size = os.fstat(source).st_size
+            try:
+                fcntl.ioctl(fd, _CLONE, source)
+            except OSError:  # another file system, or one that cannot share blocks
+                os.ftruncate(fd, size)
+                for offset in range(0, size, PIECE):
+                    data = _read(source, offset, min(PIECE, size - offset))
+                    if os.pread(fd, len(data), offset) != data:
+                        _write_all(fd, data, offset)
+        finally:
+            os.close(fd)
     finally:
-        os.close(fd)
-
-
-def _copy_data(source: int, fd: int, size: int) -> None:
-    """Copy what is no hole."""
-    offset = 0
-    while offset < size:
-        try:
-            offset = os.lseek(source, offset, os.SEEK_DATA)
-        except OSError as error:
-            if error.errno == errno.ENXIO:  # the rest is a hole
-                return
-            raise
-        end = os.lseek(source, offset, os.SEEK_HOLE)
-        os.lseek(fd, offset, os.SEEK_SET)
-        while offset < end:
-            sent = os.sendfile(fd, source, offset, end - offset)
-            if not sent:
-                raise SnapshotError("a file became shorter while it was read")
-            offset += sent
+        os.close(source)
+    return size
 
 
 async def write(manifest: Manifest, root: int, fetch: Fetch) -> None:

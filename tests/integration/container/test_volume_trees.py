@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 import signal
 import socket
 import sqlite3
@@ -91,6 +92,15 @@ def write(manifest: Manifest, source: Path, target: Path) -> None:
             os.close(end)
 
 
+def copy(source: Path, target: Path) -> None:
+    ends = opened(source), opened(target)
+    try:
+        tree.finish_copy(tree.copy(*ends), ends[1])
+    finally:
+        for end in ends:
+            os.close(end)
+
+
 def test_a_volume_is_made_again(made: Path, tmp_path: Path) -> None:
     manifest = scan(made)
     write(manifest, made, tmp_path / "again")
@@ -109,13 +119,30 @@ def test_a_volume_is_made_again(made: Path, tmp_path: Path) -> None:
 
 def test_a_copy_is_equal(made: Path, tmp_path: Path) -> None:
     (tmp_path / "copy").mkdir()
-    ends = opened(made), opened(tmp_path / "copy")
-    try:
-        tree.copy(*ends)
-    finally:
-        for end in ends:
-            os.close(end)
+    copy(made, tmp_path / "copy")
     assert scan(tmp_path / "copy") == scan(made)
+    holes = (tmp_path / "copy" / "holes").stat()
+    assert holes.st_blocks * 512 < 2 * PIECE
+
+
+def test_a_copy_follows_what_changes(made: Path, tmp_path: Path) -> None:
+    """Files become folders and links, and the other way round; others grow, shrink, change and go."""
+    (tmp_path / "copy").mkdir()
+    copy(made, tmp_path / "copy")
+    kept = (tmp_path / "copy" / "deep" / "deeper" / "file").stat()
+    (made / "text").unlink()
+    (made / "text").mkdir()
+    (made / "text" / "inner").write_text("in it")
+    shutil.rmtree(made / "empty")
+    (made / "empty").symlink_to("text")
+    (made / "link").unlink()
+    (made / "link").write_text("no link")
+    (made / "same").unlink()
+    (made / "holes").write_bytes(bytes(PIECE) + b"shorter")
+    copy(made, tmp_path / "copy")
+    assert scan(tmp_path / "copy") == scan(made)
+    found = (tmp_path / "copy" / "deep" / "deeper" / "file").stat()
+    assert (found.st_ino, found.st_blocks) == (kept.st_ino, kept.st_blocks)
 
 
 def test_a_wrong_piece_is_refused(made: Path, tmp_path: Path) -> None:
@@ -247,15 +274,17 @@ def test_a_database_is_copied_whole_while_it_is_written(
     for attempt in range(8):
         for _ in range(20):
             before = told(writer)
-        copy = tmp_path / f"copy{attempt}"
-        copy.mkdir()
-        ends = opened(tmp_path / "volume"), opened(copy)
+        work = tmp_path / "copy"
+        work.mkdir(exist_ok=True)
+        ends = opened(tmp_path / "volume"), opened(work)
+        tree.copy(*ends)
         with frozen(lambda: [writer.pid]):
             assert state(writer.pid) == "T"
             tree.copy(*ends)
         for end in ends:
             os.close(end)
-        database = sqlite3.connect(copy / "rows.sqlite")
+        shutil.copytree(work, tmp_path / f"copy{attempt}")
+        database = sqlite3.connect(tmp_path / f"copy{attempt}" / "rows.sqlite")
         assert database.execute("pragma integrity_check").fetchone() == ("ok",)
         count, last = database.execute("select count(*), max(number) from rows").fetchone()
         database.close()

@@ -205,7 +205,9 @@ async def test_a_running_volume_is_saved_again_and_again(pair: tuple[Machine, Ma
         assert (await restore(b, saved.snapshot)).error == ""
         await put(b, 1, 2)
         await b.log_holds(BOX, "node", "2 runs")
-        assert not list((files(a).parents[1] / ".scratch").iterdir())
+        await a.drop(BOX)
+        scratch = files(a).parents[1] / ".scratch"
+        await until(lambda: not list(scratch.iterdir()), what="the copy is removed with its container")
 
 
 async def test_damage_is_refused_and_changes_nothing(pair: tuple[Machine, Machine], folder: Path) -> None:
