@@ -249,7 +249,7 @@ class Manager:
         """
         with contextlib.closing(self._networks):
             async with asyncio.TaskGroup() as self._tasks:
-                await asyncio.to_thread(self._volumes.clear_scratch)
+                await asyncio.to_thread(self._volumes.places.clear_scratch)
                 await self._former.take_over(self, self._tasks)
                 ready()
                 usage = self._tasks.create_task(self._report_usage(), name="usage")

@@ -57,7 +57,7 @@ class VolumeKeeper:
             self._spawn(self._delete(id_), name=f"removal of volume {id_}")
 
     async def _delete(self, id_: str) -> None:
-        await asyncio.to_thread(self._store.delete_removed)
+        await asyncio.to_thread(self._store.places.delete_removed)
         self._send(VolumeRemoved(volume=id_))
 
     async def run(self, subjects: Mapping[str, Subject], interval: float) -> None:
@@ -67,7 +67,7 @@ class VolumeKeeper:
             subjects: The running containers, by incarnation.
             interval: Seconds between two reports of the usage.
         """
-        await asyncio.to_thread(self._store.delete_removed)
+        await asyncio.to_thread(self._store.places.delete_removed)
         while True:
             pids = {id_: subject.handle.namespaces_pid for id_, subject in subjects.items()}
             for incarnation_id, text in await asyncio.to_thread(self._store.measure, pids):

@@ -135,9 +135,9 @@ class SnapshotKeeper:
 
     async def _save_held(self, order: SaveVolume) -> str:
         async with self._held(order.volume):
-            if self._store.placement(order.volume) < order.placement:
+            if self._store.places.placement(order.volume) < order.placement:
                 raise SnapshotError("its files are not on this machine")
-            root = await asyncio.to_thread(self._store.open, order.volume)
+            root = await asyncio.to_thread(self._store.places.open, order.volume)
             try:
                 return await self._send_tree(order.volume, root)
             finally:
@@ -146,7 +146,7 @@ class SnapshotKeeper:
     async def _restore(self, order: RestoreVolume) -> None:
         error = ""
         try:
-            if self._store.placement(order.volume) < order.placement:
+            if self._store.places.placement(order.volume) < order.placement:
                 await self._restore_held(order)
         except (SnapshotError, VolumeError, OSError) as fault:
             error = str(fault)
@@ -156,7 +156,7 @@ class SnapshotKeeper:
     async def _restore_held(self, order: RestoreVolume) -> None:
         async with self._held(order.volume):
             manifest = decode_manifest(await self._whole(order.snapshot, MAX_MANIFEST))
-            new, root = await asyncio.to_thread(self._store.make_new, order.size)
+            new, root = await asyncio.to_thread(self._store.places.make_new, order.size)
             try:
                 try:
                     async with self._former(order.volume) as former:
@@ -171,7 +171,7 @@ class SnapshotKeeper:
     async def _former(self, id_: str) -> AsyncIterator[Pieces | None]:
         """Open the files of an earlier placement, to use pieces of them again; None if there are none."""
         try:
-            root = await asyncio.to_thread(self._store.open, id_)
+            root = await asyncio.to_thread(self._store.places.open, id_)
         except VolumeError:
             yield None
             return
@@ -296,7 +296,7 @@ class SnapshotKeeper:
         saved = VolumeSaved(volume=claim.id, placement=claim.placement)
         try:
             if key not in self._copies:
-                self._copies[key] = await asyncio.to_thread(self._store.make_scratch)
+                self._copies[key] = await asyncio.to_thread(self._store.places.make_scratch)
             pause = await asyncio.to_thread(self._copy, subject, claim, self._copies[key])
             _log.debug("volume %s: its container was stopped for %.1f ms", claim.id, 1e3 * pause)
             root = os.open(self._copies[key], _FOLDER)
@@ -315,7 +315,7 @@ class SnapshotKeeper:
         Returns:
             For how many seconds it was stopped.
         """
-        root = self._store.open_running(claim, subject.handle.namespaces_pid)
+        root = self._store.places.open_running(claim.id, subject.handle.namespaces_pid, claim.path)
         target = os.open(scratch, _FOLDER)
         try:
             with contextlib.suppress(SnapshotError, OSError):  # files vanish meanwhile; the next copy counts

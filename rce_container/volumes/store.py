@@ -2,34 +2,22 @@
 
 One container at a time has a volume: it is *claimed* from the start of a container until its last process has
 ended, also across restarts of the manager. While its files are saved or restored, it is claimed too.
-
-``STATE/volumes/.placements/USER/NAME`` holds the number of the placement that the files belong to.
 """
 
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
-import secrets
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from rce.control import VolumePlacement
-from rce.model import Volume, about, is_name
+from rce.model import Volume, about
 from rce_container.exceptions import VolumeError
-from rce_container.files import remove, write_whole
-from rce_container.folder import make_accessible
 from rce_container.volumes import images
-from rce_container.volumes.mounted import open_image, open_inside
-
-_log = logging.getLogger(__name__)
-
-_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
-_SETTLE_S = 10.0
-"""Seconds that a former container's mount may take to end."""
+from rce_container.volumes.places import SETTLE_S, VolumePlaces
 
 
 class VolumeMount(NamedTuple):
@@ -67,15 +55,12 @@ class VolumeStore:
         images: Whether new volumes are images; else they are folders that are watched.
 
     Attributes:
+        places: Their files.
         used: Bytes that the volumes hold, by ``user/name``, as last measured.
     """
 
     def __init__(self, folder: Path, *, images: bool) -> None:
-        self._folder = folder
-        self._trash = folder / ".removed"
-        self._scratch = folder / ".scratch"
-        """What is being copied or restored, and what a killed manager left of that."""
-        self._placements = folder / ".placements"
+        self.places = VolumePlaces(folder, images=images)
         self._images = images
         self._claims: dict[str, tuple[Claim, ...]] = {}
         """By incarnation."""
@@ -176,10 +161,10 @@ class VolumeStore:
         Raises:
             VolumeError: A former container still has one mounted, or the disk is full.
         """
-        deadline = time.monotonic() + _SETTLE_S
+        deadline = time.monotonic() + SETTLE_S
         for claim in self._claims.get(incarnation_id, ()):
-            image = self._image(claim.id)
-            if self._place(claim.id).is_dir():
+            image = self.places.image(claim.id)
+            if self.places.folder(claim.id).is_dir():
                 continue
             if not image.exists():
                 images.make(image, claim.size)
@@ -187,107 +172,8 @@ class VolumeStore:
             images.wait_until_unused(image, deadline)
             images.grow(image, claim.size)
 
-    # Files of one placement
-
-    def placement(self, id_: str) -> int:
-        """Return the number of the placement that a volume's files belong to; 0 if it is not known."""
-        if not self._exists(id_):
-            return 0
-        try:
-            return int(self._marker(id_).read_text())
-        except (OSError, ValueError):
-            return 0
-
-    def open(self, id_: str) -> int:
-        """Open a volume that is held; return a descriptor of its folder, which the caller closes. Blocks.
-
-        Raises:
-            VolumeError: It is not there, or cannot be opened.
-        """
-        if not self._exists(id_):
-            raise VolumeError("its files are not on this machine")
-        image = self._image(id_)
-        try:
-            if self._place(id_).is_dir():
-                return os.open(self._place(id_), _FOLDER)
-            images.wait_until_unused(image, time.monotonic() + _SETTLE_S)
-            return open_image(image, self._point(), read_only=True)
-        except OSError as error:
-            raise VolumeError(f"its files cannot be read: {error}") from error
-
-    def open_running(self, claim: Claim, pid: int) -> int:
-        """Open a volume that a running container has; otherwise as :meth:`open`.
-
-        Args:
-            claim: The volume.
-            pid: A process in the container's namespaces; 0 without namespaces.
-        """
-        try:
-            if self._place(claim.id).is_dir():
-                return os.open(self._place(claim.id), _FOLDER)
-            return open_inside(pid, claim.path)
-        except OSError as error:
-            raise VolumeError(f"its files cannot be read: {error}") from error
-
-    def make_scratch(self) -> Path:
-        """Make a folder for a copy of a volume. Blocks.
-
-        Raises:
-            OSError: It cannot be made.
-        """
-        path = self._scratch / secrets.token_hex(8)
-        path.mkdir(mode=0o700, parents=True)
-        return path
-
-    def make_new(self, size: int) -> tuple[Path, int]:
-        """Make an empty volume, to be filled and put in place. Blocks.
-
-        Returns:
-            The volume, and a descriptor of its folder.
-
-        Raises:
-            VolumeError: It cannot be made.
-        """
-        try:
-            if not self._images:
-                path = self.make_scratch()
-                return path, os.open(path, _FOLDER)
-            self._scratch.mkdir(mode=0o700, parents=True, exist_ok=True)
-            path = self._scratch / f"{secrets.token_hex(8)}.img"
-            images.make(path, size)
-            root = open_image(path, self._point(), read_only=False)
-            with contextlib.suppress(OSError):
-                os.rmdir("lost+found", dir_fd=root)
-        except OSError as error:
-            raise VolumeError(f"its files cannot be made: {error}") from error
-        return path, root
-
-    def replace(self, id_: str, new: Path, placement: int) -> None:
-        """Put a filled volume in the place of a former one, which is discarded. Blocks.
-
-        Raises:
-            VolumeError: It cannot be put there.
-        """
-        place = self._image(id_) if new.suffix == ".img" else self._place(id_)
-        try:
-            if new.suffix == ".img":
-                images.wait_until_unused(new, time.monotonic() + _SETTLE_S)
-            place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            if self._exists(id_) and not self._discard(id_):
-                raise VolumeError("the former files are in the way")
-            new.rename(place)
-            self._note_placement(id_, placement)
-            sync_folder(place.parent)
-        except OSError as error:
-            raise VolumeError(f"its files cannot be put in place: {error}") from error
-
-    def clear_scratch(self) -> None:
-        """Remove what a killed manager left. Blocks."""
-        make_accessible(self._scratch)
-        remove(self._scratch)
-
     def _check_placement(self, id_: str, placement: VolumePlacement) -> None:
-        if self._exists(id_) and self.placement(id_) >= placement.number:
+        if self.places.exists(id_) and self.places.placement(id_) >= placement.number:
             return
         if not placement.is_new:
             raise VolumeError(
@@ -296,31 +182,14 @@ class VolumeStore:
             )
         if placement.number:
             try:
-                self._note_placement(id_, placement.number)
+                self.places.note_placement(id_, placement.number)
             except OSError as error:
                 raise VolumeError(f"cannot write {error.filename}: {error.strerror}") from error
-
-    def _note_placement(self, id_: str, number: int) -> None:
-        marker = self._marker(id_)
-        marker.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        write_whole(marker, str(number).encode())
-        sync_folder(marker.parent)
-
-    def _exists(self, id_: str) -> bool:
-        return self._place(id_).is_dir() or self._image(id_).exists()
-
-    def _marker(self, id_: str) -> Path:
-        return self._placements / self._place(id_).relative_to(self._folder)
-
-    def _point(self) -> Path:
-        point = self._scratch / "point"
-        point.mkdir(mode=0o700, parents=True, exist_ok=True)
-        return point
 
     # Removal
 
     def doom(self, id_: str) -> bool:
-        """Remove a volume; return whether :meth:`delete_removed` can delete its files now.
+        """Remove a volume; return whether :meth:`VolumePlaces.delete_removed` can delete its files.
 
         If a container has it, it is removed at :meth:`release`.
         """
@@ -329,29 +198,14 @@ class VolumeStore:
             return False
         return self._discard(id_)
 
-    def delete_removed(self) -> None:
-        """Delete the files of volumes that were removed. Blocks; may be repeated."""
-        with contextlib.suppress(FileNotFoundError):
-            for path in list(self._trash.iterdir()):
-                if path.suffix == ".img":
-                    path.unlink(missing_ok=True)
-                    continue
-                make_accessible(path)
-                remove(path)
+    def replace(self, id_: str, new: Path, placement: int) -> None:
+        """Put a filled volume in the place of a former one (:meth:`VolumePlaces.replace`). Blocks."""
+        self.used.pop(id_, None)
+        self.places.replace(id_, new, placement)
 
     def _discard(self, id_: str) -> bool:
-        """Move a volume out of the way, so that a new one of the same name can be made at once."""
         self.used.pop(id_, None)
-        try:
-            for path in (self._place(id_), self._image(id_)):
-                if path.exists():
-                    self._trash.mkdir(mode=0o700, parents=True, exist_ok=True)
-                    path.rename(self._trash / f"{secrets.token_hex(8)}{path.suffix}")
-            self._marker(id_).unlink(missing_ok=True)
-        except OSError as error:
-            _log.error("volume %s cannot be removed: %s", id_, error)
-            return False
-        return True
+        return self.places.discard(id_)
 
     # Measuring
 
@@ -368,15 +222,19 @@ class VolumeStore:
         for incarnation_id, claims in list(self._claims.items()):
             for claim in claims:
                 self._measure(claim.id, pids.get(incarnation_id, 0), claim.path)
-                if claim.size and self._place(claim.id).is_dir() and self.used.get(claim.id, 0) > claim.size:
+                if (
+                    claim.size
+                    and self.places.folder(claim.id).is_dir()
+                    and self.used.get(claim.id, 0) > claim.size
+                ):
                     over.append((incarnation_id, _too_full(claim.id, self.used[claim.id], claim.size)))
-        for id_ in self._existing():
+        for id_ in self.places.existing():
             if id_ not in self.used:
                 self._measure(id_, 0, "")
         return over
 
     def _measure(self, id_: str, pid: int, path: str) -> None:
-        place, image = self._place(id_), self._image(id_)
+        place, image = self.places.folder(id_), self.places.image(id_)
         with contextlib.suppress(OSError, VolumeError):  # it was removed, or its container ended just now
             if place.is_dir():
                 self.used[id_] = _size_of(place)
@@ -387,13 +245,6 @@ class VolumeStore:
             elif image.exists() and self._holder(id_) is None:
                 self.used[id_] = images.used(image)
 
-    def _existing(self) -> list[str]:
-        try:
-            users = [user for user in self._folder.iterdir() if is_name(user.name)]
-            return sorted({f"{user.name}/{one.stem}" for user in users for one in user.iterdir()})
-        except OSError:
-            return []
-
     # Places
 
     def _check_free(self, id_: str, volume: Volume) -> None:
@@ -401,20 +252,23 @@ class VolumeStore:
             raise VolumeError(f"the former volume {volume.name!r} is still being removed")
         if self._holder(id_) is not None:
             raise VolumeError(f"volume {volume.name!r} belongs to a container that has not ended yet")
-        if self._place(id_).is_dir():
-            self.used[id_] = _size_of(self._place(id_))
+        if self.places.folder(id_).is_dir():
+            self.used[id_] = _size_of(self.places.folder(id_))
             if self.used[id_] > volume.size:
                 raise VolumeError(_too_full(id_, self.used[id_], volume.size))
 
     def _mount_of(self, id_: str, volume: Volume) -> VolumeMount:
-        place, image = self._place(id_), self._image(id_)
+        place, image = self.places.folder(id_), self.places.image(id_)
         if image.exists() and not self._images:
             raise VolumeError(
                 f"volume {volume.name!r} is a file system, and this machine cannot mount it any more; "
                 "its operator can start the engine as root"
             )
         try:
-            for folder in (self._folder, place.parent):  # mkdir's mode is not for the parents that it makes
+            for folder in (
+                place.parent.parent,
+                place.parent,
+            ):  # mkdir's mode is not for the parents that it makes
                 folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             if not self._images or place.is_dir():
                 place.mkdir(mode=0o700, exist_ok=True)
@@ -427,28 +281,10 @@ class VolumeStore:
     def _holder(self, id_: str) -> str | None:
         return next((holder for holder, own in self._claims.items() if any(c.id == id_ for c in own)), None)
 
-    def _place(self, id_: str) -> Path:
-        user, _, name = id_.partition("/")
-        if not (is_name(user) and is_name(name)):
-            raise VolumeError(f"{id_!r} is not the name of a volume")
-        return self._folder / user / name
-
-    def _image(self, id_: str) -> Path:
-        return self._place(id_).with_suffix(".img")
-
 
 def _claim_of(id_: str, volume: Volume, placement: VolumePlacement | None) -> Claim:
     number = 0 if placement is None else placement.number
     return Claim(id_, volume.path, volume.size, volume.snapshots, number)
-
-
-def sync_folder(folder: Path) -> None:
-    """Write to the disk which files a folder holds. Blocks."""
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 def _too_full(id_: str, used: int, size: int) -> str:

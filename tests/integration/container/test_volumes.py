@@ -207,5 +207,5 @@ async def test_an_image_is_not_mounted_twice(tmp_path: Path) -> None:
         store.doom("user/../../etc")
     store.release("1" * 12)
     assert store.doom("user/journal")
-    store.delete_removed()
+    store.places.delete_removed()
     assert [path.name for path in (tmp_path / "volumes" / "user").iterdir()] == []

@@ -193,8 +193,28 @@ async def test_only_what_is_missing_is_sent(pair: tuple[Machine, Machine], folde
         assert (files(b) / "large").read_bytes() == (files(a) / "large").read_bytes()
 
 
-async def test_a_running_volume_is_saved_again_and_again(pair: tuple[Machine, Machine], folder: Path) -> None:
-    a, b = pair
+@pytest.mark.parametrize(
+    ("runtime", "limit"),
+    [
+        ("process", VolumeLimit.WATCHED),
+        pytest.param("namespace", VolumeLimit.WATCHED, marks=pytest.mark.needs("bwrap")),
+        pytest.param("namespace", VolumeLimit.IMAGE, marks=[pytest.mark.needs("bwrap"), IMAGES]),
+    ],
+)
+async def test_a_running_volume_is_saved_again_and_again(
+    folder: Path, runtime: str, limit: VolumeLimit
+) -> None:
+    a, b = (Machine(folder / name, runtime) for name in "ab")
+    a.volume_limit = b.volume_limit = limit
+    try:
+        await check_snapshots(a, b, folder)
+    finally:
+        for machine in (a, b):
+            machine.tidy()
+
+
+async def check_snapshots(a: Machine, b: Machine, folder: Path) -> None:
+    """A snapshot of a running container is what another one starts with."""
     async with keeping(folder, a, b), a.engine(), b.engine():
         await a.manager.handle(Welcome(version=CONTROL_VERSION, master="m", features=(SNAPSHOTS,)))
         await put(a, 1, 1, snapshots=1, is_new=True)

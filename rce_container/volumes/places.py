@@ -1,0 +1,227 @@
+"""Where the volumes of a machine are, and which placement their files belong to.
+
+``STATE/volumes/USER/NAME.img``, or a folder ``NAME`` where images do not work. Beside them,
+``.placements/USER/NAME`` holds the number of the placement, ``.removed`` what is to be deleted, ``.scratch``
+what is being made.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import secrets
+import time
+from pathlib import Path
+
+from rce.model import is_name
+from rce_container.exceptions import VolumeError
+from rce_container.files import remove, write_whole
+from rce_container.folder import make_accessible
+from rce_container.volumes import images
+from rce_container.volumes.mounted import open_image, open_inside
+
+_log = logging.getLogger(__name__)
+
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
+SETTLE_S = 10.0
+"""Seconds that a former container's mount may take to end."""
+
+
+class VolumePlaces:
+    """The files of volumes. Volumes are named ``user/name``.
+
+    Args:
+        folder: Holds them.
+        images: Whether new volumes are images; else they are folders.
+    """
+
+    def __init__(self, folder: Path, *, images: bool) -> None:
+        self._folder = folder
+        self._trash = folder / ".removed"
+        self._scratch = folder / ".scratch"
+        self._placements = folder / ".placements"
+        self._images = images
+
+    def folder(self, id_: str) -> Path:
+        """Return where a volume is, or would be, if it is a folder.
+
+        Raises:
+            VolumeError: That is no name of a volume.
+        """
+        user, _, name = id_.partition("/")
+        if not (is_name(user) and is_name(name)):
+            raise VolumeError(f"{id_!r} is not the name of a volume")
+        return self._folder / user / name
+
+    def image(self, id_: str) -> Path:
+        """Return where a volume is, or would be, if it is an image."""
+        return self.folder(id_).with_suffix(".img")
+
+    def existing(self) -> list[str]:
+        """Return all volumes."""
+        try:
+            users = [user for user in self._folder.iterdir() if is_name(user.name)]
+            return sorted({f"{user.name}/{one.stem}" for user in users for one in user.iterdir()})
+        except OSError:
+            return []
+
+    # One placement
+
+    def placement(self, id_: str) -> int:
+        """Return the number of the placement of a volume's files; 0 if it is not known."""
+        if not self.exists(id_):
+            return 0
+        try:
+            return int(self._marker(id_).read_text())
+        except (OSError, ValueError):
+            return 0
+
+    def open(self, id_: str) -> int:
+        """Open a volume that no container has. Blocks.
+
+        Returns:
+            A descriptor of its folder, which the caller closes.
+
+        Raises:
+            VolumeError: It is not there, or cannot be opened.
+        """
+        if not self.exists(id_):
+            raise VolumeError("its files are not on this machine")
+        image = self.image(id_)
+        try:
+            if self.folder(id_).is_dir():
+                return os.open(self.folder(id_), _FOLDER)
+            images.wait_until_unused(image, time.monotonic() + SETTLE_S)
+            return open_image(image, self._point(), read_only=True)
+        except OSError as error:
+            raise VolumeError(f"its files cannot be read: {error}") from error
+
+    def open_running(self, id_: str, pid: int, path: str) -> int:
+        """Open a volume that a running container has; otherwise as :meth:`open`.
+
+        Args:
+            id_: The volume.
+            pid: A process in the container's namespaces; 0 without namespaces.
+            path: Where the container sees it.
+        """
+        try:
+            if self.folder(id_).is_dir():
+                return os.open(self.folder(id_), _FOLDER)
+            return open_inside(pid, path)
+        except OSError as error:
+            raise VolumeError(f"its files cannot be read: {error}") from error
+
+    def make_scratch(self) -> Path:
+        """Make a folder for a copy of a volume. Blocks.
+
+        Raises:
+            OSError: It cannot be made.
+        """
+        path = self._scratch / secrets.token_hex(8)
+        path.mkdir(mode=0o700, parents=True)
+        return path
+
+    def make_new(self, size: int) -> tuple[Path, int]:
+        """Make an empty volume, to be filled and put in place. Blocks.
+
+        Returns:
+            The volume, and a descriptor of its folder.
+
+        Raises:
+            VolumeError: It cannot be made.
+        """
+        try:
+            if not self._images:
+                path = self.make_scratch()
+                return path, os.open(path, _FOLDER)
+            self._scratch.mkdir(mode=0o700, parents=True, exist_ok=True)
+            path = self._scratch / f"{secrets.token_hex(8)}.img"
+            images.make(path, size)
+            root = open_image(path, self._point(), read_only=False)
+            with contextlib.suppress(OSError):
+                os.rmdir("lost+found", dir_fd=root)
+        except OSError as error:
+            raise VolumeError(f"its files cannot be made: {error}") from error
+        return path, root
+
+    def replace(self, id_: str, new: Path, placement: int) -> None:
+        """Put a filled volume in the place of a former one, which is discarded. Blocks.
+
+        Raises:
+            VolumeError: It cannot be put there.
+        """
+        place = self.image(id_) if new.suffix == ".img" else self.folder(id_)
+        try:
+            if new.suffix == ".img":
+                images.wait_until_unused(new, time.monotonic() + SETTLE_S)
+            place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if self.exists(id_) and not self.discard(id_):
+                raise VolumeError("the former files are in the way")
+            new.rename(place)
+            self.note_placement(id_, placement)
+            sync_folder(place.parent)
+        except OSError as error:
+            raise VolumeError(f"its files cannot be put in place: {error}") from error
+
+    def clear_scratch(self) -> None:
+        """Remove what a killed manager left. Blocks."""
+        make_accessible(self._scratch)
+        remove(self._scratch)
+
+    def note_placement(self, id_: str, number: int) -> None:
+        """Note which placement a volume's files belong to. Blocks.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        marker = self._marker(id_)
+        marker.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        write_whole(marker, str(number).encode())
+        sync_folder(marker.parent)
+
+    def exists(self, id_: str) -> bool:
+        """Whether a volume has files here."""
+        return self.folder(id_).is_dir() or self.image(id_).exists()
+
+    def _marker(self, id_: str) -> Path:
+        return self._placements / self.folder(id_).relative_to(self._folder)
+
+    def _point(self) -> Path:
+        point = self._scratch / "point"
+        point.mkdir(mode=0o700, parents=True, exist_ok=True)
+        return point
+
+    # Removal
+
+    def discard(self, id_: str) -> bool:
+        """Move a volume out of the way of a new one of the same name; return whether that worked."""
+        try:
+            for path in (self.folder(id_), self.image(id_)):
+                if path.exists():
+                    self._trash.mkdir(mode=0o700, parents=True, exist_ok=True)
+                    path.rename(self._trash / f"{secrets.token_hex(8)}{path.suffix}")
+            self._marker(id_).unlink(missing_ok=True)
+        except OSError as error:
+            _log.error("volume %s cannot be removed: %s", id_, error)
+            return False
+        return True
+
+    def delete_removed(self) -> None:
+        """Delete the files of volumes that were removed. Blocks; may be repeated."""
+        with contextlib.suppress(FileNotFoundError):
+            for path in list(self._trash.iterdir()):
+                if path.suffix == ".img":
+                    path.unlink(missing_ok=True)
+                    continue
+                make_accessible(path)
+                remove(path)
+
+
+def sync_folder(folder: Path) -> None:
+    """Write to the disk which files a folder holds. Blocks."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
