@@ -1,4 +1,4 @@
-"""Log lines for requests that are not HTTP: one line each, as it is not a fault of the engine."""
+"""Requests that no application sees: one line in the log if they are not HTTP, and refusals by headers."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ request_log = logging.getLogger("rce.web.requests")
 
 
 _CONTINUE = "100-continue"
+_PLAIN = "identity"
 
 
 def _shorten(record: logging.LogRecord) -> bool:
@@ -34,12 +35,19 @@ def _shorten(record: logging.LogRecord) -> bool:
 request_log.addFilter(_shorten)
 
 
-def refuse_expectations(handler: Handler) -> Handler:
-    """Wrap the handler of requests: the library's answer to an unknown ``Expect`` quotes it, text or not."""
+def refuse_headers(handler: Handler) -> Handler:
+    """Wrap the handler of requests: refuse those whose headers ask for what no application does.
+
+    The library's answer to an unknown ``Expect`` quotes it, text or not. A compressed body of some kilobytes
+    would take seconds of the event loop's time, also after the request was refused.
+    """
 
     async def handle(request: web.BaseRequest) -> web.StreamResponse:
         if request.headers.get(hdrs.EXPECT, _CONTINUE).lower() != _CONTINUE:
             return web.json_response({"error": "the header Expect can only be 100-continue"}, status=417)
+        if request.headers.get(hdrs.CONTENT_ENCODING, _PLAIN).lower() != _PLAIN:
+            text = "the body must not be compressed: send it without the header Content-Encoding"
+            return web.json_response({"error": text}, status=415, headers={hdrs.ACCEPT_ENCODING: _PLAIN})
         return await handler(request)
 
     return handle

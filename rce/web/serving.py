@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, cast
 
 from aiohttp import web
 
-from rce.web.faults import refuse_expectations, request_log
+from rce.web.faults import refuse_headers, request_log
 
 if TYPE_CHECKING:
     import asyncio
@@ -42,13 +42,14 @@ class RunningApplication:
             logger=request_log,
             shutdown_timeout=SHUTDOWN_S,
             keepalive_timeout=idle_timeout,
+            auto_decompress=False,
         )
 
     async def start(self) -> None:
         """Run the application's own preparations."""
         await self._runner.setup()
         assert self._runner.server is not None
-        self._runner.server.request_handler = refuse_expectations(self._runner.server.request_handler)
+        self._runner.server.request_handler = refuse_headers(self._runner.server.request_handler)
 
     async def close(self) -> None:
         """End all connections; open requests may continue for a moment."""
