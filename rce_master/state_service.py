@@ -133,7 +133,8 @@ class StateService:
                 for _ in state.reading(await load_converted(store, term)):
                     await asyncio.sleep(0)  # the lease is renewed meanwhile
         with without_collections():
-            state.begin(clock(), revision)
+            for _ in state.beginning(clock(), revision):
+                await asyncio.sleep(0)
         return cls(state, store, clock, term, fence)
 
     @property

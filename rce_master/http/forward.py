@@ -48,7 +48,7 @@ REPORT_S = 10.0
 """Shortest time from one line of the log about failures to the next: clients may ask often meanwhile."""
 
 
-class _Failures:
+class Failures:
     """Logs requests that were not answered, at most one line in a while.
 
     Args:
@@ -86,7 +86,7 @@ class Forwarder:
         self._key = key
         self._proxies = proxies
         self._tls = tls
-        self._failures = _Failures()
+        self._failures = Failures()
         self._session: aiohttp.ClientSession
 
     async def __aenter__(self) -> Self:

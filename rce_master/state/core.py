@@ -174,11 +174,12 @@ class State:
         with without_collections():
             for _ in state.reading(snapshot):
                 pass
-            state.begin(now, revision)
+            for _ in state.beginning(now, revision):
+                pass
         return state
 
     def reading(self, snapshot: Snapshot, piece: int = PIECE) -> Iterator[None]:
-        """Read the rows of the store, with a pause after each piece; :meth:`begin` ends it.
+        """Read the rows of the store, with a pause after each piece; :meth:`beginning` comes next.
 
         Args:
             snapshot: As for :meth:`load`.
@@ -195,7 +196,7 @@ class State:
             raise StoreError(f"a record in the store cannot be read: {error}") from error
 
     def write_row(self, table: str, key: str, body: bytes | None) -> bool:
-        """Write a row as the store has it, before :meth:`begin`; None removes it.
+        """Write a row as the store has it, before :meth:`beginning`; None removes it.
 
         Returns:
             Whether there is such a table.
@@ -217,9 +218,15 @@ class State:
         """The number of rows that the store has of it."""
         return sum(map(len, self._by_name.values()))
 
-    def begin(self, now: float, revision: int) -> None:
-        """Begin to work with what was read; the arguments are those of :meth:`load`."""
-        task_sets.restart(self._begin(now), revision)
+    def beginning(self, now: float, revision: int, piece: int = PIECE) -> Iterator[None]:
+        """Begin to work with what was read, with a pause after each piece.
+
+        Args:
+            now: As for :meth:`load`.
+            revision: As for :meth:`load`.
+            piece: Number of endpoints.
+        """
+        yield from task_sets.restarting(self._begin(now), revision, piece)
 
     def apply(self, command: commands.Command, now: float) -> Changes:
         """Apply a command.

@@ -39,6 +39,8 @@ from rce_master.state.records import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import (
         Continue,
@@ -315,8 +317,10 @@ def _expire(tx: Transaction, presence: Presence) -> None:
         tx.happen("task_set_gone", presence.process, f"away for {grace:.0f} s", user="")
 
 
-def restart(tx: Transaction, revision: int) -> None:
+def restarting(tx: Transaction, revision: int, piece: int) -> Iterator[None]:
     """Start with the store's contents: no task set is connected, and every grace time starts now.
+
+    It pauses after so many endpoints.
 
     Revisions continue above ``revision``. Reports of task sets do not affect this: a revision that no master
     gave would stay in force as long as the store exists.
@@ -325,8 +329,10 @@ def restart(tx: Transaction, revision: int) -> None:
     tx.tables.first_revision = tx.newest("revision")
     for task_set in tx.tables.task_sets:
         tx.put(Presence(process=task_set.process, connected=False, since=tx.now))
-    for endpoint in tx.tables.endpoints:
+    for number, endpoint in enumerate(tx.tables.endpoints, 1):
         tx.put(_restarted(tx, endpoint))
+        if number % piece == 0:
+            yield
     volume_moves.restart(tx)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import signal
 import urllib.request
 from collections.abc import AsyncIterator
 from typing import Any
@@ -104,3 +105,23 @@ async def test_robots_find_another_task_set() -> None:
             assert not engine.accepts_robots()
             fleet.set_draining(former, draining=False)
             await fleet.all_are_at(first)
+
+
+async def test_robots_leave_a_task_set_that_hangs() -> None:
+    """It closes no connection, and its machine takes what they send; when it wakes, it gets no robot back."""
+    async with running_engine(robots=2) as engine:
+        first, second = engine.robots
+        await second.stop()
+        async with Fleet(engine).connected() as fleet:
+            await fleet.all_are_at(first)
+            await second.start()
+            assert first.process is not None
+            first.process.send_signal(signal.SIGSTOP)
+            try:
+                await fleet.all_are_at(second)
+            finally:
+                first.process.send_signal(signal.SIGCONT)
+            url = f"ws://127.0.0.1:{engine.robot_ports[0][0]}/"
+            await until(lambda: url in fleet.machines(), timeout=TIMEOUT_S, what="it is connected again")
+            await fleet.all_are_at(second)
+            assert fleet.machines()[url]["endpoints"] == 0

@@ -101,7 +101,8 @@ async def take(client: EtcdClient, prefix: str, follower: StateFollower) -> dict
         pass
     found = image(state)
     assert found == image(loaded)
-    state.begin(0.0, 0)
+    for _ in state.beginning(0.0, 0):
+        pass
     state.validate()
     return found
 
