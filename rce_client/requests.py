@@ -171,6 +171,7 @@ class Requests(ABC):
         after: Sequence[str] = (),
         heartbeat: str = "",
         heartbeat_timeout: float = 5.0,
+        state_services: Mapping[str, str | float] | None = None,
     ) -> None:
         """Start a node. Cancelling does not withdraw the request.
 
@@ -190,6 +191,9 @@ class Requests(ABC):
             heartbeat: A topic on which the node publishes while it works.
             heartbeat_timeout: Seconds of silence of that topic after which the node counts as stuck, 0.1 to
                 86400.
+            state_services: How its state is kept when the container moves or starts again: ``{"save":
+                "~save_state", "restore": "~restore_state", "every": 10}``, two services of the node, and
+                seconds from one snapshot to the next, 1 to 86400.
 
         Raises:
             ValueError: An argument is invalid; the text names it and the expected value.

@@ -16,7 +16,8 @@ from rce.config import Secret, ShippedFileError, configs_dir, default_state_dir,
 from rce.control import MachineInfo, VolumeLimit
 from rce.control_channel.channel import TaskSetChannel
 from rce.control_channel.contents import ContentClient
-from rce.control_channel.dialing import Dialer, RunDialer
+from rce.control_channel.dialing import RunDialer
+from rce.control_channel.node_states import NodeStateClient
 from rce.control_channel.terms import Terms
 from rce.control_channel.uploads import Uploader
 from rce.link import LinkAcceptor, in_url, is_any, listen_on, own_address
@@ -146,6 +147,7 @@ class App:
                 if is_any(reach):
                     first = split_port(split_addresses(self.master)[0], self.control_port)
                     reach = await own_address(*first, quitting.told)
+                dialer = RunDialer(masters, self.secret, tls=tls)
                 manager = Manager(
                     name=name,
                     info=_machine(self.settings, offers, limiter, detail, limit),
@@ -157,9 +159,10 @@ class App:
                     links=(reach, port),
                     limiter=limiter,
                     library=library,
-                    dialer=RunDialer(masters, self.secret, tls=tls),
-                    uploader=Uploader(Dialer(masters, self.secret, tls=tls)),
+                    dialer=dialer,
+                    uploader=Uploader(dialer),
                     fetch=client.piece,
+                    node_states=NodeStateClient(dialer),
                 )
                 terms = Terms(state.term, state.keep_term)
                 channel = TaskSetChannel(

@@ -14,7 +14,16 @@ from typing import assert_never
 import msgspec
 
 from rce.aio.tasks import BackgroundTasks
-from rce.control import PATCHES, DesiredState, EndpointSpec, EndpointStatus, SpecPatch, StatusPatch, Unknown
+from rce.control import (
+    NODE_STATES,
+    PATCHES,
+    DesiredState,
+    EndpointSpec,
+    EndpointStatus,
+    SpecPatch,
+    StatusPatch,
+    Unknown,
+)
 from rce.control.execution import FEATURE as EXEC
 from rce.control.execution import Command
 from rce.link import LinkAcceptor
@@ -38,6 +47,7 @@ from rce_container.limits.enforcer import LimitEnforcer
 from rce_container.links import ContainerLinks
 from rce_container.logs import last_line
 from rce_container.network import Networks
+from rce_container.node_states import ContainerStates, StateCarrier
 from rce_container.observed import OuterStatus
 from rce_container.packages.shelf import Shelf
 from rce_container.packages.supply import Library, Supply
@@ -63,6 +73,7 @@ class IncarnationContext:
     archive: LogArchive
     library: Library
     volumes: VolumeStore
+    node_states: StateCarrier
 
 
 class Incarnation:
@@ -108,6 +119,7 @@ class Incarnation:
         self._stop_reason = ""
         self._kill_now = False
         self._background = BackgroundTasks()
+        self._node_states = ContainerStates(id, folder.incarnation_id, context.node_states)
         self._supply = Supply(
             self.incarnation_id,
             EndpointId.parse(id).user,
@@ -189,6 +201,26 @@ class Incarnation:
                 "the container was started by an earlier release; destroy it and create it again"
             )
         self._channel.send(m.encode(m.Execute(command=command)), sock.fileno())
+
+    async def save_state(self, node: str) -> str:
+        """Save the state of a node now.
+
+        Returns:
+            Why it is not saved; empty if the snapshot is acknowledged.
+        """
+        if self._channel is None or self._stopping or not self.reported.is_set():
+            return "its container is not running"
+        if NODE_STATES not in self._features:
+            return "its container was started by an earlier release, which saves no states"
+        return await self._node_states.save(self._channel, node)
+
+    async def save_states(self) -> None:
+        """Save the states of all nodes that have services for it."""
+        contents = self._desired.contents.nodes if self._desired is not None else ()
+        nodes = [node.tag for node in contents if node.state_services is not None]
+        for node, error in zip(nodes, await asyncio.gather(*map(self.save_state, nodes)), strict=True):
+            if error:
+                _log.warning("container %s: the state of node %s is not saved: %s", self.id, node, error)
 
     def poll(self) -> None:
         """Ask for new :attr:`counters`, and report limits that were hit."""
@@ -297,6 +329,7 @@ class Incarnation:
         self._handles_links = False
         await self._background.close()
         await self._supply.close()
+        await self._node_states.close()
         if self._channel is not None:
             self._channel.close()
             self._channel = None
@@ -313,7 +346,7 @@ class Incarnation:
     def _handle_message(self, channel: Channel, said: m.ToManager | Unknown, pace: intake.Pace) -> None:
         match said:
             case m.Report(status=status, features=features):
-                self._features = frozenset(features) & {EXEC, PATCHES}
+                self._features = frozenset(features) & {EXEC, PATCHES, NODE_STATES}
                 self._report(intake.sanitize_status(self.id, status, self._newest_revision), pace)
             case m.ReportPatch(patch=patch):
                 self._report_patch(intake.sanitize_patch(self.id, patch, self._newest_revision), pace)
@@ -326,6 +359,8 @@ class Incarnation:
                 self.counters = intake.sanitize_counters(counters)
             case m.Killed(request=number):
                 channel.send(m.encode(m.Cause(request=number, text=self.enforcer.claim())))
+            case m.StateWanted() | m.StateOffered() | m.StateSaved():
+                self._node_states.handle(channel, said)
             case m.Dial() as request:
                 self._background.spawn(self._dial(channel, request), name=f"dial for {self.id}")
             case Unknown(name=name):
@@ -380,7 +415,7 @@ class Incarnation:
     def _open_handover(self, channel: Channel) -> None:
         self._handles_links = True
         with self._links.open() as theirs:
-            channel.send(m.encode(m.Handover(features=(PATCHES,))), theirs.fileno())
+            channel.send(m.encode(m.Handover(features=(PATCHES, NODE_STATES))), theirs.fileno())
 
     async def _dial(self, channel: Channel, request: m.Dial) -> None:
         links = self._desired.links.values() if self._desired is not None else ()

@@ -24,7 +24,7 @@ from rce.control import (
     StatusPatch,
     Unknown,
 )
-from rce.model import is_name
+from rce.model import MAX_STATE, is_name
 from rce.printable import one_line
 from rce_container.environment import messages as m
 
@@ -54,6 +54,9 @@ PER_PART = 500
 """The same for each interface and connection of a specification that it requests again."""
 PER_LOOK = 100_000
 """The same for a line that makes the manager search for processes."""
+
+PER_STATE = 200_000
+"""The cost of a snapshot of a node's state in addition to its bytes, in a count of its own."""
 
 
 def read(line: bytes) -> m.ToManager | Unknown:
@@ -115,6 +118,17 @@ def sanitize_counters(said: m.Counters) -> m.Counters:
         },
         traffic=(_whole(said.traffic[0]), _whole(said.traffic[1])),
     )
+
+
+def state_fault(said: m.StateWanted | m.StateOffered) -> str:
+    """Return why a snapshot is not carried; empty if it is."""
+    if not is_name(said.node):
+        return "it names no node"
+    if isinstance(said, m.StateOffered) and not 0 <= said.size <= MAX_STATE:
+        return f"it has more than {MAX_STATE} bytes"
+    if not 0 <= said.request <= _MAX_NUMBER:
+        return "its number is too large"
+    return ""
 
 
 def _sanitize_node(node: NodeStatus) -> NodeStatus:

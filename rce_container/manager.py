@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, assert_never
 
 from rce.control import (
     CONTROL_VERSION,
+    NODE_STATES,
     PATCHES,
     SNAPSHOTS,
     VOLUMES,
@@ -34,7 +35,9 @@ from rce.control import (
     Refused,
     RemoveVolume,
     RestoreVolume,
+    SaveState,
     SaveVolume,
+    StateSaved,
     Status,
     StatusWanted,
     Sync,
@@ -62,6 +65,7 @@ from rce_container.limits import ControlGroup, Limiter
 from rce_container.limits.enforcer import LimitEnforcer
 from rce_container.log_reads import LogReads
 from rce_container.network import Networks
+from rce_container.node_states import StateCarrier
 from rce_container.packages.supply import Library
 from rce_container.reading import read_for
 from rce_container.runtimes.base import Handle, Runtime
@@ -72,6 +76,7 @@ from rce_container.volumes.store import VolumeStore
 
 if TYPE_CHECKING:
     from rce.control_channel.dialing import RunDialer
+    from rce.control_channel.node_states import NodeStateClient
     from rce.control_channel.uploads import Uploader
     from rce.link import LinkAcceptor
     from rce_container.settings import ContainerSettings
@@ -96,6 +101,7 @@ class Manager:
         dialer: Connects to the master for commands that users run; without it users cannot run commands.
         uploader: Sends snapshots of volumes to the master.
         fetch: Fetches contents from the master. Without these two, volumes stay on this machine.
+        node_states: Has the master keep snapshots of nodes' states; without it they are not kept.
 
     Attributes:
         send: Sends a message to the master, or drops it while no master is connected.
@@ -117,6 +123,7 @@ class Manager:
         dialer: RunDialer | None = None,
         uploader: Uploader | None = None,
         fetch: FetchPiece | None = None,
+        node_states: NodeStateClient | None = None,
     ) -> None:
         self._name = name
         self._info = info
@@ -151,6 +158,7 @@ class Manager:
             volumes=self._volumes,
         )
         self._former = FormerContainers(state, settings, limiter, self._launcher, self._volumes)
+        self._node_states = StateCarrier(name, node_states)
         self._context = IncarnationContext(
             settings=settings,
             acceptor=acceptor,
@@ -159,6 +167,7 @@ class Manager:
             archive=state.archive,
             library=library,
             volumes=self._volumes,
+            node_states=self._node_states,
         )
         self._executions = Executions(dialer, self._execute) if dialer is not None else None
         self._incarnations: dict[str, Incarnation] = {}
@@ -176,6 +185,7 @@ class Manager:
     def hello(self) -> Hello:
         """Return the task set's name, machine and containers."""
         self._master_features = frozenset()
+        self._node_states.learn(None)
         return Hello(
             version=CONTROL_VERSION,
             kind=TaskSetKind.CONTAINER,
@@ -184,6 +194,7 @@ class Manager:
             endpoints=self._core.statuses,
             features=(
                 PATCHES,
+                NODE_STATES,
                 VOLUMES,
                 *([EXEC] if self._executions is not None else []),
                 *([SNAPSHOTS] if self._snapshots is not None else []),
@@ -197,6 +208,7 @@ class Manager:
                 self._master_features = frozenset(features)
                 if self._snapshots is not None:
                     self._snapshots.is_wanted = SNAPSHOTS in features
+                self._node_states.learn(features)
             case Put() | PatchSpec() | StatusWanted() | Drop() | Sync():
                 self._feed(_event_of(message))
             case ReadLog():
@@ -207,11 +219,10 @@ class Manager:
                 self._snapshots.save(message)
             case RestoreVolume() if self._snapshots is not None:
                 self._snapshots.restore(message)
-            case Execute(id=id_) if self._executions is not None:
-                self._tasks.create_task(self._executions.execute(message), name=f"command in {id_}")
+            case SaveState() | Execute():
+                self._begin(message)
             case (
-                Execute()
-                | SaveVolume()
+                SaveVolume()
                 | RestoreVolume()
                 | Notify()
                 | Probe()
@@ -224,12 +235,30 @@ class Manager:
             case _:
                 assert_never(message)
 
+    def _begin(self, order: SaveState | Execute) -> None:
+        """Begin to do what takes a while."""
+        if isinstance(order, SaveState):
+            self._spawn(self._save_state(order), name=f"snapshot of {order.id}")
+        elif self._executions is not None:
+            self._spawn(self._executions.execute(order), name=f"command in {order.id}")
+
     def _execute(self, id_: str, command: Command, sock: socket.socket) -> None:
-        container = self._core.containers.get(id_)
-        incarnation = self._incarnations.get(container.incarnation_id) if container is not None else None
+        incarnation = self._present(id_)
         if incarnation is None:
             raise ExecutionError("the container is not running here")
         incarnation.execute(command, sock)
+
+    async def _save_state(self, message: SaveState) -> None:
+        incarnation = self._present(message.id)
+        error = "the container is not running here"
+        if incarnation is not None:
+            error = await incarnation.save_state(message.node)
+        self.send(StateSaved(request=message.request, error=error))
+
+    def _present(self, id_: str) -> Incarnation | None:
+        """Return the incarnation of a container that is there now."""
+        container = self._core.containers.get(id_)
+        return self._incarnations.get(container.incarnation_id) if container is not None else None
 
     @property
     def statuses(self) -> tuple[EndpointStatus, ...]:
@@ -258,6 +287,7 @@ class Manager:
                 snapshots = self._tasks.create_task(self._take_snapshots(), name="snapshots")
                 pruning = self._tasks.create_task(self._former.prune_logs(), name="old logs")
                 await quit_.wait()
+                await asyncio.gather(*(one.save_states() for one in self._incarnations.values()))
                 self._feed(events.Quit())
                 self._start_waiting()
                 if self._incarnations:

@@ -172,6 +172,7 @@ def _write(folders: Mapping[str, Path], out: IO[bytes], export: Export) -> Copy:
         export() as store,
         tarfile.open(fileobj=out, mode="w", format=tarfile.PAX_FORMAT) as tar,
     ):
+        _leave_states_out(store)
         for name, path in _files(folders, store):
             try:
                 with path.open("rb") as source:
@@ -199,6 +200,15 @@ def _write(folders: Mapping[str, Path], out: IO[bytes], export: Export) -> Copy:
     out.flush()
     os.fsync(out.fileno())
     return Copy(created, __version__, len(hashes), size)
+
+
+def _leave_states_out(store: Path) -> None:
+    """Leave the saved states of nodes out of a copy: they change all the time, also while it is made."""
+    try:
+        with closing(sqlite3.connect(store)) as database, database:
+            database.execute("DELETE FROM record WHERE kind = ?", (Tables().saved_states.name,))
+    except sqlite3.Error as error:
+        raise BackupError(f"cannot write the copy of the store: {error}") from error
 
 
 def _add(tar: tarfile.TarFile, name: str, source: IO[bytes], hashes: dict[str, str]) -> int:

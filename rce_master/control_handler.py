@@ -21,6 +21,7 @@ from rce.control import (
     PeerRefusedError,
     RequestFault,
     SpecWanted,
+    StateSaved,
     Status,
     ToMaster,
     Usage,
@@ -151,6 +152,7 @@ class ControlHandler:
                 | Left()
                 | Hello()
                 | LogChunk()
+                | StateSaved()
             ):
                 self._note_leaving(process, message)
                 await self._reconciler.on_message(process, message)

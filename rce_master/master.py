@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from rce.control import PATCHES, SNAPSHOTS, TYPED_REQUESTS
+from rce.control import NODE_STATES, PATCHES, SNAPSHOTS, TYPED_REQUESTS
 from rce.control_channel.server import ControlServer
 from rce.guard import TrustedProxies
 from rce.own_process import listening
@@ -29,7 +29,9 @@ from rce_master.executions import Executions
 from rce_master.http.entry import Entry, refusal
 from rce_master.http.forwarded import PURPOSE, ForwardingKey
 from rce_master.http.routes import Services
+from rce_master.node_states import NodeStateServer
 from rce_master.packages.contents import ARCHIVES, ContentStore
+from rce_master.packages.keeper import CONTENT, ContentKeeper
 from rce_master.packages.service import PackageService
 from rce_master.packages.transfer import PATH, SNAPSHOTS_PATH
 from rce_master.quotas import Quotas
@@ -74,6 +76,20 @@ class RunningMaster:
     """Of the HTTP server."""
     control_port: int
     state_service: StateService
+
+
+@dataclass(frozen=True, slots=True)
+class _TaskSetContents:
+    """What task sets fetch and bring beside the control channel."""
+
+    keeper: ContentKeeper
+    snapshots: SnapshotService
+    node_states: NodeStateServer
+
+    async def read(self, sha256: str, offset: int, count: int) -> tuple[bytes, int] | None:
+        """Read a piece of a content; None if it does not exist."""
+        found = await self.keeper.read(sha256, offset, count)
+        return found if found is not None else await self.snapshots.read(sha256, offset, count)
 
 
 class Master:
@@ -153,9 +169,11 @@ class Master:
         quotas = Quotas(self._settings.quotas)
         audit = AuditLog(self._settings.state_dir / "audit", time.time)
         lifetime = self._settings.token_lifetime
-        contents = ContentStore(self._settings.state_dir / ARCHIVES)
-        copies = None if self._copies is None else self._copies(contents, PATH, "package")
-        packages = PackageService(state_service, contents, copies=copies)
+        store = ContentStore(self._settings.state_dir / ARCHIVES, noun=CONTENT)
+        copies = None if self._copies is None else self._copies(store, PATH, CONTENT)
+        keeper = ContentKeeper(state_service, store, copies)
+        packages = PackageService(state_service, keeper)
+        node_states = NodeStateServer(state_service, keeper, reconciler, self._fence)
         kept = ContentStore(self._settings.state_dir / SNAPSHOTS_FOLDER, noun=SNAPSHOT)
         copies = None if self._copies is None else self._copies(kept, SNAPSHOTS_PATH, SNAPSHOT)
         snapshots = SnapshotService(state_service, kept, copies=copies)
@@ -188,7 +206,7 @@ class Master:
                     for work in (
                         state_service.run(),
                         control_handler.run(),
-                        packages.run(),
+                        keeper.run(),
                         snapshots.run(),
                         services.tokens.run(state_service),
                         services.answers.run(state_service),
@@ -196,7 +214,8 @@ class Master:
                     )
                 ]
                 try:
-                    await self._serve(services, control_handler, snapshots, on_ready)
+                    contents = _TaskSetContents(keeper, snapshots, node_states)
+                    await self._serve(services, control_handler, contents, on_ready)
                 finally:
                     # Last: task sets that leave while the servers close still need the state service.
                     for worker in workers:
@@ -209,7 +228,7 @@ class Master:
         self,
         services: Services,
         control_handler: ControlHandler,
-        snapshots: SnapshotService,
+        contents: _TaskSetContents,
         on_ready: Callable[[RunningMaster], None],
     ) -> None:
         settings = self._settings
@@ -234,12 +253,13 @@ class Master:
             master="rce-master",
             host=settings.bind,
             port=settings.control_port,
-            contents=partial(_read, services.packages, snapshots),
+            contents=contents.read,
             tls=for_task_sets.mutual_server if for_task_sets else None,
             is_revoked=for_task_sets.is_revoked if for_task_sets else None,
             on_execution=services.executions.arrived,
-            on_upload=snapshots.take,
-            features=(PATCHES, TYPED_REQUESTS, SNAPSHOTS),
+            on_upload=contents.snapshots.take,
+            on_node_state=contents.node_states.serve,
+            features=(PATCHES, TYPED_REQUESTS, SNAPSHOTS, NODE_STATES),
             is_fenced=None if fence is None else lambda: fence.is_closed,
             term=0 if fence is None else fence.term,
         )
@@ -275,14 +295,6 @@ async def make_dev_user(services: Services) -> None:
 
 def _answer_fenced(fence: Fence, entry: Entry, query: str) -> EntryAnswer:
     return refusal(FENCED) if fence.is_closed else entry.answer(query)
-
-
-async def _read(
-    packages: PackageService, snapshots: SnapshotService, sha256: str, offset: int, count: int
-) -> tuple[bytes, int] | None:
-    """Read a piece of a content for a task set; None if it does not exist."""
-    found = await packages.read(sha256, offset, count)
-    return found if found is not None else await snapshots.read(sha256, offset, count)
 
 
 async def _tick(state_service: StateService, audit: AuditLog) -> None:

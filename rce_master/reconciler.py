@@ -26,6 +26,7 @@ from rce.control import (
     Put,
     RemoveVolume,
     SpecWanted,
+    StateSaved,
     Status,
     StatusWanted,
     Sync,
@@ -65,6 +66,9 @@ class Peer(LogReader, Protocol):
 
     def send(self, message: ToTaskSet) -> None:
         """Send a message; the next ``Sync`` makes up for a lost one."""
+
+    async def save_state(self, id: str, node: str) -> str:  # noqa: A002 - wire name
+        """Have the state of a node saved now; return why it is not saved."""
 
 
 class Reconciler:
@@ -129,7 +133,7 @@ class Reconciler:
                 placed = {e.id for e in self._state_service.tables.endpoints.by("task_set", process)}
                 self.book.note(process, message, placed)
                 return
-            case Hello() | Login() | ClientRequest() | LogChunk() | VolumeSaved():
+            case Hello() | Login() | ClientRequest() | LogChunk() | VolumeSaved() | StateSaved():
                 _log.warning("%s sent a %s, which means nothing here", process, type(message).__name__)
                 return
             case _:

@@ -36,6 +36,7 @@ from rce.control import (
     Refused,
     RemoveVolume,
     RestoreVolume,
+    SaveState,
     SaveVolume,
     SpecPatch,
     SpecWanted,
@@ -172,6 +173,7 @@ class RobotTaskSet:
                 | RemoveVolume()
                 | SaveVolume()
                 | RestoreVolume()
+                | SaveState()
                 | Execute()
             ):
                 _log.debug("not for a robot task set: %s", type(message).__name__)

@@ -11,7 +11,7 @@ import types
 from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar, get_args, get_origin
 
 import msgspec
-from msgspec import Meta
+from msgspec import Meta, Struct
 from pydantic import AfterValidator, BeforeValidator, create_model
 from pydantic import Field as Option
 from pydantic_core import core_schema
@@ -46,6 +46,7 @@ SPELLING = Spelling(
         (CreateContainer, "tag"): "cTag",
         (AddNode, "container"): "cTag",
         (NodeSpec, "tag"): "nTag",
+        (NodeSpec, "state_services"): "state",
         (SetParameter, "container"): "cTag",
         (AddInterface, "endpoint"): "eTag",
         (InterfaceSpec, "tag"): "iTag",
@@ -116,7 +117,7 @@ def _annotation(field: Field) -> Any:
     rule = field.rule
     if field.choices:
         return Annotated[Any, BeforeValidator(_one_of(field.choices))]
-    if get_origin(rule.type) is list:
+    if get_origin(rule.type) is list or (isinstance(rule.type, type) and issubclass(rule.type, Struct)):
         return Annotated[Any, AfterValidator(_specs(rule))]
     if rule.words:
         return Annotated[Any, AfterValidator(_fitting(rule.type, rule.words))]
@@ -171,7 +172,7 @@ def _checked(read: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _specs(rule: AsWritten) -> Callable[[Any], Any]:
-    """Check a list of specs, such as volumes; the list stays as it was written."""
+    """Check a spec or a list of specs, such as volumes; it stays as it was written."""
 
     def check(value: Any) -> Any:
         try:

@@ -7,6 +7,7 @@
     +-- UnsendableError          a message is too long, or holds what no frame can hold
     +-- ContentError             a content cannot be fetched from the master
     +-- SnapshotError            a snapshot of a volume cannot be used, made or sent
+    +-- NodeStateError            a snapshot of a node's state cannot be fetched, or is not kept
     +-- PeerGoneError            a task set left before it answered
     +-- PeerTimeoutError         a task set did not answer in time
     +-- PeerRefusedError         raised by the master's ``on_hello``: the task set is not taken
@@ -71,6 +72,10 @@ class SnapshotError(ControlError):
     def __init__(self, problem: str, *, is_temporary: bool = False) -> None:
         super().__init__(problem)
         self.is_temporary = is_temporary
+
+
+class NodeStateError(ControlError):
+    """A snapshot of a node's state cannot be fetched from the master, or is not kept there."""
 
 
 class PeerGoneError(ControlError):

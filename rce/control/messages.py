@@ -51,6 +51,11 @@ SNAPSHOTS = "snapshots"
 take snapshots (:mod:`rce.control.snapshots`)."""
 
 
+NODE_STATES = "node-states"
+"""A feature of masters, container task sets and their environments: they keep snapshots of nodes' states
+(:mod:`rce.control.node_states`)."""
+
+
 class VolumeLimit(Enum):
     """How a machine keeps volumes within their size."""
 
@@ -202,6 +207,14 @@ class VolumeRestored(_Message, frozen=True, kw_only=True, omit_defaults=True):
     placement: int
     error: str = ""
     """Why it was not restored; empty if it was."""
+
+
+class StateSaved(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """Answer to :class:`SaveState`."""
+
+    request: int
+    error: str = ""
+    """Why the state is not saved; empty if the snapshot is acknowledged."""
 
 
 class Login(_Message, frozen=True, kw_only=True, omit_defaults=True):
@@ -405,6 +418,19 @@ class RestoreVolume(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Bytes that the volume may hold."""
 
 
+class SaveState(_Message, frozen=True, kw_only=True, omit_defaults=True):
+    """Save the state of a node now, because its container moves. Answered by :class:`StateSaved`.
+
+    Only to task sets with the feature :data:`NODE_STATES`.
+    """
+
+    request: int
+    id: str
+    """Endpoint id of the container."""
+    node: str
+    """Its tag."""
+
+
 class Execute(_Message, frozen=True, kw_only=True, omit_defaults=True):
     """Run a command in a container, and dial for it (:mod:`rce.control.execution`)."""
 
@@ -426,6 +452,7 @@ ToMaster = (
     | VolumeRemoved
     | VolumeSaved
     | VolumeRestored
+    | StateSaved
     | Login
     | Left
     | ClientRequest
@@ -447,6 +474,7 @@ ToTaskSet = (
     | RemoveVolume
     | SaveVolume
     | RestoreVolume
+    | SaveState
     | Execute
 )
 

@@ -35,6 +35,7 @@ from rce.control import (
     Refused,
     RemoveVolume,
     RestoreVolume,
+    SaveState,
     SaveVolume,
     StatusWanted,
     Sync,
@@ -377,6 +378,7 @@ class TaskSetChannel:
                 | RemoveVolume()
                 | SaveVolume()
                 | RestoreVolume()
+                | SaveState()
                 | Execute()
             ):
                 await self._inbox.put(message)

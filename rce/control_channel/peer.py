@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rce.control import (
     Hello,
@@ -14,6 +14,8 @@ from rce.control import (
     PeerGoneError,
     PeerTimeoutError,
     ReadLog,
+    SaveState,
+    StateSaved,
     TaskSetKind,
     ToTaskSet,
     encode,
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
 
 
 _log = logging.getLogger(__name__)
+
+A = TypeVar("A", LogChunk, StateSaved)
 
 
 class Peer:
@@ -45,7 +49,8 @@ class Peer:
         self._timeouts = timeouts
         self._outbox: asyncio.Queue[str] = asyncio.Queue(MAX_QUEUED)
         self._numbers = itertools.count(1)
-        self._reads: dict[int, asyncio.Future[LogChunk]] = {}
+        self._asked: dict[int, asyncio.Future[Any]] = {}
+        """Answers that are waited for, by the numbers of the requests."""
         self._left = False
         self.finished = asyncio.Event()
         """Set by the server when it is done with this peer."""
@@ -104,19 +109,43 @@ class Peer:
             PeerGoneError: The task set left.
             PeerTimeoutError: It did not answer in time.
         """
+        number = next(self._numbers)
+        question = ReadLog(request=number, id=id, node=node, offset=offset, limit=limit, query=query)
+        return await self._ask(question, LogChunk, self._timeouts.log)
+
+    async def save_state(self, id: str, node: str) -> str:  # noqa: A002 - wire name
+        """Have the state of a node saved now.
+
+        Args:
+            id: Endpoint id of the container.
+            node: Its tag.
+
+        Returns:
+            Why it is not saved; empty if the snapshot is acknowledged.
+
+        Raises:
+            PeerGoneError: The task set left.
+            PeerTimeoutError: It did not answer in time.
+        """
+        question = SaveState(request=next(self._numbers), id=id, node=node)
+        return (await self._ask(question, StateSaved, self._timeouts.state)).error
+
+    async def _ask(self, question: ReadLog | SaveState, kind: type[A], timeout: float) -> A:
         if self._left:
             raise PeerGoneError(self.process)
-        number = next(self._numbers)
-        reply: asyncio.Future[LogChunk] = asyncio.get_running_loop().create_future()
-        self._reads[number] = reply
-        self.send(ReadLog(request=number, id=id, node=node, offset=offset, limit=limit, query=query))
+        reply: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+        self._asked[question.request] = reply
+        self.send(question)
         try:
-            async with asyncio.timeout(self._timeouts.log):
-                return await reply
+            async with asyncio.timeout(timeout):
+                answer = await reply
         except TimeoutError as error:
-            raise PeerTimeoutError(self.process, self._timeouts.log) from error
+            raise PeerTimeoutError(self.process, timeout) from error
         finally:
-            del self._reads[number]
+            del self._asked[question.request]
+        if not isinstance(answer, kind):
+            raise PeerGoneError(self.process)
+        return answer
 
     async def pump(self) -> None:
         """Send what waits, until the connection ends (for the server).
@@ -131,15 +160,15 @@ class Peer:
                 return
             await self._socket.send(message)
 
-    def answer(self, chunk: LogChunk) -> None:
-        """Take an answer to :meth:`read_log` (for the server)."""
-        reply = self._reads.get(chunk.request)
+    def answer(self, message: LogChunk | StateSaved) -> None:
+        """Take an answer to :meth:`read_log` or :meth:`save_state` (for the server)."""
+        reply = self._asked.get(message.request)
         if reply is not None and not reply.done():
-            reply.set_result(chunk)
+            reply.set_result(message)
 
     def leave(self) -> None:
         """Note that the peer is gone, and fail the calls that wait for it (for the server)."""
         self._left = True
-        for reply in self._reads.values():
+        for reply in self._asked.values():
             if not reply.done():
                 reply.set_exception(PeerGoneError(self.process))

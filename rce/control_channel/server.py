@@ -26,6 +26,7 @@ from rce.control import (
     PeerRefusedError,
     Refused,
     SpecWanted,
+    StateSaved,
     Status,
     ToMaster,
     Unknown,
@@ -38,6 +39,7 @@ from rce.control import (
     encode,
 )
 from rce.control.execution import run_of
+from rce.control.node_states import PATH as NODE_STATES_PATH
 from rce.control.snapshots import UPLOADS
 from rce.control_channel.contents import ReadContent, answer, is_for_contents
 from rce.control_channel.peer import Peer
@@ -90,6 +92,8 @@ class ControlServer:
         tls: Gives the TLS context for each connection, which demands the task sets' certificates; none for a
             plain channel.
         is_revoked: Tells by its serial number whether a task set's certificate was revoked.
+        on_node_state: Takes a connection that a task set dialed for a snapshot of a node's state
+            (:mod:`rce.control.node_states`), and returns when it is done with it.
         on_execution: Takes a connection that a task set dialed for a run (:mod:`rce.control.execution`), and
             returns when it is done with it.
         on_upload: The same for a connection to send a snapshot (:mod:`rce.control.snapshots`).
@@ -113,6 +117,7 @@ class ControlServer:
         is_revoked: Callable[[int], bool] | None = None,
         on_execution: Callable[[str, ServerConnection], Awaitable[None]] | None = None,
         on_upload: Callable[[ServerConnection], Awaitable[None]] | None = None,
+        on_node_state: Callable[[ServerConnection], Awaitable[None]] | None = None,
         features: tuple[str, ...] = (),
         is_fenced: Callable[[], bool] | None = None,
         term: int = 0,
@@ -127,6 +132,7 @@ class ControlServer:
         self._contents = contents
         self._on_execution = on_execution
         self._on_upload = on_upload
+        self._on_node_state = on_node_state
         self._on_hello = on_hello
         self._on_message = on_message
         self._on_gone = on_gone
@@ -222,7 +228,11 @@ class ControlServer:
         return socket.respond(HTTPStatus.UNAUTHORIZED, "Task sets prove themselves by the engine's secret.\n")
 
     async def _serve(self, socket: ServerConnection) -> None:
-        run = run_of(socket.request.path) if socket.request is not None else None
+        path = socket.request.path if socket.request is not None else ""
+        if path == NODE_STATES_PATH and self._on_node_state is not None:
+            await self._on_node_state(socket)
+            return
+        run = run_of(path)
         if run is not None and self._on_execution is not None:
             await self._on_execution(run, socket)
             return
@@ -322,7 +332,7 @@ class ControlServer:
     async def _read(self, peer: Peer, socket: ServerConnection) -> None:
         while (message := await self._receive(socket)) is not None:
             match message:
-                case LogChunk():
+                case LogChunk() | StateSaved():
                     peer.answer(message)
                 case Hello():
                     await socket.close(_POLICY, "Hello came twice")

@@ -23,6 +23,8 @@ class ControlTimeouts:
     """An answer of a master that is connected all the time, but has much to do."""
     log: float = 5.0
     """A piece of a node's log."""
+    state: float = 20.0
+    """A snapshot of a node's state that is made before its container moves."""
     backoff: Backoff = Backoff(first=0.05, longest=2.0, jitter=1.0)
     """Waits before the next dial."""
     backoff_refused: float = 5.0

@@ -55,11 +55,13 @@ from rce.model.specs import (
     Resources,
     RestartPolicy,
 )
+from rce.model.state_services import MAX_STATE, StateServices
 from rce.model.volumes import Volume
 
 __all__ = [
     "DEFAULT_PREFIX",
     "MAX_NAME_LENGTH",
+    "MAX_STATE",
     "MEGABYTE",
     "MEMORY_PER_SLOT",
     "MIN_MEMORY",
@@ -94,6 +96,7 @@ __all__ = [
     "Role",
     "SetParameter",
     "SpecError",
+    "StateServices",
     "Volume",
     "about",
     "faults_of",

@@ -22,6 +22,12 @@ from rce.model.quantities import (
     read_memory,
     write_plain_memory,
 )
+from rce.model.state_services import (
+    StateServices,
+    WrittenStateServices,
+    read_state_services,
+    write_state_services,
+)
 from rce.model.volumes import Volume, WrittenVolume, read_volumes, write_volumes
 from rce.model.written import AsWritten
 
@@ -76,6 +82,7 @@ _LABELS = AsWritten(list[str] | str, _read_features, list, words="must be a stri
 _NETWORK = AsWritten(written.NetworkName, Network, _value_of, blank="")
 _RESTART = AsWritten(written.RestartName, RestartPolicy, _value_of)
 _VOLUMES = AsWritten(list[WrittenVolume], read_volumes, write_volumes)
+_STATE = AsWritten(WrittenStateServices, read_state_services, write_state_services)
 _TAGS = AsWritten(tuple[written.Name, ...])
 _TIMES = AsWritten(Annotated[int, Meta(ge=0, le=2**31 - 1)])
 _TIMEOUT = AsWritten(Annotated[float, Meta(ge=0.1, le=86400.0)])
@@ -138,6 +145,8 @@ class NodeSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A topic that the node publishes as long as it works; empty for none."""
     heartbeat_timeout: Annotated[float, _TIMEOUT] = 5.0
     """Seconds without a message on the heartbeat topic after which the node counts as stuck."""
+    state_services: Annotated[StateServices | None, _STATE] = field(default=None, name="state")
+    """How its state is kept when its container moves or starts again; None: it is lost."""
 
 
 class ParameterSpec(Struct, frozen=True, kw_only=True):

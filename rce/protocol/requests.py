@@ -40,6 +40,7 @@ SPELLING = Spelling(
         (DestroyContainer, "tag"): "containerTag",
         (AddNode, "container"): "containerTag",
         (NodeSpec, "tag"): "nodeTag",
+        (NodeSpec, "state_services"): "state",
         (RemoveNode, "container"): "containerTag",
         (RemoveNode, "tag"): "nodeTag",
         (SetParameter, "container"): "containerTag",

@@ -29,6 +29,7 @@ from rce_container.environment.executions import Executions
 from rce_container.environment.graph import Graph
 from rce_container.environment.logs.rosout import RosoutLog
 from rce_container.environment.managers import Managers
+from rce_container.environment.node_states import NodeStateKeeper
 from rce_container.environment.nodes.causes import Causes
 from rce_container.environment.nodes.fork_server import NodeForkServer
 from rce_container.environment.nodes.heartbeats import Heartbeats
@@ -101,6 +102,7 @@ class Environment:
                 ros1_graph(boot.address, boot.ros_port, self._packages, lambda: self._nodes.is_settling)
             )
             self._graph: Graph = graph
+            self._node_states = NodeStateKeeper(graph, self._managers)
             dial = self._dial_proxy.connect if self._boot.isolated else None
             hub = LinkHub(self._boot.machine, dial=dial, tls=self._boot.tls)
             stack.push_async_callback(hub.close)
@@ -138,6 +140,7 @@ class Environment:
 
     async def _close(self) -> None:
         await self._executions.close()
+        await self._node_states.close()
         await self._endpoint.close()
         await self._nodes.close()
         if not self._boot.isolated:
@@ -163,6 +166,7 @@ class Environment:
             terminate_timeout=self._boot.terminate_timeout,
             on_change=self._changed,
             on_fault=self._fault,
+            keep_state=self._node_states.states.keep,
             why_killed=self._causes.ask,
         )
 
@@ -306,6 +310,7 @@ class Environment:
 
     def manager_arrived(self, _: Channel) -> None:
         """Report the whole state to a new manager."""
+        self._node_states.vault.begin()
         self._reporter.begin()
         self._report()
 
@@ -328,16 +333,23 @@ class Environment:
                 self._causes.answered(request, text)
             case m.Handover(features=features):
                 self._reporter.learn(features)
+                self._node_states.vault.learn(features)
                 if self._handover is not None:
                     await self._handover.close()
                 self._handover = HandoverReceiver(socket.socket(fileno=channel.take_fd()), self._hub.adopt)
-            case m.Execute() | m.Stop() | Unknown():
+            case m.Execute() | m.SaveState() | m.OpenState() | m.StateDone() | m.Stop() | Unknown():
                 self._take_order(channel, message)
             case _:
                 assert_never(message)
 
-    def _take_order(self, channel: Channel, message: m.Execute | m.Stop | Unknown) -> None:
+    def _take_order(
+        self,
+        channel: Channel,
+        message: m.Execute | m.SaveState | m.OpenState | m.StateDone | m.Stop | Unknown,
+    ) -> None:
         match message:
+            case m.SaveState() | m.OpenState() | m.StateDone():
+                self._node_states.handle(channel, message)
             case m.Execute(command=command):
                 self._executions.start(command, socket.socket(fileno=channel.take_fd()))
             case m.Stop():

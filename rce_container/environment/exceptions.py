@@ -2,7 +2,8 @@
 
 EnvironmentFaultError         told to the user as it is; the rest of the container continues
 ├── NodeError            a node cannot be started
-└── ParameterError       a parameter cannot be set
+├── ParameterError       a parameter cannot be set
+└── NodeStateError        a snapshot of a node's state cannot be fetched or kept
 ChannelError             the other end of the control socket breaks the protocol, or does not read
 """
 
@@ -23,3 +24,7 @@ class ParameterError(EnvironmentFaultError):
 
 class ChannelError(Exception):
     """The other end of a control socket breaks the protocol, or does not read."""
+
+
+class NodeStateError(EnvironmentFaultError):
+    """A snapshot of a node's state cannot be fetched or kept."""

@@ -63,5 +63,26 @@ class Graph(Protocol):
             GraphError: The topic cannot be listened to.
         """
 
+    async def wait_for_service(self, service: str, timeout: float) -> None:
+        """Wait until a service answers.
+
+        Raises:
+            GraphError: None does within ``timeout`` seconds.
+        """
+
+    async def save_state(self, service: str, timeout: float) -> bytes:
+        """Ask a node for its state.
+
+        Raises:
+            GraphError: It did not give it within ``timeout`` seconds.
+        """
+
+    async def restore_state(self, service: str, state: bytes, timeout: float) -> None:
+        """Give a node its state.
+
+        Raises:
+            GraphError: It did not take it within ``timeout`` seconds.
+        """
+
     async def watch_nodes(self, listener: NodeListener) -> None:
         """Report nodes that register, until cancelled."""

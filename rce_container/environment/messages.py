@@ -113,6 +113,36 @@ class Execute(_Message):
     command: Command
 
 
+class SaveState(_Message):
+    """Make a snapshot of a node's state now. Answered by :class:`StateSaved`.
+
+    Only to environments with the feature ``node-states``; so are the next two.
+    """
+
+    request: int
+    node: str
+    """Its tag."""
+
+
+class OpenState(_Message):
+    """Answer to :class:`StateWanted` and :class:`StateOffered`.
+
+    Comes with a socket that carries the snapshot, if there is one: down its size in eight bytes and then the
+    snapshot, or up the snapshot.
+    """
+
+    request: int
+    empty: bool = False
+    """There is no snapshot, and no socket."""
+
+
+class StateDone(_Message):
+    """Last answer to :class:`StateOffered`, or to :class:`StateWanted` if it fails."""
+
+    request: int
+    error: str = ""
+
+
 class Stop(_Message):
     """Stop all nodes and end."""
 
@@ -166,8 +196,62 @@ class Killed(_Message):
     request: int
 
 
-ToEnvironment = Apply | ApplyPatch | Shelved | Handover | Dialed | Cause | Poll | Execute | Stop
-ToManager = Report | ReportPatch | SpecWanted | Fault | Counters | Dial | Killed
+class StateWanted(_Message):
+    """Asks for the newest snapshot of a node's state. Answered by :class:`OpenState`.
+
+    Only to managers with the feature ``node-states``; so are the next two.
+    """
+
+    request: int
+    node: str
+    """Its tag."""
+
+
+class StateOffered(_Message):
+    """Asks to keep a snapshot. Answered by :class:`OpenState`, then :class:`StateDone`."""
+
+    request: int
+    """Grows; a snapshot with a smaller number is older."""
+    node: str
+    """Its tag."""
+    size: int
+    """Bytes."""
+
+
+class StateSaved(_Message):
+    """Answer to :class:`SaveState`."""
+
+    request: int
+    error: str = ""
+    """Why the state is not saved; empty if the snapshot is acknowledged."""
+
+
+ToEnvironment = (
+    Apply
+    | ApplyPatch
+    | Shelved
+    | Handover
+    | Dialed
+    | Cause
+    | Poll
+    | Execute
+    | SaveState
+    | OpenState
+    | StateDone
+    | Stop
+)
+ToManager = (
+    Report
+    | ReportPatch
+    | SpecWanted
+    | Fault
+    | Counters
+    | Dial
+    | Killed
+    | StateWanted
+    | StateOffered
+    | StateSaved
+)
 
 encode = msgspec.json.Encoder().encode
 """Write a message as JSON; holds no newline."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from rce.control import PATCHES, EndpointStatus, StatusPatch
+from rce.control import NODE_STATES, PATCHES, EndpointStatus, StatusPatch
 from rce.control.execution import FEATURE as EXEC
 from rce_container.environment import messages as m
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rce.link import Endpoint
     from rce_container.environment.channel import Channel
 
-FEATURES = (EXEC, PATCHES)
+FEATURES = (EXEC, PATCHES, NODE_STATES)
 """The features of this environment that earlier releases do not have."""
 
 

@@ -30,6 +30,10 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _GET_PID_TIMEOUT_S = 5.0
+SAVE_STATE = "rce_msgs/SaveState"
+RESTORE_STATE = "rce_msgs/RestoreState"
+"""Both have one field, ``uint8[] data``: its length in four bytes, then the bytes."""
+_LENGTH = 4
 
 
 class Ros1Graph:
@@ -80,6 +84,49 @@ class Ros1Graph:
         """
         try:
             return await self._node.subscribe_serialized(topic, ANY, lambda *_: on_message())
+        except RosError as error:
+            raise GraphError(str(error)) from error
+
+    async def wait_for_service(self, service: str, timeout: float) -> None:
+        """Wait until a service answers.
+
+        Raises:
+            GraphError: None does within ``timeout`` seconds.
+        """
+        try:
+            await self._node.wait_for_service(service, timeout=timeout)
+        except TimeoutError:
+            raise GraphError(f"service {service} was not there within {timeout:.0f} s") from None
+        except RosError as error:
+            raise GraphError(str(error)) from error
+
+    async def save_state(self, service: str, timeout: float) -> bytes:
+        """Ask a node for its state.
+
+        Raises:
+            GraphError: It did not give it within ``timeout`` seconds.
+        """
+        answer = await self._call(service, SAVE_STATE, b"", timeout)
+        size = int.from_bytes(answer[:_LENGTH], "little")
+        if len(answer) != _LENGTH + size:
+            raise GraphError(f"service {service} answered with a wrong length")
+        return answer[_LENGTH:]
+
+    async def restore_state(self, service: str, state: bytes, timeout: float) -> None:
+        """Give a node its state.
+
+        Raises:
+            GraphError: It did not take it within ``timeout`` seconds.
+        """
+        await self._call(service, RESTORE_STATE, len(state).to_bytes(_LENGTH, "little") + state, timeout)
+
+    async def _call(self, service: str, service_type: str, request: bytes, timeout: float) -> bytes:
+        try:
+            client = self._node.service_client(service, service_type, persistent=False)
+            try:
+                return await client.call_serialized(request, timeout=timeout)
+            finally:
+                await client.close()
         except RosError as error:
             raise GraphError(str(error)) from error
 

@@ -21,7 +21,7 @@ from rce_master.cli.client import run
 from rce_master.cli.exceptions import CliError
 from rce_master.cli.offline import find_folder, find_state, open_store
 from rce_master.exceptions import StoreBusyError
-from rce_master.packages.carrying import carry, packages_of
+from rce_master.packages.carrying import carry, packages_of, states_of
 from rce_master.packages.contents import ARCHIVES
 from rce_master.state_service import load_converted
 from rce_master.store.copying import copy_rows
@@ -70,15 +70,15 @@ async def _copy(source: str, target: str, state_dir: Path | None) -> None:
             term = await old.begin_term()
             new = await stack.enter_async_context(open_store(there, tls))
             snapshot = await load_converted(old, term)
-            archives = carry(packages_of(snapshot), folder, new_folder)
+            archives = carry([*packages_of(snapshot), *states_of(snapshot)], folder, new_folder)
             count = await copy_rows(snapshot, new, above=term)
         except StoreBusyError as error:
             raise CliError(f"{error}; the state is copied while no master runs") from error
     typer.echo(f"copied {count} records to {there}; start no master on {here} any more")
     if archives and isinstance(there, EtcdAddress):
         typer.echo(
-            f"{archives} archives of packages are in {new_folder / ARCHIVES}: start a master of this machine"
-            f" on that folder (--state-dir {new_folder}); the others get them from it"
+            f"{archives} packages and states of nodes are in {new_folder / ARCHIVES}: start a master of this"
+            f" machine on that folder (--state-dir {new_folder}); the others get them from it"
         )
 
 

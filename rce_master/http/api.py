@@ -26,6 +26,7 @@ from rce_master.http import (
     api_machines,
     api_packages,
     api_read,
+    api_states,
     api_stream,
     api_tokens,
     api_usage,
@@ -53,6 +54,7 @@ ROUTES: list[Route] = [
     *api_usage.routes,
     *api_packages.routes,
     *api_volumes.routes,
+    *api_states.routes,
     *api_stream.routes,
     *api_exec.routes,
 ]

@@ -9,8 +9,8 @@ from __future__ import annotations
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from msgspec import NODEFAULT, Struct, to_builtins
-from msgspec.structs import fields
+import msgspec
+from msgspec import Struct, to_builtins
 from pydantic import Field as Option
 from pydantic import create_model
 
@@ -90,6 +90,8 @@ def _taken(field: Field) -> Any:
         kind = str
     elif get_origin(field.kept) is tuple:
         kind = list[_item(kind) or str]  # type: ignore[misc]  # made at run time
+    elif _is_spec(kind):
+        kind = _model(kind)
     elif field.rule.type != Value and len(get_args(kind)) > 1 and get_origin(kind) is not None:
         kind = get_args(kind)[0] if hasattr(kind, "__metadata__") else Amount
     return kind | None if field.default is None else kind
@@ -109,29 +111,34 @@ def _given(field: Field) -> Any:
         return str
     if get_origin(field.kept) is tuple:
         return list[_item(field.kept) or str]  # type: ignore[misc]  # made at run time
-    return field.kept
+    spec = next(filter(_is_spec, get_args(field.kept)), None)
+    return field.kept if spec is None else _model(spec) | None
+
+
+def _is_spec(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Struct)
 
 
 def _item(kind: Any) -> Any:
     """Return the model of the specs in a list, such as volumes; None for a list of texts."""
     spec = next(iter(get_args(kind)), None)
-    if not (isinstance(spec, type) and issubclass(spec, Struct)):
-        return None
-    members = get_type_hints(spec)
-    types: dict[str, Any] = {
-        one.name: (
-            Amount if len(get_args(members[one.name])) > 1 else members[one.name],
-            ... if one.default is NODEFAULT else one.default,
-        )
-        for one in fields(spec)
-    }
+    return _model(spec) if _is_spec(spec) else None
+
+
+def _model(spec: Any) -> Any:
+    """Return the model of a spec in another one."""
+    hints = get_type_hints(spec)
+    types: dict[str, Any] = {}
+    for one in msgspec.structs.fields(spec):
+        kind = Amount if len(get_args(hints[one.name])) > 1 else hints[one.name]
+        types[one.name] = (kind, ... if one.required else one.default)
     return create_model(spec.__name__, __base__=Body, __doc__=spec.__doc__, **types)
 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, Enum):
         return value.value
-    return to_builtins(value) if isinstance(value, tuple) else value
+    return to_builtins(value) if isinstance(value, tuple | Struct) else value
 
 
 # In

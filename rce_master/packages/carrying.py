@@ -12,7 +12,7 @@ import msgspec
 
 from rce_master.exceptions import StoreError
 from rce_master.packages.contents import ARCHIVES
-from rce_master.state.records import UserPackage
+from rce_master.state.records import SavedState, UserPackage
 from rce_master.state.tables import Tables
 
 if TYPE_CHECKING:
@@ -31,11 +31,17 @@ def packages_of(snapshot: Snapshot) -> list[UserPackage]:
     return [msgspec.json.decode(body, type=UserPackage) for body in rows.values()]
 
 
-def carry(packages: Iterable[UserPackage], source: Path, target: Path) -> int:
-    """Copy the archives of packages, each after a check of its hash.
+def states_of(snapshot: Snapshot) -> list[SavedState]:
+    """Return the saved states of nodes."""
+    rows = snapshot.get(Tables().saved_states.name, {})
+    return [msgspec.json.decode(body, type=SavedState) for body in rows.values()]
+
+
+def carry(contents: Iterable[UserPackage | SavedState], source: Path, target: Path) -> int:
+    """Copy the archives of packages and the saved states of nodes, each after a check of its hash.
 
     Args:
-        packages: Whose archives.
+        contents: Of what.
         source: The state folder of a master that has them.
         target: The state folder that gets those that it lacks; may be the same.
 
@@ -45,14 +51,15 @@ def carry(packages: Iterable[UserPackage], source: Path, target: Path) -> int:
     Raises:
         StoreError: Archives are missing or damaged, or cannot be written.
     """
-    names = {package.sha256: f"{package.user}/{package.name}@{package.version}" for package in packages}
+    names = {one.sha256: one.id for one in contents}
     try:
         missing = [name for sha256, name in names.items() if _hash(source / ARCHIVES / sha256) != sha256]
         if missing:
             shown = ", ".join([*missing[:_SHOWN], *(["..."] if len(missing) > _SHOWN else [])])
             raise StoreError(
                 f"{source / ARCHIVES} lacks the archives of {shown}, or they are damaged; name the state"
-                " folder of a master that has them, or remove these packages first: rce package remove"
+                " folder of a master that has them, or remove these first: rce package remove, or rce state"
+                " remove"
             )
         for sha256 in names:
             if not (target / ARCHIVES / sha256).exists():

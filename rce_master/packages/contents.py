@@ -13,6 +13,7 @@ import re
 import shutil
 import tempfile
 import time
+from itertools import count
 from typing import TYPE_CHECKING
 
 from rce.packages import DEFAULT_LIMITS, ArchiveLimits, BadArchiveError
@@ -74,6 +75,7 @@ class ContentStore:
         self._noun = noun
         self._folder = folder
         self._limits = limits
+        self._numbers = count(1)
 
     @contextlib.asynccontextmanager
     async def receive(self, chunks: AsyncIterator[bytes]) -> AsyncIterator[Incoming]:
@@ -103,7 +105,7 @@ class ContentStore:
         except OSError as error:
             raise StoreError(f"the master cannot keep the {self._noun}: {error.strerror or error}") from error
 
-    async def read(self, sha256: str, offset: int, count: int) -> tuple[bytes, int] | None:
+    async def read(self, sha256: str, offset: int, length: int) -> tuple[bytes, int] | None:
         """Read a piece of an archive.
 
         Returns:
@@ -111,7 +113,7 @@ class ContentStore:
         """
         if _HASH.fullmatch(sha256) is None:
             return None
-        return await asyncio.to_thread(self._read, sha256, offset, count)
+        return await asyncio.to_thread(self._read, sha256, offset, length)
 
     def path(self, sha256: str) -> Path:
         """Return where an archive is, or would be."""
@@ -138,6 +140,12 @@ class ContentStore:
                     continue
                 if not spared or path.stat().st_mtime <= newest:
                     path.unlink(missing_ok=True)
+
+    def set_aside(self, sha256: str) -> Path:
+        """Take an archive away, and return its file, which the caller removes. Does not block for long."""
+        incoming = self._folder / _INCOMING
+        incoming.mkdir(mode=0o700, exist_ok=True)
+        return self.path(sha256).rename(incoming / f"{sha256}-{next(self._numbers)}")
 
     def touch(self, sha256: str) -> bool:
         """Return whether an archive exists, which :meth:`sweep` spares for a while then. Blocks."""
@@ -185,13 +193,13 @@ class ContentStore:
         finally:
             os.close(descriptor)
 
-    def _read(self, sha256: str, offset: int, count: int) -> tuple[bytes, int] | None:
+    def _read(self, sha256: str, offset: int, length: int) -> tuple[bytes, int] | None:
         try:
             descriptor = os.open(self._folder / sha256, os.O_RDONLY | os.O_CLOEXEC)
         except FileNotFoundError:
             return None
         try:
-            return os.pread(descriptor, count, offset), os.fstat(descriptor).st_size
+            return os.pread(descriptor, length, offset), os.fstat(descriptor).st_size
         finally:
             os.close(descriptor)
 

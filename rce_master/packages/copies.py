@@ -130,7 +130,7 @@ class ArchiveCopies:
         if missing > 0:
             raise StoreError(
                 f"a {self._noun} must be on more than half of the {len(others) + 1} masters, and {missing}"
-                f" more must take it: {'; '.join(reasons)}; push it again later"
+                f" more must take it: {'; '.join(reasons)}; try again later"
             )
 
     async def _send(self, other: OtherMaster, archives: Collection[str]) -> str:

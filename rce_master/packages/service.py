@@ -1,15 +1,11 @@
-"""Accepts packages that users push, and removes contents that are not needed any more."""
+"""Accepts packages that users push."""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import logging
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rce.aio.tasks import TaskScope
 from rce.control import TaskSetKind
 from rce.guard import CrowdedError, Turns
 from rce.packages import BadKeyError, BadSignatureError, statement, verify
@@ -20,15 +16,11 @@ from rce_master.state.records import UserPackage, package_key_key, user_package_
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
-    from contextlib import AbstractAsyncContextManager
 
     from rce.packages.contents import Contents
-    from rce_master.packages.contents import ContentStore, Incoming
-    from rce_master.packages.copies import ArchiveCopies
-    from rce_master.state.changes import Changes
+    from rce_master.packages.contents import Incoming
+    from rce_master.packages.keeper import ContentKeeper
     from rce_master.state_service import StateService
-
-_log = logging.getLogger(__name__)
 
 INSPECTED_AT_ONCE = 2
 """Archives that are inspected at the same time, which takes processor time."""
@@ -58,71 +50,21 @@ class PackageService:
 
     Args:
         state_service: Knows the versions and the keys.
-        store: Keeps their contents.
+        keeper: Keeps their contents.
         clock: Seconds since 1970.
-        copies: Those at other masters, if there may be any.
     """
 
     def __init__(
         self,
         state_service: StateService,
-        store: ContentStore,
+        keeper: ContentKeeper,
         clock: Callable[[], float] = time.time,
-        copies: ArchiveCopies | None = None,
     ) -> None:
-        self._copies = copies
         self._state_service = state_service
-        self._store = store
+        self._keeper = keeper
         self._clock = clock
         self._uploads = Uploads()
         self._turns = Turns(INSPECTED_AT_ONCE, waiting=MAX_UPLOADS)
-        # Held while contents exist that the state does not know yet, or any more.
-        self._lock = asyncio.Lock()
-        self._dirty = asyncio.Event()
-        state_service.listeners.append(self._note)
-
-    async def run(self) -> None:
-        """Remove contents that are not needed, and keep the other masters' complete, until cancelled.
-
-        Raises:
-            FencedError: This master leads no more.
-        """
-        async with TaskScope() as tasks:
-            if self._copies is not None:
-                tasks.spawn(self._copies.run(self._known), name="copies of packages")
-            await self._sweep()
-
-    def _known(self) -> set[str]:
-        return {package.sha256 for package in self._state_service.tables.packages}
-
-    async def _sweep(self) -> None:
-        await asyncio.to_thread(self._store.forget_incoming)
-        self._dirty.set()
-        while True:
-            await self._dirty.wait()
-            self._dirty.clear()
-            async with self._lock:
-                try:
-                    await asyncio.to_thread(self._store.sweep, self._known())
-                except OSError as error:
-                    _log.error("packages that are needed no more stay on the disk: %s", error)
-            if self._copies is not None:
-                self._copies.look()
-
-    async def read(self, sha256: str, offset: int, count: int) -> tuple[bytes, int] | None:
-        """Read a piece of an archive for a task set; one that only another master has is fetched first.
-
-        Returns:
-            The piece and the size of the archive; None if there is no such package.
-
-        Raises:
-            OSError: It cannot be read, or not yet.
-        """
-        found = await self._store.read(sha256, offset, count)
-        if found is not None or self._copies is None or sha256 not in self._known():
-            return found
-        await self._copies.obtain(sha256)
-        return await self._store.read(sha256, offset, count)
 
     async def push(
         self, request: PushRequest, size: int, chunks: AsyncIterator[bytes]
@@ -148,22 +90,14 @@ class PackageService:
         return kept, (*contents.warnings, *self._warnings(contents))
 
     async def _take(self, request: PushRequest, chunks: AsyncIterator[bytes]) -> tuple[UserPackage, Contents]:
-        async with self._store.receive(chunks) as incoming:
+        async with self._keeper.store.receive(chunks) as incoming:
             _verify(request, incoming)
             contents = await self._inspect(request.user, incoming)
             package = self._package(request, incoming, contents)
             packages.check_new(self._state_service.tables, package)
-            async with self._lock:
-                try:
-                    await self._store.keep(incoming)
-                    async with self._spread(incoming.sha256):
-                        await self._state_service.submit(commands.AddPackage(package=package))
-                finally:
-                    self._dirty.set()
+            async with self._keeper.keep(incoming):
+                await self._state_service.submit(commands.AddPackage(package=package))
         return package, contents
-
-    def _spread(self, sha256: str) -> AbstractAsyncContextManager[None]:
-        return contextlib.nullcontext() if self._copies is None else self._copies.spread(sha256)
 
     async def _inspect(self, user: str, incoming: Incoming) -> Contents:
         try:
@@ -213,10 +147,6 @@ class PackageService:
         ):
             return ()
         return (_NOT_INSTALLED,)
-
-    def _note(self, changes: Changes) -> None:
-        if any(table == "bundles" for table, _ in changes.written()):
-            self._dirty.set()
 
 
 def _verify(request: PushRequest, incoming: Incoming) -> None:

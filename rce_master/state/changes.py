@@ -20,6 +20,7 @@ from rce_master.state.records import (
     Presence,
     Robot,
     RobotLive,
+    SavedState,
     TaskSet,
     Token,
     Tombstone,
@@ -188,6 +189,7 @@ class Transaction:
         | UserVolume
         | VolumeRemoval
         | VolumeMove
+        | SavedState
         | Endpoint
         | Interface
         | Link
@@ -320,6 +322,7 @@ _TABLES: dict[type, str] = {
     UserVolume: "volumes",
     VolumeRemoval: "volume_removals",
     VolumeMove: "volume_moves",
+    SavedState: "saved_states",
     Robot: "endpoints",
     Container: "endpoints",
     Interface: "interfaces",

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         KeptAnswer,
         KnownLogin,
         PackageKey,
+        SavedState,
         Token,
         User,
         UserPackage,
@@ -228,6 +229,25 @@ class VolumeRestored:
     volume: str
     placement: int
     error: str = ""
+
+
+# States of nodes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SaveState:
+    """Keep a snapshot of a node's state; its contents are kept already."""
+
+    state: SavedState
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemoveState:
+    """Remove the saved state of a node."""
+
+    user: str
+    container: str
+    node: str
 
 
 # Task sets
@@ -482,6 +502,8 @@ Command: TypeAlias = (
     | SnapshotTaken
     | SnapshotLost
     | VolumeRestored
+    | SaveState
+    | RemoveState
     | TaskSetArrived
     | TaskSetLeft
     | StatusReported

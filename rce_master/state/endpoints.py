@@ -8,7 +8,7 @@ import msgspec
 
 from rce.control import EndpointKind, LinkAddress
 from rce_master.exceptions import LimitReachedError
-from rce_master.state import activity, volumes
+from rce_master.state import activity, saved_states, volumes
 from rce_master.state.records import Container, Endpoint, Robot, Tombstone
 
 if TYPE_CHECKING:
@@ -60,6 +60,7 @@ def remove(tx: Transaction, id_: str, reason: str) -> None:
     tx.delete(tx.tables.live, id_)
     if isinstance(endpoint, Container):
         volumes.release(tx, endpoint)
+        saved_states.forget(tx, id_)
     if endpoint.task_set:
         withdraw(tx, endpoint, reason)
 

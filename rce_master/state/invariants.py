@@ -35,6 +35,8 @@ def validate(tables: Tables) -> None:
     _check_observed(tables)
     _check_moves(tables)
     _check_volumes(tables)
+    for state in tables.saved_states:
+        assert tables.container(state.container) is not None, f"{state.id}: its container is unknown"
     _check_users_records(tables)
 
 

@@ -75,7 +75,8 @@ def used_of(tables: Tables, user: str) -> dict[str, float]:
         **{kind: _asked(requested, kind) for kind in _OF_MACHINES},
         "packages": len(packages),
         "disk": sum(package.size for package in packages)
-        + sum(disk_of(volume.size, volume.snapshots) for volume in tables.volumes.by("user", user)),
+        + sum(disk_of(volume.size, volume.snapshots) for volume in tables.volumes.by("user", user))
+        + tables.saved_states.total(user),
     }
 
 

@@ -247,6 +247,42 @@ def volume_removal_key(process: str, volume: str) -> str:
     return f"{process} {volume}"
 
 
+class SavedState(Struct, frozen=True, kw_only=True):
+    """The newest snapshot of a node's state; the contents are kept under their hash."""
+
+    container: str
+    """``user/tag``."""
+    node: str
+    """Its tag."""
+    process: str
+    """Of the task set where it was taken."""
+    incarnation: str
+    """Of the container of which it was taken."""
+    number: int
+    """Grows from snapshot to snapshot of an incarnation."""
+    size: int
+    """Bytes."""
+    sha256: str
+    """In hex."""
+    taken: float
+    """When it came; seconds since 1970."""
+
+    @property
+    def id(self) -> str:
+        """``user/container/node``."""
+        return saved_state_key(self.container, self.node)
+
+    @property
+    def user(self) -> str:
+        """The user it belongs to."""
+        return self.container.partition("/")[0]
+
+
+def saved_state_key(container: str, node: str) -> str:
+    """Tell the key of the saved state of a node."""
+    return f"{container}/{node}"
+
+
 class _Endpoint(Struct, frozen=True, kw_only=True):
     """The base of robots and containers."""
 

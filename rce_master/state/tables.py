@@ -21,6 +21,7 @@ from rce_master.state.records import (
     Presence,
     Robot,
     RobotLive,
+    SavedState,
     TaskSet,
     Token,
     Tombstone,
@@ -61,6 +62,7 @@ class Tables:
     - ``endpoints``: robots and containers; both in one table, because a tag is unique among both.
     - ``volumes``: every volume of every container, and those that containers left.
     - ``volume_removals``: also of task sets that are gone: they may come back.
+    - ``saved_states``: only of containers that are there; at most one for each node.
     - ``interfaces``: only of endpoints that are there.
     - ``links``: one for each pair of endpoints that has a connection.
     - ``connections``: only on links that are there, between interfaces that are there.
@@ -105,6 +107,15 @@ class Tables:
         )
         self.volume_removals = Table[VolumeRemoval](
             "volume_removals", type_=VolumeRemoval, key=lambda r: r.id, process=lambda r: [r.process]
+        )
+        self.saved_states = Table[SavedState](
+            "saved_states",
+            type_=SavedState,
+            key=lambda s: s.id,
+            amount=lambda s: (s.user, s.size),
+            user=lambda s: [s.user],
+            container=lambda s: [s.container],
+            sha256=lambda s: [s.sha256],
         )
         self.endpoints = Table[Endpoint](
             "endpoints",
@@ -202,6 +213,7 @@ class Tables:
             self.packages,
             self.volumes,
             self.volume_removals,
+            self.saved_states,
             self.endpoints,
             self.interfaces,
             self.links,

@@ -2,7 +2,32 @@
 
 from __future__ import annotations
 
+_STATEFUL = """import asyncio
+from rce.ros.node import Node, run
+
+async def main():
+    state = {state}
+    async def save(_):
+        {wait}
+        return {{"data": state}}
+    def restore(request):
+        nonlocal state
+        state = bytes(request.data)
+        return {{}}
+    async with Node("{name}") as node:
+        await node.advertise_service("save_count", "rce_msgs/SaveState", save)
+        await node.advertise_service("restore_count", "rce_msgs/RestoreState", restore)
+        await node.spin()
+
+run(main())
+"""
+"""A node whose services are in its own namespace, as several of them are in one container."""
+
 NODES = {
+    "deaf.py": _STATEFUL.format(name="deaf", state="b''", wait="await asyncio.Event().wait()"),
+    "huge.py": _STATEFUL.format(name="huge", state="bytes((16 << 20) + 1)", wait="pass"),
+    "grow.py": _STATEFUL.format(name="grow", state="b''", wait="nonlocal state\n        state += b'x'"),
+    "echo_state.py": _STATEFUL.format(name="large", state="b''", wait="pass"),
     "talk.py": "import os, sys, time\nprint('hello', *sys.argv[1:], flush=True)\ntime.sleep(600)\n",
     "keep.py": (
         "import os, pathlib, time\n"

@@ -34,6 +34,7 @@ from rce.control.model import (
     NodeStatus,
 )
 from rce.control_channel.contents import Piece
+from rce.control_channel.node_states import NodeStateClient
 from rce.control_channel.uploads import Uploader
 from rce.link.handover import LinkAcceptor
 from rce_container.environment import proc
@@ -107,6 +108,7 @@ class Machine:
         self.library.open()
         self.contents: dict[str, bytes] = {}
         """What its master hands out, by hash."""
+        self.node_states: NodeStateClient | None = None
         self.told: list[ToMaster] = []
         self._chunk: asyncio.Future[LogChunk] | None = None
         self.manager: Manager
@@ -154,6 +156,7 @@ class Machine:
                 library=self.library,
                 uploader=self.uploader,
                 fetch=self.fetch_content,
+                node_states=self.node_states,
             )
             self.manager.send = self._tell
             ready, self.quit = asyncio.Event(), asyncio.Event()

@@ -92,6 +92,9 @@ class FakePeer:
             raise PeerTimeoutError(self.process, 1.0)
         return self.log
 
+    async def save_state(self, id: str, node: str) -> str:  # noqa: A002 - wire name
+        return f"{self.process} saves no {id}/{node}"
+
     async def get(self, kind: type[M]) -> M:
         """Take messages until one of a kind comes."""
         async with asyncio.timeout(60):

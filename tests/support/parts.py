@@ -12,7 +12,7 @@ from rce.control.model import (
     PackageSpec,
     VolumePlacement,
 )
-from rce.model import Volume
+from rce.model import StateServices, Volume
 from rce.model.specs import InterfaceSpec, Network, NodeSpec, ParameterSpec, Resources, RestartPolicy
 
 
@@ -37,6 +37,7 @@ class NodeLife(TypedDict, total=False):
     heartbeat_timeout: float
     restart: RestartPolicy
     max_restarts: int
+    state_services: StateServices | None
 
 
 class MachineParts(TypedDict, total=False):

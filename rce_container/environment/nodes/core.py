@@ -28,8 +28,10 @@ from rce_container.environment.nodes.events import (
     Note,
     Refused,
     Registered,
+    Restored,
     Tell,
     Tick,
+    Unsaved,
 )
 from rce_container.environment.nodes.life import LifeEvent
 from rce_container.environment.nodes.order import StartOrder, levels, ready_to_end
@@ -46,6 +48,7 @@ SETTLES_WITHIN_S = 0.5
 SOON_S = 5.0
 """A node that is started again within this time is worth waiting for."""
 
+_RESTORES = "its state is restored"
 _UNREGISTERED = "it has not registered with the ROS core; nodes that come after it wait until it does"
 
 
@@ -84,7 +87,7 @@ class NodesCore:
                     return []
             case Tick():
                 self._tick()
-            case Made() | Refused() | Registered() | Ended():
+            case Made() | Refused() | Registered() | Restored() | Unsaved() | Ended():
                 node = self._nodes.get(event.tag)
                 if node is not None and node.life == event.life and node.has_process:
                     self._happen(node, event)
@@ -103,9 +106,10 @@ class NodesCore:
 
     @property
     def is_degraded(self) -> bool:
-        """Whether a node failed, is stuck, or pauses after a failure."""
+        """Whether a node failed, is stuck, pauses after a failure, or did not get its state."""
         return any(
             node.state in (NodeState.FAILED, NodeState.STUCK)
+            or (node.unrestored and node.has_process)
             or (node.failing and node.state in (NodeState.WAITING, NodeState.STOPPING))
             for node in self._nodes.values()
         )
@@ -168,12 +172,16 @@ class NodesCore:
             node.in_a_row = 0
             node.silent_at = self._now + FIRST_BEAT_WITHIN_S
 
-    def _happen(self, node: Node, event: Made | Refused | Registered | Ended) -> None:
+    def _happen(self, node: Node, event: Made | Refused | Registered | Restored | Unsaved | Ended) -> None:
         match event:
             case Made(pid=pid):
                 node.pid = pid
             case Registered():
                 self._register(node)
+            case Restored(fault=fault):
+                self._restore(node, fault)
+            case Unsaved(text=text):
+                self._unsave(node, text)
             case Refused(reason=reason, hopeless=hopeless):
                 self._note(node, f"cannot be started: {reason}")
                 self._end(node, None, f"cannot be started: {reason}", hopeless=hopeless)
@@ -187,7 +195,28 @@ class NodesCore:
         if node.registered_at is None:
             node.registered_at = self._now
         if node.state is NodeState.STARTING:
-            self._become(node, LifeEvent.REGISTER)
+            if node.restoring:
+                node.detail = _RESTORES
+            else:
+                self._become(node, LifeEvent.REGISTER)
+
+    def _restore(self, node: Node, fault: str) -> None:
+        node.restoring = False
+        node.unrestored = bool(fault)
+        node.state_fault = f"its state was not restored, and is not saved: {fault}" if fault else ""
+        if fault:
+            self._note(node, node.state_fault)
+            self._tell(node, f"runs, but {node.state_fault}")
+        if node.registered_at is not None:
+            self._register(node)
+
+    def _unsave(self, node: Node, text: str) -> None:
+        if text == node.state_fault:
+            return
+        node.state_fault = text
+        self._note(node, text or "its state is saved again")
+        if text:
+            self._tell(node, f"runs, but {text}")
 
     def _beat(self, tag: str) -> bool:
         """Handle a heartbeat; return whether it changes anything."""
@@ -209,7 +238,7 @@ class NodesCore:
                 self._halt(node, node.detail)
             elif node.beats and node.silent_at <= self._now:
                 self._stuck(node)
-            elif node.state is NodeState.STARTING and self._now >= node.started_at + REGISTERS_WITHIN_S:
+            elif node.is_unregistered and self._now >= node.started_at + REGISTERS_WITHIN_S:
                 node.detail = _UNREGISTERED
 
     def _stuck(self, node: Node) -> None:
@@ -312,13 +341,16 @@ class NodesCore:
 
     def _why(self, tag: str) -> str:
         node = self._nodes[tag]
-        return "not registered yet" if node.state is NodeState.STARTING else node.state.value
+        if node.is_unregistered:
+            return "not registered yet"
+        return _RESTORES if node.restoring else node.state.value
 
     def _launch(self, node: Node, spec: NodeSpec) -> None:
         node.life = next(self._lives)
         node.restarts += node.pausing
         node.spec, node.exit_code = spec, None
-        node.pausing = node.failing = node.is_done = False
+        node.pausing = node.failing = node.is_done = node.unrestored = False
+        node.restoring, node.state_fault = spec.state_services is not None, ""
         node.started_at, node.registered_at, node.ill_at = self._now, None, math.inf
         node.silent_at = self._now + FIRST_BEAT_WITHIN_S
         self._become(node, LifeEvent.LAUNCH)
@@ -383,7 +415,7 @@ class NodesCore:
     def _moments(self, node: Node) -> Iterator[float]:
         if node.state is NodeState.WAITING and node.pausing and node.due > self._now:
             yield node.due
-        if node.state is NodeState.STARTING and not node.detail:
+        if node.is_unregistered and not node.detail:
             yield node.started_at + REGISTERS_WITHIN_S
         if node.beats:
             yield node.silent_at

@@ -70,11 +70,31 @@ class Ended:
 
 
 @dataclass(frozen=True, slots=True)
+class Restored:
+    """A life of a node has the state that was kept for it, or will not get it."""
+
+    tag: str
+    life: int
+    fault: str = ""
+    """Why it was not restored; empty if it was, or there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unsaved:
+    """What keeps the state of a node from being fetched or saved changed."""
+
+    tag: str
+    life: int
+    text: str
+    """Empty: nothing does any more."""
+
+
+@dataclass(frozen=True, slots=True)
 class Tick:
     """Time passed."""
 
 
-Event = Desire | Lack | Made | Refused | Registered | Beat | Ended | Tick
+Event = Desire | Lack | Made | Refused | Registered | Restored | Unsaved | Beat | Ended | Tick
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from rce.model import NodeSpec
 from rce.ros import names
 from rce_container.environment.graph import Graph, GraphError, Subscription
+from rce_container.environment.nodes.launch import ros_name_of
 
 
 class _Listening(NamedTuple):
@@ -59,5 +60,4 @@ class Heartbeats:
 
 def topic_of(spec: NodeSpec) -> str:
     """Return the global name of a node's heartbeat topic, which may be relative or private to the node."""
-    caller = "/" + "/".join(filter(None, (spec.namespace.strip("/"), spec.name or spec.tag)))
-    return names.resolve(spec.heartbeat, caller)
+    return names.resolve(spec.heartbeat, ros_name_of(spec))

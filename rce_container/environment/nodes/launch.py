@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from rce.model import NodeSpec
 from rce.ros.substitution import split_arguments
 from rce.ros.system import system_environ
 from rce_container.environment.exceptions import NodeError
@@ -28,6 +29,11 @@ class Launch(NamedTuple):
     """The global ROS name that it is to take; empty if it chooses its own name."""
     choice: str = ""
     """For its log: which of several programs of its name was chosen; empty if there is only one."""
+
+
+def ros_name_of(spec: NodeSpec) -> str:
+    """Return the global ROS name of a node that takes the name it is given; its tag, if it is given none."""
+    return "/" + "/".join(filter(None, (spec.namespace.strip("/"), spec.name or spec.tag)))
 
 
 def prepare(launch_environment: LaunchEnvironment, mark: str) -> Launch:

@@ -6,11 +6,12 @@ import asyncio
 import errno
 import os
 import signal
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from rce.aio.tasks import BackgroundTasks
 from rce.model import NodeSpec
 from rce_container.environment.exceptions import NodeError
 from rce_container.environment.logs.node_log import NodeLog
@@ -43,6 +44,9 @@ class NodeContext:
     """Called when a node's status has changed."""
     on_fault: Callable[[str], None]
     """A node failed; a text for the user."""
+    keep_state: Callable[[NodeSpec, int, Callable[[Event], None]], Coroutine[None, None, None]]
+    """Restores and saves the state of a life of a node until cancelled
+    (:meth:`rce_container.environment.nodes.states.NodeStates.keep`)."""
     why_killed: Callable[[], Awaitable[str]]
     """Returns why a process ended by a SIGKILL that the environment did not send; empty if unknown."""
 
@@ -97,9 +101,13 @@ class NodeLife:
             self._log.note(launch.choice)
         with ExitStack() as pumps:
             child = self._start(launch, pumps)
+            tasks = BackgroundTasks()
+            keeping = self._context.keep_state(self._spec, self.life, self._feed)
+            tasks.spawn(keeping, name=f"state of {self._spec.tag}")
             try:
                 code, reason = await self._watch(child)
             finally:
+                await tasks.close()
                 child.signal_group(signal.SIGKILL)
                 await kill_marked(launch.env[NODE_MARK], variable=NODE_MARK)
         if code and not self._halted.done() and (words := self._log.last_output):

@@ -45,6 +45,12 @@ class Node:
     silent_at: float = math.inf
     """When it counts as stuck, unless a heartbeat arrives before."""
     share: float = 1.0
+    restoring: bool = False
+    """Its newest life has yet to get the state that was kept for it, or to learn that there is none."""
+    unrestored: bool = False
+    """Its newest life did not get the state that was kept for it."""
+    state_fault: str = ""
+    """Why its state is not restored or saved."""
     told: str = ""
     """The last failure that was reported to the user."""
     course: StateMachine[NodeState, LifeEvent] = field(init=False)
@@ -70,7 +76,12 @@ class Node:
     @property
     def is_ready(self) -> bool:
         """Whether nodes that come after it may start."""
-        return self.state is NodeState.RUNNING or self.is_done
+        return (self.state is NodeState.RUNNING and not self.restoring) or self.is_done
+
+    @property
+    def is_unregistered(self) -> bool:
+        """Whether its process has not registered with the ROS core yet."""
+        return self.state is NodeState.STARTING and self.registered_at is None
 
     @property
     def beats(self) -> bool:
@@ -103,10 +114,13 @@ class Node:
             pid=self.pid,
             exit_code=self.exit_code,
             restarts=self.restarts,
-            detail=self.detail,
+            detail="; ".join(filter(None, (self.detail, self.state_fault))),
         )
 
 
-def _command(spec: NodeSpec) -> tuple[str, ...]:
-    """Return the parts of a specification that determine its process."""
-    return spec.pkg, spec.exe, spec.args, spec.name, spec.namespace
+def _command(spec: NodeSpec) -> tuple[object, ...]:
+    """Return the parts of a specification that determine its process.
+
+    The services of its state are among them: a process that was not restored must not be saved.
+    """
+    return spec.pkg, spec.exe, spec.args, spec.name, spec.namespace, spec.state_services

@@ -108,7 +108,7 @@ async def test_archives_of_packages_move_too(tmp_path: Path) -> None:
         archive.write_bytes(b"an archive")
         told = await rce(tmp_path, "master", *copy)
         beside = tmp_path / "beside" / "master" / "bundles" / archive.name
-        assert f"1 archives of packages are in {beside.parent}" in told
+        assert f"1 packages and states of nodes are in {beside.parent}" in told
         assert beside.read_bytes() == b"an archive"
         await rce(tmp_path, "master", "copy", "--from", etcd.store, "--to", "sqlite:back", *own)
     assert (tmp_path / "back" / "master" / "bundles" / archive.name).read_bytes() == b"an archive"

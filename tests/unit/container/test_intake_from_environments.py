@@ -89,3 +89,18 @@ def test_who_says_too_much_has_to_wait() -> None:
     now = 1000.0
     pace.pay(intake.BURST + intake.BYTES_PER_S)
     assert pace.pause == pytest.approx(1.0), "no more than a burst is saved up"
+
+
+@pytest.mark.parametrize(
+    ("said", "fault"),
+    [
+        (m.StateWanted(request=1, node="n"), ""),
+        (m.StateOffered(request=1, node="n", size=16 << 20), ""),
+        (m.StateOffered(request=1, node="n", size=(16 << 20) + 1), "it has more than 16777216 bytes"),
+        (m.StateOffered(request=1, node="n", size=-1), "it has more than 16777216 bytes"),
+        (m.StateWanted(request=1, node="../n"), "it names no node"),
+        (m.StateWanted(request=2**60, node="n"), "its number is too large"),
+    ],
+)
+def test_snapshots_are_of_nodes_and_not_too_large(said: m.StateWanted | m.StateOffered, fault: str) -> None:
+    assert intake.state_fault(said) == fault

@@ -24,6 +24,9 @@ def context(folder: Path, faults: list[str]) -> NodeContext:
     async def why_killed() -> str:
         return ""
 
+    async def keep_state(*_: object) -> None:
+        """No node of these tests has a state."""
+
     return NodeContext(
         reaper=Reaper(),
         launch_environment=launch_environment,
@@ -34,6 +37,7 @@ def context(folder: Path, faults: list[str]) -> NodeContext:
         terminate_timeout=1.0,
         on_change=lambda: None,
         on_fault=faults.append,
+        keep_state=keep_state,
         why_killed=why_killed,
     )
 

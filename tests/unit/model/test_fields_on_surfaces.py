@@ -20,7 +20,7 @@ from rce.config import items
 from rce.config.client import loads
 from rce.control.messages import ClientRequest, Put, decode_to_master, decode_to_task_set, encode
 from rce.control.model import EndpointKind, EndpointSpec
-from rce.model import Volume
+from rce.model import StateServices, Volume
 from rce.model.requests import (
     AddInterface,
     AddNode,
@@ -47,6 +47,7 @@ SAMPLES: dict[str, Any] = {
     "tag_a": "a/x",
     "tag_b": "b/x",
     "volumes": (Volume(name="x", path="/data", size=64 << 20),),
+    "state_services": StateServices(save="~save", restore="~restore", every=2.5),
     "value": [1, 2.5, "x", True],
 }
 """Where any value of the type will not do."""
