@@ -13,7 +13,7 @@ from typing import Any
 import aiohttp
 import psutil
 import pytest
-from support.demo import clean_folder, environment, run_headless, running_demo
+from support.demo import LIGHT, clean_folder, environment, run_headless, running_demo
 from support.engine import command_line, until
 
 from rce_fleet.demo.scenario import choose_scenario
@@ -63,7 +63,7 @@ async def test_blocked_cells_never_cut_off_a_goal(tmp_path: Path) -> None:
     rows = [f"0\tlane.map\t10\t2\t{start}\t1\t{goal}\t1\t5\n" for start, goal in ((0, 5), (3, 8))]
     scen.write_text("version 1\n" + "".join(rows))
     code, report, text = await run_headless(
-        *("--mode", "single", "--world", world, "--scen", scen, "--robots", 2, "--blocked-cells", 2),
+        *("--mode", "single", "--world", world, "--scen", scen, *LIGHT, "--robots", 2, "--blocked-cells", 2),
         timeout=TIMEOUT_S,
     )
     assert code == 0, text
@@ -104,7 +104,7 @@ async def test_sigterm_ends_a_demo_that_is_still_starting() -> None:
 
 @pytest.mark.parametrize("runtime", RUNTIMES)
 async def test_robots_continue_after_parts_of_the_engine_are_killed(runtime: str) -> None:
-    async with running_demo("--robots", 2, "--runtime", runtime) as demo:
+    async with running_demo(*LIGHT, "--robots", 2, "--runtime", runtime) as demo:
         (report,) = demo.folder.glob("rce-demo-*/world.json")
 
         def driven() -> float:
@@ -136,7 +136,7 @@ async def test_robots_continue_after_parts_of_the_engine_are_killed(runtime: str
 
 async def test_killed_planner_returns_with_goals_and_blocked_cells() -> None:
     async with (
-        running_demo("--robots", 1, "--seed", 12, "--runtime", "process", "--no-auto") as demo,
+        running_demo(*LIGHT, "--robots", 1, "--seed", 12, "--runtime", "process", "--no-auto") as demo,
         aiohttp.ClientSession() as session,
     ):
         station = StationClient(session, demo.page)

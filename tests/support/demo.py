@@ -24,6 +24,8 @@ from support.processes import finish
 from tools.leaks import sweep_cgroups
 
 STOP_TIMEOUT_S = 120.0
+LIGHT = ("--full-stack", 0)
+"""Options of a demo with robots that need little CPU, for a test of something else."""
 
 
 def environment(folder: Path) -> dict[str, str]:

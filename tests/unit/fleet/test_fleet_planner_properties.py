@@ -29,7 +29,7 @@ def connected_map(rng: Random, boxes: int) -> GridMap:
             return grid
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 8))
 def test_every_robot_arrives_within_its_own_cells(
     make_fleet: type[SimulatedClients], seed: int, count: int
@@ -57,7 +57,7 @@ def test_every_robot_arrives_within_its_own_cells(
     }
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 8))
 def test_indexes_equal_a_recomputation_whatever_happens(
     make_fleet: type[SimulatedClients], seed: int, count: int
@@ -143,7 +143,7 @@ def put_zone(fleet: SimulatedClients, rng: Random) -> None:
 
 
 @pytest.mark.needs("data")
-@pytest.mark.parametrize("count", [4, 20])
+@pytest.mark.parametrize("count", [4, 12])
 def test_robots_drive_on_a_benchmark_map(
     make_fleet: type[SimulatedClients], rce_data: Path, count: int
 ) -> None:

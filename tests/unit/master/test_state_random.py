@@ -336,7 +336,7 @@ class Histories(RuleBasedStateMachine):
 
 
 Histories.TestCase.settings = settings(
-    max_examples=60, stateful_step_count=40, deadline=None, suppress_health_check=list(HealthCheck)
+    max_examples=30, stateful_step_count=40, deadline=None, suppress_health_check=list(HealthCheck)
 )
 TestHistories = pytest.mark.timeout(120)(Histories.TestCase)
 
@@ -347,5 +347,5 @@ class SlicedHistories(Histories):
     limits = replace_dataclass(LIMITS, max_work=1)
 
 
-SlicedHistories.TestCase.settings = settings(Histories.TestCase.settings, max_examples=30)
+SlicedHistories.TestCase.settings = settings(Histories.TestCase.settings, max_examples=15)
 TestSlicedHistories = pytest.mark.timeout(120)(SlicedHistories.TestCase)

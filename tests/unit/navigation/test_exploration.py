@@ -186,7 +186,7 @@ def test_a_search_says_why_it_is_impossible() -> None:
     assert "has room" in find_frontiers(walled, Pose(1.5, 1.5, 0.0), PARAMETERS).reason
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.integers(0, 10**6), st.floats(-3, 3), st.floats(-3, 3), st.floats(-pi, pi))
 def test_frontiers_move_with_the_maps_origin(seed: int, x: float, y: float, yaw: float) -> None:
     """The same map elsewhere in the world gives the same frontiers there; goals are free and in sight."""
@@ -302,7 +302,7 @@ def test_a_lost_robot_ends_nothing() -> None:
     assert explorer.update(search_of(CLOSED), 3.0, 3.0) is Action.DONE
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from((1.0, 2.0, inf)))
 def test_every_floor_is_explored_to_the_end(seed: int, reach: float) -> None:
     """Whatever the floor and the sensor's reach: it ends, and what the robot can reach is known."""

@@ -79,7 +79,7 @@ def test_the_robot_reaches_the_goal_with_its_heading(sampling: str) -> None:
     st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2)), min_size=1, max_size=3),
     st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2)), max_size=12),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_limits_hold_and_nothing_is_touched(
     yaw: float, corners: list[tuple[float, float]], obstacles: list[tuple[float, float]]
 ) -> None:

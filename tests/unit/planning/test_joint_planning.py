@@ -53,7 +53,7 @@ def problem_of(grid: GridMap, cells: list[int], count: int, seed: int, **more: o
     )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     count=st.integers(1, 18),

@@ -98,7 +98,7 @@ def drawn(seed: int, count: int, share: float, side: int) -> tuple[GridMap, list
     return grid, rng.sample(part, count), rng.sample(part, count)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     count=st.integers(1, 12),

@@ -254,7 +254,7 @@ VALUES = st.recursive(
 MESSAGES = st.dictionaries(KEYS, VALUES, max_size=4) | st.binary(max_size=40)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.lists(MESSAGES, min_size=1, max_size=8), st.randoms(use_true_random=False))
 def test_frames_of_many_messages_in_any_order(sent: list[Any], random: Random) -> None:
     stream = ProtocolStream.for_engine()
@@ -291,7 +291,7 @@ NASTY_FRAMES = (
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(NASTY_FRAMES, max_size=40))
 def test_no_frame_raises_and_memory_stays_bounded(frames: list[Frame]) -> None:
     limits = Limits(max_pending_bytes=400, max_pending=5)
