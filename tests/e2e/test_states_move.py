@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import shutil
 import sys
 import tempfile
@@ -19,7 +20,7 @@ import psutil
 import pytest
 from support.engine import Program, engine_processes, until
 from support.etcd import cluster
-from support.master_program import environment
+from support.master_program import environment, rce
 from support.masters import DEV_USER, MasterProcess, Masters, masters
 from support.ports import free_port
 
@@ -234,11 +235,25 @@ async def test_a_count_moves_with_its_container(folder: Path) -> None:
             await cloud.passes(count, "second")
             await cloud.start(cloud.machines[0])
             await cloud.handed_over("first")
+            await check_commands(folder, master, cloud)
             await cloud.call("DELETE", "/containers/C")
             assert await cloud.state() == {}
             await until(lambda: not _contents(master), what="its contents are removed")
     finally:
         assert await master.stop() == 0
+
+
+async def check_commands(folder: Path, master: MasterProcess, cloud: Cloud) -> None:
+    """``rce state`` lists the snapshot, and removes it; a node that runs is saved again."""
+    login = {"url": master.url, "user": DEV_USER, "token": await log_in(master), "expires": 2e10}
+    (folder / "login.json").write_text(json.dumps(login))
+    listed = await rce(folder, "state", "list")
+    assert "C/count" in listed
+    assert "first" in listed
+    assert "removed" in await rce(folder, "state", "remove", "C/count", "--yes")
+    assert "names no node" in await rce(folder, "state", "remove", "C", "--yes", code=1)
+    before = await cloud.count()
+    await cloud.passes(before, "first")
 
 
 @pytest.mark.needs("etcd")
