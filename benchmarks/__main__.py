@@ -19,6 +19,7 @@ from benchmarks import (
     fanout,
     joining,
     latched,
+    node_states,
     offload,
     rate,
     roundtrip,
@@ -76,6 +77,10 @@ def suites(*, quick: bool) -> dict[str, tuple[str, Callable[[RunningEngine], Awa
         "failover": (
             "A robot task set ends, and its robots are at another one",
             lambda _: failover.run(robots=200, passes=1 if quick else 3),
+        ),
+        "states": (
+            "Snapshots of a node's state, at a master with SQLite",
+            lambda _: node_states.run(count=5 if quick else 30),
         ),
         "abuse": (
             "Beside another user's abuse",
