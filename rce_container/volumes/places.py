@@ -58,6 +58,17 @@ class VolumePlaces:
         """Return where a volume is, or would be, if it is an image."""
         return self.folder(id_).with_suffix(".img")
 
+    def make_folder(self, path: Path) -> None:
+        """Make a folder of volumes, with those above it, for the owner only. Quick.
+
+        Raises:
+            OSError: It cannot be made.
+        """
+        self._folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        parts = path.relative_to(self._folder).parts
+        for count in range(len(parts) + 1):  # mkdir's mode is not for the parents that it makes
+            self._folder.joinpath(*parts[:count]).mkdir(mode=0o700, exist_ok=True)
+
     def existing(self) -> list[str]:
         """Return all volumes."""
         try:
@@ -119,7 +130,7 @@ class VolumePlaces:
             OSError: It cannot be made.
         """
         path = self._scratch / secrets.token_hex(8)
-        path.mkdir(mode=0o700, parents=True)
+        self.make_folder(path)
         return path
 
     def make_new(self, size: int) -> tuple[Path, int]:
@@ -135,7 +146,7 @@ class VolumePlaces:
             if not self._images:
                 path = self.make_scratch()
                 return path, os.open(path, _FOLDER)
-            self._scratch.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self.make_folder(self._scratch)
             path = self._scratch / f"{secrets.token_hex(8)}.img"
             images.make(path, size)
             root = open_image(path, self._point(), read_only=False)
@@ -155,7 +166,7 @@ class VolumePlaces:
         try:
             if new.suffix == ".img":
                 images.wait_until_unused(new, time.monotonic() + SETTLE_S)
-            place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self.make_folder(place.parent)
             if self.exists(id_) and not self.discard(id_):
                 raise VolumeError("the former files are in the way")
             new.rename(place)
@@ -176,7 +187,7 @@ class VolumePlaces:
             OSError: It cannot be written.
         """
         marker = self._marker(id_)
-        marker.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.make_folder(marker.parent)
         write_whole(marker, str(number).encode())
         sync_folder(marker.parent)
 
@@ -189,7 +200,7 @@ class VolumePlaces:
 
     def _point(self) -> Path:
         point = self._scratch / "point"
-        point.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.make_folder(point)
         return point
 
     # Removal
@@ -199,7 +210,7 @@ class VolumePlaces:
         try:
             for path in (self.folder(id_), self.image(id_)):
                 if path.exists():
-                    self._trash.mkdir(mode=0o700, parents=True, exist_ok=True)
+                    self.make_folder(self._trash)
                     path.rename(self._trash / f"{secrets.token_hex(8)}{path.suffix}")
             self._marker(id_).unlink(missing_ok=True)
         except OSError as error:

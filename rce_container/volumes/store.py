@@ -265,11 +265,7 @@ class VolumeStore:
                 "its operator can start the engine as root"
             )
         try:
-            for folder in (
-                place.parent.parent,
-                place.parent,
-            ):  # mkdir's mode is not for the parents that it makes
-                folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self.places.make_folder(place.parent)
             if not self._images or place.is_dir():
                 place.mkdir(mode=0o700, exist_ok=True)
         except OSError as error:

@@ -162,13 +162,13 @@ class SnapshotService:
                 answer = Wanted(contents=await asyncio.to_thread(self._missing, offer.contents))
             await socket.send(msgspec.json.encode(answer).decode())
             if known is not None:
-                await self._receive(socket, known.size + _SLACK)
+                await self._receive(socket, known.size)
 
     def _missing(self, contents: list[str]) -> list[str]:
         return [sha256 for sha256 in contents if not self._store.touch(sha256)]
 
     async def _receive(self, socket: ServerConnection, most: int) -> None:
-        left = most + MAX_MANIFEST
+        left = most + _SLACK + MAX_MANIFEST
         while True:
             data = await socket.recv()
             left -= len(data)

@@ -151,6 +151,9 @@ async def check_move(a: Machine, b: Machine, folder: Path) -> None:
         await b.drop(BOX)
         saved = await save(b, 2)
         assert (await restore(a, saved.snapshot, 3)).error == ""
+        for machine in (a, b):
+            for made in (machine.folder / "state" / "volumes").glob("**/"):
+                assert made.stat().st_mode & 0o077 == 0, f"others can look into {made}"
         await put(a, 300, 3)
         await a.log_holds(BOX, "node", "3 runs")
         await a.drop(BOX, 400)
