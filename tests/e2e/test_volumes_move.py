@@ -93,6 +93,15 @@ class Moved:
 
         return await until(does, timeout=WAIT_S, what="the container runs and writes")
 
+    async def is_at(self, machine: str) -> None:
+        """Wait until the container is placed at a machine; the master shows the former one for a while."""
+
+        async def is_there() -> bool:
+            found = await self.shown()
+            return found is not None and found["machine"] == machine
+
+        await until(is_there, timeout=WAIT_S, what=f"the container is at {machine}")
+
     async def other(self) -> str:
         """Return the machine where the container is not."""
         found = await self.shown()
@@ -155,11 +164,7 @@ async def test_moves_and_drains_keep_every_row(packages: Path) -> None:
             source = "machine1" if target == "machine0" else "machine0"
             await world.ask("PUT", f"/machines/{source}/drain")
 
-            async def is_there(target: str = target) -> bool:
-                found = await world.shown()
-                return found is not None and found["machine"] == target
-
-            await until(is_there, timeout=WAIT_S, what="it is drained")
+            await world.is_at(target)
             await world.check(world.acknowledged())
             await world.ask("DELETE", f"/machines/{source}/drain")
 
@@ -205,8 +210,8 @@ async def test_a_lost_machine_costs_what_came_after_the_snapshot(packages: Path)
         await world.program(source).kill()
         for process in world.engine.processes_of("rce_container.environment"):
             process.kill()
-        found = await world.writes()
-        assert found["machine"] == target
+        await world.is_at(target)
+        await world.writes()
         with sqlite3.connect(world.folder(target) / "rows.sqlite") as database:
             assert database.execute("pragma integrity_check").fetchone() == ("ok",)
         database.close()
