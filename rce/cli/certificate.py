@@ -71,7 +71,7 @@ def revoke(
     typer.echo(f"revoked {name} (serial number {serials}) in {folder.revoked}")
     typer.echo(
         "a master that uses this folder refuses it from now on; copy the file to the folders of other"
-        " machines. A machine needs a new secret too: rce secret new"
+        " machines. If the machine was stolen, replace the secret too: rce secret rotate"
     )
 
 
