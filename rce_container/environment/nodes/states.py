@@ -6,6 +6,7 @@ A life that did not get its snapshot is not saved: what it would save replaced t
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 from typing import TYPE_CHECKING, Protocol
 
@@ -80,14 +81,17 @@ class NodeStates:
         feed(Restored(spec.tag, life, fault))
         if fault:
             return
+        service = _global(spec, services.save)
         saver = self._savers[spec.tag] = _Saver(
             self._graph,
             self._vault,
             spec.tag,
-            _global(spec, services.save),
+            service,
             lambda text: feed(Unsaved(spec.tag, life, text)),
         )
         try:
+            with contextlib.suppress(GraphError):  # the first save tells it
+                await self._graph.wait_for_service(service, SERVICE_WITHIN_S)
             pauses, pause = RETRY.start(), services.every
             while True:
                 await asyncio.sleep(pause)
