@@ -13,7 +13,7 @@ from typing import Any
 import aiohttp
 import psutil
 import pytest
-from support.demo import LIGHT, Demo, kill_program, run_headless, running_demo
+from support.demo import Demo, kill_program, run_headless, running_demo
 from support.engine import engine_processes, until
 from support.ports import free_port
 
@@ -62,7 +62,7 @@ async def test_single_with_a_real_roscore() -> None:
 
 
 async def test_the_page_of_a_single_core_and_its_end() -> None:
-    options = ("--mode", "single", *LIGHT, "--robots", 1, "--core-port", free_port(), "--no-auto")
+    options = ("--mode", "single", "--robots", 1, "--core-port", free_port(), "--no-auto")
     async with running_demo(*options) as demo, aiohttp.ClientSession() as session:
         station = StationClient(session, demo.page)
 
@@ -132,7 +132,7 @@ async def test_machines_share_only_the_synced_topics() -> None:
 @pytest.mark.parametrize("mode", ["single", "multi"])
 async def test_a_killed_planner_and_a_killed_move_client_come_back(mode: str) -> None:
     """They do until the demo itself is killed, which leaves no program."""
-    options = ("--mode", mode, *LIGHT, "--robots", 2, "--core-port", free_port(), "--no-auto")
+    options = ("--mode", mode, "--robots", 2, "--core-port", free_port(), "--no-auto")
     async with running_demo(*options, "--machines", "ports") as demo, aiohttp.ClientSession() as session:
         station = StationClient(session, demo.page)
         await until(lambda: _is(_state(station), "idle"), timeout=WAIT_S, what="the robot is in its place")
