@@ -32,8 +32,8 @@ from rce_master.http.routes import Services
 from rce_master.node_states import NodeStateServer
 from rce_master.packages.contents import ARCHIVES, ContentStore
 from rce_master.packages.keeper import CONTENT, ContentKeeper
+from rce_master.packages.request_key import PATH, SNAPSHOTS_PATH
 from rce_master.packages.service import PackageService
-from rce_master.packages.transfer import PATH, SNAPSHOTS_PATH
 from rce_master.quotas import Quotas
 from rce_master.reconciler import Reconciler
 from rce_master.snapshots.service import SNAPSHOT, SnapshotService

@@ -30,9 +30,9 @@ from rce_master.leadership.registry import MasterRegistry
 from rce_master.master import Master
 from rce_master.packages.contents import ARCHIVES, ContentStore
 from rce_master.packages.copies import ArchiveCopies
+from rce_master.packages.request_key import PATH, SNAPSHOTS_PATH, RequestKey
 from rce_master.packages.request_key import PURPOSE as ARCHIVE_PURPOSE
-from rce_master.packages.request_key import RequestKey
-from rce_master.packages.transfer import CONNECT_S, PATH, SNAPSHOTS_PATH, ArchiveClient
+from rce_master.packages.transfer import CONNECT_S, ArchiveClient
 from rce_master.snapshots.service import SNAPSHOT, SNAPSHOTS
 from rce_master.store.etcd import EtcdClient
 from rce_master.store.etcd.exceptions import EtcdAwayError, NoQuorumError

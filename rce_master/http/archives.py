@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 from aiohttp import hdrs, web
 
 from rce_master.exceptions import MasterError
-from rce_master.packages.request_key import HEADER
-from rce_master.packages.transfer import PATH
+from rce_master.packages.request_key import HEADER, PATH
 
 if TYPE_CHECKING:
     from collections.abc import Callable

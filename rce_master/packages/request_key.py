@@ -1,9 +1,12 @@
-"""The header by which the leading master proves itself when it asks a stand-by about archives. Pure."""
+"""Where a stand-by takes archives, and the header by which the leading master proves itself there. Pure."""
 
 from __future__ import annotations
 
 import hmac
 
+PATH = "/archives"
+SNAPSHOTS_PATH = "/snapshots"
+"""The same for parts of snapshots of volumes."""
 HEADER = "RCE-Master"
 """``TERM MAC``, of the method, the path and the term of the leader that asks."""
 PURPOSE = "archives between masters"

@@ -15,7 +15,7 @@ from aiohttp import hdrs
 
 from rce.packages import DEFAULT_LIMITS
 from rce.tls import CertificateError, explain_to_client
-from rce_master.packages.request_key import HEADER
+from rce_master.packages.request_key import HEADER, PATH
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from rce_master.packages.request_key import RequestKey
     from rce_master.store.etcd.layout import OtherMaster
 
-PATH = "/archives"
-SNAPSHOTS_PATH = "/snapshots"
-"""The same for parts of snapshots of volumes."""
 CONNECT_S = 2.0
 ANSWER_S = 15.0
 """How long a stand-by may take for an answer, beside the transfer."""

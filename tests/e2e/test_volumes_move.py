@@ -72,6 +72,20 @@ class Moved:
         except (CliError, aiohttp.ClientError, OSError):
             return None
 
+    async def move(self, machine: str) -> None:
+        """Ask for a move, as soon as the files of the move before are removed there."""
+
+        async def is_accepted() -> bool:
+            try:
+                await self.ask("PUT", "/containers/C/machine", {"machine": machine})
+            except ApiError as error:
+                if "its former files are still being removed there" not in str(error):
+                    raise
+                return False
+            return True
+
+        await until(is_accepted, timeout=WAIT_S, what=f"the container may move to {machine}")
+
     async def shown(self) -> dict[str, Any] | None:
         found = await self.ask("GET", "/containers")
         return None if found is None else next(one for one in found["containers"] if one["tag"] == "C")
@@ -155,7 +169,7 @@ async def test_moves_and_drains_keep_every_row(packages: Path) -> None:
     async with moved(packages) as world:
         for _ in range(2):
             target = await world.other()
-            await world.ask("PUT", "/containers/C/machine", {"machine": target})
+            await world.move(target)
             found = await world.writes()
             assert found["machine"] == target
             await world.check(world.acknowledged())
@@ -183,7 +197,7 @@ async def test_kills_at_any_moment_keep_every_row(packages: Path, victim: str) -
         for moment in (0.0, *(moments.uniform(0.0, 1.5) for _ in range(4))):
             target = await world.other()
             source = "machine1" if target == "machine0" else "machine0"
-            await world.ask("PUT", "/containers/C/machine", {"machine": target})
+            await world.move(target)
             await asyncio.sleep(moment)  # the moment of the fault
             program = VICTIMS[victim](world, source, target)
             await program.kill()
