@@ -238,7 +238,7 @@ async def test_restarted_master_keeps_state_clears_begun_work(
     (folder / "incoming" / "half").write_text("x")
     (folder / ("0" * 64)).write_text("nobody knows it")
     async with run_site(store, state_dir=tmp_path / "master") as site:
-        await until(lambda: stored(tmp_path) == kept and not (folder / "incoming").exists())
+        await until(lambda: stored(tmp_path) == kept and not (folder / "incoming" / "half").exists())
         assert [one["version"] for one in (await site.api("GET", "/packages"))["packages"]] == ["1.0"]
 
 
