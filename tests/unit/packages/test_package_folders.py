@@ -81,7 +81,7 @@ def test_a_ros_package_is_one_too(tmp_path: Path) -> None:
 
 def test_the_shipped_example_can_be_pushed() -> None:
     source = look_into(examples_dir() / "Test", "1.0")
-    assert source.contents.executables == ("paramTest.py", "stringEcho.py")
+    assert source.contents.executables == ("counter.py", "paramTest.py", "stringEcho.py")
     assert not any("__pycache__" in path for path in source.tree.entries)
 
 
