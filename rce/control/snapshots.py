@@ -113,12 +113,12 @@ def decode_manifest(data: bytes) -> Manifest:
     """Read a manifest, and check that its files can be made in a folder and nowhere else.
 
     Raises:
-        SnapshotError: It is no manifest, or names what may not be made.
+        SnapshotError: It is not a manifest, or names what may not be made.
     """
     try:
         manifest = msgspec.msgpack.decode(data, type=Manifest)
     except msgspec.MsgspecError as error:
-        raise SnapshotError(f"it is no manifest: {error}") from error
+        raise SnapshotError(f"it is not a manifest: {error}") from error
     if len(manifest.entries) > MAX_ENTRIES:
         raise SnapshotError(f"it names more than {MAX_ENTRIES} files")
     seen: set[bytes] = set()

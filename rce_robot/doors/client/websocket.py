@@ -259,7 +259,7 @@ class RobotSocket(GuardedConnection):
             self._collect(event, data)
 
     def send_data(self) -> None:
-        """Write the library's frames, without answers to pings that nobody will read."""
+        """Write the library's frames, without answers to pings that will not be read."""
         self.protocol.writes = self._pongs.take(self.protocol.writes, writable=not self.paused)
         super().send_data()
 

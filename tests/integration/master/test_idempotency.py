@@ -37,7 +37,7 @@ REQUESTS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 UNKEYED = {
     "/login": "a login whose answer is lost ends by itself",
-    "/audit": "the log is no part of the state",
+    "/audit": "the log is not part of the state",
 }
 
 
