@@ -75,7 +75,7 @@ def test_pieces_fit_the_size() -> None:
 
 @pytest.mark.parametrize("data", [b"", b"{}", b"\x00", msgspec.msgpack.encode({"entries": [{"type": "x"}]})])
 def test_garbage_is_refused(data: bytes) -> None:
-    with pytest.raises(SnapshotError, match="no manifest"):
+    with pytest.raises(SnapshotError, match="not a manifest"):
         decode_manifest(data)
 
 
