@@ -24,6 +24,7 @@ functions marked with :func:`helper`. They must not call themselves: numba's cac
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import shutil
@@ -205,20 +206,16 @@ def _jit(function: Callable[..., Any], signatures: list[str] | None) -> Any:
     import numba
 
     assert isinstance(function, FunctionType)
-    names = {
-        name: _compiled_helper(value)
-        for name in function.__code__.co_names
-        if (value := function.__globals__.get(name)) is not None
-        and isinstance(value, FunctionType)
-        and value in _helpers
-    }
+    helpers = _helpers_of(function)
+    names = {name: _compiled_helper(value) for name, value in helpers.items()}
     loop = function
     if names:
         loop = FunctionType(
             function.__code__, {**function.__globals__, **names}, function.__name__, function.__defaults__
         )
         loop.__module__ = function.__module__
-        loop.__qualname__ = function.__qualname__
+        # numba's cache looks at the loop's own file only: another helper is another name there.
+        loop.__qualname__ = f"{function.__qualname__}_{_digest(helpers.values())}"
     try:
         return numba.njit(signatures, cache=True, nogil=True)(loop) if signatures else numba.njit(loop)
     except RuntimeError as error:  # no folder can be written to for the cache
@@ -231,3 +228,29 @@ def _compiled_helper(function: FunctionType) -> Any:
     if _helpers[function] is None:
         _helpers[function] = _jit(function, None)
     return _helpers[function]
+
+
+def _helpers_of(function: FunctionType) -> dict[str, FunctionType]:
+    """Return the helpers that a function calls, by the name that it calls them."""
+    return {
+        name: value
+        for name in function.__code__.co_names
+        if isinstance(value := function.__globals__.get(name), FunctionType) and value in _helpers
+    }
+
+
+def _digest(helpers: Iterable[FunctionType]) -> str:
+    """Return a text that is another one if a helper, or what it calls or reads, is another one."""
+    content = hashlib.sha256()
+    waiting, seen = list(helpers), set[FunctionType]()
+    while waiting:
+        function = waiting.pop()
+        if function in seen:
+            continue
+        seen.add(function)
+        code, called = function.__code__, _helpers_of(function)
+        read = [(name, function.__globals__.get(name)) for name in code.co_names if name not in called]
+        constants = [(name, value) for name, value in read if isinstance(value, (bool, int, float, tuple))]
+        content.update(repr((code.co_name, code.co_code, code.co_consts, code.co_names, constants)).encode())
+        waiting += called.values()
+    return content.hexdigest()[:16]

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,17 +16,67 @@ from rce_fleet.compiled import copy_compiled
 from rce_fleet.offline.compile_command import MODULES
 
 ROOT = Path(__file__).parents[3]
+LOOP = """
+from rce_fleet.compiled import kernel
+from the_helper import plus
+
+@kernel("int64(int64)", numpy=lambda value: -1)
+def twice_plus(value):
+    return plus(plus(value))
+"""
+HELPER = """
+from rce_fleet.compiled import helper
+
+STEP = {step}
+
+@helper
+def plus(value):
+    return value {sign} STEP
+"""
 COMPILE = """
 import sys
 from pathlib import Path
 from rce_fleet import compiled
 compiled.INSTALLED = Path(sys.argv[1])
-from rce_fleet.navigation.planners import cost_to_go
+from the_loop import twice_plus
 made = compiled.compile_for_all() if sys.argv[2] == "install" else compiled.compile_kernels()
 assert made
-loops = [kernel.compile() for kernel in compiled._kernels]
-print(sum(sum(loop.stats.cache_hits.values()) for loop in loops), len(loops))
+loop = twice_plus.compile()
+print(sum(loop.stats.cache_hits.values()), twice_plus(10))
 """
+
+
+@dataclass
+class Cache:
+    """A loop and its helper in two files, and the folders that they are compiled into."""
+
+    folder: Path
+
+    def write_helper(self, *, step: int, sign: str = "+") -> None:
+        (self.folder / "the_helper.py").write_text(HELPER.format(step=step, sign=sign))
+
+    def run(self, what: str, own: Path | None = None) -> tuple[int, int]:
+        """Compile or use the loop in a process; return how often the cache had it, and what it answers."""
+        env = {
+            key: value for key, value in os.environ.items() if key not in ("NUMBA_CACHE_DIR", "RCE_COMPILED")
+        }
+        env |= {"PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1"}
+        if own is not None:
+            env["NUMBA_CACHE_DIR"] = str(own)
+        argv = [sys.executable, "-c", COMPILE, str(self.folder / "installed"), what]
+        told = subprocess.run(argv, capture_output=True, text=True, check=True, env=env, cwd=ROOT)
+        hits, answer = told.stdout.split()
+        return int(hits), int(answer)
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Cache:
+    if find_spec("numba") is None:
+        pytest.skip("numba is missing (pip install rce[compiled])")
+    made = Cache(tmp_path)
+    (tmp_path / "the_loop.py").write_text(LOOP)
+    made.write_helper(step=1)
+    return made
 
 
 def test_every_module_with_loops_is_compiled() -> None:
@@ -57,22 +108,19 @@ def test_only_what_is_new_is_copied(tmp_path: Path) -> None:
     assert copies == {"old.nbc": "target", "new.nbi": "source", "first.nbc": "source"}
 
 
-@pytest.mark.skipif(find_spec("numba") is None, reason="numba is missing (pip install rce[compiled])")
-def test_a_process_with_its_own_folder_compiles_nothing(tmp_path: Path) -> None:
-    def run(what: str, own: Path | None) -> tuple[int, int]:
-        env = {
-            key: value for key, value in os.environ.items() if key not in ("NUMBA_CACHE_DIR", "RCE_COMPILED")
-        }
-        if own is not None:
-            env["NUMBA_CACHE_DIR"] = str(own)
-        argv = [sys.executable, "-c", COMPILE, str(tmp_path / "installed"), what]
-        hits, loops = subprocess.run(argv, capture_output=True, text=True, check=True, env=env).stdout.split()
-        return int(hits), int(loops)
+def test_a_process_with_its_own_folder_compiles_nothing(cache: Cache, tmp_path: Path) -> None:
+    assert cache.run("install") == (0, 12)
+    assert cache.run("use", tmp_path / "own") == (1, 12)
+    assert cache.run("use") == (1, 12)
 
-    assert run("install", None)[0] == 0
-    hits, loops = run("use", tmp_path / "own")
-    assert hits >= loops > 0
-    assert run("use", None)[0] >= loops
+
+def test_a_changed_helper_is_compiled_anew(cache: Cache) -> None:
+    """numba itself looks at the file of the loop only."""
+    assert cache.run("install") == (0, 12)
+    cache.write_helper(step=2)
+    assert cache.run("use") == (0, 14)
+    cache.write_helper(step=2, sign="-")
+    assert cache.run("use") == (0, 6)
 
 
 def test_looking_for_numba_does_not_import_it() -> None:
