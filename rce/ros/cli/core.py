@@ -22,7 +22,9 @@ GOODBYE_S = 0.1
 
 @from_file("core")
 def core(
-    port: Annotated[int, typer.Option(help="Port to listen on; 0: any free port.")] = DEFAULT_PORT,
+    port: Annotated[
+        int, typer.Option("--port", "-p", help="Port to listen on; 0: any free port.")
+    ] = DEFAULT_PORT,
     bind: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for all.")] = "127.0.0.1",
     advertised: Annotated[
         str, typer.Option(help="Host name in the core's URI; default: the bound address.")
