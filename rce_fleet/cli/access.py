@@ -11,13 +11,15 @@ from typing import Annotated, Any
 import typer
 
 from rce.tls import CertificateError, client_context
-from rce_fleet.client import FleetClient
+from rce_fleet.client import ApiError, FleetClient
 from rce_fleet.exceptions import StationError
 from rce_master.cli import credentials
 from rce_master.cli.exceptions import CliError, NotLoggedInError
 
 STATION = "http://127.0.0.1:9080"
 TOKEN_VARIABLE = "RCE_STATION_TOKEN"  # noqa: S105 - its name
+
+_UNAUTHORIZED = 401
 
 _TOKEN: ContextVar[str] = ContextVar("token", default="")
 Token = Annotated[
@@ -45,7 +47,8 @@ def set_token(token: str) -> None:
 def do(station: str, work: Work) -> None:
     """Run a command with a client; print why if it fails.
 
-    The token is ``--token`` or ``RCE_STATION_TOKEN``, or else that of ``rce login``.
+    The token is ``--token`` or ``RCE_STATION_TOKEN``, or else that of ``rce login``; none if the station
+    refuses that one.
 
     Raises:
         typer.Exit: It failed, with code 1, or was interrupted, with code 130.
@@ -62,13 +65,29 @@ def do(station: str, work: Work) -> None:
 
 
 async def _do(station: str, work: Work, token: str) -> None:
-    authority = ""
     try:
         login = credentials.load()
     except NotLoggedInError:
-        pass  # a station on loopback asks for no login
-    else:
-        token, authority = token or login.token, login.authority
+        await _work(station, work, token, "")  # a station on loopback asks for no login
+        return
+    try:
+        await _work(station, work, token or login.token, login.authority)
+    except ApiError as refused:
+        if token or refused.status != _UNAUTHORIZED:
+            raise
+        # The login is at another engine, or has ended; a station on loopback does not need it.
+        try:
+            await _work(station, work, "", login.authority)
+        except ApiError as error:
+            if error.status != _UNAUTHORIZED:
+                raise
+            raise CliError(
+                f"the login at {login.url} is not valid at {station}: run rce login with the URL of "
+                f"the station's engine, or give a token ({TOKEN_VARIABLE})"
+            ) from None
+
+
+async def _work(station: str, work: Work, token: str, authority: str) -> None:
     tls = client_context(Path(authority) if authority else None)
     async with FleetClient(station, token, tls=tls, attempts=3) as client:
         await work(client)

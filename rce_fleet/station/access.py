@@ -46,7 +46,7 @@ class AccessControl:
         token = token_of(request)
         user = await self._authenticator.authenticate(token)
         if user is None:
-            return self._unauthorized(request)
+            return self._unauthorized(request, token)
         if not user.may_view:
             return problem(403, f"user {user.name!r} has the role {user.role}, which may not see this fleet")
         request[USER], request[TOKEN] = user, token
@@ -88,13 +88,15 @@ class AccessControl:
         if self.on_audit is not None:
             self.on_audit(request[USER].name, action)
 
-    def _unauthorized(self, request: web.Request) -> web.StreamResponse:
+    def _unauthorized(self, request: web.Request, token: str) -> web.StreamResponse:
         if request.path == "/" and self._authenticator.has_logins:
             return web.Response(status=303, headers={hdrs.LOCATION: "/login"})
         if self._authenticator.has_logins:
             text = "log in at /login, or send a token (rce token) as 'Authorization: Bearer TOKEN'"
         else:
             text = "send the station's token: as 'Authorization: Bearer TOKEN', or once as ?token=TOKEN"
+        if token:
+            text = f"the token is not valid here (it may have ended, or be of another engine): {text}"
         return problem(401, text, {hdrs.WWW_AUTHENTICATE: "Bearer"})
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import io
 import json
+import os
+import sys
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -21,6 +23,7 @@ from support.managed_fleet import ManagedFleet, managed_fleet
 from rce_fleet.api.tasks import StopModel, TaskChange, TaskRequest
 from rce_fleet.api.webhooks import SIGNATURE, TIMESTAMP, WebhookRequest, verify
 from rce_fleet.client import ApiError, EventsRestartedError, FleetClient, NotFoundError, OutdatedError
+from rce_fleet.station.authentication import StationUser
 
 GO = {"stops": [{"cell": 9}]}
 
@@ -143,8 +146,42 @@ async def check_requests(fleet: ManagedFleet) -> None:
             assert (status, "may only see" in said["error"]) == (403, True)
             assert (await ask(viewer, "GET", "/webhooks"))[0] == 403
         async with session_of(url, "stranger") as stranger:
-            assert (await ask(stranger, "GET", "/tasks"))[0] == 401
+            status, said, _ = await ask(stranger, "GET", "/tasks")
+            assert (status, "not valid here" in said["error"]) == (401, True)
         assert (await ask(erp, "GET", "/webhooks"))[0] == 403
+
+
+class LoopbackAuthenticator(RoleAuthenticator):
+    """An engine's users, and no login for requests without a token."""
+
+    async def authenticate(self, token: str) -> StationUser | None:
+        return await super().authenticate(token or "operator")
+
+
+async def run_command(url: str, login: Path) -> tuple[int | None, str]:
+    """Run ``rce fleet robots`` with a login; return its exit code, and what it prints."""
+    env = {name: text for name, text in os.environ.items() if name != "RCE_STATION_TOKEN"}
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", "from rce.cli import main; main()", "fleet", "robots"),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+        env={**env, "RCE_STATION": url, "RCE_LOGIN_FILE": str(login)},
+    )
+    told, _ = await process.communicate()
+    return process.returncode, told.decode()
+
+
+async def check_logins_of_the_command(fleet: ManagedFleet, login: Path) -> None:
+    there = {"url": "http://other.example.org:9000/", "user": "ada", "expires": time.time() + 3600}
+    for token, refused in (("viewer", False), ("stranger", True)):
+        login.write_text(json.dumps({**there, "token": token}))
+        async with fleet_station(fleet.core.uri, authenticator=RoleAuthenticator()) as url:
+            code, told = await run_command(url, login)
+            expected = "the login at http://other.example.org:9000/ is not valid" if refused else "Robot2"
+            assert (code, expected in told) == (int(refused), True), told
+        async with fleet_station(fleet.core.uri, authenticator=LoopbackAuthenticator()) as url:
+            code, told = await run_command(url, login)
+            assert (code, "Robot2" in told) == (0, True), told
 
 
 async def check_events(fleet: ManagedFleet) -> None:
@@ -262,6 +299,7 @@ async def test_requests_reach_the_manager(tmp_path: Path) -> None:
         await until_all_are_there(fleet)
         await check_requests(fleet)
         await check_client(fleet)
+        await check_logins_of_the_command(fleet, tmp_path / "login.json")
 
 
 async def test_events_reach_streams_and_webhooks(tmp_path: Path) -> None:
