@@ -126,7 +126,8 @@ class App:
         limit, why = await asyncio.to_thread(find_volume_limit, runtime)
         if why:
             _log.info("volumes are folders that are watched: %s", why)
-        offers = await asyncio.to_thread(find_offers, runtime, runtimes.values())
+        others = runtimes.values() if self.settings.offer_images else ()
+        offers = await asyncio.to_thread(find_offers, runtime, others)
         await asyncio.to_thread(_compile_engine)
         keep = self.settings.log_days, self.settings.log_space
         masters = self._masters(tls)

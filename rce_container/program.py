@@ -48,6 +48,7 @@ def run(engine: EngineSettings, *, end: bool = False, check: bool = False, verbo
         tls=engine.tls.enabled,
         grace=own.grace,
         images=own.images,
+        offer_images=own.offer_images,
         slots=own.slots,
         slot_memory=own.slot_memory,
         slot_processes=own.slot_processes,

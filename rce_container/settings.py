@@ -53,6 +53,8 @@ class ContainerSettings:
     """Whether links by TCP must be in TLS."""
     images: tuple[str, ...] = ()
     """See :class:`rce_container.runtimes.podman.PodmanRuntime`."""
+    offer_images: bool = True
+    """Whether containers may have an image, whatever the runtime of the others is."""
     home_bytes: int = 256 * MEGABYTE
     """Size of a container's home, which is in memory."""
     first_uid: int = FIRST_UID

@@ -159,9 +159,9 @@ _CHECKS: dict[str, tuple[Callable[[], bool], str]] = {
         lambda: shutil.which("systemd-analyze") is not None,
         "systemd-analyze is missing (Debian: systemd)",
     ),
-    "debootstrap": (
-        lambda: shutil.which("debootstrap", path=f"{os.environ['PATH']}:/usr/sbin") is not None,
-        "debootstrap is missing (Debian: debootstrap)",
+    "venv packages": (
+        lambda: _runs("dpkg-query", "--status", "python3", "python3-venv", "ca-certificates"),
+        "Debian's packages of Python are not installed (Debian: python3 python3-venv ca-certificates)",
     ),
     "root": (lambda: os.geteuid() == 0, "needs root"),
     "cgroups": (_can_limit, "no cgroup can be made here (needs root, or a delegated subtree)"),

@@ -131,6 +131,14 @@ class ContainerSettings(Section, frozen=True, kw_only=True):
             option="image",
         ),
     ] = ()
+    offer_images: Annotated[
+        bool,
+        Setting(
+            "Offer containers with an image beside those of `runtime`, if podman works here; the program"
+            " tries it at its start.",
+            up="offer-images",
+        ),
+    ] = True
     slots: Annotated[
         int,
         Meta(ge=0),

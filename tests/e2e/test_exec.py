@@ -8,12 +8,12 @@ import json
 import os
 import signal
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 
 import aiohttp
 import msgspec
 import psutil
 import pytest
+import pytest_asyncio
 from support.engine import Engine, running_engine, until
 from support.owner import Owner
 from support.stranger import stranger
@@ -23,20 +23,28 @@ from rce.control.execution import Command
 RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]
 NODE = {"containerTag": "box", "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(180)]
+IN_PROCESSES = pytest.mark.parametrize("shared_engine", ["process"], indirect=True, scope="module")
+
+pytestmark = [pytest.mark.e2e, pytest.mark.timeout(180), pytest.mark.asyncio(loop_scope="module")]
 
 
-@asynccontextmanager
-async def box(runtime: str = "process") -> AsyncIterator[tuple[Engine, Owner]]:
+@pytest_asyncio.fixture(scope="module", loop_scope="module", params=RUNTIMES)
+async def shared_engine(request: pytest.FixtureRequest) -> AsyncIterator[Engine]:
     """An engine with a container ``box`` in which a node runs."""
-    async with running_engine(runtime=runtime) as engine:
-        owner = Owner(engine, "testUser")
-        await owner.login()
+    async with running_engine(runtime=request.param) as engine:
         async with stranger(engine.url, robot="r") as robot:
             await robot.send("CC", {"containerTag": "box"})
             await robot.send("CN", {"addNodes": [NODE]})
             await until(lambda: _runs(engine), timeout=60, what="the node runs")
-        yield engine, owner
+        yield engine
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def owner(shared_engine: Engine) -> Owner:
+    """The owner of ``box``, logged in."""
+    made = Owner(shared_engine, "testUser")
+    await made.login()
+    return made
 
 
 def _runs(engine: Engine) -> bool:
@@ -61,159 +69,152 @@ async def execute(owner: Owner, *words: str, typed: bytes = b"") -> tuple[int, b
     return process.returncode, output, error
 
 
-@pytest.mark.parametrize("runtime", RUNTIMES)
-async def test_commands_run_with_their_streams_and_exit_codes(runtime: str) -> None:
-    async with box(runtime) as (engine, owner):
-        assert await execute(owner, "box", "--", "sh", "-c", "echo out; echo err >&2; exit 7") == (
-            7,
-            b"out\n",
-            b"err\n",
-        )
-        data = os.urandom(3_000_000)
-        assert await execute(owner, "box", "cat", typed=data) == (0, data, b"")
-        code, _, error = await execute(owner, "box", "nosuch")
-        assert (code, error) == (127, b"rce: nosuch: No such file or directory\n")
-        assert (await execute(owner, "box", "sh", "-c", "kill -9 $$"))[0] == 137
-        code, _, error = await execute(owner, "nobox", "ls")
-        assert (code, error) == (125, b"rce: there is no container 'nobox'\n")
-        code, output, _ = await execute(owner, "-t", "box", "sh", "-c", "test -t 0 && stty size")
-        assert code == 0
-        assert len(output.split()) == 2
-        # What a command leaves in the background ends with it.
-        code, _, _ = await execute(owner, "box", "sh", "-c", "sleep 4321 & sleep 4321 & echo")
-        assert code == 0
-        await until(lambda: not runs(engine, "sleep 4321"), what="nothing is left of the command")
-        # The pipe is not read: the command waits, and neither it nor the engine keeps much of what it writes.
-        stuck = await owner.start("exec", "box", "yes")
-        assert stuck.stdout is not None
-        await stuck.stdout.read(1)
-        stuck.kill()
-        await stuck.communicate()
-        await until(lambda: not runs(engine, "yes"), what="the command ended with its user")
+async def test_commands_run_with_their_streams_and_exit_codes(shared_engine: Engine, owner: Owner) -> None:
+    assert await execute(owner, "box", "--", "sh", "-c", "echo out; echo err >&2; exit 7") == (
+        7,
+        b"out\n",
+        b"err\n",
+    )
+    data = os.urandom(3_000_000)
+    assert await execute(owner, "box", "cat", typed=data) == (0, data, b"")
+    refused = await owner.run("exec", "box", "nosuch")
+    assert refused == (127, "rce: nosuch: No such file or directory\n")
+    assert (await owner.run("exec", "box", "sh", "-c", "kill -9 $$"))[0] == 137
+    assert await owner.run("exec", "nobox", "ls") == (125, "rce: there is no container 'nobox'\n")
+    code, output, _ = await execute(owner, "-t", "box", "sh", "-c", "test -t 0 && stty size")
+    assert code == 0
+    assert len(output.split()) == 2
+    # What a command leaves in the background ends with it.
+    await owner.rce("exec", "box", "sh", "-c", "sleep 4321 & sleep 4321 & echo")
+    await until(lambda: not runs(shared_engine, "sleep 4321"), what="nothing is left of the command")
+    # The pipe is not read: the command waits, and neither it nor the engine keeps much of what it writes.
+    stuck = await owner.start("exec", "box", "yes")
+    assert stuck.stdout is not None
+    await stuck.stdout.read(1)
+    stuck.kill()
+    await stuck.communicate()
+    await until(lambda: not runs(shared_engine, "yes"), what="the command ended with its user")
 
 
-@pytest.mark.parametrize("runtime", RUNTIMES)
-async def test_a_shell_in_a_terminal(runtime: str) -> None:
-    async with box(runtime) as (engine, owner):
-        ours, theirs = os.openpty()
-        shell = await owner.start("exec", "box", stdin=theirs, stdout=theirs, stderr=theirs)
-        os.close(theirs)
-        loop = asyncio.get_running_loop()
-        seen, ended = bytearray(), asyncio.Event()
+async def test_a_shell_in_a_terminal(shared_engine: Engine, owner: Owner) -> None:
+    ours, theirs = os.openpty()
+    shell = await owner.start("exec", "box", stdin=theirs, stdout=theirs, stderr=theirs)
+    os.close(theirs)
+    loop = asyncio.get_running_loop()
+    seen, ended = bytearray(), asyncio.Event()
 
-        def read() -> None:
-            try:
-                data = os.read(ours, 65536)
-            except OSError:  # the last process closed it
-                data = b""
-            seen.extend(data)
-            if not data:
-                loop.remove_reader(ours)
-                ended.set()
+    def read() -> None:
+        try:
+            data = os.read(ours, 65536)
+        except OSError:  # the last process closed it
+            data = b""
+        seen.extend(data)
+        if not data:
+            loop.remove_reader(ours)
+            ended.set()
 
-        loop.add_reader(ours, read)
-        os.write(ours, b"echo $((6 * 7))x\n")
-        await until(lambda: b"42x" in seen, timeout=30, what="an answer")
-        os.write(ours, b"sleep 5432\n")
-        await until(lambda: runs(engine, "sleep 5432"), what="the shell's command runs")
-        os.write(ours, b"\x03")  # Ctrl-C is the command's, not the tool's
-        await until(lambda: not runs(engine, "sleep 5432"), what="the shell's command is interrupted")
-        os.write(ours, b"exit 3\n")
-        assert await asyncio.wait_for(shell.wait(), 60) == 3
-        loop.remove_reader(ours)
-        os.close(ours)
+    loop.add_reader(ours, read)
+    os.write(ours, b"echo $((6 * 7))x\n")
+    await until(lambda: b"42x" in seen, timeout=30, what="an answer")
+    os.write(ours, b"sleep 5432\n")
+    await until(lambda: runs(shared_engine, "sleep 5432"), what="the shell's command runs")
+    os.write(ours, b"\x03")  # Ctrl-C is the command's, not the tool's
+    await until(lambda: not runs(shared_engine, "sleep 5432"), what="the shell's command is interrupted")
+    os.write(ours, b"exit 3\n")
+    assert await asyncio.wait_for(shell.wait(), 60) == 3
+    loop.remove_reader(ours)
+    os.close(ours)
 
 
-async def test_signals_reach_the_command() -> None:
-    async with box() as (engine, owner):
-        script = "trap 'echo caught; exit 9' INT; echo ready; while :; do sleep 0.1; done"
-        process = await owner.start("exec", "box", "--", "sh", "-c", script)
+@IN_PROCESSES
+async def test_signals_reach_the_command(shared_engine: Engine, owner: Owner) -> None:
+    script = "trap 'echo caught; exit 9' INT; echo ready; while :; do sleep 0.1; done"
+    process = await owner.start("exec", "box", "--", "sh", "-c", script)
+    assert process.stdout is not None
+    assert await process.stdout.readline() == b"ready\n"
+    process.send_signal(signal.SIGINT)
+    output, _ = await process.communicate()
+    assert (process.returncode, output) == (9, b"caught\n")
+    killed = await owner.start("exec", "box", "sleep", "6543")
+    await until(lambda: runs(shared_engine, "sleep 6543"), what="the command runs")
+    killed.kill()
+    await killed.communicate()
+    await until(lambda: not runs(shared_engine, "sleep 6543"), what="it ended with its user")
+
+
+async def test_the_graph_of_a_container_is_seen_from_outside(owner: Owner) -> None:
+    assert "/stringEchoReq" in await owner.rce("topic", "list", "-c", "box")
+    echo = await owner.start("topic", "echo", "/stringEchoResp", "-n", "1", "--json", "-c", "box")
+    assert echo.stdout is not None
+    published = asyncio.create_task(echo.stdout.readline())
+    while not published.done():
+        await owner.rce("topic", "pub", "-c", "box", "/stringEchoReq", "std_msgs/String", "hi")
+    assert json.loads(await published) == {"data": "hi"}
+    await echo.communicate()
+    assert "x" in await owner.rce("service", "call", "-c", "box", "/stringEchoService", "{data: x}")
+    await owner.rce("param", "set", "-c", "box", "/speed", "1.5")
+    assert await owner.rce("param", "get", "-c", "box", "/speed") == "1.5\n"
+    assert "-c CONTAINER" in await owner.rce("topic", "hz", "--help")
+    assert "no node publishes" in await owner.rce("topic", "echo", "-c", "box", "/x", fails=True)
+
+
+@IN_PROCESSES
+async def test_parts_that_die_end_the_command_and_say_so(shared_engine: Engine, owner: Owner) -> None:
+    for victim in (shared_engine.master, shared_engine.container):
+        await until(lambda: _again(owner), timeout=60, what="commands run")
+        process = await owner.start("exec", "box", "sh", "-c", "echo up; exec sleep 7654")
         assert process.stdout is not None
-        assert await process.stdout.readline() == b"ready\n"
-        process.send_signal(signal.SIGINT)
-        output, _ = await process.communicate()
-        assert (process.returncode, output) == (9, b"caught\n")
-        killed = await owner.start("exec", "box", "sleep", "6543")
-        await until(lambda: runs(engine, "sleep 6543"), what="the command runs")
-        killed.kill()
-        await killed.communicate()
-        await until(lambda: not runs(engine, "sleep 6543"), what="it ended with its user")
-
-
-@pytest.mark.parametrize("runtime", RUNTIMES)
-async def test_the_graph_of_a_container_is_seen_from_outside(runtime: str) -> None:
-    async with box(runtime) as (_, owner):
-        assert "/stringEchoReq" in await owner.rce("topic", "list", "-c", "box")
-        echo = await owner.start("topic", "echo", "/stringEchoResp", "-n", "1", "--json", "-c", "box")
-        assert echo.stdout is not None
-        published = asyncio.create_task(echo.stdout.readline())
-        while not published.done():
-            await owner.rce("topic", "pub", "-c", "box", "/stringEchoReq", "std_msgs/String", "hi")
-        assert json.loads(await published) == {"data": "hi"}
-        await echo.communicate()
-        assert "x" in await owner.rce("service", "call", "-c", "box", "/stringEchoService", "{data: x}")
-        await owner.rce("param", "set", "-c", "box", "/speed", "1.5")
-        assert await owner.rce("param", "get", "-c", "box", "/speed") == "1.5\n"
-        assert "-c CONTAINER" in await owner.rce("topic", "hz", "--help")
-        assert "no node publishes" in await owner.rce("topic", "echo", "-c", "box", "/x", fails=True)
-
-
-async def test_parts_that_die_end_the_command_and_say_so() -> None:
-    async with box() as (engine, owner):
-        for victim in (engine.master, engine.container):
-            await until(lambda: _again(owner), timeout=60, what="commands run")
-            process = await owner.start("exec", "box", "sh", "-c", "echo up; exec sleep 7654")
-            assert process.stdout is not None
-            assert await process.stdout.readline() == b"up\n"
-            await victim.kill()
-            _, error = await asyncio.wait_for(process.communicate(), 60)
-            assert process.returncode == 125
-            assert b"the command has been ended" in error
-            await until(lambda: not runs(engine, "sleep 7654"), what="nothing is left of it")
-            await victim.start()
-        await until(lambda: _again(owner), timeout=60, what="commands run again")
+        assert await process.stdout.readline() == b"up\n"
+        await victim.kill()
+        _, error = await asyncio.wait_for(process.communicate(), 60)
+        assert process.returncode == 125
+        assert b"the command has been ended" in error
+        await until(lambda: not runs(shared_engine, "sleep 7654"), what="nothing is left of it")
+        await victim.start()
+    await until(lambda: _again(owner), timeout=60, what="commands run again")
 
 
 async def _again(owner: Owner) -> bool:
-    return await execute(owner, "box", "echo", "again") == (0, b"again\n", b"")
+    return await owner.run("exec", "box", "echo", "again") == (0, "again\n")
 
 
-async def test_only_the_owner_and_administrators_run_commands() -> None:
-    async with box() as (engine, owner):
-        await owner.rce("user", "add", "eve", "--password-stdin", typed="eve\n")
-        eve = Owner(engine, "eve")
-        await eve.login()
-        assert (await execute(eve, "box", "id"))[0] == 125
-        code, _, error = await execute(eve, "--user", "testUser", "box", "id")
-        assert code == 125
-        assert b"administrator" in error
-        assert (await execute(owner, "--user", "testUser", "box", "true"))[0] == 0
-        for role in ("viewer", "operator"):
-            await owner.rce("user", "add", role, "--role", role, "--password-stdin", typed=f"{role}\n")
-            looker = Owner(engine, role)
-            await looker.login()
-            assert (await execute(looker, "--user", "testUser", "box", "id"))[0] == 125
-        assert "execute" in await owner.rce("audit")
-        url = f"{engine.url}api/v1/containers/box/exec"
-        async with aiohttp.ClientSession() as session:
-            async with session.get(url) as reply:
-                assert reply.status == 401
-            headers = {"Authorization": f"Bearer {engine.token()}"}
-            async with session.get(url, headers=headers) as reply:
-                assert reply.status == 422
-            for first in ("{", '{"argv": 3}', "[]"):
-                async with session.ws_connect(url, headers=headers) as socket:
-                    await socket.send_str(first)
-                    answer = await socket.receive_bytes()
-                    assert answer[:1] == b"x"
-                    assert msgspec.json.decode(answer[1:])["code"] == 125
+@IN_PROCESSES
+async def test_only_the_owner_and_administrators_run_commands(shared_engine: Engine, owner: Owner) -> None:
+    await owner.rce("user", "add", "eve", "--password-stdin", typed="eve\n")
+    eve = Owner(shared_engine, "eve")
+    await eve.login()
+    assert (await eve.run("exec", "box", "id"))[0] == 125
+    code, error = await eve.run("exec", "--user", "testUser", "box", "id")
+    assert code == 125
+    assert "administrator" in error
+    await owner.rce("exec", "--user", "testUser", "box", "true")
+    for role in ("viewer", "operator"):
+        await owner.rce("user", "add", role, "--role", role, "--password-stdin", typed=f"{role}\n")
+        looker = Owner(shared_engine, role)
+        await looker.login()
+        assert (await looker.run("exec", "--user", "testUser", "box", "id"))[0] == 125
+    assert "execute" in await owner.rce("audit")
+    url = f"{shared_engine.url}api/v1/containers/box/exec"
+    async with aiohttp.ClientSession() as session:
+        async with session.get(url) as reply:
+            assert reply.status == 401
+        headers = {"Authorization": f"Bearer {shared_engine.token()}"}
+        async with session.get(url, headers=headers) as reply:
+            assert reply.status == 422
+        for first in ("{", '{"argv": 3}', "[]"):
             async with session.ws_connect(url, headers=headers) as socket:
-                await socket.send_bytes(msgspec.json.encode(Command(argv=("sleep", "8765"), terminal=True)))
-                assert b"as JSON text" in await socket.receive_bytes()
-        # A login that ends takes its commands with it.
-        process = await owner.start("exec", "box", "sleep", "8765")
-        await until(lambda: runs(engine, "sleep 8765"), what="the command runs")
-        await owner.rce("logout")
-        _, error = await process.communicate()
-        assert b"your login has ended" in error
-        await until(lambda: not runs(engine, "sleep 8765"), what="it ended")
+                await socket.send_str(first)
+                answer = await socket.receive_bytes()
+                assert answer[:1] == b"x"
+                assert msgspec.json.decode(answer[1:])["code"] == 125
+        async with session.ws_connect(url, headers=headers) as socket:
+            await socket.send_bytes(msgspec.json.encode(Command(argv=("sleep", "8765"), terminal=True)))
+            assert b"as JSON text" in await socket.receive_bytes()
+    # A login that ends takes its commands with it.
+    process = await owner.start("exec", "box", "sleep", "8765")
+    await until(lambda: runs(shared_engine, "sleep 8765"), what="the command runs")
+    await owner.rce("logout")
+    _, told = await process.communicate()
+    assert b"your login has ended" in told
+    await until(lambda: not runs(shared_engine, "sleep 8765"), what="it ended")
+    await owner.login()

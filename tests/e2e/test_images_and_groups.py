@@ -59,7 +59,7 @@ def _interface(endpoint: str, tag: str, kind: str, addr: str = "") -> dict[str, 
 
 async def _talk(image: str, packages: Path) -> None:
     async with (
-        running_engine(runtime="namespace", packages=packages) as engine,
+        running_engine(runtime="namespace", packages=packages, images=True) as engine,
         stranger(engine.url) as robot,
     ):
         await robot.send("CC", _container("inner", "10.1.0.1", image))
@@ -84,3 +84,13 @@ async def _talk(image: str, packages: Path) -> None:
         answer = await robot.receive("back", timeout=30)
         assert answer["data"] == "through the image and the group"
         assert robot.errors == []
+
+
+async def test_machine_that_offers_no_images_gets_none() -> None:
+    """Podman works here, but its operator said ``--no-offer-images``."""
+    async with running_engine() as engine, stranger(engine.url) as robot:
+        machines = engine.get("/api/v1/machines")["machines"]
+        (machine,) = [each for each in machines if each["kind"] == "container"]
+        assert machine["runtimes"] == ["process"]
+        await robot.send("CC", {"containerTag": "box", "containerData": {"image": "localhost/any:1"}})
+        await robot.wait_error("has no podman for the image localhost/any:1")

@@ -10,12 +10,42 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 
 import psutil
 import pytest
+import pytest_asyncio
 from support.engine import Engine, running_engine, until
 from support.stranger import ROBOT_TAGS, Stranger, check_echo, stranger, wire_echo
 
-pytestmark = [pytest.mark.e2e]
+pytestmark = [pytest.mark.e2e, pytest.mark.asyncio(loop_scope="module")]
 
 RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]
+PAUSE_S = 0.02
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module", params=RUNTIMES)
+async def shared_engine(request: pytest.FixtureRequest) -> AsyncIterator[Engine]:
+    async with running_engine(runtime=request.param, robots=2) as engine:
+        yield engine
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def engine(shared_engine: Engine) -> AsyncIterator[Engine]:
+    """An engine with all its programs and without a container, which runs as well after the test."""
+    yield shared_engine
+    for program in shared_engine.programs:
+        if not program.running:
+            await program.start()
+    await until(shared_engine.accepts_robots, what="a robot process is there")
+    async with stranger(shared_engine.url, robot="cleaner") as client:
+        for container in shared_engine.get("/api/v1/containers")["containers"]:
+            await client.send("DC", {"containerTag": container["tag"]})
+    await until(
+        lambda: not shared_engine.get("/api/v1/containers")["containers"], what="all containers ended"
+    )
+    await until(shared_engine.has_no_robots, what="all robots left")
+
+
+def only(runtime: object) -> pytest.MarkDecorator:
+    """Run a test with one runtime only."""
+    return pytest.mark.parametrize("shared_engine", [runtime], indirect=True, scope="module")
 
 
 class Traffic:
@@ -35,7 +65,7 @@ class Traffic:
         while True:
             await self.client.publish("requestIn", "std_msgs/String", {"data": f"number {self.sent}"})
             self.sent += 1
-            await asyncio.sleep(0.005)
+            await asyncio.sleep(PAUSE_S)
 
     async def _count(self) -> None:
         while True:
@@ -73,8 +103,9 @@ def environments(engine: Engine) -> list[psutil.Process]:
     return found
 
 
-async def test_master_dies_and_comes_back() -> None:
-    async with running_engine() as engine, stranger(engine.url) as client:
+@only("process")
+async def test_master_dies_and_comes_back(engine: Engine) -> None:
+    async with stranger(engine.url) as client:
         await wire_echo(client)
         nodes = node_pids(engine)
         async with traffic(client) as running:
@@ -102,26 +133,24 @@ async def test_master_dies_and_comes_back() -> None:
             ],
             what="a container made by the new master",
         )
-        async with stranger(engine.url, robot="secondRobot") as other:
-            await other.send("DC", {"containerTag": "second"})
 
 
-async def test_robot_process_dies_and_its_robots_come_back() -> None:
-    async with running_engine(robots=2) as engine:
-        async with stranger(engine.url) as client:
-            await wire_echo(client)
-            victim = next(
-                r
-                for r, (ws, _) in zip(engine.robots, engine.robot_ports, strict=True)
-                if client.socket.get_extra_info("peername")[1] == ws
-            )
-            await victim.kill()
-        await until(engine.accepts_robots, what="another robot process")
-        nodes = node_pids(engine)
-        async with stranger(engine.url) as client:
-            await client.wait_status(dict.fromkeys(ROBOT_TAGS, True))
-            await check_echo(client, "back again")
-        assert node_pids(engine) == nodes
+@only("process")
+async def test_robot_process_dies_and_its_robots_come_back(engine: Engine) -> None:
+    async with stranger(engine.url) as client:
+        await wire_echo(client)
+        victim = next(
+            r
+            for r, (ws, _) in zip(engine.robots, engine.robot_ports, strict=True)
+            if client.socket.get_extra_info("peername")[1] == ws
+        )
+        await victim.kill()
+    await until(engine.accepts_robots, what="another robot process")
+    nodes = node_pids(engine)
+    async with stranger(engine.url) as client:
+        await client.wait_status(dict.fromkeys(ROBOT_TAGS, True))
+        await check_echo(client, "back again")
+    assert node_pids(engine) == nodes
 
 
 async def seen_inactive_and_active(client: Stranger) -> dict[str, list[bool]]:
@@ -134,9 +163,8 @@ async def seen_inactive_and_active(client: Stranger) -> dict[str, list[bool]]:
     return states()
 
 
-@pytest.mark.parametrize("runtime", RUNTIMES)
-async def test_environment_dies_and_is_made_again(runtime: str) -> None:
-    async with running_engine(runtime=runtime) as engine, stranger(engine.url) as client:
+async def test_environment_dies_and_is_made_again(engine: Engine) -> None:
+    async with stranger(engine.url) as client:
         await wire_echo(client)
         old = node_pids(engine)
         client.statuses.clear()
@@ -148,9 +176,9 @@ async def test_environment_dies_and_is_made_again(runtime: str) -> None:
         await until(lambda: not old & node_pids(engine), what="the old node is gone")
 
 
-@pytest.mark.needs("bwrap")
-async def test_whole_container_dies_and_is_made_again() -> None:
-    async with running_engine(runtime="namespace") as engine, stranger(engine.url) as client:
+@only(RUNTIMES[1])
+async def test_whole_container_dies_and_is_made_again(engine: Engine) -> None:
+    async with stranger(engine.url) as client:
         await wire_echo(client)
         client.statuses.clear()
         engine.kill_processes("rce_container.environment")
@@ -180,12 +208,11 @@ async def renewed(engine: Engine, traffic: Traffic) -> None:
     assert {process.pid for process in engine.processes_of("rce-container-shim")} == shims
 
 
-@pytest.mark.parametrize("runtime", RUNTIMES)
 @pytest.mark.parametrize("change", [killed, renewed])
 async def test_next_manager_adopts_its_containers(
-    runtime: str, change: Callable[[Engine, Traffic], Awaitable[None]]
+    engine: Engine, change: Callable[[Engine, Traffic], Awaitable[None]]
 ) -> None:
-    async with running_engine(runtime=runtime) as engine, stranger(engine.url) as client:
+    async with stranger(engine.url) as client:
         await wire_echo(client)
         nodes = node_pids(engine)
         async with traffic(client) as running:
@@ -209,12 +236,21 @@ async def test_next_manager_adopts_its_containers(
         await until(lambda: not zombies(engine.container.pid), what="ended children are waited for")
 
 
-@pytest.mark.parametrize("runtime", RUNTIMES)
-async def test_containers_end_whole_without_a_manager(runtime: str) -> None:
-    async with running_engine(runtime=runtime) as engine, stranger(engine.url) as client:
-        engine.container.argv += ["--grace", "2"]
-        await engine.container.stop()
-        await engine.container.start()
+@pytest_asyncio.fixture(loop_scope="module")
+async def impatient(engine: Engine) -> AsyncIterator[Engine]:
+    """The engine, whose containers end themselves after two seconds without a manager."""
+    argv = engine.container.argv
+    engine.container.argv = [*argv, "--grace", "2"]
+    await engine.container.stop()
+    await engine.container.start()
+    yield engine
+    engine.container.argv = argv
+    await engine.container.stop()
+
+
+async def test_containers_end_whole_without_a_manager(impatient: Engine) -> None:
+    engine = impatient
+    async with stranger(engine.url) as client:
         await wire_echo(client)
         node_pids(engine)
         await engine.container.kill()

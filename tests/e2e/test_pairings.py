@@ -13,6 +13,7 @@ from pathlib import Path
 from urllib.parse import urlencode
 
 import pytest
+import pytest_asyncio
 from support.engine import Engine, Program, running_engine, until
 from support.stranger import Stranger, stranger
 from websockets.asyncio.client import connect
@@ -20,10 +21,34 @@ from websockets.exceptions import InvalidStatus
 
 from rce.ros.core import Core
 
-pytestmark = [pytest.mark.e2e]
+pytestmark = [pytest.mark.e2e, pytest.mark.asyncio(loop_scope="module")]
 
+ONE_PROCESS = "one robot process"
+ONE_MACHINE = pytest.param("one machine", marks=pytest.mark.needs("bwrap"))
+TWO_MACHINES = pytest.param("two machines", marks=pytest.mark.needs("bwrap"))
 STRING = "std_msgs/String"
 ECHO = "Test/StringEcho"
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def shared_engine(request: pytest.FixtureRequest) -> AsyncIterator[Engine]:
+    """Endpoints in one process, or in several that reach each other by unix sockets, or by TCP."""
+    if request.param == ONE_PROCESS:
+        running = running_engine()
+    else:
+        running = running_engine(runtime="namespace", robots=2, apart=request.param == "two machines")
+    async with running as engine:
+        yield engine
+
+
+@pytest_asyncio.fixture(autouse=True, loop_scope="module")
+async def _no_robots(shared_engine: Engine) -> None:
+    await until(shared_engine.has_no_robots, what="the robots of other tests left")
+
+
+def of(*engines: object) -> pytest.MarkDecorator:
+    """Run a test with these engines."""
+    return pytest.mark.parametrize("shared_engine", engines, indirect=True, scope="module")
 
 
 def interface(endpoint: str, tag: str, kind: str, cls: str = STRING, addr: str = "") -> dict[str, str]:
@@ -82,34 +107,27 @@ async def check_robots(first: Stranger, second: Stranger) -> None:
     }
 
 
-@pytest.mark.parametrize("processes", [1, 2])
-@pytest.mark.parametrize("machines", ["one machine", "two machines"])
-async def test_robot_with_robot(processes: int, machines: str) -> None:
-    async with (
-        running_engine(robots=processes, apart=machines == "two machines") as engine,
-        two_robots(engine) as (first, second),
-    ):
+@of(ONE_PROCESS, ONE_MACHINE, TWO_MACHINES)
+async def test_robot_with_robot(shared_engine: Engine) -> None:
+    async with two_robots(shared_engine) as (first, second):
         await wire_robots(first, second)
         await check_robots(first, second)
 
 
-async def test_provider_that_dies_answers_its_callers_with_an_error() -> None:
-    async with running_engine(robots=2) as engine, stranger(engine.url, robot="first") as first:
-        async with stranger(engine.url, robot="second") as second:
+@of(ONE_MACHINE)
+async def test_provider_that_dies_answers_its_callers_with_an_error(shared_engine: Engine) -> None:
+    async with stranger(shared_engine.url, robot="first") as first:
+        async with stranger(shared_engine.url, robot="second") as second:
             await wire_robots(first, second)
             await first.send("DM", {"iTag": "ask", "type": ECHO, "msgID": "n1", "msg": {"data": "anybody?"}})
             await second.queue("answer").get()
         await first.wait_error("n1")
 
 
-@pytest.mark.parametrize("runtime", ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))])
-@pytest.mark.parametrize("machines", ["one machine", "two machines"])
-async def test_container_with_container_and_with_robot(runtime: str, machines: str) -> None:
+@of(ONE_PROCESS, ONE_MACHINE, TWO_MACHINES)
+async def test_container_with_container_and_with_robot(shared_engine: Engine) -> None:
     """The robot's words go to the echo node of container a, on to that of container b, and back."""
-    async with (
-        running_engine(runtime=runtime, apart=machines == "two machines") as engine,
-        stranger(engine.url) as robot,
-    ):
+    async with stranger(shared_engine.url) as robot:
         for tag in ("a", "b"):
             await robot.send("CC", {"containerTag": tag})
         nodes = [
@@ -145,7 +163,9 @@ async def test_container_with_container_and_with_robot(runtime: str, machines: s
         await robot.wait_status({"say": True, "hear": True, "ask": True})
         # The robot's own interfaces say nothing of the connection between the containers.
         await until(
-            lambda: all(one["established"] for one in engine.get("/api/v1/connections")["connections"]),
+            lambda: all(
+                one["established"] for one in shared_engine.get("/api/v1/connections")["connections"]
+            ),
             what="all connections are established",
         )
         assert await robot.call("ask", ECHO, {"data": "over two containers"}) == {
@@ -156,12 +176,13 @@ async def test_container_with_container_and_with_robot(runtime: str, machines: s
         assert robot.errors == []
 
 
-@pytest.mark.parametrize("processes", [1, 2])
-async def test_who_has_a_robot_id_is_told_to_its_user(processes: int) -> None:
+@of(ONE_MACHINE)
+async def test_who_has_a_robot_id_is_told_to_its_user(shared_engine: Engine) -> None:
     """At whichever robot process the second client tries to come in; by ``rce-ros`` in a line of its own."""
     query = urlencode({"userID": "testUser", "robotID": "first", "password": sha256(b"testUser").hexdigest()})
     holder = r"connected already, from 127\.0\.0\.1 since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC"
-    async with running_engine(robots=processes) as engine, stranger(engine.url, robot="first"):
+    engine = shared_engine
+    async with stranger(engine.url, robot="first"):
         for port, _ in engine.robot_ports:
             with pytest.raises(InvalidStatus) as caught:
                 await connect(f"ws://127.0.0.1:{port}/?{query}", proxy=None)
@@ -180,12 +201,12 @@ async def test_who_has_a_robot_id_is_told_to_its_user(processes: int) -> None:
             await bridge.stop()
 
 
-async def test_interfaces_of_one_endpoint_connect_both_ways() -> None:
+@of(ONE_PROCESS)
+async def test_interfaces_of_one_endpoint_connect_both_ways(shared_engine: Engine) -> None:
     """As in the original engine: a robot with itself, a container with itself, and no echo of a bridge."""
     async with (
-        running_engine() as engine,
-        stranger(engine.url, robot="first") as first,
-        stranger(engine.url, robot="second") as second,
+        stranger(shared_engine.url, robot="one") as first,
+        stranger(shared_engine.url, robot="other") as second,
     ):
         await first.send("CC", {"containerTag": "box"})
         node = {"containerTag": "box", "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}
@@ -194,36 +215,38 @@ async def test_interfaces_of_one_endpoint_connect_both_ways() -> None:
             {
                 "addNodes": [node],
                 "addInterfaces": [
-                    interface("first", "out", "SubscriberConverter"),
-                    interface("first", "in", "PublisherConverter"),
+                    interface("one", "out", "SubscriberConverter"),
+                    interface("one", "in", "PublisherConverter"),
                     interface("box", "there", "PublisherInterface", addr="/relay"),
                     interface("box", "back", "SubscriberInterface", addr="/relay"),
                     interface("box", "from", "SubscriberInterface", addr="/stringEchoResp"),
                     interface("box", "to", "PublisherInterface", addr="/relay"),
                     interface("box", "request", "PublisherInterface", addr="/stringEchoReq"),
-                    interface("second", "request", "SubscriberConverter"),
-                    interface("second", "own_out", "SubscriberConverter"),
-                    interface("second", "own_in", "PublisherConverter"),
-                    interface("second", "own_ask", "ServiceProviderConverter", ECHO),
-                    interface("second", "answer", "ServiceClientConverter", ECHO),
+                    interface("other", "request", "SubscriberConverter"),
+                    interface("other", "own_out", "SubscriberConverter"),
+                    interface("other", "own_in", "PublisherConverter"),
+                    interface("other", "own_ask", "ServiceProviderConverter", ECHO),
+                    interface("other", "answer", "ServiceClientConverter", ECHO),
                     interface("box", "response", "SubscriberInterface", addr="/stringEchoResp"),
                 ],
             },
         )
         pairs = [
-            ("first/out", "box/there"),
-            ("first/in", "box/back"),
-            ("first/in", "box/response"),
+            ("one/out", "box/there"),
+            ("one/in", "box/back"),
+            ("one/in", "box/response"),
             ("box/from", "box/to"),
-            ("second/request", "box/request"),
-            ("second/own_in", "second/own_out"),
-            ("second/own_ask", "second/answer"),
+            ("other/request", "box/request"),
+            ("other/own_in", "other/own_out"),
+            ("other/own_ask", "other/answer"),
         ]
         await first.send("CX", {"connect": [{"tagA": a, "tagB": b} for a, b in pairs]})
         await first.wait_status({"out": True, "in": True})
         await second.wait_status({"own_in": True, "own_out": True, "own_ask": True, "request": True})
         await until(
-            lambda: all(one["established"] for one in engine.get("/api/v1/connections")["connections"]),
+            lambda: all(
+                one["established"] for one in shared_engine.get("/api/v1/connections")["connections"]
+            ),
             what="all connections are established",
         )
         await second.publish("own_out", STRING, {"data": "to myself"})

@@ -1,4 +1,4 @@
-"""The project's Containerfile, built on a root file system of debootstrap, and both of its images run."""
+"""The project's Containerfile, built on Debian's packages of Python, and both of its images run."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from support.debian_root import make_debian_root
 from support.engine import Program
 from support.ports import free_ports
 from support.rootfs import image_of
@@ -21,7 +22,11 @@ ASK = ROOT / "tests" / "support" / "ask.py"
 BIN = Path(sys.executable).parent
 TIMEOUT_S = 300.0
 
-pytestmark = [pytest.mark.e2e, pytest.mark.needs("root", "podman", "debootstrap"), pytest.mark.timeout(2400)]
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.needs("root", "podman", "venv packages"),
+    pytest.mark.timeout(2400),
+]
 
 # crun refuses machines that have controllers in cgroups of both versions: the newer one is hidden from it.
 _APART = ("unshare", "--mount", "sh", "-c")
@@ -80,15 +85,8 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     if given := os.environ.get("RCE_TEST_BASE"):
         yield given
         return
-    release = Path("/etc/os-release").read_text()
-    (suite,) = [
-        line.partition("=")[2] for line in release.splitlines() if line.startswith("VERSION_CODENAME=")
-    ]
     rootfs = tmp_path_factory.mktemp("rootfs") / "root"
-    include = "--include=python3,python3-venv,ca-certificates"
-    argv = ["debootstrap", "--variant=minbase", include, suite, str(rootfs)]
-    done = subprocess.run(argv, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout[-2000:]
+    make_debian_root(rootfs, ("python3", "python3-venv", "ca-certificates"))
     with image_of(rootfs) as name:
         yield name
 

@@ -4,21 +4,35 @@ from __future__ import annotations
 
 import asyncio
 import struct
+from collections.abc import AsyncIterator
 
 import pytest
-from support.engine import running_engine
+import pytest_asyncio
+from support.engine import Engine, running_engine, until
 from support.stranger import TIMEOUT_S, check_echo, stranger, wire_echo
 
 from rce_client.connection import Connection
 
-pytestmark = pytest.mark.e2e
+pytestmark = [pytest.mark.e2e, pytest.mark.asyncio(loop_scope="module")]
 
+RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]
+IN_PROCESSES = pytest.mark.parametrize("shared_engine", ["process"], indirect=True, scope="module")
 STRING = "std_msgs/String"
 
 
-@pytest.mark.parametrize("runtime", ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))])
-async def test_echo_by_topic_and_service(runtime: str) -> None:
-    async with running_engine(runtime=runtime) as engine, stranger(engine.url) as client:
+@pytest_asyncio.fixture(scope="module", loop_scope="module", params=RUNTIMES)
+async def shared_engine(request: pytest.FixtureRequest) -> AsyncIterator[Engine]:
+    async with running_engine(runtime=request.param) as engine:
+        yield engine
+
+
+@pytest_asyncio.fixture(autouse=True, loop_scope="module")
+async def _no_robots(shared_engine: Engine) -> None:
+    await until(shared_engine.has_no_robots, what="the robots of other tests left")
+
+
+async def test_echo_by_topic_and_service(shared_engine: Engine) -> None:
+    async with stranger(shared_engine.url) as client:
         await wire_echo(client)
         await check_echo(client, "grüezi")
         await check_echo(client, "x" * 100_000)
@@ -27,8 +41,9 @@ async def test_echo_by_topic_and_service(runtime: str) -> None:
         await client.wait_status(dict.fromkeys(("requestIn", "responseOut", "serviceIn"), False))
 
 
-async def test_faults_are_told_and_nothing_else_is_lost() -> None:
-    async with running_engine() as engine, stranger(engine.url) as client:
+@IN_PROCESSES
+async def test_faults_are_told_and_nothing_else_is_lost(shared_engine: Engine) -> None:
+    async with stranger(shared_engine.url) as client:
         await client.socket.send_str("no json")
         await client.send("XY", {})
         await client.send(
@@ -56,16 +71,17 @@ async def test_faults_are_told_and_nothing_else_is_lost() -> None:
         await client.wait_error("noSuchFile")
         assert len(client.errors) >= before + 5
         await check_echo(client, "still here")
+        await client.send("DC", {"containerTag": "cTag_01"})
 
 
-async def test_echo_in_one_frame_beside_two_frame_client() -> None:
+@IN_PROCESSES
+async def test_echo_in_one_frame_beside_two_frame_client(shared_engine: Engine) -> None:
     """Both are connected to one container's topics; a client that did not ask sees nothing new."""
     text = struct.pack("<I", 5) + b"hello"
     topics = (("say", "Publisher", "/stringEchoReq"), ("hear", "Subscriber", "/stringEchoResp"))
     async with (
-        running_engine() as engine,
-        Connection(engine.url, "testUser", "testUser", "asking") as asking,
-        stranger(engine.url, robot="plain") as plain,
+        Connection(shared_engine.url, "testUser", "testUser", "asking") as asking,
+        stranger(shared_engine.url, robot="plain") as plain,
     ):
         assert asking.takes_single_frames
         await asking.create_container("box")

@@ -123,6 +123,7 @@ class EngineOptions(TypedDict, total=False):
     packages: Path | None
     machines: int
     robot_options: tuple[str, ...]
+    images: bool
 
 
 class Engine:
@@ -138,6 +139,7 @@ class Engine:
         packages: Path | None = None,
         machines: int = 1,
         robot_options: tuple[str, ...] = (),
+        images: bool = False,
     ) -> None:
         """Prepare an engine.
 
@@ -149,10 +151,12 @@ class Engine:
             packages: A folder with more packages.
             machines: How many container task sets; several are on machines of their own, ``machine0``, ...
             robot_options: Options of the robot task sets.
+            images: Whether containers may have an image, which a container task set tries at each start.
         """
         self.folder = folder
         self.http_port, self.control_port, *rest = free_ports(3 + 2 * robots + machines - 1)
         self.runtime = runtime
+        self._images = images
         self._token = ""
         self.container_link_port = rest[0]
         self.robot_ports = [tuple(rest[1 + 2 * i : 3 + 2 * i]) for i in range(robots)]
@@ -196,6 +200,7 @@ class Engine:
             "127.0.0.1",
             *("--control-port", self.control_port, "--link-port", link_port),
             *("--state-dir", state, "--runtime", self.runtime, "--dev"),
+            *(() if self._images else ("--no-offer-images",)),
             *(("--machine", machine) if machine else ()),
             name=name,
         )
@@ -223,6 +228,10 @@ class Engine:
         except OSError:
             return False
         return True
+
+    def has_no_robots(self) -> bool:
+        """Whether no robot is connected; one that left may be so for a moment, and its name is taken then."""
+        return all(robot["state"] != "connected" for robot in self.get("/api/v1/robots")["robots"])
 
     async def stop(self) -> None:
         if self._token and self.master.running:

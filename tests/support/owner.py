@@ -31,9 +31,12 @@ class Owner:
             **{**pipes, **streams},  # type: ignore[arg-type]  # the streams are keywords of it
         )
 
+    async def run(self, *words: str, typed: str = "") -> tuple[int, str]:
+        """Run ``rce WORDS``; return its exit code and what it printed, on both streams."""
+        return await run_command(words, env={**self.env, "COLUMNS": "200"}, folder=self.folder, typed=typed)
+
     async def rce(self, *words: str, typed: str = "", fails: bool = False) -> str:
-        env = {**self.env, "COLUMNS": "200"}
-        code, text = await run_command(words, env=env, folder=self.folder, typed=typed)
+        code, text = await self.run(*words, typed=typed)
         assert (code != 0) == fails, text
         return text
 

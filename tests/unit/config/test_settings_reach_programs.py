@@ -65,6 +65,7 @@ SETTINGS = EngineSettings(
         runtime=Runtime.PROCESS,
         package_path=(Path("/p"), Path("/q")),
         images=("debian:12", "/srv/rootfs"),
+        offer_images=False,
         home_size=1 << 30,
         allow_requirements=True,
         pip_args="--no-index --pre",
