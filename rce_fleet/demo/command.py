@@ -22,8 +22,6 @@ from rce.config import Runtime
 from rce.own_process import end_signals
 from rce_fleet.demo.config import CoreProgram, DemoConfig, MachineBackend, Mode, TaskSource
 from rce_fleet.demo.exceptions import DemoError
-from rce_fleet.demo.headless import run_headless
-from rce_fleet.demo.leader_key import KEY, leader_key
 from rce_fleet.demo.modes import start_demo
 from rce_fleet.demo.random_goals import send_random_goals
 from rce_fleet.demo.resources import ANY, Ports, run_folder
@@ -269,6 +267,8 @@ def say(text: str) -> None:
 async def _headless(
     config: DemoConfig, timeout: float, report: Path | None, show: Callable[[str], None]
 ) -> int:
+    from rce_fleet.demo.headless import run_headless  # a demo with a page starts sooner without it
+
     say(
         f"{len(config.scenario.robots)} robots, mode {config.mode}, seed {config.seed}, at most {timeout:g} s"
     )
@@ -292,6 +292,8 @@ async def _with_page(config: DemoConfig, show: Callable[[str], None], *, auto: b
         demo.group.enable_restarts(say)
         typer.echo(f"RCE demo: {demo.page}")
         if config.replicas > 1:
+            from rce_fleet.demo.leader_key import KEY, leader_key  # other demos start sooner without it
+
             stack.enter_context(leader_key(config.master_urls, say))
             say(f"press {KEY} to kill the leading master")
         station = StationClient(session, demo.page)

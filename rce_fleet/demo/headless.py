@@ -9,13 +9,12 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from random import Random
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import aiohttp
 
 from rce_fleet.demo.config import DemoConfig, Mode, TaskSource
 from rce_fleet.demo.exceptions import DemoError
-from rce_fleet.demo.exploration import Explored
 from rce_fleet.demo.goal_tasks import GoalTasks
 from rce_fleet.demo.judge import Judge, RobotScore
 from rce_fleet.demo.manager_tasks import ManagerTasks
@@ -29,6 +28,9 @@ from rce_fleet.drivers.report import WorldReport, read_report
 from rce_fleet.exceptions import FleetError
 from rce_fleet.planning.scenario import Scenario
 from rce_fleet.station.client import StationClient
+
+if TYPE_CHECKING:
+    from rce_fleet.demo.exploration import Explored
 
 TAIL_LINES = 8
 """How many of each program's last lines are shown after a timeout."""

@@ -6,13 +6,12 @@ import sys
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import aiohttp
 
 from rce.config.documents import write_items
 from rce_fleet.demo.config import JOIN_TOGETHER, DemoConfig, Mode
-from rce_fleet.demo.exploration import Explored, block_cells, explore
 from rce_fleet.demo.programs import RCE, START_TIMEOUT, Program, ProgramGroup
 from rce_fleet.demo.robots import RobotGraph, client_config, cloud_arguments, start_robots
 from rce_fleet.demo.ros_modes import MultiCorePrograms, SingleCorePrograms
@@ -20,6 +19,9 @@ from rce_fleet.demo.traffic import MessageTotals, read_engine_totals
 from rce_fleet.drivers.report import WorldReport, read_report
 from rce_fleet.station.client import StationClient
 from rce_fleet.wiring import fleet_config, light_config
+
+if TYPE_CHECKING:
+    from rce_fleet.demo.exploration import Explored
 
 START_PER_ROBOT = 0.5
 """Seconds that the start may take longer for each robot: each has some ten connections in the engine."""
@@ -242,6 +244,8 @@ async def _explore(
     config: DemoConfig, group: ProgramGroup, mode: ModePrograms, page: str, say: Callable[[str], None]
 ) -> Explored:
     """Let the first robot make the map, and start all robots on it."""
+    from rce_fleet.demo.exploration import block_cells, explore  # long to load, needed only without a map
+
     first, *_ = mode.graphs()
     explored = await explore(group, config, first, mode.launch_arguments(first), say)
     async with aiohttp.ClientSession() as session:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pymunk import BB
 from pymunk.autogeometry import march_soft, simplify_curves
-from scipy import ndimage
 
 from rce_fleet.geometry.poses import Pose, transform_points
 from rce_fleet.maps.occupancy_map import FREE, OCCUPIED, UNKNOWN, OccupancyMap
@@ -90,6 +89,8 @@ def draw_map(
         _draw(solid, np.array(block.edges), (first_column, first_row), resolution, 1e-9, block)
     for line in np.concatenate((walls.lines, walls.glass_lines)):
         _draw(solid, line[None], (first_column, first_row), resolution, reach)
+    from scipy import ndimage  # long to load, needed only where a map is drawn
+
     free, _ = ndimage.label(~solid)
     places = np.array(list(inside), np.float64).reshape(-1, 2)
     cells = np.round(places / resolution).astype(int) - np.array((first_column, first_row))

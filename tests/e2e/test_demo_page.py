@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import pytest_asyncio
-from playwright.async_api import Page, ViewportSize, async_playwright
+from playwright.async_api import Browser, Page, ViewportSize, async_playwright
 from support.demo import Demo, running_demo
 
 from rce_fleet.demo.floor import FLOOR
@@ -42,9 +42,20 @@ WAIT_MS = 180_000
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
 async def shared_demo() -> AsyncIterator[Demo]:
-    """Three robots that stand until a test sends them."""
-    async with running_demo("--robots", 3, "--seed", 4, "--runtime", "process", "--no-auto") as demo:
+    """Three robots that stand until a test sends them; the first one has sensors, for layers and detours."""
+    kinds = ("--robots", 3, "--full-stack", 1)
+    async with running_demo(*kinds, "--seed", 4, "--runtime", "process", "--no-auto") as demo:
         yield demo
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def browser() -> AsyncIterator[Browser]:
+    async with async_playwright() as playwright:
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=list(BROWSER))
+        try:
+            yield browser
+        finally:
+            await browser.close()
 
 
 def artifact(name: str) -> Path:
@@ -54,23 +65,21 @@ def artifact(name: str) -> Path:
 
 
 @contextlib.asynccontextmanager
-async def opened(demo: Demo, viewport: ViewportSize = DESKTOP, *, expected: str = "") -> AsyncIterator[Page]:
+async def opened(
+    browser: Browser, demo: Demo, viewport: ViewportSize = DESKTOP, *, expected: str = ""
+) -> AsyncIterator[Page]:
     """The page in a browser; what the browser complains of and is not ``expected`` fails the test."""
     messages: list[str] = []
-    async with async_playwright() as playwright:
-        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=list(BROWSER))
-        try:
-            page = await browser.new_page(
-                viewport=viewport, color_scheme="light", has_touch=viewport is PHONE
-            )
-            page.on("console", lambda said: messages.append(said.text) if said.type == "error" else None)
-            page.on("pageerror", lambda error: messages.append(str(error)))
-            page.set_default_timeout(WAIT_MS)
-            await page.goto(demo.page)
-            await page.wait_for_function("document.querySelector('#link').textContent === 'live'")
-            yield page
-        finally:
-            await browser.close()
+    page = await browser.new_page(viewport=viewport, color_scheme="light", has_touch=viewport is PHONE)
+    try:
+        page.on("console", lambda said: messages.append(said.text) if said.type == "error" else None)
+        page.on("pageerror", lambda error: messages.append(str(error)))
+        page.set_default_timeout(WAIT_MS)
+        await page.goto(demo.page)
+        await page.wait_for_function("document.querySelector('#link').textContent === 'live'")
+        yield page
+    finally:
+        await page.close()
     assert [text for text in messages if not (expected and expected in text)] == []
 
 
@@ -140,8 +149,8 @@ async def send_away(page: Page, robot: str) -> dict[str, Any]:
     return await robot_of(page, robot)
 
 
-async def test_an_operator_sends_a_robot_and_blocks_its_way(shared_demo: Demo) -> None:
-    async with opened(shared_demo) as page:
+async def test_an_operator_sends_a_robot_and_blocks_its_way(browser: Browser, shared_demo: Demo) -> None:
+    async with opened(browser, shared_demo) as page:
         await robots_placed(page, 3)
         await page.wait_for_function("rceFleet.fleet.models?.some(([name]) => name === 'Robot1')")
         before = await send_away(page, "Robot1")
@@ -178,8 +187,8 @@ async def test_an_operator_sends_a_robot_and_blocks_its_way(shared_demo: Demo) -
         assert "Robot1 is at its goal" in words
 
 
-async def test_the_page_shows_engine_and_refusals(shared_demo: Demo) -> None:
-    async with opened(shared_demo, expected="409") as page:
+async def test_the_page_shows_engine_and_refusals(browser: Browser, shared_demo: Demo) -> None:
+    async with opened(browser, shared_demo, expected="409") as page:
         await robots_placed(page, 3)
         await page.wait_for_function(
             "document.querySelector('#engine').textContent.includes('fleetPlanner running')"
@@ -212,8 +221,8 @@ async def test_the_page_shows_engine_and_refusals(shared_demo: Demo) -> None:
         await page.wait_for_function("document.querySelector('#message').textContent.includes('wall')")
 
 
-async def test_the_page_on_a_phone(shared_demo: Demo) -> None:
-    async with opened(shared_demo, PHONE) as page:
+async def test_the_page_on_a_phone(browser: Browser, shared_demo: Demo) -> None:
+    async with opened(browser, shared_demo, PHONE) as page:
         await robots_placed(page, 3)
         width = await page.evaluate("document.documentElement.scrollWidth")
         assert width <= PHONE["width"], "nothing sticks out to the right"

@@ -66,8 +66,9 @@ class Provider:
             self._new.append(self._graph.output(new_topic(len(self._new)), TEXT))
         for output in self._new[-NEWEST:]:
             output.send({})
-        self._due = max(self._due + PERIOD_S, time.monotonic())
-        return self._due - time.monotonic()
+        now = time.monotonic()
+        self._due = max(self._due + PERIOD_S, now)
+        return self._due - now
 
 
 def main() -> None:

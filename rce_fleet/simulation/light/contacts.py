@@ -6,7 +6,6 @@ from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rce_fleet.simulation.lidar import Floats
 
@@ -119,6 +118,8 @@ class ContactJudge:
     def _judge_pairs(self, places: Floats, radii: Floats, judged: int) -> None:
         if len(places) <= 1:
             return
+        from scipy.spatial import cKDTree  # long to load, needed only for many discs
+
         tree, widest = cKDTree(places), 2 * float(radii.max())
         if self.min_separation == inf:
             # The nearest middles bound how far apart the nearest hulls can be.
