@@ -241,7 +241,8 @@ class Machine:
     async def node_pid(self, id_: str, tag: str) -> int:
         """Wait until the pid of a node's process is reported. It may start yet: not all nodes register."""
         return await until(
-            lambda: node.pid if (node := self.node(id_, tag)) else 0, what=f"the pid of {id_}/{tag} is told"
+            lambda: node.pid if (node := self.node(id_, tag)) else 0,
+            what=lambda: f"the pid of {id_}/{tag} is told: {self.node(id_, tag)}, faults {self.faults}",
         )
 
     async def log(self, id_: str, node: str, offset: int = 0) -> str:
