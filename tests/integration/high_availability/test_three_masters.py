@@ -211,6 +211,18 @@ async def test_nothing_acknowledged_is_lost_when_the_leader_is_killed(shared_mas
     await shared_masters.check_nothing_is_lost()
 
 
+async def ask_for_token(
+    session: aiohttp.ClientSession, url: str, key: dict[str, str]
+) -> tuple[int, str, str | None]:
+    """Ask a master for a token, again while it does not know yet who leads."""
+    async with asyncio.timeout(60):
+        while True:
+            async with session.post(f"{url}api/v1/tokens", json={"scope": "fleet"}, headers=key) as reply:
+                if reply.status != 503:
+                    return reply.status, await reply.text(), reply.headers.get("Idempotent-Replayed")
+            await asyncio.sleep(0.2)
+
+
 async def test_a_request_repeated_at_the_next_leader_is_done_once(shared_masters: Masters) -> None:
     """The key and its answer are stored with what the request did, so the next leader knows them."""
     leader = await shared_masters.leader()
@@ -222,10 +234,7 @@ async def test_a_request_repeated_at_the_next_leader_is_done_once(shared_masters
             if killed is not None:
                 await killed.kill()
                 await shared_masters.leader(but=killed)
-            url = f"{standby.url}api/v1/tokens"
-            async with session.post(url, json={"scope": "fleet"}, headers=key) as reply:
-                told = reply.headers.get("Idempotent-Replayed")
-                answers.append((reply.status, await reply.text(), told))
+            answers.append(await ask_for_token(session, standby.url, key))
     await restart(leader)
     (status, text, _), again = answers
     assert status == 201, text
