@@ -15,6 +15,7 @@ import typer
 
 from rce import __version__
 from rce.cli.programs import missing_for
+from rce.cli.summaries import summary_of
 from rce.own_process import open_missing_streams
 
 if TYPE_CHECKING:
@@ -45,14 +46,22 @@ def _root(
     """RCE, a cloud robotics engine: run and inspect it, drive a fleet."""
 
 
-def build_app(points: list[EntryPoint]) -> typer.Typer:
-    """Return the program with the given commands."""
+def build_app(points: list[EntryPoint], *, listing: bool = False) -> typer.Typer:
+    """Return the program with the given commands.
+
+    Args:
+        points: The commands.
+        listing: Import only commands that are run, and those whose source does not say their help text.
+    """
     app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
     app.callback()(_root)
     for point in points:
         problem = missing_for(point.module)
         if problem is not None:
             _add_unavailable(app, point.name, problem)
+            continue
+        if listing and (summary := summary_of(point.module, point.attr)):
+            _add_listed(app, point, summary)
             continue
         try:
             plugged: Any = point.load()
@@ -68,6 +77,19 @@ def build_app(points: list[EntryPoint]) -> typer.Typer:
         else:
             app.command(name=point.name)(plugged)
     return app
+
+
+def _add_listed(app: typer.Typer, point: EntryPoint, summary: str) -> None:
+    """Add a command that is imported when it is run, such as by ``rce -- ps``."""
+
+    @app.command(
+        point.name,
+        help=summary,
+        add_help_option=False,
+        context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+    )
+    def listed(context: typer.Context) -> None:
+        build_app([point])([point.name, *context.args], prog_name="rce")
 
 
 def _add_unavailable(app: typer.Typer, name: str, problem: str) -> None:
@@ -88,4 +110,4 @@ def main() -> None:
     open_missing_streams()
     points = sorted(entry_points(group=GROUP), key=lambda point: point.name)
     asked = [point for point in points if point.name == sys.argv[1]] if len(sys.argv) > 1 else []
-    build_app(asked or points)(prog_name="rce")
+    build_app(asked or points, listing=not asked)(prog_name="rce")

@@ -160,7 +160,8 @@ class CloudPrograms:
             **({"--runtime": config.runtime} if config.runtime else {}),
             **({"--replicas": config.replicas} if config.replicas > 1 else {}),
         }
-        return [*RCE, "up", "--dev", *(str(part) for item in options.items() for part in item)]
+        words = [str(part) for item in options.items() for part in item]
+        return [*RCE, "up", "--dev", "--no-offer-images", *words]
 
     def _station_argv(self, world: str) -> list[str]:
         folder, page = self._config.folder, str(self._config.ports.page)

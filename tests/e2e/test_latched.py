@@ -11,11 +11,17 @@ from typing import Any
 
 import psutil
 import pytest
+import pytest_asyncio
 from support.engine import Engine, Program, command_line, running_engine, until
 from support.ros_real import Graph, real_graph
 from support.stranger import Stranger, stranger
 
-pytestmark = [pytest.mark.e2e, pytest.mark.timeout(400), pytest.mark.needs("rospy", "roslaunch")]
+pytestmark = [
+    pytest.mark.e2e,
+    pytest.mark.timeout(400),
+    pytest.mark.needs("rospy", "roslaunch"),
+    pytest.mark.asyncio(loop_scope="module"),
+]
 
 STRING = "std_msgs/String"
 LATCHER = """#!/usr/bin/python3
@@ -49,10 +55,10 @@ rospy.spin()
 """
 
 
-@pytest.fixture
-def packages(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A package of rospy nodes that latch, for containers; the same programs are run in robots' graphs."""
-    package = tmp_path / "packages" / "latches"
+    package = tmp_path_factory.mktemp("packages") / "latches"
     scripts = package / "scripts"
     scripts.mkdir(parents=True)
     package.joinpath("package.xml").write_text("<package><name>latches</name></package>")
@@ -61,6 +67,18 @@ def packages(tmp_path: Path) -> Path:
         node.write_text(text)
         node.chmod(0o755)
     return package.parent
+
+
+def latching(name: str) -> dict[str, Any]:
+    """A node of the container that latches a text on ``/map``."""
+    return {
+        "containerTag": "box",
+        "nodeTag": name,
+        "pkg": "latches",
+        "exe": "latcher.py",
+        "restart": "always",
+        "args": f"{name} /map {name}_says",
+    }
 
 
 def config(engine: Engine, robot: str) -> dict[str, Any]:
@@ -73,15 +91,8 @@ def config(engine: Engine, robot: str) -> dict[str, Any]:
         for endpoint, kind in (("box", box), (robot, own))
     ]
     nodes = [
-        {
-            "cTag": "box",
-            "nTag": name,
-            "pkg": "latches",
-            "exe": "latcher.py",
-            "restart": "always",
-            "args": f"{name} /map {name}_says",
-        }
-        for name in ("one", "two")
+        {"cTag": node.pop("containerTag"), "nTag": node.pop("nodeTag"), **node}
+        for node in (latching("one"), latching("two"))
     ]
     return {
         "url": engine.url,
@@ -124,10 +135,12 @@ class World:
         return [p for p in self.engine.processes_of("latcher.py") if name in command_line(p)]
 
 
-@contextlib.asynccontextmanager
-async def world(packages: Path, tmp_path: Path) -> AsyncIterator[World]:
-    async with running_engine(packages=packages) as engine, real_graph(tmp_path) as graph:
-        file = tmp_path / "robot.config"
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def shared_engine(packages: Path, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[World]:
+    """All of it, for all tests: each leaves it as it found it."""
+    folder = tmp_path_factory.mktemp("robot")
+    async with running_engine(packages=packages) as engine, real_graph(folder) as graph:
+        file = folder / "robot.config"
         file.write_text(json.dumps(config(engine, "R1")))
         bridge = bridge_of(engine, graph, file)
         await bridge.start(timeout=90)
@@ -140,34 +153,38 @@ async def world(packages: Path, tmp_path: Path) -> AsyncIterator[World]:
             await bridge.stop()
 
 
-async def test_latched_in_the_cloud_is_latched_at_the_robot(packages: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def it(shared_engine: World) -> World:
+    return shared_engine
+
+
+async def test_latched_in_the_cloud_is_latched_at_the_robot(it: World) -> None:
     """One message per publisher, over the restart of each part between them."""
-    async with world(packages, tmp_path) as it:
-        everything = ("one_says", "two_says")
+    everything = ("one_says", "two_says")
+    await it.late("/map", *everything)
+
+    for process in it.nodes("one"):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            process.kill()
+    await it.late("/map", *everything)
+
+    for part in (*it.engine.robots, it.engine.container, it.engine.master):
+        await part.kill()
+        await part.start()
         await it.late("/map", *everything)
 
-        for process in it.nodes("one"):
-            with contextlib.suppress(psutil.NoSuchProcess):
-                process.kill()
-        await it.late("/map", *everything)
+    it.engine.kill_processes("rce_container.environment")
+    await it.late("/map", *everything)
 
-        for part in (*it.engine.robots, it.engine.container, it.engine.master):
-            await part.kill()
-            await part.start()
-            await it.late("/map", *everything)
-
-        it.engine.kill_processes("rce_container.environment")
-        await it.late("/map", *everything)
-
-        await it.bridge.kill()
-        await it.bridge.start(timeout=90)
-        await it.late("/map", *everything)
+    await it.bridge.kill()
+    await it.bridge.start(timeout=90)
+    await it.late("/map", *everything)
 
 
-async def test_a_publisher_that_ends_takes_its_message_back(packages: Path, tmp_path: Path) -> None:
+async def test_a_publisher_that_ends_takes_its_message_back(it: World, packages: Path) -> None:
     """In both directions: only what the other one latched is left."""
     latcher = str(packages / "latches" / "scripts" / "latcher.py")
-    async with world(packages, tmp_path) as it, visitor(it.engine) as pending_login:
+    async with visitor(it.engine) as pending_login:
         await it.late("/map", "one_says", "two_says")
         await pending_login.robot.send("CN", {"removeNodes": [{"containerTag": "box", "nodeTag": "two"}]})
         await until(lambda: not it.nodes("two"), what="the node ended")
@@ -176,13 +193,14 @@ async def test_a_publisher_that_ends_takes_its_message_back(packages: Path, tmp_
             async with it.graph.program(latcher, "there", "/pose", "there_says", node="/there"):
                 await pending_login.late("here_says", "there_says")
             await pending_login.late("here_says")
+        await pending_login.robot.send("CN", {"addNodes": [latching("two")]})
+        await it.late("/map", "one_says", "two_says")
 
 
-async def test_latched_at_the_robot_is_latched_in_the_cloud(packages: Path, tmp_path: Path) -> None:
+async def test_latched_at_the_robot_is_latched_in_the_cloud(it: World, packages: Path) -> None:
     """Over the restart of each part between them; the robot's nodes say nothing again."""
     latcher = str(packages / "latches" / "scripts" / "latcher.py")
     async with (
-        world(packages, tmp_path) as it,
         it.graph.program(latcher, "here", "/pose", "here_says", node="/here"),
         it.graph.program(latcher, "there", "/pose", "there_says", node="/there"),
     ):
@@ -197,11 +215,10 @@ async def test_latched_at_the_robot_is_latched_in_the_cloud(packages: Path, tmp_
             await pending_login.late("here_says", "there_says")
 
 
-async def test_latched_from_robot_to_robot(packages: Path, tmp_path: Path) -> None:
+async def test_latched_from_robot_to_robot(it: World, packages: Path) -> None:
     """A robot that connects later gets what the first one's nodes latched."""
     latcher = str(packages / "latches" / "scripts" / "latcher.py")
     async with (
-        world(packages, tmp_path) as it,
         it.graph.program(latcher, "here", "/pose", "here_says", node="/here"),
         it.graph.program(latcher, "there", "/pose", "there_says", node="/there"),
         stranger(it.engine.url, robot="R2") as second,

@@ -24,7 +24,7 @@ KINDS = ("containers", "slots", "packages")
 INITIAL = 1_000_000
 """Of all registers, which are limits of users."""
 TIMEOUT_S = 3.0
-PAUSE_S = 0.05
+PAUSE_S = 0.1
 TOKENS = 1500
 """A user may have 2000."""
 _FAILURES = (aiohttp.ClientError, TimeoutError, OSError)

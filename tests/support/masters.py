@@ -132,7 +132,7 @@ class Masters:
                             used += 1
                 except _FAILURES:
                     used += 1
-                await asyncio.sleep(0.05)
+                await asyncio.sleep(0.1)
 
     async def stored(self) -> set[str]:
         """Return the robots that have tokens."""

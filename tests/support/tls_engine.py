@@ -72,7 +72,7 @@ class World:
             "container-link-port": self.links[1],
         }
         options = [text for name, port in ports.items() for text in (f"--{name}", str(port))]
-        state = ["--state-dir", str(self.folder / "state"), "--runtime", "process"]
+        state = ["--state-dir", str(self.folder / "state"), "--runtime", "process", "--no-offer-images"]
         with self.log.open("ab") as log:
             self.process = await asyncio.create_subprocess_exec(
                 *(str(BIN / "rce"), "up", "--dev", "--tls", *state, *options),

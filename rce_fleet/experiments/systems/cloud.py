@@ -192,7 +192,8 @@ class Cloud(System):
             bench.run(SERVER, "secret", ("rce", "secret", "new", secret[1])),
             bench.run(SERVER, "user", add, given=PASSWORD),
         )
-        up: tuple[str, ...] = ("rce", "up", "--bind", bench.address(SERVER), *state, *secret)
+        bind = ("--bind", bench.address(SERVER))
+        up: tuple[str, ...] = ("rce", "up", "--no-offer-images", *bind, *state, *secret)
         if packages is not None:
             up += ("--package-path", str(packages))
         self._engine = await bench.start(SERVER, "engine", up, ready="RCE ready")

@@ -20,7 +20,7 @@ async def kill(world: World) -> None:
     """Kill the leading master, etcd's leader, both, or a stand-by, in turn, at any moment of a save."""
     rounds = ROUNDS if world.scale == 1 else round(LONG_ROUNDS * world.scale / 100)
     kinds = (_kill_leader, _kill_etcd, _kill_both, _kill_standby) * max(1, rounds)
-    for kind in kinds if world.scale > 1 else kinds[:5]:
+    for kind in kinds if world.scale > 1 else kinds[:4]:
         await asyncio.sleep(world.rng.uniform(0, 0.5))  # at which moment of a save is left to chance
         since = await kind(world)
         await world.until_task_sets_are_back(since)
