@@ -41,6 +41,15 @@ def client_digest(password: str) -> str:
     return hashlib.sha256(password.encode("utf-8", "surrogatepass")).hexdigest()
 
 
+def hash_public(digest: str) -> str:
+    """Hash a password that all know, such as that of development mode; neither it nor its checks take long.
+
+    Args:
+        digest: SHA-256 of the password in hex.
+    """
+    return PasswordHasher(time_cost=1, memory_cost=8, parallelism=1).hash(digest)
+
+
 @dataclass(eq=False, slots=True)
 class _Check:
     """A password that is being checked; concurrent logins with the same password wait for the same check."""

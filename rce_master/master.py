@@ -21,7 +21,7 @@ from rce.web.server import HttpServer, LateApplication
 from rce_master.answers import PURPOSE as ANSWERS_PURPOSE
 from rce_master.answers import Answers
 from rce_master.audit import AuditLog
-from rce_master.auth import Authenticator, client_digest
+from rce_master.auth import Authenticator, client_digest, hash_public
 from rce_master.control_handler import ControlHandler
 from rce_master.events import EventLog
 from rce_master.exceptions import MasterError
@@ -287,7 +287,7 @@ async def make_dev_user(services: Services) -> None:
     user = User(
         name=DEV_USER,
         role=UserRole.ADMIN,
-        password=await services.authenticator.hash(client_digest(DEV_USER)),
+        password=hash_public(client_digest(DEV_USER)),
         created=services.clock(),
     )
     await services.state_service.submit(commands.AddUser(user=user))

@@ -9,7 +9,7 @@ from argon2 import PasswordHasher, extract_parameters
 from argon2.exceptions import VerifyMismatchError
 from support.master_world import World
 
-from rce_master.auth import Authenticator, client_digest
+from rce_master.auth import Authenticator, client_digest, hash_public
 from rce_master.exceptions import TooManyFailuresError, WrongCredentialsError
 from rce_master.state import commands
 from rce_master.state.records import KnownLogin, User, UserRole
@@ -55,6 +55,21 @@ async def test_right_and_wrong_passwords(gate: Gate) -> None:
     for name, password in (("zoe", WRONG), ("nobody", RIGHT), ("anna", RIGHT)):
         with pytest.raises(WrongCredentialsError, match="unknown user or wrong password"):
             await gate.auth.verify(name, password)
+
+
+async def test_a_public_password_costs_little_to_check() -> None:
+    """By the hasher of all passwords, which a wrong one does not pass either."""
+    world = World()
+    hashed = hash_public(RIGHT)
+    world.do(commands.AddUser(user=User(name="zoe", role=UserRole.USER, password=hashed, created=0.0)))
+    auth = Authenticator(world.state.tables)
+    assert (await auth.verify("zoe", RIGHT)).name == "zoe"
+    with pytest.raises(WrongCredentialsError):
+        await auth.verify("zoe", WRONG)
+    auth.close()
+    costs, usual = extract_parameters(hashed), extract_parameters(PasswordHasher().hash(RIGHT))
+    assert (costs.time_cost, costs.type) == (1, usual.type)
+    assert costs.memory_cost * 1000 < usual.memory_cost
 
 
 async def test_a_storm_of_reconnects_costs_one_hash(gate: Gate) -> None:
