@@ -66,7 +66,7 @@ class ContainerLinks:
         Raises:
             OSError: The container has no link to this address, or the peer does not answer.
         """
-        if not any(link.address == address for link in links):
+        if not any(address in (link.address, link.next) for link in links):
             raise ConnectionError("the container has no link to there")
         async with asyncio.timeout(_DIAL_TIMEOUT_S):
             return await dial(address, self._settings.machine, tls=self._settings.tls)

@@ -44,6 +44,10 @@ class LinkSpec(Struct, frozen=True, kw_only=True, omit_defaults=True):
     dial: bool
     address: LinkAddress = LinkAddress()
     """Where to dial; empty while the peer is not up (yet)."""
+    next: LinkAddress | None = None
+    """Where to dial beside it: the copy of a peer that is being moved (:mod:`rce.link.takeover`)."""
+    copy: bool = False
+    """Whether this end belongs to such a copy: it is silent until this is no longer set."""
 
 
 class ConnectionSpec(Struct, frozen=True, kw_only=True):

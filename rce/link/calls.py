@@ -127,6 +127,12 @@ class CallServer:
             waiting[:2] == (channel, call_id) for waiting in self._waiting
         )
 
+    def serves(self, channel: Channel) -> bool:
+        """Return whether a request of a channel is being served or waits."""
+        return any(key[0] is channel for key in self._serving) or any(
+            waiting[0] is channel for waiting in self._waiting
+        )
+
     def cancel(self, channel: Channel, call_id: int | None = None) -> None:
         """Stop working on a request, or on all requests of a channel; they get no answer."""
         for key in [key for key in self._held if key[0] is channel and call_id in (None, key[1])]:

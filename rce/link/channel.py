@@ -62,6 +62,12 @@ class Channel:
         """Payload bytes that wait to be sent."""
         return self._queue.waiting_bytes
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether a call, of this end or of the peer, has no answer yet, or something waits to be sent."""
+        server = self.slot.server
+        return bool(self._calls) or bool(self._queue) or (server is not None and server.serves(self))
+
     def shed(self, size: int) -> None:
         """Drop the oldest messages of a topic, until ``size`` bytes are free."""
         self._queue.shed(size)
@@ -129,20 +135,22 @@ class Channel:
             source: Number of the source of a latched message; 0 if it is not latched.
         """
         carrier = self.link.carrier
-        if self.established and carrier is not None:
+        if self.established and carrier is not None and not self.link.spec.copy:
             flags = LATCHED if source else 0
             carrier.send(self._queue, Frame(FrameType.DATA, self.number, source, flags, payload))
 
     def send_sources(self, sources: Collection[int]) -> None:
         """Tell the peer which sources' latched messages are in force, after everything sent before."""
         carrier = self.link.carrier
-        if self.established and carrier is not None and LATCH in carrier.features:
+        if carrier is None or self.link.spec.copy:
+            return
+        if self.established and LATCH in carrier.features:
             carrier.send(self._queue, encode_sources(self.number, sources))
 
     async def call(self, payload: bytes | memoryview, deadline: float) -> bytes:
         """Send a request and wait ``deadline`` seconds for its answer. Raises as :meth:`Port.call`."""
         carrier = self.link.carrier
-        if not self.established or carrier is None:
+        if not self.established or carrier is None or self.link.spec.copy:
             raise NotConnectedError
         call_id, answer = self._calls.add()
         queue = self._queue
@@ -188,8 +196,8 @@ class Channel:
         Raises:
             ProtocolError: The peer must not send this.
         """
-        if not self.established:
-            return  # it was sent before the peer heard that this end closed
+        if not self.established or self.link.is_standby:
+            return  # it was sent before the peer heard that this end closed, or the peer is still a copy
         payload = bytes(frame.payload)
         match frame.type:
             case FrameType.DATA:
@@ -218,6 +226,8 @@ class Channel:
                 | FrameType.GRANT
                 | FrameType.OPEN
                 | FrameType.CLOSE
+                | FrameType.TAKE
+                | FrameType.LEAVE
                 | FrameType.FRAGMENT
                 | FrameType.ABORT
             ):

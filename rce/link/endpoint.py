@@ -24,6 +24,7 @@ from rce.link.channel import Channel
 from rce.link.links import EndpointLinks, is_same_link
 from rce.link.queues import Backlog
 from rce.link.slot import InterfaceSlot
+from rce.link.takeover import Takeovers
 from rce.link.wiring import ChannelTable, Refusals, WiringNews
 
 if TYPE_CHECKING:
@@ -77,6 +78,7 @@ class Endpoint:
         self._starts: dict[InterfaceSlot, asyncio.Task[None]] = {}
         self._tasks = BackgroundTasks()
         self._links = EndpointLinks(id, hub, self._tasks, on_growth)
+        self._takeovers = Takeovers(self._links, self._channels, self._backlog, self._tasks, hub.timeouts)
         self._lock = asyncio.Lock()
         self._notice: asyncio.Handle | None = None
         self._closed = False
@@ -180,6 +182,7 @@ class Endpoint:
         async with self._lock:
             self._closed = True
             self._drop_channels(list(self._channels))
+            self._takeovers.close()
             carriers = self._links.drop(list(self._links))
             await self._close_slots(list(self._slots.values()))
             await self._tasks.close()
@@ -213,6 +216,8 @@ class Endpoint:
         for link_id in due.links:
             due.connections.update(dict.fromkeys(desired.connections_on(link_id)))
         self._drop_channels(self._stale_channels(due, slots, gone))
+        for link in gone:
+            self._takeovers.forget(link.spec.id)
         self._links.drop(gone)
         await self._close_slots(slots)
         self._add(due)
@@ -236,6 +241,7 @@ class Endpoint:
 
     def _drop_channels(self, channels: list[Channel]) -> None:
         for channel in channels:
+            self._takeovers.channel_removed(channel)
             channel.link.remove(channel)
             channel.slot.remove(channel)
             self._channels.remove(channel)
@@ -272,6 +278,7 @@ class Endpoint:
         for link_id in due.links:
             if (link := desired.links.get(link_id)) is not None:
                 self._links.put(link)
+                self._takeovers.review(link_id)
         for tag in due.interfaces:
             interface = desired.interfaces.get(tag)
             if interface is not None and tag not in self._slots and not self._refused.has_interface(tag):
@@ -331,6 +338,7 @@ class Endpoint:
         self._channels.add(channel)
         slot.add(channel)
         link.add(channel)
+        self._takeovers.channel_added(channel)
 
     def _channel_changed(self, tag: str, number: int) -> None:
         """Take note that a channel of an interface was established or lost."""

@@ -66,6 +66,10 @@ class FrameType(IntEnum):
     """The sender's interface is ready on this channel."""
     CLOSE = 9
     """The sender's interface is gone from this channel."""
+    TAKE = 10
+    """The sender, until now the copy of an endpoint, is the endpoint from here on."""
+    LEAVE = 11
+    """The sender uses another connection of this link from here on, to the endpoint at its new place."""
     DATA = 16
     """A message of a topic."""
     CALL = 17

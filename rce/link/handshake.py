@@ -16,6 +16,8 @@ class Hello(msgspec.Struct, frozen=True, kw_only=True):
     token: str
     features: tuple[str, ...] = ()
     """The dialing end's features beyond the first version; unknown words are ignored."""
+    standby: bool = False
+    """Whether this connection is to stand beside the present one until TAKE (:mod:`rce.link.takeover`)."""
 
 
 class Welcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -26,16 +28,18 @@ class Welcome(msgspec.Struct, frozen=True, kw_only=True):
 
 LATCH = "latch"
 """Feature: latched messages name their source, and SOURCES takes back those of sources that ended."""
-FEATURES = (LATCH,)
+TAKEOVER = "takeover"
+"""Feature: a second connection of a link may stand by and take over."""
+FEATURES = (LATCH, TAKEOVER)
 """This end's features beyond the first version of links."""
 
 _hello_decoder = msgspec.json.Decoder(Hello)
 _welcome_decoder = msgspec.json.Decoder(Welcome)
 
 
-def encode_hello(link: str, token: str) -> bytes:
+def encode_hello(link: str, token: str, *, standby: bool = False) -> bytes:
     """Write the first frame of a link's dialing end."""
-    hello = Hello(version=VERSION, link=link, token=token, features=FEATURES)
+    hello = Hello(version=VERSION, link=link, token=token, features=FEATURES, standby=standby)
     return encode(Frame(FrameType.HELLO, payload=msgspec.json.encode(hello)))
 
 

@@ -211,8 +211,12 @@ class LinkHub:
             return Path(address.unix) not in self._unix_sockets
         return bool(address.port)
 
-    async def connect(self, spec: LinkSpec) -> Carrier:
+    async def connect(self, spec: LinkSpec, *, standby: bool = False) -> Carrier:
         """Reach the accepting end of a link: in this process, by its unix socket, or by TCP.
+
+        Args:
+            spec: The link.
+            standby: Whether the connection is to stand beside the link's present one.
 
         Raises:
             OSError: It cannot be reached, or not in time.
@@ -222,11 +226,14 @@ class LinkHub:
         if local is not None:
             _check_token(local, spec.token)
             ours, theirs = LocalCarrier.pair()
-            local.attach(theirs)
+            local.accept(theirs, standby=standby)
             return ours
+        return await self._introduce(await self._reach(spec), spec, standby=standby)
+
+    async def _reach(self, spec: LinkSpec) -> SocketCarrier:
         address = spec.address
         if self._dial is not None:
-            return await self._introduce(await self._carry(await self._dial(address), spec), spec)
+            return await self._carry(await self._dial(address), spec)
         if self._is_near(address):
             try:
                 return await self._dial_unix(spec)
@@ -239,16 +246,16 @@ class LinkHub:
     def _is_near(self, address: LinkAddress) -> bool:
         return bool(address.unix) and address.machine == self.machine
 
-    async def _dial_unix(self, spec: LinkSpec) -> Carrier:
+    async def _dial_unix(self, spec: LinkSpec) -> SocketCarrier:
         async with asyncio.timeout(self.timeouts.connect):
             _, carrier = await self.loop.create_unix_connection(self._new_carrier, spec.address.unix)
-        return await self._introduce(carrier, spec)
+        return carrier
 
-    async def _dial_tcp(self, spec: LinkSpec) -> Carrier:
+    async def _dial_tcp(self, spec: LinkSpec) -> SocketCarrier:
         address = spec.address
         async with asyncio.timeout(self.timeouts.connect):
             sock = await open_socket(address.host, address.port)
-        return await self._introduce(await self._carry(sock, spec), spec)
+        return await self._carry(sock, spec)
 
     async def _carry(self, sock: socket.socket, spec: LinkSpec) -> SocketCarrier:
         """Make a carrier of a connected socket, in TLS if the peer wants that on TCP."""
@@ -264,10 +271,10 @@ class LinkHub:
             raise
         return carrier
 
-    async def _introduce(self, carrier: SocketCarrier, spec: LinkSpec) -> Carrier:
+    async def _introduce(self, carrier: SocketCarrier, spec: LinkSpec, *, standby: bool) -> Carrier:
         """Shake hands as the dialing end."""
         try:
-            carrier.greet(encode_hello(spec.id, spec.token))
+            carrier.greet(encode_hello(spec.id, spec.token, standby=standby))
             async with asyncio.timeout(self.timeouts.handshake):
                 carrier.features = check_answer(await carrier.handshake_frame())
         except BaseException as error:
@@ -323,7 +330,7 @@ class LinkHub:
         else:
             carrier.features = frozenset(hello.features)
             carrier.greet(encode_welcome() if hello.features else encode(Frame(FrameType.WELCOME)))
-            link.attach(carrier)
+            link.accept(carrier, standby=hello.standby)
         finally:
             guest.leave()
 

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 from rce.link.exceptions import ProtocolError
 from rce.link.frames import Frame, FrameType
+from rce.link.handshake import TAKEOVER
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from rce.control import LinkSpec
     from rce.link.carrier import Carrier
@@ -28,6 +29,10 @@ class Link:
         limits: Of everything on this link.
         carrier: What carries the frames at present.
         peer_open: Channels that the peer opened on this carrier; also those that are unknown here yet.
+        is_standby: Whether it stands beside the present link to the peer (:mod:`rce.link.takeover`).
+        was_left: Whether the peer uses another connection of this link now.
+        on_successor: Takes a connection that the peer wants to stand beside the present one.
+        on_take: Called when the peer, until then a copy, is the endpoint.
     """
 
     def __init__(
@@ -37,6 +42,11 @@ class Link:
         self.limits = limits
         self.carrier: Carrier | None = None
         self.peer_open: set[int] = set()
+        self.is_standby = False
+        self.was_left = False
+        self.on_successor: Callable[[Carrier], None] | None = None
+        self.on_take: Callable[[], None] = lambda: None
+        self._was_copy = False
         self._on_growth = on_growth
         self._channels: dict[int, Channel] = {}
         self._pacer: Pacer | None = None
@@ -74,6 +84,13 @@ class Link:
         if self.carrier is not None:
             self.carrier.pace(pacer)
 
+    def __iter__(self) -> Iterator[Channel]:
+        return iter(list(self._channels.values()))
+
+    def get(self, number: int) -> Channel | None:
+        """Return a channel, or None."""
+        return self._channels.get(number)
+
     def add(self, channel: Channel) -> None:
         """Add a channel and open it if its interface has started."""
         self._channels[channel.number] = channel
@@ -83,6 +100,37 @@ class Link:
         """Close and forget a channel."""
         channel.close()
         del self._channels[channel.number]
+
+    def accept(self, carrier: Carrier, *, standby: bool) -> None:
+        """Take a carrier that the peer dialed; one on standby does not replace the present one.
+
+        A peer whose end is on standby is told at once that this end takes over, if it has done so before.
+        """
+        is_copy = self.spec.copy or self._was_copy
+        if standby and not is_copy and self.carrier is not None and self.on_successor is not None:
+            self.on_successor(carrier)
+            return
+        self.attach(carrier)
+        if standby and not self.spec.copy:
+            self._tell(FrameType.TAKE)
+
+    def change(self, spec: LinkSpec) -> None:
+        """Give the link its new spec; if this end belonged to a copy until now, it takes over."""
+        takes_over = self.spec.copy and not spec.copy
+        self.spec = spec
+        if takes_over:
+            self._was_copy = True
+            self._tell(FrameType.TAKE)
+            for channel in self:
+                channel.slot.send_latched(channel)
+
+    def leave(self) -> None:
+        """Tell the peer that another connection of this link is used from now on."""
+        self._tell(FrameType.LEAVE)
+
+    def _tell(self, news: FrameType) -> None:
+        if self.carrier is not None and TAKEOVER in self.carrier.features:
+            self.carrier.control(Frame(news))
 
     def attach(self, carrier: Carrier) -> None:
         """Continue over a new carrier; a former one is closed, as its peer has given it up."""
@@ -120,10 +168,20 @@ class Link:
             self.peer_open.discard(number)
             if channel is not None:
                 channel.peer_closed()
+        elif frame.type in (FrameType.TAKE, FrameType.LEAVE):
+            self._peer_moved(frame.type)
         elif channel is not None:
+            if frame.type is FrameType.DATA:
+                self._was_copy = False  # the peer has noticed that this end took over
             channel.frame_received(frame)
         elif frame.type < FrameType.DATA:
             raise ProtocolError(f"{frame.type.name} after the handshake")
+
+    def _peer_moved(self, news: FrameType) -> None:
+        if news is FrameType.TAKE:
+            self.on_take()
+        else:
+            self.was_left = True
 
     def carrier_lost(self, carrier: Carrier, reason: Exception) -> None:
         """Close all channels."""

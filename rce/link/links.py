@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
 from rce.link.carrier import Carrier, LocalCarrier
 from rce.link.exceptions import LinkError
+from rce.link.handshake import TAKEOVER
 from rce.link.link import Link, add_traffic
 from rce.link.pacing import Pacer
 
@@ -51,12 +54,20 @@ class EndpointLinks:
         self._links: dict[str, Link] = {}
         self._far_ends: dict[str, Link] = {}
         """The other ends of links of this endpoint with itself."""
+        self._others: dict[Link, None] = {}
+        """Links to copies of peers, and to former places of peers."""
+        self.is_awaited: Callable[[Link], bool] = lambda _: False
+        """Whether the link to the peer's copy, which has the address now, will take the place of a link."""
+        self.take_over: Callable[[str], None] = lambda _: None
+        """Let it take the place now."""
+        self.on_successor: Callable[[Link, Carrier], None] | None = None
+        """Takes a connection that a peer's copy dialed."""
         self._dials: dict[Link, asyncio.Task[None]] = {}
         self._pacer: Pacer | None = None
         self._former_traffic = (0, 0)
 
     def __iter__(self) -> Iterator[Link]:
-        return iter(self._links.values())
+        return chain(self._links.values(), self._others)
 
     def __getitem__(self, link_id: str) -> Link:
         return self._links[link_id]
@@ -97,21 +108,49 @@ class EndpointLinks:
         """Make a link, or give the present one its new spec."""
         link = self._links.get(spec.id)
         if link is None:
-            link = self._links[spec.id] = Link(spec, self._hub.limits, self._on_growth)
-            link.pace(self._pacer)
+            link = self._links[spec.id] = self.make(spec)
             if spec.peer == str(self._id):
                 self._far_ends[spec.id] = _loop_back(link)
             elif spec.dial:
-                self._dial(link)
+                self.dial(link)
             else:
                 self._hub.register(link)
         elif link.spec != spec:
             redial = spec.dial and _must_redial(link, spec.address)
-            link.spec = spec
-            if redial:
+            link.change(spec)
+            if redial and not self.is_awaited(link):
                 self._stop_dialing(link)
                 link.detach()
-                self._dial(link)
+                self.dial(link)
+
+    def make(self, spec: LinkSpec) -> Link:
+        """Make a link, without adding it."""
+        link = Link(spec, self._hub.limits, self._on_growth)
+        link.pace(self._pacer)
+        if self.on_successor is not None:
+            link.on_successor = partial(self.on_successor, link)
+        return link
+
+    def include(self, link: Link) -> None:
+        """Add a link that stands beside another one."""
+        self._others[link] = None
+
+    def exclude(self, link: Link) -> None:
+        """End a link that stood beside another one."""
+        self._stop_dialing(link)
+        link.detach()
+        del self._others[link]
+        self._former_traffic = add_traffic(self._former_traffic, link.traffic)
+
+    def exchange(self, former: Link, link: Link) -> None:
+        """Let two links that stand beside each other change places."""
+        self._stop_dialing(former)
+        self._hub.unregister(former)
+        self._others[former] = None
+        del self._others[link]
+        self._links[link.spec.id] = link
+        if not link.spec.dial:
+            self._hub.register(link)
 
     def drop(self, links: list[Link]) -> list[Carrier]:
         """Forget links; return the carriers that are still closing."""
@@ -126,33 +165,42 @@ class EndpointLinks:
             self._former_traffic = add_traffic(self._former_traffic, link.traffic)
         return carriers
 
-    def _dial(self, link: Link) -> None:
-        task = self._tasks.spawn(_keep_dialed(link, self._hub), name=f"{self._id} dials {link.spec.peer}")
-        self._dials[link] = task
+    def dial(self, link: Link) -> None:
+        """Dial a link, and again whenever its connection ends."""
+        name = f"{self._id} dials {link.spec.peer}"
+        self._dials[link] = self._tasks.spawn(self._keep_dialed(link), name=name)
+
+    async def _keep_dialed(self, link: Link) -> None:
+        """Dial a link, again whenever its carrier ended, until another one is to take its place."""
+        hub = self._hub
+        pauses = hub.timeouts.redial.start()
+        while True:
+            if not hub.can_reach(link.spec):
+                await hub.wait_registered(link.spec.id, None)
+            since = hub.loop.time()
+            try:
+                carrier = await hub.connect(link.spec, standby=link.is_standby or link.spec.copy)
+            except (OSError, LinkError) as error:
+                _log.debug("link %s to %s: %s", link.spec.id, link.spec.peer, error)
+            else:
+                if link.is_standby and TAKEOVER not in carrier.features:
+                    carrier.close()
+                    return
+                link.attach(carrier)
+                await carrier.wait_closed()
+                if link.was_left:
+                    return
+                if self.is_awaited(link):
+                    self.take_over(link.spec.id)
+                    return
+            if hub.loop.time() - since > _LONG_ENOUGH:
+                pauses.reset()
+            await hub.wait_registered(link.spec.id, pauses.next())
 
     def _stop_dialing(self, link: Link) -> None:
         task = self._dials.pop(link, None)
         if task is not None:
             task.cancel()
-
-
-async def _keep_dialed(link: Link, hub: LinkHub) -> None:
-    """Dial a link, again whenever its carrier ended. Ends by cancellation only."""
-    pauses = hub.timeouts.redial.start()
-    while True:
-        if not hub.can_reach(link.spec):
-            await hub.wait_registered(link.spec.id, None)
-        since = hub.loop.time()
-        try:
-            carrier = await hub.connect(link.spec)
-        except (OSError, LinkError) as error:
-            _log.debug("link %s to %s: %s", link.spec.id, link.spec.peer, error)
-        else:
-            link.attach(carrier)
-            await carrier.wait_closed()
-        if hub.loop.time() - since > _LONG_ENOUGH:
-            pauses.reset()
-        await hub.wait_registered(link.spec.id, pauses.next())
 
 
 def _must_redial(link: Link, address: LinkAddress) -> bool:

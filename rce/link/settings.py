@@ -32,6 +32,12 @@ class LinkTimeouts:
     """A service call without a timeout of its own."""
     close: float = 10.0
     """An interface may take so long to close."""
+    take: float = 5.0
+    """The copy of a peer that was moved may take so long to say that it takes over."""
+    former: float = 10.0
+    """The former connection to a peer that was moved may take so long to answer the last calls."""
+    quiet: float = 0.5
+    """It ends once it has answered all calls and nothing came on it for so long."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -55,6 +55,8 @@ class InterfaceSlot:
         self._on_fault = on_fault
         self._interface: Interface | None = None
         self._channels: dict[int, Channel] = {}
+        self._others: dict[Channel, None] = {}
+        """Channels to copies of peers and to former places of peers: nothing is sent on them."""
         self._holdings = Holdings() if holdings is None else holdings
         self._latched = LatchedMessages(self._holdings, self._latched_given_up)
         self._heard = HeardSources()
@@ -114,7 +116,7 @@ class InterfaceSlot:
             self._fault(str(error) or type(error).__name__)
             return
         self.started = True
-        for channel in list(self._channels.values()):
+        for channel in [*self._channels.values(), *self._others]:
             channel.open()
 
     async def close(self) -> None:
@@ -140,14 +142,40 @@ class InterfaceSlot:
         del self._channels[channel.number]
         self._unlatch(self._heard.retain(channel.number))
 
-    def channel_changed(self, channel: Channel) -> None:
-        """Take note that a channel was established or lost."""
+    @property
+    def others(self) -> tuple[Channel, ...]:
+        """The channels to copies of peers, and to former places of peers."""
+        return tuple(self._others)
+
+    def add_other(self, channel: Channel) -> None:
+        """Take a channel in on which nothing is sent."""
+        self._others[channel] = None
+
+    def remove_other(self, channel: Channel) -> None:
+        """Remove such a channel."""
+        self._others.pop(channel, None)
+
+    def replace(self, former: Channel, channel: Channel) -> None:
+        """Send on another channel of the same connection from now on; what comes on both is taken."""
+        self.remove_other(channel)
+        self._channels[channel.number] = channel
+        self.add_other(former)
+        self.channel_changed(channel)
+
+    def send_latched(self, channel: Channel) -> None:
+        """Send what is latched on a channel."""
         if channel.established and self.role is Role.SUBSCRIBER:
             for kept in self._latched:
                 channel.send(kept.payload, source=kept.number)
             channel.send_sources(self._latched.numbers)
+
+    def channel_changed(self, channel: Channel) -> None:
+        """Take note that a channel was established or lost."""
         if not channel.established and self.server is not None:
             self.server.cancel(channel)
+        if channel in self._others:
+            return
+        self.send_latched(channel)
         active = any(channel.established for channel in self._channels.values())
         if active != self.active:
             self.active = active
@@ -159,7 +187,7 @@ class InterfaceSlot:
         self.counters.count_in(len(payload))
         assert self._interface is not None
         try:
-            if source is None:
+            if source is None or channel in self._others:
                 self._interface.receive(payload, latched=False)
             else:
                 name, ended = self._heard.note_source(channel.number, source)
@@ -179,6 +207,8 @@ class InterfaceSlot:
 
     def keep_sources(self, channel: Channel, sources: Collection[int]) -> None:
         """Have the interface forget what other sources of the peer latched."""
+        if channel in self._others:
+            return
         self._unlatch(self._heard.retain(channel.number, sources))
 
     def _unlatch(self, sources: list[str]) -> None:

@@ -51,6 +51,10 @@ class ChannelTable:
         if not ends:
             del self._channels[channel.number]
 
+    def replace(self, channel: Channel) -> None:
+        """Put a channel in the place of another one of the same connection."""
+        self._channels[channel.number][channel.spec.interface] = channel
+
     def has(self, end: ConnectionSpec) -> bool:
         """Return whether there is a channel for an end of a connection."""
         return end.interface in self._channels.get(end.id, {})

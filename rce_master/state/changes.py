@@ -11,6 +11,7 @@ from rce_master.state.records import (
     Container,
     ContainerLive,
     Counter,
+    Departure,
     Drain,
     Endpoint,
     KeptAnswer,
@@ -202,7 +203,8 @@ class Transaction:
         | Presence
         | Tombstone
         | Drain
-        | Move,
+        | Move
+        | Departure,
     ) -> None:
         """Write a record into its table."""
         self._assign(self._table_of(record), record)
@@ -337,4 +339,5 @@ _TABLES: dict[type, str] = {
     Tombstone: "tombstones",
     Drain: "drains",
     Move: "moves",
+    Departure: "departures",
 }

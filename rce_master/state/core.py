@@ -32,7 +32,7 @@ from rce_master.state.changes import Changes, Touched, Transaction
 from rce_master.state.invariants import validate
 from rce_master.state.migration import converted
 from rce_master.state.settings import StateSettings
-from rce_master.state.specs import build_patch, build_spec
+from rce_master.state.specs import build_copy_spec, build_patch, build_spec
 from rce_master.state.tables import Tables
 
 if TYPE_CHECKING:
@@ -264,13 +264,12 @@ class State:
         """Return the desired state of a container's copy at its next machine; None without a copy.
 
         Returns:
-            The process name of the task set, and the spec to make: the contents of the container, without
-            interfaces and connections.
+            The process name of the task set, and the spec to make.
         """
         move = self.tables.moves.get(endpoint)
         if move is None:
             return None
-        return move.to, build_spec(self.tables, endpoint, with_wiring=False)
+        return move.to, build_copy_spec(self.tables, endpoint)
 
     def is_held(self, endpoint: str) -> bool:
         """Return whether an endpoint is a container that is to run nowhere, since it moves with volumes."""

@@ -7,7 +7,8 @@ An operator may have a single container handed over, too.
 
 A container is *handed over* by a move: a copy of it, with its nodes and parameters but without interfaces and
 connections, is made at another machine while the container continues; once the copy's nodes are up, the copy
-becomes the container, gets the interfaces and connections, and the former one is dropped. A node that is not
+makes its links, becomes the container, and the former one gives its last answers
+(:mod:`rce_master.state.handing_over`). A node that is not
 up in the container need not be up in the copy: a node without ROS never registers. A container with volumes
 is ended first, and moves with its files (:mod:`rce_master.state.volume_moves`). One container at a time
 moves away from a machine; those in the network of one group move together. A container without room elsewhere
@@ -25,7 +26,7 @@ from msgspec.structs import replace
 
 from rce.control import EndpointState, EndpointStatus, NodeState, TaskSetKind, without_wiring
 from rce_master.exceptions import ConflictError, NoRoomError, NotFoundError
-from rce_master.state import activity, capacity, endpoints, placing, robots, volume_moves
+from rce_master.state import activity, capacity, endpoints, handing_over, placing, robots, volume_moves
 from rce_master.state.lifecycle import ContainerEvent
 from rce_master.state.placement import Room, best_of, refusals
 from rce_master.state.records import Container, Drain, Move
@@ -33,6 +34,7 @@ from rce_master.state.records import Container, Drain, Move
 if TYPE_CHECKING:
     from collections.abc import Collection
 
+    from rce.control import StatusPatch
     from rce.model import Resources
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import MoveContainer, SetDraining
@@ -139,6 +141,9 @@ def continue_round(tx: Transaction) -> None:
             tx.spend(_MOVE)
             give_up(tx, move, f"did not come up there within {tx.settings.move_timeout:.0f} s")
     volume_moves.expire(tx)
+    handing_over.expire(tx)
+    for id_ in [move.id for move in tx.tables.moves]:
+        _proceed(tx, id_)
     waiting, draining = tx.tables.drain_round, set(tx.tables.rooms.draining)
     search = _Search(tx)
     while waiting and not tx.is_out_of_work():
@@ -279,19 +284,37 @@ def _is_draining(tx: Transaction, container: Container) -> bool:
 # Progress of moves
 
 
-def reported(tx: Transaction, move: Move, status: EndpointStatus) -> None:
-    """Apply a report about a container's copy."""
-    container = tx.tables.container(move.id)
-    assert container is not None
+def reported(tx: Transaction, move: Move, status: EndpointStatus, patch: StatusPatch | None = None) -> None:
+    """Apply a report about a container's copy, or a patch of one."""
     if status.state is EndpointState.FAILED:
         give_up(tx, move, f"failed there: {status.detail or 'no reason was given'}")
         return
-    tx.put(replace(move, status=status))
-    moves = [m for each in _unit(tx.tables, container) if (m := tx.tables.moves.get(each.id)) is not None]
-    if all(_is_ready(tx, m) for m in moves):
-        for m in moves:
-            _switch(tx, m)
+    connections = handing_over.established(move, status, patch)
+    tx.put(replace(move, status=without_wiring(status), connections=connections))
+    if _proceed(tx, move.id):
         advance(tx)
+
+
+def _proceed(tx: Transaction, id_: str) -> bool:
+    """Let copies make their links, or take over, if they can; return whether they took over."""
+    container = tx.tables.container(id_)
+    if container is None or id_ not in tx.tables.moves:
+        return False
+    moves = [m for each in _unit(tx.tables, container) if (m := tx.tables.moves.get(each.id)) is not None]
+    company = frozenset(m.id for m in moves)
+    if not all(_is_ready(tx, m) for m in moves):
+        return False
+    late = [m for m in moves if m.linking_since is None]
+    if late and any(handing_over.in_use(tx.tables, m.id, company) for m in moves):
+        if handing_over.may_link(tx.tables, company):
+            for m in late:
+                handing_over.begin_links(tx, m)
+        return False
+    if not late and not all(handing_over.has_links(tx, m, company) for m in moves):
+        return False
+    for m in moves:
+        _switch(tx, m, company)
+    return True
 
 
 def _is_ready(tx: Transaction, move: Move) -> bool:
@@ -307,17 +330,16 @@ def _is_ready(tx: Transaction, move: Move) -> bool:
     return status.state is EndpointState.RUNNING
 
 
-def _switch(tx: Transaction, move: Move) -> None:
+def _switch(tx: Transaction, move: Move, company: frozenset[str]) -> None:
     container = tx.tables.container(move.id)
     assert container is not None
     assert move.status is not None
+    handing_over.depart(tx, container, handing_over.in_use(tx.tables, move.id, company))
     tx.delete(tx.tables.moves, move.id)
-    endpoints.withdraw(tx, container, "it was handed over to another machine")
     _settle(tx, container, move)
-    tx.put(replace(tx.tables.container_live(move.id), status=without_wiring(move.status)))
-    activity.note(tx, move.status)
+    tx.put(replace(tx.tables.container_live(move.id), status=move.status))
+    tx.changes.wanted_statuses.append((move.to, move.id))
     placing.happened(tx, move.id, _PHASES[move.status.state])
-    tx.put(replace(tx.tables.endpoints[move.id], address=move.status.address))
     tx.happen("container_moved", move.id, f"from {container.task_set} to {move.to}")
 
 
@@ -326,6 +348,8 @@ _PHASES = {EndpointState.RUNNING: ContainerEvent.RUNNING, EndpointState.DEGRADED
 
 def _settle(tx: Transaction, container: Container, move: Move) -> None:
     tx.put(replace(container, task_set=move.to))
+    if move.status is not None:
+        tx.put(replace(tx.tables.endpoints[move.id], address=move.status.address))
     placing.happened(tx, move.id, ContainerEvent.PLACE)
     tx.touch(move.id)
     endpoints.touch_dialers(tx, move.id)

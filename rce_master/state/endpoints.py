@@ -49,6 +49,7 @@ def remove(tx: Transaction, id_: str, reason: str) -> None:
     """Remove an endpoint with its links and have its task set drop it."""
     endpoint = tx.tables.endpoints[id_]
     drop_copy(tx, id_, reason)
+    end_departure(tx, id_, reason)
     if isinstance(endpoint, Container):
         volumes.end_move(tx, endpoint)
     for connection in tx.tables.connections.by("endpoint", id_):
@@ -94,9 +95,21 @@ def drop_copy(tx: Transaction, id_: str, reason: str) -> None:
     if move is None:
         return
     tx.delete(tx.tables.moves, id_)
+    if move.linking_since is not None:
+        touch_dialers(tx, id_)
     if tx.tables.is_connected(move.to):
         tx.withdraw(move.to, id_, reason)
         tx.put(Tombstone(process=move.to, id=id_))
+
+
+def end_departure(tx: Transaction, id_: str, reason: str) -> None:
+    """Drop a container at its former machine, if it still gives its last answers there."""
+    departure = tx.tables.departures.get(id_)
+    if departure is None:
+        return
+    tx.delete(tx.tables.departures, id_)
+    if tx.tables.is_connected(departure.process):
+        tx.withdraw(departure.process, id_, reason)
 
 
 def dials(tables: Tables, link: Link, endpoint: str) -> bool:

@@ -457,6 +457,23 @@ class Move(Struct, frozen=True, kw_only=True):
     since: float
     status: EndpointStatus | None = None
     """What is reported of the copy."""
+    linking_since: float | None = None
+    """When its nodes were up, and it was told to make its links; None: not yet."""
+    connections: frozenset[int] = frozenset()
+    """Those that it reports as established."""
+
+
+class Departure(Struct, frozen=True, kw_only=True):
+    """A container that was handed over, at its former machine, where it gives its last answers."""
+
+    id: str
+    process: str
+    """Of the former task set."""
+    since: float
+    number: int
+    """Of the last report from there."""
+    connections: frozenset[int]
+    """Those that are still established there."""
 
 
 Live: TypeAlias = RobotLive | ContainerLive

@@ -19,6 +19,10 @@ class StateSettings:
     """How long a robot that was let in may take until its task set reports it; then it counts as away."""
     move_timeout: float = 60.0
     """How long a container's copy at another machine may take to come up, when its machine is drained."""
+    link_timeout: float = 10.0
+    """How long the links of a copy may take to be established beside those of the container."""
+    departure_timeout: float = 15.0
+    """How long a container that was handed over may take for its last answers."""
     volume_move_timeout: float = 1800.0
     """How long each phase of a move with volumes may take: to end, to save, to restore."""
     move_rest: float = 30.0

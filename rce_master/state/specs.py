@@ -17,6 +17,36 @@ if TYPE_CHECKING:
     from rce_master.state.tables import Tables
 
 
+def build_copy_spec(tables: Tables, id_: str) -> EndpointSpec:
+    """Build the spec of the copy of a container that is being handed over.
+
+    It has no interfaces, links and connections before its nodes are up.
+
+    Raises:
+        KeyError: There is no such container, or it has no copy.
+    """
+    if tables.moves[id_].linking_since is None:
+        return build_spec(tables, id_, with_wiring=False)
+    spec = build_spec(tables, id_)
+    links = (_copy_end(tables, link) for link in spec.links)
+    return replace(spec, links=tuple(links))
+
+
+def _copy_end(tables: Tables, link: LinkSpec) -> LinkSpec:
+    """Return a copy's end of a link; the copies of two containers that move together are linked."""
+    peer = _copy_address(tables, link.peer)
+    address = peer if link.dial and peer is not None else link.address
+    return replace(link, copy=True, address=address, next=None)
+
+
+def _copy_address(tables: Tables, id_: str) -> LinkAddress | None:
+    """Tell where the copy of a container accepts links; None without a copy that makes its links."""
+    move = tables.moves.get(id_)
+    if move is None or move.linking_since is None or move.status is None:
+        return None
+    return move.status.address
+
+
 def build_spec(tables: Tables, id_: str, *, with_wiring: bool = True) -> EndpointSpec:
     """Build the spec of an endpoint from the tables.
 
@@ -102,12 +132,14 @@ def link_spec(tables: Tables, link: Link, id_: str) -> LinkSpec:
     """Return one end of a link."""
     peer = link.peer(id_)
     dial = peer != id_ and endpoints.dials(tables, link, id_)
+    moves_too = _copy_address(tables, id_) is not None
     return LinkSpec(
         id=link.id,
         peer=peer,
         token=link.token,
         dial=dial,
         address=endpoints.address(tables, peer) if dial else LinkAddress(),
+        next=_copy_address(tables, peer) if dial and not moves_too else None,
     )
 
 

@@ -11,6 +11,7 @@ from rce_master.state.records import (
     Container,
     ContainerLive,
     Counter,
+    Departure,
     Drain,
     Endpoint,
     KeptAnswer,
@@ -182,6 +183,9 @@ class Tables:
         self.moves = Table[Move](
             "moves", type_=Any, key=lambda m: m.id, persistent=False, to=lambda m: [m.to]
         )
+        self.departures = Table[Departure](
+            "departures", type_=Any, key=lambda d: d.id, persistent=False, process=lambda d: [d.process]
+        )
         self.first_revision = 0
         """Revisions that this run of the master gives are above this."""
         self.queue = PlacementQueue(self.endpoints, self.tombstones, self.volume_removals)
@@ -228,6 +232,7 @@ class Tables:
             self.presence,
             self.tombstones,
             self.moves,
+            self.departures,
         )
 
     def robot(self, endpoint: str) -> Robot | None:

@@ -21,6 +21,7 @@ from rce_master.state import (
     containers,
     draining,
     endpoints,
+    handing_over,
     placing,
     robots,
     volume_moves,
@@ -175,6 +176,8 @@ def left(tx: Transaction, command: TaskSetLeft) -> None:
     tx.put(Presence(process=process, connected=False, since=tx.now))
     for tombstone in tx.tables.tombstones.by("process", process):
         tx.delete(tx.tables.tombstones, tombstone.key)
+    for departure in list(tx.tables.departures.by("process", process)):
+        tx.delete(tx.tables.departures, departure.id)
     for endpoint in tx.tables.endpoints.by("task_set", process):
         if isinstance(endpoint, Robot):
             robots.leave(tx, endpoint, f"its task set {process!r} is away")
@@ -196,6 +199,8 @@ def status_reported(tx: Transaction, command: StatusReported) -> None:
         _note(tx, endpoint, command.status)
     elif move is not None and move.to == command.process:
         draining.reported(tx, move, command.status)
+    else:
+        handing_over.departing_reported(tx, command.process, command.status)
 
 
 def status_patched(tx: Transaction, command: StatusPatched) -> None:
@@ -212,9 +217,11 @@ def status_patched(tx: Transaction, command: StatusPatched) -> None:
             tx.changes.wanted_statuses.append((process, id_))
     elif move is not None and move.to == process:
         if _follows(patch, move.status):
-            draining.reported(tx, move, without_wiring(patch.status))
+            draining.reported(tx, move, patch.status, patch)
         else:
             tx.changes.wanted_statuses.append((process, id_))
+    else:
+        handing_over.departing_reported(tx, process, patch.status, patch)
 
 
 def _follows(patch: StatusPatch, known: EndpointStatus | None) -> bool:
@@ -247,6 +254,7 @@ def _note(
 def gone(tx: Transaction, command: EndpointGone) -> None:
     """Note that an endpoint ended at a task set."""
     key = tombstone_key(command.process, command.id)
+    handing_over.departed(tx, command.process, command.id)
     if key in tx.tables.tombstones:
         tx.delete(tx.tables.tombstones, key)
         if command.id not in tx.tables.endpoints:

@@ -73,4 +73,5 @@ class StatusParts(TypedDict, total=False):
     incarnation: str
     address: LinkAddress
     nodes: tuple[NodeStatus, ...]
+    connections: tuple[int, ...]
     detail: str

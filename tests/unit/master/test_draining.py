@@ -92,6 +92,77 @@ def test_a_copy_is_made_first_and_takes_over_when_it_is_up(two: World) -> None:
     assert (at(two, "d"), moves(two)) == ("c2", {})
 
 
+def established(world: World) -> tuple[int, ...]:
+    """Let the robot and its container report their connection as established."""
+    (number,) = (connection.id for connection in world.spec("c").connections)
+    running = NodeStatus(tag="n", state=NodeState.RUNNING)
+    report(world, "c", "c1", nodes=(running,), connections=(number,))
+    status = EndpointStatus(id="anna/rob", revision=1, state=EndpointState.RUNNING, connections=(number,))
+    world.report("r1", status)
+    return (number,)
+
+
+def test_links_are_made_before_they_are_broken(two: World) -> None:
+    """The robot gets the copy's address beside the container's; the copy takes over when it is linked."""
+    numbers = established(two)
+    drain(two)
+    nodes = (NodeStatus(tag="n", state=NodeState.RUNNING),)
+    changes = report(two, "c", "c2", nodes=nodes)
+    assert (at(two, "c"), changes.withdrawals) == ("c1", [])
+    assert {"anna/c", "anna/rob"} <= set(changes.touched)
+    (link,) = two.spec("rob").links
+    assert link.next is not None
+    assert (link.address.unix, link.next.unix) == ("/c1/c", "/c2/c")
+    _, copy = two.state.copy_spec("anna/c") or ("", None)
+    assert copy is not None
+    assert [one.copy for one in copy.links] == [True]
+    assert [one.id for one in copy.connections] == [*numbers]
+    changes = report(two, "c", "c2", nodes=nodes, connections=numbers)
+    assert (at(two, "c"), changes.withdrawals) == ("c2", []), "the former one still answers"
+    (link,) = two.spec("rob").links
+    assert (link.address.unix, link.next) == ("/c2/c", None)
+    assert [one.copy for one in two.spec("c").links] == [False]
+    assert changes.wanted_statuses == [("c2", "anna/c")]
+    changes = report(two, "c", "c1", nodes=nodes)
+    assert [(w.process, w.id) for w in changes.withdrawals] == [("c1", "anna/c")], "after its last answers"
+    two.state.validate()
+
+
+def test_a_copy_without_links_takes_over_after_a_while(two: World) -> None:
+    """A robot of an earlier release does not link to the copy; the former container has its time, too."""
+    established(two)
+    drain(two)
+    nodes = (NodeStatus(tag="n", state=NodeState.RUNNING),)
+    report(two, "c", "c2", nodes=nodes)
+    assert two.tick(9.0).withdrawals == []
+    assert at(two, "c") == "c1"
+    two.tick(2.0)
+    assert at(two, "c") == "c2"
+    assert two.tick(14.0).withdrawals == []
+    assert [(w.process, w.id) for w in two.tick(2.0).withdrawals] == [("c1", "anna/c")]
+
+
+def test_a_move_that_is_given_up_takes_the_copy_s_address_back(two: World) -> None:
+    """The target dies while the links are made: the robot keeps its link to the container."""
+    established(two)
+    drain(two)
+    report(two, "c", "c2", nodes=(NodeStatus(tag="n", state=NodeState.RUNNING),))
+    changes = two.leave("c2")
+    (link,) = two.spec("rob").links
+    assert (link.address.unix, link.next, at(two, "c")) == ("/c1/c", None, "c1")
+    assert "anna/rob" in changes.touched
+
+
+def test_a_container_that_ends_while_links_are_made_is_replaced(two: World) -> None:
+    """Its copy takes over at once, at the address that the robot has linked to already."""
+    established(two)
+    drain(two)
+    report(two, "c", "c2", nodes=(NodeStatus(tag="n", state=NodeState.RUNNING),))
+    two.do(commands.EndpointGone(process="c1", id="anna/c"))
+    (link,) = two.spec("rob").links
+    assert (link.address.unix, link.next, at(two, "c")) == ("/c2/c", None, "c2")
+
+
 def test_a_copy_need_not_be_better_than_the_container(two: World) -> None:
     two.node("c", "silent")
     running, starting = NodeState.RUNNING, NodeState.STARTING

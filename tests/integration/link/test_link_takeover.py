@@ -1,0 +1,171 @@
+"""A peer that is moved: its copy's link is made beside the present one, and takes over at one point."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import pytest
+from msgspec.structs import replace
+from support.link_kinds import SERVICE_OUT, TOPIC_IN, TOPIC_OUT
+
+from rce.control.model import LinkAddress, LinkSpec
+
+if TYPE_CHECKING:
+    from .conftest import Party, Rig
+
+ENDS = [TOPIC_OUT, TOPIC_IN, SERVICE_OUT]
+ALL = (1, 2, 3)
+
+
+class Move:
+    """A robot whose peer ``former`` is being moved: ``copy`` is linked to it, and silent."""
+
+    def __init__(self, robot: Party, former: Party, copy: Party) -> None:
+        self.robot, self.former, self.copy = robot, former, copy
+
+    async def begin(self, *, robot_dials: bool) -> None:
+        """Link the copy."""
+        (link,) = self.robot.spec.links
+        if robot_dials:
+            await self.robot.apply(links=[replace(link, next=self.copy.address)])
+        (end,) = self.former.spec.links
+        interfaces = {one.tag: one.type for one in self.former.spec.interfaces}
+        await self.copy.apply(interfaces, [replace(end, copy=True)], list(self.former.spec.connections))
+        await self.copy.connected(*ALL)
+
+    async def take_over(self) -> None:
+        """Let the copy be the endpoint; as the master does, tell it and the robot."""
+        (end,) = self.copy.spec.links
+        await self.copy.apply(links=[replace(end, copy=False)])
+        (link,) = self.robot.spec.links
+        if link.dial:
+            await self.robot.apply(links=[replace(link, address=self.copy.address, next=None)])
+
+
+@pytest.fixture(params=["robot-dials", "peer-dials"])
+def robot_dials(request: pytest.FixtureRequest) -> bool:
+    return str(request.param) == "robot-dials"
+
+
+@pytest.fixture(params=["unix", "tcp", "secure", "handed-over"])
+def way(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+async def move(rig: Rig, way: str, *, robot_dials: bool) -> Move:
+    dialing, accepting = await rig.pair(way, quiet=0.1, take=1.0)
+    robot, former = (dialing, accepting) if robot_dials else (accepting, dialing)
+    copy = rig.party(former.spec.id.partition("/")[2], await rig.hub())
+    if robot_dials:
+        await rig.listen(copy, way)
+        await rig.join(robot, former, ENDS)
+    else:
+        await rig.join(former, robot, [(there, here) for here, there in ENDS])
+    await robot.connected(*ALL)
+    await former.connected(*ALL)
+    return Move(robot, former, copy)
+
+
+async def test_takeover_loses_nothing(move: Move, *, robot_dials: bool) -> None:
+    """Calls are answered where they came in, messages go to one place each, and no interface is inactive."""
+    robot, former, copy = move.robot, move.former, move.copy
+    await move.begin(robot_dials=robot_dials)
+    copy.fakes["i2"].port.send(b"the copy is silent")
+    robot.fakes["i1"].port.send(b"to the former")
+    answers = asyncio.Event()
+
+    async def late(payload: bytes) -> bytes:
+        await answers.wait()
+        return b"former " + payload
+
+    former.fakes["i3"].answer = late
+    call = asyncio.create_task(robot.fakes["i3"].port.call(b"call"))
+    await former.fakes["i3"].asked.wait()
+    await move.take_over()
+    copy.fakes["i2"].port.send(b"from the new place")
+    assert await robot.fakes["i2"].received.get() == (b"from the new place", False)
+    former.fakes["i2"].port.send(b"a last word")
+    assert await robot.fakes["i2"].received.get() == (b"a last word", False)
+    robot.fakes["i1"].port.send(b"to the new place")
+    assert await copy.fakes["i1"].received.get() == (b"to the new place", False)
+    assert await former.fakes["i1"].received.get() == (b"to the former", False)
+    assert await robot.fakes["i3"].port.call(b"new") == b"NEW"
+    assert former.endpoint.connections == ALL, "a call is still under way there"
+    answers.set()
+    assert await call == b"former call"
+    await former.connected()
+    assert former.fakes["i1"].received.empty()
+    assert robot.endpoint.connections == ALL
+    assert [robot.fakes[tag].active for tag in ("i1", "i2", "i3")] == [[True]] * 3
+
+
+async def test_latched_messages_reach_the_new_place(move: Move, *, robot_dials: bool) -> None:
+    """Those of the robot come to the copy when it takes over, and those of the copy to the robot."""
+    robot, copy = move.robot, move.copy
+    robot.fakes["i1"].port.send(b"robot's map", latched=True)
+    move.former.fakes["i2"].port.send(b"former map", latched=True)
+    await robot.fakes["i2"].until_latched(b"former map")
+    await move.begin(robot_dials=robot_dials)
+    copy.fakes["i2"].port.send(b"new map", latched=True)
+    assert not copy.fakes["i1"].latched
+    await move.take_over()
+    await copy.fakes["i1"].until_latched(b"robot's map")
+    await robot.fakes["i2"].until_latched(b"new map")
+
+
+async def test_copy_that_dies_changes_nothing(move: Move, *, robot_dials: bool) -> None:
+    """The link to the former place continues."""
+    robot, former = move.robot, move.former
+    await move.begin(robot_dials=robot_dials)
+    await move.copy.endpoint.close()
+    (link,) = robot.spec.links
+    await robot.apply(links=[replace(link, next=None)])
+    robot.fakes["i1"].port.send(b"still here")
+    assert await former.fakes["i1"].received.get() == (b"still here", False)
+    assert robot.fakes["i1"].active == [True]
+
+
+async def test_former_place_dies_before_the_takeover(move: Move, *, robot_dials: bool) -> None:
+    """The copy takes over: at once where the robot dials, else when the copy says so."""
+    robot, copy = move.robot, move.copy
+    await move.begin(robot_dials=robot_dials)
+    await move.former.endpoint.close()
+    await move.take_over()
+    await robot.connected(*ALL)
+    assert await robot.fakes["i3"].port.call(b"new") == b"NEW"
+    robot.fakes["i1"].port.send(b"to the new place")
+    assert await copy.fakes["i1"].received.get() == (b"to the new place", False)
+
+
+async def test_connections_change_while_a_copy_is_linked(move: Move, *, robot_dials: bool) -> None:
+    """One that is removed is removed beside it too; the others are taken over."""
+    robot, copy = move.robot, move.copy
+    await move.begin(robot_dials=robot_dials)
+    for party in (robot, move.former, copy):
+        await party.apply(connections=[one for one in party.spec.connections if one.id != 1])
+    await copy.connected(2, 3)
+    await move.take_over()
+    assert await robot.fakes["i3"].port.call(b"new") == b"NEW"
+    await move.former.connected()
+    assert robot.endpoint.connections == (2, 3)
+
+
+async def test_robot_that_links_late_changes_at_once(rig: Rig) -> None:
+    """The copy has taken over before the robot reached it."""
+    robot, former = await rig.pair("unix", quiet=0.1)
+    copy = rig.party("b", await rig.hub())
+    await rig.listen(copy, "unix")
+    await rig.join(robot, former, ENDS)
+    await robot.connected(*ALL)
+    interfaces = {one.tag: one.type for one in former.spec.interfaces}
+    end = LinkSpec(id="L", peer=robot.spec.id, token="secret", dial=False, address=LinkAddress())
+    await copy.apply(interfaces, [replace(end, copy=True)], list(former.spec.connections))
+    await copy.apply(links=[end])
+    (link,) = robot.spec.links
+    await robot.apply(links=[replace(link, next=copy.address)])
+    await copy.connected(*ALL)
+    await former.connected()
+    assert await robot.fakes["i3"].port.call(b"new") == b"NEW"
+    assert robot.fakes["i3"].active == [True]
