@@ -128,7 +128,8 @@ class App:
             _log.info("volumes are folders that are watched: %s", why)
         others = runtimes.values() if self.settings.offer_images else ()
         offers = await asyncio.to_thread(find_offers, runtime, others)
-        await asyncio.to_thread(_compile_engine)
+        if not runtime.isolated:  # the probe of an isolated one has done it
+            await asyncio.to_thread(_compile_engine)
         keep = self.settings.log_days, self.settings.log_space
         masters = self._masters(tls)
         with StateFolder(self._state_dir, run_dir(), log_days=keep[0], log_space=keep[1]) as state:

@@ -19,6 +19,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
 from rce.model.volumes import overlap
@@ -241,8 +242,9 @@ def interpreter_paths() -> list[Path]:
     return [*wanted, *(path.resolve() for path in wanted), *_python_packages()]
 
 
+@cache
 def _compile() -> None:
-    """Compile the modules here: inside they are read-only, and every container would compile them again."""
+    """Compile the modules here, once: inside they are read-only, and each container would do it again."""
     for folder in _python_packages():
         compileall.compile_dir(folder, quiet=2)
 
