@@ -56,8 +56,8 @@ class Laser(Experiment):
     programs = ("listener", "robots")
 
     def setups(self, options: Options) -> list[Condition]:
-        """Return a set-up for each system and software."""
-        software = options.software[:1] if options.quick else options.software
+        """Return a set-up for each system and software; quickly, with the last one, which starts soonest."""
+        software = options.software[-1:] if options.quick else options.software
         return [
             Condition.of(self.name, setup.system, setup.software, robots=options.robots)
             for setup in self.each(options, software=software)

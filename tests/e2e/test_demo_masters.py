@@ -37,7 +37,7 @@ def replicas() -> list[object]:
 
 async def test_robots_drive_while_leading_masters_are_killed() -> None:
     """The masters are killed at random moments of a headless run; all that is measured is in its report."""
-    words = ("--duration", 45, "--tasks", "goals", "--seed", 5)
+    words = ("--duration", 20, "--tasks", "goals", "--seed", 5)
     code, report, text = await run_headless(*replicas(), *words, timeout=700)
     assert code == 0, text
     assert report["ok"] is True

@@ -122,9 +122,13 @@ def save(drawing: Drawing, folder: Path) -> None:
         for idle in axes[drawing.panels :]:
             idle.remove()
         drawing.draw(axes[: drawing.panels], figure)
+        # It is laid out once: with a layout engine, each file would take a further drawing.
+        layout = figure.get_layout_engine()
+        assert layout is not None
+        layout.execute(figure)
+        figure.set_layout_engine(None)
         # Dates and versions would make each file a new one.
         figure.savefig(folder / f"{drawing.name}.png", metadata={"Software": None})
-        figure.set_layout_engine("none")  # it is laid out, which takes a third of the time
         figure.savefig(folder / f"{drawing.name}.svg", metadata={"Date": None, "Creator": _SALT})
 
 

@@ -7,6 +7,7 @@ programs has other values of ``discovery`` and ``sync``.
 from __future__ import annotations
 
 import json
+import sys
 from typing import TYPE_CHECKING, ClassVar
 
 from rce_fleet.experiments.bench import SERVER
@@ -23,15 +24,20 @@ GROUP = "224.0.0.1"
 """The paper's multicast group."""
 
 
+def fkie_node(name: str) -> tuple[str, ...]:
+    """Return the command line of our program for a node of fkie's: what ``rce run`` becomes for it."""
+    return (sys.executable, "-c", f"import sys; from rce.ros.cli.fkie_nodes import {name}; sys.exit({name}())")
+
+
 class MultiMaster(System):
     """A core on each machine; only the flows are shared."""
 
     name = "multi_master"
     title = "MMS"
     has_master = True
-    discovery: ClassVar[tuple[str, ...]] = ("rce", "run", "fkie_master_discovery", "master_discovery")
+    discovery: ClassVar[tuple[str, ...]] = fkie_node("master_discovery")
     """Command line of the discovery, to which its parameters are added."""
-    sync: ClassVar[tuple[str, ...]] = ("rce", "run", "fkie_master_sync", "master_sync")
+    sync: ClassVar[tuple[str, ...]] = fkie_node("master_sync")
     """The same of the sync."""
 
     def __init__(self, bench: Bench, software: Software, layout: Layout) -> None:
