@@ -12,6 +12,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
+from rce.config import SecretError, new_secret
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments import node_log
 from rce_fleet.experiments.bench import CLIENT, SERVER, TAIL_LINES
@@ -186,14 +187,15 @@ class Cloud(System):
         """
         bench = self.bench
         state = ("--state-dir", str(bench.folder / "engine"))
-        secret = ("--secret-file", str(bench.folder / "secret"))
+        secret = bench.folder / "secret"
+        try:
+            await asyncio.to_thread(new_secret, secret)
+        except SecretError as error:
+            raise ExperimentError(str(error)) from error
         add = ("rce", "user", "add", USER, "--admin", "--password-stdin", *state)
-        await together(
-            bench.run(SERVER, "secret", ("rce", "secret", "new", secret[1])),
-            bench.run(SERVER, "user", add, given=PASSWORD),
-        )
-        bind = ("--bind", bench.address(SERVER))
-        up: tuple[str, ...] = ("rce", "up", "--no-offer-images", *bind, *state, *secret)
+        await bench.run(SERVER, "user", add, given=PASSWORD)
+        words = ("--no-offer-images", "--bind", bench.address(SERVER), "--secret-file", str(secret))
+        up: tuple[str, ...] = ("rce", "up", *words, *state)
         if packages is not None:
             up += ("--package-path", str(packages))
         self._engine = await bench.start(SERVER, "engine", up, ready="RCE ready")

@@ -26,7 +26,8 @@ GROUP = "224.0.0.1"
 
 def fkie_node(name: str) -> tuple[str, ...]:
     """Return the command line of our program for a node of fkie's: what ``rce run`` becomes for it."""
-    return (sys.executable, "-c", f"import sys; from rce.ros.cli.fkie_nodes import {name}; sys.exit({name}())")
+    program = f"import sys; from rce.ros.cli.fkie_nodes import {name}; sys.exit({name}())"
+    return (sys.executable, "-c", program)
 
 
 class MultiMaster(System):
