@@ -179,17 +179,17 @@ async def test_container_with_container_and_with_robot(shared_engine: Engine) ->
 @of(ONE_MACHINE)
 async def test_who_has_a_robot_id_is_told_to_its_user(shared_engine: Engine) -> None:
     """At whichever robot process the second client tries to come in; by ``rce-ros`` in a line of its own."""
-    query = urlencode({"userID": "testUser", "robotID": "first", "password": sha256(b"testUser").hexdigest()})
+    query = urlencode({"userID": "testUser", "robotID": "holder", "password": sha256(b"testUser").hexdigest()})
     holder = r"connected already, from 127\.0\.0\.1 since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC"
     engine = shared_engine
-    async with stranger(engine.url, robot="first"):
+    async with stranger(engine.url, robot="holder"):
         for port, _ in engine.robot_ports:
             with pytest.raises(InvalidStatus) as caught:
                 await connect(f"ws://127.0.0.1:{port}/?{query}", proxy=None)
             assert caught.value.response.status_code == 409
             assert re.search(holder, bytes(caught.value.response.body or b"").decode())
         file = engine.folder / "robot.config"
-        login = {"url": engine.url, "userID": "testUser", "password": "testUser", "robotID": "first"}
+        login = {"url": engine.url, "userID": "testUser", "password": "testUser", "robotID": "holder"}
         file.write_text(json.dumps(login))
         async with Core("127.0.0.1", 0) as core:
             program = str(Path(sys.executable).parent / "rce-ros")
