@@ -179,7 +179,9 @@ async def test_container_with_container_and_with_robot(shared_engine: Engine) ->
 @of(ONE_MACHINE)
 async def test_who_has_a_robot_id_is_told_to_its_user(shared_engine: Engine) -> None:
     """At whichever robot process the second client tries to come in; by ``rce-ros`` in a line of its own."""
-    query = urlencode({"userID": "testUser", "robotID": "holder", "password": sha256(b"testUser").hexdigest()})
+    query = urlencode(
+        {"userID": "testUser", "robotID": "holder", "password": sha256(b"testUser").hexdigest()}
+    )
     holder = r"connected already, from 127\.0\.0\.1 since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC"
     engine = shared_engine
     async with stranger(engine.url, robot="holder"):
