@@ -7,6 +7,7 @@ all machines of the test share. There it also holds a lock, so that two that run
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import random
 import sqlite3
 from collections.abc import AsyncIterator, Callable
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import aiohttp
+import psutil
 import pytest
 from support.engine import Engine, Program, running_engine, until
 
@@ -125,6 +127,15 @@ class Moved:
     def program(self, machine: str) -> Program:
         return self.engine.machines[int(machine.removeprefix("machine"))]
 
+    def kill_containers(self) -> None:
+        """Kill environments with their nodes, which outlive an environment that is killed alone."""
+        for environment in self.engine.processes_of("rce_container.environment"):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                nodes = environment.children(recursive=True)
+                environment.kill()
+                for node in nodes:
+                    node.kill()
+
     def folder(self, machine: str) -> Path:
         return self.engine.folder / machine / "volumes" / "testUser" / "journal"
 
@@ -222,8 +233,7 @@ async def test_a_lost_machine_costs_what_came_after_the_snapshot(packages: Path)
         target = await world.other()
         source = "machine1" if target == "machine0" else "machine0"
         await world.program(source).kill()
-        for process in world.engine.processes_of("rce_container.environment"):
-            process.kill()
+        world.kill_containers()
         await world.is_at(target)
         await world.writes()
         with sqlite3.connect(world.folder(target) / "rows.sqlite") as database:

@@ -9,6 +9,7 @@ from pathlib import Path
 from support.sources import PACKAGES, ROOT, files, statements, text_of
 
 OPEN = {
+    "rce/cli/summaries.py": "parts of Python's grammar; those not listed have no summary",
     "rce/ros/launch/expressions.py": "parts of Python's grammar; those not listed are refused",
     "rce/ros/multimaster/relay/frames.py": "numbers from the wire; what is left is JSON",
     "rce/ros/tools/plain.py": "values of any type",

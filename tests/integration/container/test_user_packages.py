@@ -19,7 +19,7 @@ from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec
 from rce_container.packages.requirements import Installer, InstallerSettings
 
 BOX = "user/box"
-SAY = "import sys, time\nprint({text!r}, *sys.argv[1:], flush=True)\ntime.sleep(600)\n"
+SAY = "import sys, time\nprint(' '.join([{text!r}, *sys.argv[1:]]), flush=True)\ntime.sleep(600)\n"
 LOOK = """
 import json, os, sys, time
 from pathlib import Path

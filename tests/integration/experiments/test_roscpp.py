@@ -131,7 +131,7 @@ async def test_programs_print_and_tell_as_those_in_python(tmp_path: Path) -> Non
             lambda: all(one.lines().count("---") >= FEW * len(kinds) for one in (listener, reference)),
             lambda: [one.lines()[-5:] for one in everyone],
         )
-        assert robots.cpu_s() - before >= FEW * WORK_S
+        assert robots.cpu_s() - before > (FEW - 1) * WORK_S  # the kernel tells whole ticks
         give(control, Phase("end", END))
         await until(
             lambda: all(one.has_ended() for one in everyone), lambda: [one.lines()[-5:] for one in everyone]
