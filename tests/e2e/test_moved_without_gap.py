@@ -167,3 +167,33 @@ async def test_moves_and_drains_lose_no_call_and_no_message() -> None:
         finally:
             running.cancel()
         traffic.check()
+
+
+@pytest.mark.parametrize("victim", ["master", "target"])
+async def test_fault_in_the_middle_of_a_move_loses_nothing(victim: str) -> None:
+    """The master, or the task set of the machine that it moves to, is killed while the container moves."""
+    async with (
+        running_engine(machines=2) as engine,
+        Connection(engine.url, "testUser", "testUser", "robot") as robot,
+    ):
+        traffic = Traffic(robot)
+        await traffic.make()
+        await until(lambda: len(machines(engine)) == 2, timeout=WAIT_S)
+        running = asyncio.create_task(traffic.run())
+        try:
+            await traffic.flows()
+            here, _ = place(engine)
+            (there,) = machines(engine) - {here}
+            (target,) = (one for one in engine.machines if one.name == there)
+            await until(lambda: moves(engine, there), timeout=WAIT_S, what="the move begins")
+            program = engine.master if victim == "master" else target
+            await program.kill()
+            await traffic.flows()
+            await program.start()
+            await until(lambda: len(machines(engine)) == 2, timeout=WAIT_S)
+            await traffic.flows()
+            traffic.end()
+            await running
+        finally:
+            running.cancel()
+        traffic.check()

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from support.link_kinds import SERVICE_OUT, TOPIC_IN, TOPIC_OUT
 
 from rce.control.model import LinkAddress, LinkSpec
+from rce.link import LinkLostError
 
 if TYPE_CHECKING:
     from .conftest import Party, Rig
@@ -169,3 +170,21 @@ async def test_robot_that_links_late_changes_at_once(rig: Rig) -> None:
     await former.connected()
     assert await robot.fakes["i3"].port.call(b"new") == b"NEW"
     assert robot.fakes["i3"].active == [True]
+
+
+async def test_links_that_break_before_the_takeover_are_made_again(move: Move, *, robot_dials: bool) -> None:
+    """The robot's connections to both places are torn: each place keeps its part."""
+    robot, former, copy = move.robot, move.former, move.copy
+    await move.begin(robot_dials=robot_dials)
+    for carrier in list(robot.hub._carriers):
+        carrier.abort(LinkLostError("torn by the test"))
+    await robot.connected()
+    await robot.connected(*ALL)
+    await copy.connected(*ALL)
+    assert await robot.fakes["i3"].port.call(b"call") == b"CALL"
+    assert former.fakes["i3"].asked.is_set()
+    assert not copy.fakes["i3"].asked.is_set()
+    await move.take_over()
+    await former.connected()
+    assert await robot.fakes["i3"].port.call(b"new") == b"NEW"
+    assert copy.fakes["i3"].asked.is_set()
