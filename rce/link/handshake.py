@@ -17,7 +17,11 @@ class Hello(msgspec.Struct, frozen=True, kw_only=True):
     features: tuple[str, ...] = ()
     """The dialing end's features beyond the first version; unknown words are ignored."""
     standby: bool = False
-    """Whether this connection is to stand beside the present one until TAKE (:mod:`rce.link.takeover`)."""
+    """Whether this connection is to stand beside the dialing end's present one until TAKE
+    (:mod:`rce.link.takeover`)."""
+    copy: bool = False
+    """Whether the dialing end is a copy: the connection is to stand beside the accepting end's present one,
+    also if that one is down."""
 
 
 class Welcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -37,9 +41,9 @@ _hello_decoder = msgspec.json.Decoder(Hello)
 _welcome_decoder = msgspec.json.Decoder(Welcome)
 
 
-def encode_hello(link: str, token: str, *, standby: bool = False) -> bytes:
+def encode_hello(link: str, token: str, *, standby: bool = False, copy: bool = False) -> bytes:
     """Write the first frame of a link's dialing end."""
-    hello = Hello(version=VERSION, link=link, token=token, features=FEATURES, standby=standby)
+    hello = Hello(version=VERSION, link=link, token=token, features=FEATURES, standby=standby, copy=copy)
     return encode(Frame(FrameType.HELLO, payload=msgspec.json.encode(hello)))
 
 

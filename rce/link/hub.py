@@ -216,7 +216,7 @@ class LinkHub:
 
         Args:
             spec: The link.
-            standby: Whether the connection is to stand beside the link's present one.
+            standby: Whether the connection is to stand beside the present one of this end.
 
         Raises:
             OSError: It cannot be reached, or not in time.
@@ -226,7 +226,7 @@ class LinkHub:
         if local is not None:
             _check_token(local, spec.token)
             ours, theirs = LocalCarrier.pair()
-            local.accept(theirs, standby=standby)
+            local.accept(theirs, standby=standby, copy=spec.copy)
             return ours
         return await self._introduce(await self._reach(spec), spec, standby=standby)
 
@@ -274,7 +274,7 @@ class LinkHub:
     async def _introduce(self, carrier: SocketCarrier, spec: LinkSpec, *, standby: bool) -> Carrier:
         """Shake hands as the dialing end."""
         try:
-            carrier.greet(encode_hello(spec.id, spec.token, standby=standby))
+            carrier.greet(encode_hello(spec.id, spec.token, standby=standby, copy=spec.copy))
             async with asyncio.timeout(self.timeouts.handshake):
                 carrier.features = check_answer(await carrier.handshake_frame())
         except BaseException as error:
@@ -330,7 +330,7 @@ class LinkHub:
         else:
             carrier.features = frozenset(hello.features)
             carrier.greet(encode_welcome() if hello.features else encode(Frame(FrameType.WELCOME)))
-            link.accept(carrier, standby=hello.standby)
+            link.accept(carrier, standby=hello.standby, copy=hello.copy)
         finally:
             guest.leave()
 

@@ -101,17 +101,21 @@ class Link:
         channel.close()
         del self._channels[channel.number]
 
-    def accept(self, carrier: Carrier, *, standby: bool) -> None:
-        """Take a carrier that the peer dialed; one on standby does not replace the present one.
+    def accept(self, carrier: Carrier, *, standby: bool, copy: bool) -> None:
+        """Take a carrier that the peer dialed.
 
-        A peer whose end is on standby is told at once that this end takes over, if it has done so before.
+        Args:
+            carrier: The connection.
+            standby: Whether it stands beside the peer's present one: the peer is told at once that this end
+                takes over, if it has done so before.
+            copy: Whether the peer is a copy: its connection stands beside the present one, or beside none.
         """
         is_copy = self.spec.copy or self._was_copy
-        if standby and not is_copy and self.carrier is not None and self.on_successor is not None:
+        if copy and not is_copy and self.on_successor is not None:
             self.on_successor(carrier)
             return
         self.attach(carrier)
-        if standby and not self.spec.copy:
+        if (standby or copy) and not self.spec.copy:
             self._tell(FrameType.TAKE)
 
     def change(self, spec: LinkSpec) -> None:

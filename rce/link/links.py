@@ -179,7 +179,7 @@ class EndpointLinks:
                 await hub.wait_registered(link.spec.id, None)
             since = hub.loop.time()
             try:
-                carrier = await hub.connect(link.spec, standby=link.is_standby or link.spec.copy)
+                carrier = await hub.connect(link.spec, standby=link.is_standby)
             except (OSError, LinkError) as error:
                 _log.debug("link %s to %s: %s", link.spec.id, link.spec.peer, error)
             else:

@@ -33,7 +33,7 @@ def machines(
 async def _machines(as_json: bool) -> None:
     async with ApiClient.of(credentials.load()) as client:
         found = await client.items("/machines")
-        masters = [] if as_json else await _masters(client)
+        masters = [] if as_json else await fetch_masters(client)
     if as_json:
         typer.echo(json.dumps(found, indent=2))
         return
@@ -47,7 +47,7 @@ async def _machines(as_json: bool) -> None:
         _print_staying(machine)
 
 
-async def _masters(client: ApiClient) -> list[Machine]:
+async def fetch_masters(client: ApiClient) -> list[Machine]:
     """Return the masters; a master of the previous release does not know them."""
     try:
         return list((await client.call("GET", "/masters"))["masters"])
@@ -157,7 +157,7 @@ async def _drain_master(client: ApiClient, name: str, *, wait: bool) -> None:
     lost = 0
     while True:
         try:
-            masters = await _masters(client)
+            masters = await fetch_masters(client)
             lost = 0
         except CliError as error:  # while the lead changes
             lost += 1

@@ -16,6 +16,7 @@ from rich.table import Table
 from rce.model import about
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient, run
+from rce_master.cli.machines import fetch_masters, overview_of_masters
 from rce_master.cli.show import coloured, console, fetch
 
 _FULL, _BUSY = 0.9, 0.75
@@ -65,7 +66,7 @@ class Look:
             interval: Seconds since the last reading.
         """
         first, containers = await client.pages("/usage", "containers")
-        usage = {**first, "containers": containers}
+        usage = {**first, "containers": containers, "masters": await _masters_seen(client, first)}
         parts: list[RenderableType] = [layout(usage, self)]
         if self.interfaces:
             now = (await fetch(client, "interfaces"))["interfaces"]
@@ -92,11 +93,18 @@ def layout(usage: Usage, look: Look) -> Group:
     parts: list[RenderableType] = []
     if usage["machines"]:
         parts += [_machines(usage["machines"]), ""]
+    if masters := usage.get("masters"):
+        parts += [overview_of_masters(masters), ""]
     parts.append(_containers(usage["containers"], look))
     advice = [*_advice(usage["machines"], "process"), *_container_advice(usage["containers"], look.user)]
     if advice:
         parts += ["", *advice]
     return Group(*parts)
+
+
+async def _masters_seen(client: ApiClient, usage: Usage) -> list[Usage]:
+    """Return the masters, for users who see machines."""
+    return await fetch_masters(client) if usage["machines"] else []
 
 
 def _machines(machines: list[Usage]) -> Table:

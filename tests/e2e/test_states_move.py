@@ -152,10 +152,10 @@ class Cloud:
 
         await until(known, timeout=WAIT_S, what=f"{machines} are connected")
 
-    async def begin(self) -> None:
+    async def begin(self, *volumes: dict[str, Any]) -> None:
         """Start the counter at the first machine."""
         await self.start(self.machines[0])
-        await self.call("POST", "/containers", {"tag": "C"})
+        await self.call("POST", "/containers", {"tag": "C", "volumes": list(volumes)})
         await self.call("POST", "/containers/C/nodes", NODE)
 
         async def counts() -> bool:
@@ -239,6 +239,23 @@ async def test_a_count_moves_with_its_container(folder: Path) -> None:
             await cloud.call("DELETE", "/containers/C")
             assert await cloud.state() == {}
             await until(lambda: not _contents(master), what="its contents are removed")
+    finally:
+        assert await master.stop() == 0
+
+
+async def test_a_count_moves_with_a_volume(folder: Path) -> None:
+    """A container with both is ended, moved with its files, and counts on from the snapshot."""
+    master = Single(folder)
+    await master.start(ready="rce-master ready")
+    try:
+        hosts = f"127.0.0.1:{master.control_port}"
+        async with counting(folder, master.url, await log_in(master), hosts) as cloud:
+            await cloud.begin({"name": "files", "path": "/data", "size": "16M"})
+            await cloud.handed_over("second")
+            await cloud.drained("second", "first")
+            (volume,) = (await cloud.call("GET", "/volumes"))["volumes"]
+            assert volume["machine"] == "first"
+            await cloud.call("DELETE", "/containers/C")
     finally:
         assert await master.stop() == 0
 

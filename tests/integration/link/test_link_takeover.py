@@ -178,8 +178,9 @@ async def test_links_that_break_before_the_takeover_are_made_again(move: Move, *
     await move.begin(robot_dials=robot_dials)
     for carrier in list(robot.hub._carriers):
         carrier.abort(LinkLostError("torn by the test"))
-    await robot.connected()
+    await robot.until(lambda: robot.fakes["i3"].active == [True, False, True])
     await robot.connected(*ALL)
+    await copy.until(lambda: copy.fakes["i3"].active == [True, False, True])
     await copy.connected(*ALL)
     assert await robot.fakes["i3"].port.call(b"call") == b"CALL"
     assert former.fakes["i3"].asked.is_set()

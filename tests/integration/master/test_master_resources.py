@@ -361,6 +361,7 @@ async def test_top_sorts_and_names_users_of_others(site: Site) -> None:
         usage = await using(site, there)
     quiet = {**usage["containers"][0], "id": "anna/quiet", "user": "anna", "cpu": 0.0, "memory": 1 << 40}
     usage["containers"] = [quiet, usage["containers"][0]]
+    usage["masters"] = [{"name": "m7:9000", "role": "standby", "url": "http://m7:9000/", "drained": True}]
 
     def shown(order: top.Order) -> str:
         console = Console(file=io.StringIO(), width=200)
@@ -372,6 +373,7 @@ async def test_top_sorts_and_names_users_of_others(site: Site) -> None:
     assert by_cpu.index("testUser/c") < by_cpu.index("anna/quiet")
     assert by_memory.index("anna/quiet") < by_memory.index("testUser/c")
     assert "rce resize c --memory 512M --user anna" in by_cpu
+    assert " ".join(by_cpu.split()).count("m7:9000 standby drained") == 1
 
 
 # Health
