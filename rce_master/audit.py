@@ -10,7 +10,6 @@ import logging
 import os
 import re
 from collections import OrderedDict, deque
-from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
@@ -21,13 +20,15 @@ from rce.guard import Rates
 from rce.printable import one_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from rce_master.state.commands import Command
 
 _log = logging.getLogger(__name__)
 
+AUDIT = "audit"
+"""Name of the folder in a master's state folder."""
 FILE_NAME = "audit.jsonl"
 MAX_BYTES = 8 << 20
 """Bytes of one file; then the next one begins."""
@@ -43,6 +44,8 @@ BURST = 2000
 PER_SECOND = 2.0
 """Records of one user beyond the burst; more of an action and an address within a minute are one record."""
 MAX_TEXT = 300
+IDS_OF_TERM = 10**10
+"""Each term of leadership has ids of its own, so that the records of several masters have one order."""
 
 SHOWN = 5
 """How many of a request's commands are named; the others are counted."""
@@ -61,7 +64,7 @@ class Record(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """An action that a user performed or was refused."""
 
     id: int
-    """Increases by one."""
+    """Grows, also from master to master; see :data:`IDS_OF_TERM`."""
     time: float
     """Seconds since 1970."""
     user: str
@@ -87,20 +90,29 @@ class AuditLog:
     Args:
         folder: The folder of the files; made with the first record, readable by its owner only.
         clock: Seconds since 1970.
+        term: Of the leadership, if other masters may lead; 0: there are no others.
         max_bytes: Of one file.
         files: How many are kept.
     """
 
     def __init__(
-        self, folder: Path, clock: Callable[[], float], *, max_bytes: int = MAX_BYTES, files: int = FILES
+        self,
+        folder: Path,
+        clock: Callable[[], float],
+        *,
+        term: int = 0,
+        max_bytes: int = MAX_BYTES,
+        files: int = FILES,
     ) -> None:
         self._folder = folder
         self._file = folder / FILE_NAME
         self._clock = clock
         self._max_bytes = max_bytes
         self._files = files
-        self._records: deque[Record] = deque(self._newest(), maxlen=KEPT)
-        self._next_id = self._records[-1].id + 1 if self._records else 1
+        self._records: deque[Record] = deque(newest(folder, files), maxlen=KEPT)
+        self.first_id = max(term * IDS_OF_TERM, 1)
+        """No record of this term has a smaller id."""
+        self._next_id = max(self.first_id, self._records[-1].id + 1 if self._records else 0)
         self._descriptor = -1
         self._size = 0
         self._failed = False
@@ -173,15 +185,8 @@ class AuditLog:
             self._add_missed(key, self._repeated.pop(key)[1])
 
     def since(self, id_: int, limit: int, user: str = "") -> list[Record]:
-        """List records after an id, oldest first; with a negative id, the newest ``-id`` ones.
-
-        Args:
-            id_: The last known record.
-            limit: Maximum number of records.
-            user: Only of this user; empty: of all.
-        """
-        found = [r for r in self._records if (id_ < 0 or r.id > id_) and (not user or r.user == user)]
-        return list(islice(found[id_:] if id_ < 0 else found, limit))
+        """List records as :func:`choose` does."""
+        return choose(self._records, id_, limit, user)
 
     def close(self) -> None:
         """Write the counted repetitions, and close the file."""
@@ -227,9 +232,9 @@ class AuditLog:
         """Begin a new file; remove the oldest one."""
         self._close()
         for number in range(self._files - 1, 0, -1):
-            older = self._numbered(number - 1)
+            older = _numbered(self._folder, number - 1)
             if older.exists():
-                older.replace(self._numbered(number))
+                older.replace(_numbered(self._folder, number))
         self._open()
 
     def _close(self) -> None:
@@ -237,17 +242,32 @@ class AuditLog:
             os.close(self._descriptor)
             self._descriptor = -1
 
-    def _numbered(self, number: int) -> Path:
-        return self._folder / f"{FILE_NAME}.{number}" if number else self._file
 
-    def _newest(self) -> list[Record]:
-        """Read the newest records of the files."""
-        found: list[Record] = []
-        for number in range(self._files):
-            found = [*_read(self._numbered(number)), *found]
-            if len(found) >= KEPT:
-                break
-        return found[-KEPT:]
+def choose(records: Iterable[Record], since: int, limit: int, user: str = "") -> list[Record]:
+    """List records after an id, oldest first; with a negative id, the newest ``-since`` ones.
+
+    Args:
+        records: Ordered by id.
+        since: The last known record.
+        limit: Maximum number of records.
+        user: Only of this user; empty: of all.
+    """
+    found = [one for one in records if (since < 0 or one.id > since) and (not user or one.user == user)]
+    return found[max(since, -limit) :] if since < 0 else found[:limit]
+
+
+def newest(folder: Path, files: int = FILES) -> list[Record]:
+    """Read the newest records of a log's files, oldest first."""
+    found: list[Record] = []
+    for number in range(files):
+        found = [*_read(_numbered(folder, number)), *found]
+        if len(found) >= KEPT:
+            break
+    return found[-KEPT:]
+
+
+def _numbered(folder: Path, number: int) -> Path:
+    return folder / f"{FILE_NAME}.{number}" if number else folder / FILE_NAME
 
 
 def _clean(text: str) -> str:

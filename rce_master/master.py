@@ -20,7 +20,7 @@ from rce.web.origin import ServerNames
 from rce.web.server import HttpServer, LateApplication
 from rce_master.answers import PURPOSE as ANSWERS_PURPOSE
 from rce_master.answers import Answers
-from rce_master.audit import AuditLog
+from rce_master.audit import AUDIT, AuditLog
 from rce_master.auth import Authenticator, client_digest, hash_public
 from rce_master.control_handler import ControlHandler
 from rce_master.events import EventLog
@@ -30,13 +30,12 @@ from rce_master.http.entry import Entry, refusal
 from rce_master.http.forwarded import PURPOSE, ForwardingKey
 from rce_master.http.routes import Services
 from rce_master.node_states import NodeStateServer
-from rce_master.packages.contents import ARCHIVES, ContentStore
+from rce_master.packages.contents import ARCHIVES, ARCHIVES_PATH, ContentStore
 from rce_master.packages.keeper import CONTENT, ContentKeeper
-from rce_master.packages.request_key import PATH, SNAPSHOTS_PATH
 from rce_master.packages.service import PackageService
 from rce_master.quotas import Quotas
 from rce_master.reconciler import Reconciler
-from rce_master.snapshots.service import SNAPSHOT, SnapshotService
+from rce_master.snapshots.service import SNAPSHOT, SNAPSHOTS_PATH, SnapshotService
 from rce_master.snapshots.service import SNAPSHOTS as SNAPSHOTS_FOLDER
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
@@ -53,6 +52,7 @@ if TYPE_CHECKING:
     from rce.web.entry import EntryAnswer
     from rce_master.leadership import Fence
     from rce_master.leadership.drains import MasterDrains
+    from rce_master.other_audits import OtherAudits
     from rce_master.packages.copies import ArchiveCopies
     from rce_master.settings import MasterSettings
     from rce_master.state.changes import Changes
@@ -104,6 +104,7 @@ class Master:
         copies: Makes what copies contents to the other masters, if there may be any: of a folder, where
             the others are asked for them, and what they are part of.
         drains: Of this master and the others, if there may be any; the caller runs them.
+        audits: Those of the others, if there may be any.
         copy: As :meth:`rce_master.state_service.StateService.open` takes it.
     """
 
@@ -117,11 +118,13 @@ class Master:
         fence: Fence | None = None,
         copies: Callable[[ContentStore, str, str], ArchiveCopies] | None = None,
         drains: MasterDrains | None = None,
+        audits: OtherAudits | None = None,
         copy: Callable[[], Awaitable[State | None]] | None = None,
     ) -> None:
         self._fence = fence
         self._copies = copies
         self._drains = drains
+        self._audits = audits
         self._copy = copy
         self._settings = settings
         self._secret = secret
@@ -156,7 +159,8 @@ class Master:
                 " `rce user add NAME --admin %s`",
                 f"--state-dir {self._settings.state_dir}" if self._fence is None else "--store etcd://...",
             )
-        events = EventLog(time.time(), term=0 if self._fence is None else self._fence.term)
+        term = 0 if self._fence is None else self._fence.term
+        events = EventLog(time.time(), term=term)
         state_service.listeners.append(lambda changes: _log_events(events, changes))
         reconciler = Reconciler(state_service)
         authenticator = Authenticator(
@@ -167,10 +171,10 @@ class Master:
         )
         tokens = Tokens(state_service.tables)
         quotas = Quotas(self._settings.quotas)
-        audit = AuditLog(self._settings.state_dir / "audit", time.time)
+        audit = AuditLog(self._settings.state_dir / AUDIT, time.time, term=term)
         lifetime = self._settings.token_lifetime
         store = ContentStore(self._settings.state_dir / ARCHIVES, noun=CONTENT)
-        copies = None if self._copies is None else self._copies(store, PATH, CONTENT)
+        copies = None if self._copies is None else self._copies(store, ARCHIVES_PATH, CONTENT)
         keeper = ContentKeeper(state_service, store, copies)
         packages = PackageService(state_service, keeper)
         node_states = NodeStateServer(state_service, keeper, reconciler, self._fence)
@@ -198,6 +202,7 @@ class Master:
             fence=self._fence,
             forwarding=ForwardingKey(self._secret.derive(PURPOSE)),
             drains=self._drains,
+            other_audits=self._audits,
         )
         try:
             async with asyncio.TaskGroup() as group:

@@ -18,6 +18,7 @@ from rce.tls.choice import is_loopback
 from rce.tls.expiry import watch_expiry
 from rce.web.origin import ServerNames
 from rce.web.server import HttpServer
+from rce_master.audit import AUDIT
 from rce_master.exceptions import FencedError, MasterError
 from rce_master.follower import StateFollower
 from rce_master.http.forwarded import PURPOSE, ForwardingKey
@@ -27,13 +28,15 @@ from rce_master.leadership.drains import MasterDrains
 from rce_master.leadership.engine_mark import EngineMark
 from rce_master.leadership.keeper import LeadershipKeeper
 from rce_master.leadership.registry import MasterRegistry
+from rce_master.leadership.request_key import PURPOSE as REQUEST_PURPOSE
+from rce_master.leadership.request_key import RequestKey
+from rce_master.leadership.standby_client import CONNECT_S, StandbyClient
 from rce_master.master import Master
-from rce_master.packages.contents import ARCHIVES, ContentStore
+from rce_master.other_audits import OtherAudits
+from rce_master.packages.contents import ARCHIVES, ARCHIVES_PATH, ContentStore
 from rce_master.packages.copies import ArchiveCopies
-from rce_master.packages.request_key import PATH, SNAPSHOTS_PATH, RequestKey
-from rce_master.packages.request_key import PURPOSE as ARCHIVE_PURPOSE
-from rce_master.packages.transfer import CONNECT_S, ArchiveClient
-from rce_master.snapshots.service import SNAPSHOT, SNAPSHOTS
+from rce_master.packages.transfer import ArchiveClient
+from rce_master.snapshots.service import SNAPSHOT, SNAPSHOTS, SNAPSHOTS_PATH
 from rce_master.store.etcd import EtcdClient
 from rce_master.store.etcd.exceptions import EtcdAwayError, NoQuorumError
 from rce_master.store.etcd.layout import prepare
@@ -134,16 +137,22 @@ class ReplicatedMaster:
         on_standby: Callable[[str], None],
     ) -> None:
         from rce_master.http.archives import ArchiveRoutes  # loads aiohttp's server
+        from rce_master.http.audit_route import AuditRoute
+        from rce_master.http.leader_check import LeaderCheck
         from rce_master.http.standby import make_standby_app
 
         settings = self._settings
         for_clients = settings.tls.for_clients()
         names = ServerNames(settings.bind, settings.names)
-        key = RequestKey(self._secret.derive(ARCHIVE_PURPOSE))
-        archives = [
-            ArchiveRoutes(ContentStore(settings.state_dir / folder, noun=noun), key, keeper.newest_term, path)
-            for folder, noun, path in ((ARCHIVES, "package", PATH), (SNAPSHOTS, SNAPSHOT, SNAPSHOTS_PATH))
-        ]
+        key = RequestKey(self._secret.derive(REQUEST_PURPOSE))
+        check = LeaderCheck(key, keeper.newest_term)
+        packages = ContentStore(settings.state_dir / ARCHIVES, noun="package")
+        snapshots = ContentStore(settings.state_dir / SNAPSHOTS, noun=SNAPSHOT)
+        for_leader = (
+            ArchiveRoutes(packages, check, ARCHIVES_PATH),
+            ArchiveRoutes(snapshots, check, SNAPSHOTS_PATH),
+            AuditRoute(settings.state_dir / AUDIT, check),
+        )
         assert settings.etcd is not None
         follower = StateFollower(etcd, settings.etcd.prefix, settings.state, asyncio.get_running_loop().time)
         keeper.on_save = follower.saw
@@ -152,7 +161,7 @@ class ReplicatedMaster:
             beside.spawn(follower.run(), name="copy of the state")
             forwarder = await waiting.enter_async_context(self._forwarder())
             server = HttpServer(
-                make_standby_app(keeper, follower, forwarder, archives, names, settings.allowed_origins),
+                make_standby_app(keeper, follower, forwarder, for_leader, names, settings.allowed_origins),
                 settings.bind,
                 settings.http_port,
                 for_clients.server if for_clients else None,
@@ -172,11 +181,10 @@ class ReplicatedMaster:
             prefix = settings.etcd.prefix
             drains = MasterDrains(etcd, prefix, settings.name, registry, probe.stands_by)
             mark = EngineMark(etcd, prefix, self._secret)
+            standbys = StandbyClient(session, key, fence, tls)
 
             def copies(contents: ContentStore, path: str, noun: str) -> ArchiveCopies:
-                return ArchiveCopies(
-                    contents, registry, ArchiveClient(session, key, fence, tls, path), noun=noun
-                )
+                return ArchiveCopies(contents, registry, ArchiveClient(standbys, path), noun=noun)
 
             try:
                 master = Master(
@@ -187,6 +195,7 @@ class ReplicatedMaster:
                     fence=fence,
                     copies=copies,
                     drains=drains,
+                    audits=OtherAudits(registry, standbys),
                     copy=partial(follower.take, store.begun),
                 )
                 async with asyncio.TaskGroup() as group:

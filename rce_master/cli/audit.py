@@ -19,7 +19,9 @@ POLL_S = 1.0
 def audit(
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Follow the audit log.")] = False,
     user: Annotated[str, typer.Option("--user", help="Only what this user did.")] = "",
-    lines: Annotated[int, typer.Option("--lines", "-n", help="Number of newest records.", min=1)] = 100,
+    lines: Annotated[
+        int, typer.Option("--lines", "-n", help="Number of newest records.", min=1, max=1000)
+    ] = 100,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON lines.")] = False,
 ) -> None:
     """Show logins, refusals and changes (administrators)."""
@@ -27,11 +29,17 @@ def audit(
 
 
 async def _audit(user: str, lines: int, *, follow: bool, as_json: bool) -> None:
-    last = -lines
+    last, told = -lines, list[str]()
     async with ApiClient.of(credentials.load()) as client:
         while True:
             query: dict[str, str | int] = {"since": last, **({"user": user} if user else {})}
-            records = (await client.call("GET", "/audit", query=query))["records"]
+            answer = await client.call("GET", "/audit", query=query)
+            records, missing = answer["records"], answer.get("missing", [])
+            if missing != told:
+                typer.echo(
+                    "".join(f"rce audit: records are missing: {why}\n" for why in missing), err=True, nl=False
+                )
+                told = missing
             for record in records:
                 typer.echo(json.dumps(record) if as_json else _line(record))
             if not follow:

@@ -26,7 +26,7 @@ from rce.config import (
 )
 from rce.tls import CertificateError
 from rce.tls.choice import TlsChoice
-from rce_master.audit import AuditLog
+from rce_master.audit import AUDIT, AuditLog
 from rce_master.cli import credentials
 from rce_master.cli.exceptions import CliError, NotLoggedInError
 from rce_master.exceptions import StoreBusyError
@@ -172,7 +172,7 @@ async def open_state(place: Path | EtcdAddress, state_dir: Path | None = None) -
             term = await store.begin_term()
         except StoreBusyError as error:
             raise CliError(f"{error}; to work over its API, log in there: rce login") from error
-        audit = AuditLog(folder / "audit", time.time)
+        audit = AuditLog(folder / AUDIT, time.time)
         stack.callback(audit.close)
         limits = state_settings(settings)
         state = State.load(await load_converted(store, term), time.monotonic(), settings=limits)

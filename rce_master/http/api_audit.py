@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from msgspec.structs import asdict
 
 from rce.web.openapi import Query
+from rce_master.audit import choose
 from rce_master.exceptions import ForbiddenError
 from rce_master.http import models
 from rce_master.http.routes import Call, route_table
 from rce_master.state.records import UserRole
+
+if TYPE_CHECKING:
+    from rce_master.audit import Record
 
 routes = route_table("audit")
 
@@ -32,9 +38,16 @@ MAX_RECORDS = 1000
 )
 async def read_audit(call: Call) -> models.AuditOut:
     """Read records."""
-    user = call.request.query.get("user", "")
-    found = call.services.audit.since(call.number("since", -100), MAX_RECORDS, user)
-    return models.AuditOut(records=[models.AuditRecord(**asdict(record)) for record in found])
+    user, since = call.request.query.get("user", ""), call.number("since", -100)
+    audit, others = call.services.audit, call.services.other_audits
+    found = audit.since(since, MAX_RECORDS, user)
+    missing: list[str] = []
+    if others is not None and since < audit.first_id:  # other masters may have led then
+        theirs: list[Record]
+        theirs, missing = await others.since(since, MAX_RECORDS, user)
+        found = choose(sorted([*theirs, *found], key=lambda one: one.id), since, MAX_RECORDS)
+    records = [models.AuditRecord(**asdict(record)) for record in found]
+    return models.AuditOut(records=records, missing=missing)
 
 
 @routes.route(

@@ -8,16 +8,13 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from aiohttp import hdrs, web
+from aiohttp import web
 
 from rce_master.exceptions import MasterError
-from rce_master.packages.request_key import HEADER, PATH
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
+    from rce_master.http.leader_check import LeaderCheck
     from rce_master.packages.contents import ContentStore
-    from rce_master.packages.request_key import RequestKey
 
 _ONE = "/{sha256:[0-9a-f]{64}}"
 
@@ -27,18 +24,14 @@ class ArchiveRoutes:
 
     Args:
         store: Where this master keeps archives.
-        key: Tells whether a master asks.
-        term: Returns the newest term that this master knows.
+        check: Refuses others than the leading master.
         path: Where they are asked for.
     """
 
-    def __init__(
-        self, store: ContentStore, key: RequestKey, term: Callable[[], int], path: str = PATH
-    ) -> None:
-        self._path = path
+    def __init__(self, store: ContentStore, check: LeaderCheck, path: str) -> None:
         self._store = store
-        self._key = key
-        self._term = term
+        self._check = check
+        self._path = path
 
     def add_to(self, app: web.Application) -> None:
         """Add the routes to an application."""
@@ -78,16 +71,3 @@ class ArchiveRoutes:
         except OSError as error:
             return web.Response(status=503, text=f"it cannot be removed: {error.strerror}")
         return web.Response(status=204)
-
-    def _check(self, request: web.Request) -> None:
-        """Refuse a peer that is not the leading master.
-
-        Raises:
-            HTTPForbidden: It is another program, or a master that led before.
-        """
-        value = request.headers.get(HEADER, "")
-        term = self._key.read(value, request.method or hdrs.METH_GET, request.path)
-        if term is None:
-            raise web.HTTPForbidden(text="only masters of this engine may ask for this")
-        if term < self._term():
-            raise web.HTTPForbidden(text=f"term {self._term()} has begun; you ask in term {term}")

@@ -169,6 +169,8 @@ class AuditOut(Model):
     """Records of the audit log."""
 
     records: list[AuditRecord]
+    missing: list[str]
+    """Why records of other masters may be missing, one text for each of those; empty if none are."""
 
 
 class TokensOut(Model):

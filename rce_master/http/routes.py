@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from rce_master.executions import Executions
     from rce_master.leadership import Fence
     from rce_master.leadership.drains import MasterDrains
+    from rce_master.other_audits import OtherAudits
     from rce_master.packages.service import PackageService
     from rce_master.quotas import Quotas
     from rce_master.reconciler import Reconciler
@@ -71,6 +72,8 @@ class Services:
     """Of the stand-bys that forward requests to this master; None if there are none."""
     drains: MasterDrains | None = None
     """Of this master and the others; None if there are no others."""
+    other_audits: OtherAudits | None = None
+    """The audit logs of the others; None if there are none."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,18 +15,24 @@ from rce_master.leadership.core import LEADER_HEADER, STANDBY_HEADER
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
+    from typing import Protocol
 
     from rce_master.follower import StateFollower
-    from rce_master.http.archives import ArchiveRoutes
     from rce_master.http.forward import Forwarder
     from rce_master.leadership.keeper import LeadershipKeeper
+
+    class Routes(Protocol):
+        """Some routes of a server."""
+
+        def add_to(self, app: web.Application) -> None:
+            """Add them to an application."""
 
 
 def make_standby_app(
     keeper: LeadershipKeeper,
     follower: StateFollower,
     forwarder: Forwarder,
-    archives: Iterable[ArchiveRoutes],
+    for_leader: Iterable[Routes],
     names: ServerNames | None = None,
     allowed_origins: Iterable[str] = (),
 ) -> web.Application:
@@ -36,7 +42,7 @@ def make_standby_app(
         keeper: Knows who leads.
         follower: Follows the state.
         forwarder: Sends requests on to that master; it is open.
-        archives: Of packages and snapshots, for the leading master.
+        for_leader: What the leading master asks for.
         names: The allowed host names of the server.
         allowed_origins: Origins of other sites whose pages may use the server.
     """
@@ -44,7 +50,7 @@ def make_standby_app(
     app = web.Application(middlewares=[origin_guard(frozenset(allowed_origins), names or ServerNames())])
     app.router.add_get("/healthz", standby.health)
     app.router.add_get("/metrics", standby.metrics)
-    for one in archives:
+    for one in for_leader:
         one.add_to(app)
     app.router.add_route("*", "/{rest:.*}", standby.forward)
     return app

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 ARCHIVES = "bundles"
 """Name of the folder in a master's state folder."""
+ARCHIVES_PATH = "/archives"
+"""Where a stand-by takes and gives them."""
 _HASH = re.compile(r"[0-9a-f]{64}")
 _INCOMING = "incoming"
 _BUFFER = 1 << 20

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from rce.aio.tasks import BackgroundTasks
 from rce_master.exceptions import FencedError, StoreError
-from rce_master.packages.transfer import TransferError
+from rce_master.leadership.standby_client import StandbyError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Collection
@@ -142,7 +142,7 @@ class ArchiveCopies:
             for sha256 in archives:
                 if sha256 not in held:
                     await self._client.send(other, sha256, self._store)
-        except (TransferError, FencedError) as error:
+        except (StandbyError, FencedError) as error:
             return str(error)
         finally:
             self._sending -= sending
@@ -161,7 +161,7 @@ class ArchiveCopies:
                 await asyncio.shield(self._fetch(sha256))
         except TimeoutError:
             raise OSError(EAGAIN, "it is being fetched from another master") from None
-        except (StoreError, TransferError) as error:
+        except (StoreError, StandbyError) as error:
             raise OSError(EAGAIN, str(error)) from error
 
     def _fetch(self, sha256: str) -> asyncio.Task[None]:
@@ -183,12 +183,12 @@ class ArchiveCopies:
         for other in await self._registry.others():
             try:
                 await self._client.fetch(other, sha256, self._store)
-            except TransferError as error:
+            except StandbyError as error:
                 reasons.append(str(error))
             else:
                 _log.info("fetched the archive %s from %s", sha256, other.name)
                 return
-        raise TransferError(f"no other master gives the archive: {'; '.join(reasons) or 'there is none'}")
+        raise StandbyError(f"no other master gives the archive: {'; '.join(reasons) or 'there is none'}")
 
     # Comparing
 
@@ -202,7 +202,7 @@ class ArchiveCopies:
                     own.add(sha256)
         except FencedError:
             raise
-        except (StoreError, TransferError) as error:
+        except (StoreError, StandbyError) as error:
             self._note("this master", f"packages are incomplete: {error}")
             others = []
         else:
@@ -210,7 +210,7 @@ class ArchiveCopies:
         for other in others:
             try:
                 await self._complete(other, needed, own, is_complete)
-            except TransferError as error:
+            except StandbyError as error:
                 self._note(other.name, f"its packages are not compared: {error}")
             else:
                 self._note(other.name, "")

@@ -35,6 +35,8 @@ _log = logging.getLogger(__name__)
 
 SNAPSHOTS: Final = "snapshots"
 """Name of the folder in a master's state folder."""
+SNAPSHOTS_PATH: Final = "/snapshots"
+"""Where a stand-by takes and gives them."""
 SNAPSHOT: Final = "snapshot"
 SPARED_S = 900.0
 """Contents that no volume needs are kept for so long: a task set may be sending a snapshot that has them."""

@@ -35,6 +35,7 @@ TINY = {
     "rce_fleet/offline/inputs.py": "chooses between two readers, one of which needs rosbags",
     "rce_master/cli/exceptions.py": BASE,
     "rce_master/command.py": TYPER,
+    "rce_master/http/leader_check.py": "common to archives and the audit log, which do not load each other",
     "rce_master/http/model.py": BASE,
     "rce_master/http/origin_guard.py": "common to two servers, neither of which loads the other",
     "rce_robot/command.py": TYPER,

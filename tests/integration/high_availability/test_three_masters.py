@@ -302,6 +302,55 @@ async def test_a_drained_leader_hands_over(shared_masters: Masters) -> None:
     await until(lambda: shows(leader, role="standby", drained=False), timeout=120, what="the drain has ended")
 
 
+async def test_audit_log_of_all_terms(shared_masters: Masters) -> None:
+    former = await shared_masters.leader()
+    await note(former, shared_masters, "before")
+    (last,) = await audit(former, shared_masters, since=-1)
+    await former.kill()
+    leader = await shared_masters.leader(but=former)
+    await note(leader, shared_masters, "after")
+    found = await audited(leader, shared_masters, since=-1000)
+    assert [why.partition(":")[0] for why in found["missing"]] == [former.name]
+    await restart(former)
+
+    async def complete() -> list[dict[str, Any]] | None:
+        found = await audited(leader, shared_masters, since=-1000)
+        return None if found["missing"] else list(found["records"])
+
+    records = await until(complete, timeout=120, what="the former leader gives its records")
+    ids = [record["id"] for record in records]
+    assert ids == sorted(set(ids))
+    noted = [record["subject"] for record in records if record["action"] == "note"]
+    assert noted[-2:] == ["before", "after"]
+    newer = await audit(leader, shared_masters, since=last["id"])
+    assert newer == records[ids.index(last["id"]) + 1 :]
+    assert [one["subject"] for one in newer if one["action"] == "note"] == ["after"]
+    assert await audit(leader, shared_masters, since=-1, user="nobody") == []
+
+
+async def note(master: MasterProcess, shared_masters: Masters, subject: str) -> None:
+    body = {"action": "note", "subject": subject}
+    async with (
+        shared_masters.session(20.0) as session,
+        session.post(f"{master.url}api/v1/audit", json=body) as reply,
+    ):
+        assert reply.status == 204, await reply.text()
+
+
+async def audited(master: MasterProcess, shared_masters: Masters, **query: str | int) -> dict[str, Any]:
+    async with (
+        shared_masters.session(20.0) as session,
+        session.get(f"{master.url}api/v1/audit", params=query) as reply,
+    ):
+        found: dict[str, Any] = await reply.json()
+        assert reply.status == 200, found
+        return found
+
+
+async def audit(master: MasterProcess, shared_masters: Masters, **query: str | int) -> list[dict[str, Any]]:
+    return list((await audited(master, shared_masters, **query))["records"])
+
+
 async def shows(master: MasterProcess, **expected: object) -> bool:
     found = await master.health()
     return all(found.get(key) == value for key, value in expected.items())

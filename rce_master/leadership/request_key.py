@@ -1,23 +1,21 @@
-"""Where a stand-by takes archives, and the header by which the leading master proves itself there. Pure."""
+"""The header by which the leading master proves itself to a stand-by. Pure."""
 
 from __future__ import annotations
 
 import hmac
 
-PATH = "/archives"
-SNAPSHOTS_PATH = "/snapshots"
-"""The same for parts of snapshots of volumes."""
 HEADER = "RCE-Master"
-"""``TERM MAC``, of the method, the path and the term of the leader that asks."""
+"""``TERM MAC``, of the method, the path with its query, and the term of the leader that asks."""
 PURPOSE = "archives between masters"
-"""Of the key that is derived from the engine's secret."""
+"""Of the key that is derived from the engine's secret; masters of several releases use the same."""
 
 
 class RequestKey:
     """Signs and checks the header.
 
     Who reads it on a connection without TLS can repeat the same request in the same term. It makes a stand-by
-    take or remove the archive that the path names by its hash; the leader puts that right at its next look.
+    take or remove the archive that the path names by its hash, which the leader puts right at its next look,
+    or give the same records of the audit log once more.
 
     Args:
         key: Known to the masters only.
