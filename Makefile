@@ -10,7 +10,7 @@ PARALLEL := -n auto --dist loadgroup --durations=25
 # Tests start thousands of programs; without bytecode each of them compiles all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help packages install demo test test-all test-quick fuzz faults lint format docs reference bench lock clean
+.PHONY: help packages install demo test test-all collect test-quick fuzz faults lint format docs reference bench lock clean
 
 help:
 	@echo "make demo    engine, containers and a simulated fleet, with its web page"
@@ -47,6 +47,10 @@ test: lint docs
 
 test-all: install
 	$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
+
+# Makes the tests' bytecode once; else each of the workers, which start together, makes it.
+collect: install
+	$(BIN)/python -m pytest --collect-only --quiet --quiet >/dev/null
 
 fuzz: install
 	RCE_FUZZ_EXAMPLES=$(or $(EXAMPLES),5000) $(BIN)/python -m pytest --timeout 3600 \
