@@ -12,14 +12,17 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
 
 import hypothesis
 import psutil
 import pytest
 
+TESTS = Path(__file__).parent
 REQUIRE_ALL = os.environ.get("RCE_REQUIRE_ALL") == "1"
 LEAK_TIMEOUT_S = 3.0
 RUN_FOLDER = "RCE_TEST_RUN_FOLDER"
@@ -231,8 +234,15 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks for the groups
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep tests together, in one worker of a parallel run, that share what is made once or is the machine's.
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Prepare a parallel run."""
+    _group(items)
+    if _is_worker(config):
+        _mix(items)
+
+
+def _group(items: list[pytest.Item]) -> None:
+    """Keep tests together, in one worker, that share what is made once or is the machine's.
 
     What podman keeps is the machine's; what a person finds out about the sandbox takes long.
     """
@@ -247,6 +257,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group(f"person {person}"))
         elif _shares_with_its_module(item):
             item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+
+
+def _mix(items: list[pytest.Item]) -> None:
+    """Spread end-to-end tests, which keep the processors busy, among integration tests, which wait more.
+
+    Unit tests come last: they are short, so that the workers end at about the same time.
+    """
+    kinds = [item.path.relative_to(TESTS).parts[0] for item in items]
+    totals, seen = Counter(kinds), Counter[str]()
+    places = []
+    for kind in kinds:
+        places.append(1.0 if kind == "unit" else seen[kind] / totals[kind])
+        seen[kind] += 1
+    items[:] = [item for _, item in sorted(zip(places, items, strict=True), key=itemgetter(0))]
 
 
 def _shares_with_its_module(item: pytest.Item) -> bool:

@@ -26,6 +26,7 @@ from rce_master.cli.exceptions import ApiError, CliError
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600)]
 
 WAIT_S = 180.0
+NOT_YET = ("its former files are still being removed there", "that machine is away")
 ROWS = """
 import fcntl, os, pathlib, sqlite3, sys, time, uuid
 shared = pathlib.Path(sys.argv[1])
@@ -75,13 +76,13 @@ class Moved:
             return None
 
     async def move(self, machine: str) -> None:
-        """Ask for a move, as soon as the files of the move before are removed there."""
+        """Ask for a move, as soon as the machine is connected, without files of the move before."""
 
         async def is_accepted() -> bool:
             try:
                 await self.ask("PUT", "/containers/C/machine", {"machine": machine})
             except ApiError as error:
-                if "its former files are still being removed there" not in str(error):
+                if not any(reason in str(error) for reason in NOT_YET):
                     raise
                 return False
             return True
