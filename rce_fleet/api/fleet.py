@@ -59,9 +59,12 @@ class FleetRobotModel(ApiModel):
 
 
 class RobotList(ApiModel):
-    """All robots."""
+    """Robots by name: all, or a page of them."""
 
     robots: list[FleetRobotModel]
+    next: str | None = Field(
+        default=None, description="The cursor of the next page; null: these are the last."
+    )
 
 
 class RobotChange(ApiModel):

@@ -19,7 +19,14 @@ class RobotRequests(ApiRequests):
             low = [robot.id for robot in await fleet.robots() if (robot.battery or 1) < 0.2]
             ```
         """
-        return (await self._read("/robots", RobotList)).robots
+        robots: list[FleetRobotModel] = []
+        query = {"limit": "500"}
+        while True:
+            page = await self._read("/robots", RobotList, query)
+            robots += page.robots
+            if page.next is None:
+                return robots
+            query["cursor"] = page.next
 
     async def change_robot(
         self, robot: str, profile: ProfileModel | None, *, revision: int | None = None

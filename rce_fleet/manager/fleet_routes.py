@@ -28,17 +28,26 @@ from rce_fleet.tasks.loads import carried
 from rce_fleet.tasks.records import AUTOMATIC, RobotEntry
 
 MOST_EVENTS = 5000
+MOST_ROBOTS = 1000
+"""In one page."""
 
 
 # Robots
 
 
 async def robots(call: Call) -> FleetAnswer:
-    """Return all robots."""
-    call.only()
-    names = sorted({*call.manager.facts.robots, *call.manager.book.robots})
+    """Return robots by name: all, or a page of them."""
+    call.only("limit", "cursor")
+    limit, after = call.count("limit", 0, MOST_ROBOTS), call.query.get("cursor", "")
+    names = sorted(name for name in {*call.manager.facts.robots, *call.manager.book.robots} if name > after)
+    page = names[:limit] if limit else names
     queues = _queues(call)
-    return shown(RobotList(robots=[_show_robot(call, name, queues) for name in names]))
+    return shown(
+        RobotList(
+            robots=[_show_robot(call, name, queues) for name in page],
+            next=page[-1] if len(names) > len(page) else None,
+        )
+    )
 
 
 async def robot(call: Call) -> FleetAnswer:

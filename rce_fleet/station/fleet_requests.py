@@ -48,6 +48,7 @@ _UNKNOWN_OUTCOME = (
     "the fleet manager did not answer, so the request may have been carried out: send it again, with the same"
     " Idempotency-Key if it creates a task"
 )
+_CURSOR = Query(name="cursor", description="The field next of the page before.")
 _LIMIT = Query(name="limit", description="Most in one answer.", type="integer")
 
 
@@ -224,7 +225,7 @@ ROUTES: list[Route[str]] = [
             Query(name="robot", description="The robot that does them."),
             Query(name="requester", description="Who created them."),
             Query(name="order", description="asc (default) or desc."),
-            Query(name="cursor", description="The field next of the page before."),
+            _CURSOR,
             _LIMIT,
         ),
     ),
@@ -249,7 +250,11 @@ ROUTES: list[Route[str]] = [
         *("POST", "/tasks/{id}/reassign", "reassign_task", "Give a task to another robot"),
         reply=TaskModel,
     ),
-    _route("GET", "/robots", "", "List robots", reply=RobotList),
+    _route(
+        *("GET", "/robots", "", "List robots, by name; all of them without limit"),
+        reply=RobotList,
+        query=(_CURSOR, _LIMIT),
+    ),
     _route(
         *("PATCH", "/robots/{robot}", "change_robot", "Change what a robot can do"),
         body=RobotChange,

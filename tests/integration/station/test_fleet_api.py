@@ -136,6 +136,12 @@ async def check_requests(fleet: ManagedFleet) -> None:
         assert len(page["tasks"]) == 1
         robots = (await ask(erp, "GET", "/robots"))[1]["robots"]
         assert [robot["id"] for robot in robots] == ["Robot1", "Robot2"]
+        page = (await ask(erp, "GET", "/robots?limit=1"))[1]
+        assert ([robot["id"] for robot in page["robots"]], page["next"]) == (["Robot1"], "Robot1")
+        page = (await ask(erp, "GET", "/robots?limit=1&cursor=Robot1"))[1]
+        assert ([robot["id"] for robot in page["robots"]], page["next"]) == (["Robot2"], None)
+        status, said, _ = await ask(erp, "GET", "/robots?limit=9999")
+        assert (status, "limit" in said["error"]) == (422, True)
         _, _, tag = await ask(erp, "GET", "/chargers")
         assert (await ask(erp, "GET", "/chargers", If_None_Match=tag))[0] == 304
         assert (await ask(erp, "GET", "/map"))[1]["rows"] == 8
