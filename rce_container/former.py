@@ -17,6 +17,8 @@ from rce_container.environment.process import kill_marked
 from rce_container.exceptions import ContainerError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rce_container.environment.proc import Process
     from rce_container.folder import ContainerFolder, Record, StateFolder
     from rce_container.launcher import Launcher
@@ -43,6 +45,7 @@ class FormerContainers:
         limiter: Enforces the containers' limits.
         launcher: Removes what it made for a container.
         volumes: Learns which volumes the containers have.
+        release: Takes the volumes of a container that has ended.
     """
 
     def __init__(
@@ -52,8 +55,10 @@ class FormerContainers:
         limiter: Limiter,
         launcher: Launcher,
         volumes: VolumeStore,
+        release: Callable[[str], None],
     ) -> None:
         self._volumes = volumes
+        self._release = release
         self._state = state
         self._settings = settings
         self._limiter = limiter
@@ -109,8 +114,7 @@ class FormerContainers:
         await self._launcher.undo(folder.incarnation_id)
         await asyncio.to_thread(folder.remove)
         await asyncio.to_thread(self._state.archive.settle_one, folder.incarnation_id, time.time())
-        # What was to be removed meanwhile is asked for again when the master is connected again.
-        self._volumes.release(folder.incarnation_id)
+        self._release(folder.incarnation_id)
 
     async def _sweep_control_groups(self, keep: set[str]) -> None:
         """Remove the control groups of containers that have no other remains."""

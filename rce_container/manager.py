@@ -157,7 +157,9 @@ class Manager:
             networks=self._networks,
             volumes=self._volumes,
         )
-        self._former = FormerContainers(state, settings, limiter, self._launcher, self._volumes)
+        self._former = FormerContainers(
+            state, settings, limiter, self._launcher, self._volumes, self._keeper.release
+        )
         self._node_states = StateCarrier(name, node_states)
         self._context = IncarnationContext(
             settings=settings,

@@ -146,6 +146,12 @@ class Moved:
         machine = found["machine"]
         other = "machine1" if machine == "machine0" else "machine0"
         await until(lambda: not self.folder(other).exists(), timeout=WAIT_S, what="the former folder is gone")
+        removed = self.engine.folder / other / "volumes" / ".removed"
+        await until(
+            lambda: not removed.exists() or not any(removed.iterdir()),
+            timeout=WAIT_S,
+            what="the former files are deleted",
+        )
         with sqlite3.connect(self.folder(machine) / "rows.sqlite") as database:
             rows = {name for (name,) in database.execute("select name from rows")}
         database.close()
