@@ -227,8 +227,10 @@ async def test_the_limit_holds_whatever_holds_the_messages(
 
 
 def _gauge(metrics: str, name: str) -> str:
-    return next(
+    """Return a figure of the robot endpoint; "inf" until it has been told."""
+    found = (
         line.rpartition(" ")[2]
         for line in metrics.splitlines()
         if line.startswith(name) and 'kind="robot"' in line
     )
+    return next(found, "inf")
