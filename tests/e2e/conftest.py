@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
 import pytest_asyncio
+from support.engine import engine_folder
 from support.tls_engine import World
 
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    """For sockets too, whose paths have at most 107 bytes."""
-    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
-    yield path
-    shutil.rmtree(path)
+    """For an engine that leaves nothing, and for sockets, whose paths have at most 107 bytes."""
+    with engine_folder() as path:
+        yield path
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")

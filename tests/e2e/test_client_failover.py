@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from support.engine import until
 from support.etcd import cluster
 from support.masters import DEV_USER, masters
-from support.replicated import TIMEOUT_S, Caller, engine_folder, task_sets
+from support.replicated import TIMEOUT_S, Caller, task_sets
 
 from rce_client import Connection, State
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("etcd"), pytest.mark.timeout(600)]
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    with engine_folder() as path:
-        yield path
 
 
 async def test_connection_finds_the_next_leader(folder: Path) -> None:

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from support.engine import command_line, engine_processes, until
 from support.etcd import cluster
 from support.masters import DEV_USER, masters
-from support.replicated import TIMEOUT_S, Caller, engine_folder, task_sets
+from support.replicated import TIMEOUT_S, Caller, task_sets
 
 from rce_client import Connection
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("etcd"), pytest.mark.timeout(900)]
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    with engine_folder() as path:
-        yield path
 
 
 def node(folder: Path) -> int:

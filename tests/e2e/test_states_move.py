@@ -8,10 +8,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import shutil
 import sys
-import tempfile
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -26,7 +24,6 @@ from support.ports import free_port
 
 from rce_master.cli.client import ApiClient
 from rce_master.cli.exceptions import ApiError, CliError
-from tools.leaks import sweep_cgroups
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("bwrap"), pytest.mark.timeout(600)]
 
@@ -41,21 +38,6 @@ ENOUGH = 20
 """More than a counter that starts anew reaches before its first snapshot."""
 NUMBERS = {hashlib.sha256(str(number).encode()).hexdigest(): number for number in range(100_000)}
 """Counts by the hashes of their snapshots."""
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
-    path.chmod(0o755)  # nodes are another user
-    yield path
-    left = engine_processes(path)
-    for process in left:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            process.kill()
-    cgroups = sweep_cgroups(path)
-    shutil.rmtree(path)
-    assert not left, f"left behind: {left}"
-    assert not cgroups, f"left behind: {cgroups}"
 
 
 class Machine(Program):

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import signal
 import socket
 import sys
-import tempfile
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from functools import partial
 from pathlib import Path
 
@@ -19,24 +17,9 @@ from support.engine import Program, command_line, engine_processes, until
 from support.ports import free_ports
 from support.stranger import check_echo, stranger, wire_echo
 
-from tools.leaks import sweep_cgroups
-
 pytestmark = [pytest.mark.e2e]
 
 PORT_OPTIONS = ("--http-port", "--control-port", "--ws-port", "--robot-link-port", "--container-link-port")
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
-    yield path
-    left = engine_processes(path)
-    for process in left:
-        process.kill()
-    cgroups = sweep_cgroups(path)
-    shutil.rmtree(path)
-    assert not left, f"left behind: {left}"
-    assert not cgroups, f"left behind: {cgroups}"
 
 
 @contextlib.asynccontextmanager

@@ -5,11 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
 import signal
 import sys
-import tempfile
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import aiohttp
@@ -18,25 +16,10 @@ from support.engine import Program, command_line, engine_processes, until
 from support.ports import free_port, free_ports, free_row
 from support.stranger import check_echo, stranger, wire_echo
 
-from tools.leaks import sweep_cgroups
-
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("etcd")]
 
 COUNT = 3
 TASK_SETS = 2
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
-    yield path
-    left = engine_processes(path)
-    for process in left:
-        process.kill()
-    cgroups = sweep_cgroups(path)
-    shutil.rmtree(path)
-    assert not left, f"left behind: {left}"
-    assert not cgroups, f"left behind: {cgroups}"
 
 
 @contextlib.asynccontextmanager

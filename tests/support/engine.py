@@ -11,7 +11,7 @@ import signal
 import sys
 import tempfile
 import urllib.request
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any, TypedDict, TypeVar, Unpack, overload
 
@@ -333,6 +333,24 @@ def _environments(folder: Path) -> list[psutil.Process]:
             if process is not None and "rce_container.environment" in process.cmdline():
                 found.append(process)
     return found
+
+
+@contextlib.contextmanager
+def engine_folder() -> Iterator[Path]:
+    """Give a folder with a short name, which nodes may enter; check that an engine in it leaves nothing."""
+    folder = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
+    folder.chmod(0o755)
+    try:
+        yield folder
+    finally:
+        left = engine_processes(folder)
+        for process in left:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
+        cgroups = sweep_cgroups(folder)
+        shutil.rmtree(folder)
+    assert not left, f"processes left behind: {left}"
+    assert not cgroups, f"cgroups left behind: {cgroups}"
 
 
 @contextlib.asynccontextmanager

@@ -5,37 +5,20 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import shutil
 import sys
-import tempfile
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 from rce_client import Connection, ServiceClient
 from rce_client.exceptions import CallError, NotConnectedError
-from support.engine import Program, engine_processes, until
+from support.engine import Program, until
 from support.master_program import environment
 from support.masters import Masters
 from support.ports import free_ports
 
 ECHO = "Test/StringEcho"
 TIMEOUT_S = 120.0
-
-
-@contextlib.contextmanager
-def engine_folder() -> Iterator[Path]:
-    """Give a folder with a short name; check that no process of the engine is left."""
-    path = Path(tempfile.mkdtemp(prefix="rce-", dir="/tmp"))
-    try:
-        yield path
-    finally:
-        left = engine_processes(path)
-        for process in left:
-            with contextlib.suppress(ProcessLookupError):
-                process.kill()
-        shutil.rmtree(path)
-    assert not left, f"left behind: {left}"
 
 
 class Caller:
