@@ -43,7 +43,9 @@ Export: TypeAlias = Callable[[], AbstractContextManager[Path]]
 """Gives a store as an SQLite file."""
 
 _ATTEMPTS = 5
-_LEFT_OUT = {"lock", FILE_NAME, f"{FILE_NAME}-wal", f"{FILE_NAME}-shm", f"{FILE_NAME}-journal", ARCHIVES}
+_STORE = {FILE_NAME, f"{FILE_NAME}-wal", f"{FILE_NAME}-shm", f"{FILE_NAME}-journal"}
+_LEFT_OUT = {*_STORE, "lock", ARCHIVES, "etcd", "etcd.yaml"}
+"""What is copied in another way, and a member of etcd, if it has the same state folder."""
 _PIECE = 1 << 20
 
 
@@ -261,10 +263,14 @@ def _files(folders: Mapping[str, Path], store: Path) -> Iterator[tuple[str, Path
     master = folders[MASTER]
     for sha256 in sorted({package.sha256 for package in packages_in(store)}):
         yield f"{MASTER}/{ARCHIVES}/{sha256}", master / ARCHIVES / sha256
+    certificates = folders.get(CERTIFICATES)
     for part, folder in folders.items():
         for path in sorted(folder.rglob("*")):
             inside = path.relative_to(folder)
-            left_out = part == MASTER and inside.parts[0] in _LEFT_OUT
+            left_out = part == MASTER and (
+                inside.parts[0] in _LEFT_OUT
+                or (certificates is not None and path.is_relative_to(certificates))
+            )
             if path.is_file() and not path.is_symlink() and not left_out:
                 yield f"{part}/{inside.as_posix()}", path
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from msgspec.structs import replace
+from msgspec import structs
 
 from rce.config import ConfigError, EngineSettings, EtcdAddress, load_settings, read_store_address
 from rce.model import about
@@ -121,7 +121,10 @@ def _place(config: Path | None, state_dir: Path | None, store: str) -> _Place:
         address = read_store_address(settings.master.store)
     etcd = address if isinstance(address, EtcdAddress) else None
     if etcd is not None and state_dir is not None:
-        return _Place({MASTER: find_folder(state_dir.absolute())}, etcd, tls)
+        master = find_folder(state_dir.absolute())
+        certificates = _certificates_of(master, settings)
+        folders = {MASTER: master, CERTIFICATES: certificates}
+        return _Place(folders, etcd, replace(tls, folder=certificates))
     return _Place(_folders(settings, state_dir), etcd, tls)
 
 
@@ -136,4 +139,12 @@ def _folders(settings: EngineSettings, state_dir: Path | None) -> dict[str, Path
         raise typer.Exit(1) from None
     if folder == state_dir.absolute():
         return {MASTER: folder}  # a folder that `rce-master --state-dir` was given
-    return {MASTER: folder, CERTIFICATES: replace(settings, state_dir=folder.parent).certificates}
+    return {MASTER: folder, CERTIFICATES: structs.replace(settings, state_dir=folder.parent).certificates}
+
+
+def _certificates_of(master: Path, settings: EngineSettings) -> Path:
+    """Find the certificates of a master: those of the settings, or in its folder or the engine's."""
+    inside = master / CERTIFICATES
+    if settings.tls.certificates is None and inside.is_dir():
+        return inside
+    return structs.replace(settings, state_dir=master.parent).certificates

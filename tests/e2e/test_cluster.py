@@ -8,6 +8,7 @@ import os
 import shlex
 import shutil
 import sys
+import tarfile
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
@@ -215,6 +216,12 @@ async def test_lost_machine_is_replaced(folder: Path) -> None:
             await host.start_master()
         assert "two machines cannot be highly available" in two.etcd.output()  # type: ignore[union-attr]
         await wait_until_whole(one, {"m1", "m2", "m3"})
+        code, output = await two.rce(
+            *("backup", str(two.folder / "backup.tar"), "--state-dir", str(two.state)),
+            *("--store", f"etcds://{two.machine.address}:2379"),
+        )
+        assert code == 0, output
+        _check_backup(two.folder / "backup.tar")
 
         authority = str(one.state / "certificates" / "authority.pem")
         urls = [host.url for host in (one, two, three)]
@@ -245,6 +252,14 @@ async def test_lost_machine_is_replaced(folder: Path) -> None:
         code, output = await four.run(sys.executable, "-c", LISTING, authority, PASSWORD, four.url)
         assert code == 0, output
         assert set(acknowledged(writer)) <= set(json.loads(output))
+
+
+def _check_backup(file: Path) -> None:
+    """It has the state and this machine's certificates, and nothing of its etcd."""
+    with tarfile.open(file) as tar:
+        names = tar.getnames()
+    assert {"master/master.sqlite", "certificates/engine.key", "certificates/authority.pem"} <= set(names)
+    assert not [name for name in names if "etcd" in name]
 
 
 async def _leads_one_of(host: Host, names: set[str]) -> bool:
