@@ -22,6 +22,7 @@ from rce.cli.main import GROUP, build_app
 from rce.cli.program_files import keys_of
 from rce.config.fields import Field, Section, fields_of, sections_of
 from rce.config.settings import PROGRAM_SECTIONS, EngineSettings
+from rce.ros.tools import program
 from rce_client.ros_bridge.__main__ import app as rce_ros
 from rce_container.command import app as rce_container
 from rce_master.command import app as rce_master
@@ -30,6 +31,12 @@ from tools import lifecycles
 
 ROOT = Path(__file__).resolve().parent.parent
 WIDTH = 110
+TOOLS = {f"rce {tool}": getattr(program, tool) for tool in ("topic", "service", "param")}
+"""Commands that pass their words on to others, by name, which have the options."""
+TOOL_OPTIONS = (
+    "| `--container`, `-c` | CONTAINER | Container; default: the graph of ROS_MASTER_URI. |",
+    "| `--user` | USER | Whose container; administrators only. |",
+)
 
 YAML_HEAD = """\
 # Settings of the engine, for `rce up --config FILE` and for the single programs. Made by `make reference`.
@@ -208,15 +215,17 @@ def _settings_table(place: str, section: type[Section], title: str) -> Iterator[
 
 def _commands(name: str, command: Any) -> Iterator[str]:
     """Describe a command and those in it."""
-    inner = getattr(command, "commands", {})
+    tool = TOOLS.get(name)
+    inner = getattr(typer.main.get_command(tool) if tool else command, "commands", {})
     yield f"\n## `{name}`\n"
     if command.help:
         yield command.help.strip() + "\n"
-    options = [each for each in command.params if each.name != "help"]
+    shown = (each for each in command.params if each.name != "help" and not getattr(each, "hidden", False))
+    options = [*map(_option, shown), *(TOOL_OPTIONS if tool else ())]
     if options:
         yield "| option | value | |"
         yield "|---|---|---|"
-        yield from map(_option, options)
+        yield from options
     for each in inner.values():
         yield from _commands(f"{name} {each.name}", each)
 

@@ -32,7 +32,7 @@ def init(
 
 @app.command()
 def issue(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a robot or machine, or engine.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a machine, or engine.")],
     host: Annotated[
         list[str] | None,
         typer.Option(

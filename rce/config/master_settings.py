@@ -96,7 +96,7 @@ class MasterSettings(Section, frozen=True, kw_only=True):
         int, Meta(ge=0), Setting("Versions of packages that one user may keep; 0: no limit.")
     ] = 200
     max_disk: Annotated[
-        Memory, Setting("What the packages and volumes of one user may take; 0: no limit.")
+        Memory, Setting("What packages, volumes and saved states of one user may take; 0: no limit.")
     ] = 4 << 30
     max_slots: Annotated[
         int,

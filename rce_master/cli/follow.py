@@ -42,7 +42,7 @@ def logs(
     previous: Annotated[
         bool, typer.Option("--previous", "-p", help="The log of the last incarnation that ended.")
     ] = False,
-    user: Annotated[str, typer.Option(help="Whose container; administrators only.")] = "",
+    user: Annotated[str, typer.Option(help="Whose container; not for role user.")] = "",
 ) -> None:
     """Print the log of a node. Several of --stdout, --stderr, --rosout and --engine may be given; else all.
 

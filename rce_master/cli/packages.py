@@ -31,7 +31,7 @@ _CHUNK = 1 << 20
 _LISTED = 40
 """How many files of a package are shown, unless all are asked for."""
 
-OfUser = Annotated[str, typer.Option("--user", help="Whose; administrators only (default: yourself).")]
+OfUser = Annotated[str, typer.Option("--user", help="Whose; not for role user (default: yourself).")]
 
 
 @app.command("push")

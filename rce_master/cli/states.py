@@ -16,7 +16,7 @@ from rce_master.cli.exceptions import CliError
 
 app = typer.Typer(no_args_is_help=True, help="List and remove saved states of nodes.")
 
-OfUser = Annotated[str, typer.Option("--user", help="Whose; administrators only (default: yourself).")]
+OfUser = Annotated[str, typer.Option("--user", help="Whose; not for role user (default: yourself).")]
 
 
 @app.command("list")

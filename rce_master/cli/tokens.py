@@ -16,7 +16,7 @@ from rce_master.cli.exceptions import NotLoggedInError
 tokens = typer.Typer(invoke_without_command=True, help="Print, list, make and revoke tokens.")
 robots = typer.Typer(no_args_is_help=True, help="Add, list and revoke tokens of robots.")
 
-OfUser = Annotated[str, typer.Option("--user", help="Whose; administrators only (default: yourself).")]
+OfUser = Annotated[str, typer.Option("--user", help="Whose; not for role user (default: yourself).")]
 Label = Annotated[str, typer.Option(help="Your name for the token.")]
 Days = Annotated[float, typer.Option(help="Days until it expires; 0: valid until it is revoked.", min=0)]
 

@@ -15,7 +15,7 @@ from rce_master.cli.client import ApiClient, run
 
 app = typer.Typer(no_args_is_help=True, help="List and remove volumes of containers.")
 
-OfUser = Annotated[str, typer.Option("--user", help="Whose; administrators only (default: yourself).")]
+OfUser = Annotated[str, typer.Option("--user", help="Whose; not for role user (default: yourself).")]
 
 
 @app.command("list")
