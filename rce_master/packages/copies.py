@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import Counter
 from contextlib import asynccontextmanager
 from errno import EAGAIN
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from rce.aio.tasks import BackgroundTasks
 from rce_master.exceptions import FencedError, StoreError
 from rce_master.leadership.standby_client import StandbyError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Collection
+    from collections.abc import AsyncIterator, Collection
 
     from rce_master.leadership.registry import MasterRegistry
     from rce_master.packages.contents import ContentStore
@@ -32,6 +33,24 @@ LOOK_S = 10.0
 """Longest time from one comparison with the other masters to the next."""
 WAIT_S = 5.0
 """How long a task set waits for an archive that this master fetches; then it asks again."""
+_PIECE = 1000
+"""Archives that are looked at in one turn of the event loop."""
+
+
+class NeededContents(Protocol):
+    """Which archives the state needs. There may be very many: each comparison lists them once."""
+
+    async def look(self) -> None:
+        """Read what the other methods need to know; it may have come since the last look."""
+
+    def hashes(self) -> set[str]:
+        """Return the hashes of all archives that are needed."""
+
+    def is_needed(self, sha256: str) -> bool:
+        """Tell whether one archive is needed, in a time that does not grow with their number."""
+
+    def is_complete(self) -> bool:
+        """Tell whether all that is needed is known; else nothing is removed."""
 
 
 class ArchiveCopies:
@@ -55,7 +74,7 @@ class ArchiveCopies:
         self._wanted = asyncio.Event()
         self._removal = asyncio.Lock()
         """Held while another master removes an archive, which must not be pushed meanwhile."""
-        self._pushed: list[str] = []
+        self._pushed: Counter[str] = Counter()
         """Hashes of archives that may get a package soon."""
         self._sending: set[tuple[str, str]] = set()
         """Names of masters, and hashes."""
@@ -67,14 +86,11 @@ class ArchiveCopies:
         """Compare with the other masters soon."""
         self._wanted.set()
 
-    async def run(
-        self, needed: Callable[[], set[str]], is_complete: Callable[[], bool] = lambda: True
-    ) -> None:
+    async def run(self, needed: NeededContents) -> None:
         """Compare with the other masters now and then, until cancelled.
 
         Args:
-            needed: Returns the hashes of all packages' archives.
-            is_complete: Tells whether that is all; else nothing is removed.
+            needed: Tells which archives are needed.
 
         Raises:
             FencedError: This master leads no more.
@@ -82,7 +98,7 @@ class ArchiveCopies:
         try:
             while True:
                 self._wanted.clear()
-                await self._compare(needed, is_complete)
+                await self._compare(needed)
                 try:
                     async with asyncio.timeout(LOOK_S):
                         await self._wanted.wait()
@@ -104,13 +120,12 @@ class ArchiveCopies:
             StoreError: Too few masters have it; it has to be pushed again.
         """
         async with self._removal:
-            self._pushed += archives
+            self._pushed.update(archives)
         try:
             await self._send_to_majority(archives)
             yield
         finally:
-            for sha256 in archives:
-                self._pushed.remove(sha256)
+            self._pushed -= Counter(archives)
             self.look()
 
     async def _send_to_majority(self, archives: Collection[str]) -> None:
@@ -192,11 +207,11 @@ class ArchiveCopies:
 
     # Comparing
 
-    async def _compare(self, needed: Callable[[], set[str]], is_complete: Callable[[], bool]) -> None:
+    async def _compare(self, needed: NeededContents) -> None:
         try:
             others = await self._registry.others()
             own = await asyncio.to_thread(self._store.held)
-            while missing := needed() - own:  # what is fetched may name more
+            while missing := await self._list(needed) - own:  # what is fetched may name more
                 for sha256 in missing:
                     await self._fetch(sha256)
                     own.add(sha256)
@@ -209,28 +224,34 @@ class ArchiveCopies:
             self._note("this master", "")
         for other in others:
             try:
-                await self._complete(other, needed, own, is_complete)
+                await self._complete(other, needed, own)
             except StandbyError as error:
                 self._note(other.name, f"its packages are not compared: {error}")
             else:
                 self._note(other.name, "")
 
-    async def _complete(
-        self,
-        other: OtherMaster,
-        needed: Callable[[], set[str]],
-        own: set[str],
-        is_complete: Callable[[], bool],
-    ) -> None:
+    @staticmethod
+    async def _list(needed: NeededContents) -> set[str]:
+        await needed.look()
+        return needed.hashes()
+
+    async def _complete(self, other: OtherMaster, needed: NeededContents, own: set[str]) -> None:
         """Send another master what it lacks, and let it remove what no package has."""
         held = await self._client.held(other)
-        for sha256 in (needed() & own) - held:
+        listed = await self._list(needed)
+        for sha256 in (listed & own) - held:
             if (other.name, sha256) not in self._sending:
                 await self._client.send(other, sha256, self._store)
-        for sha256 in held:
+        for number, sha256 in enumerate(held - listed, 1):
+            if number % _PIECE == 0:
+                await asyncio.sleep(0)
             async with self._removal:
-                if sha256 not in needed() and sha256 not in self._pushed and is_complete():
-                    await self._client.remove(other, sha256)
+                # Asked again: what is not needed now may have become so since the list was made.
+                if sha256 in self._pushed or needed.is_needed(sha256):
+                    continue
+                if not needed.is_complete():
+                    return
+                await self._client.remove(other, sha256)
 
     def _note(self, name: str, fault: str) -> None:
         if fault and fault != self._faults.get(name):

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rce_master.packages.contents import ContentStore, Incoming
     from rce_master.packages.copies import ArchiveCopies
     from rce_master.state.changes import Changes
+    from rce_master.state.tables import Tables
     from rce_master.state_service import StateService
 
 _log = logging.getLogger(__name__)
@@ -46,11 +47,11 @@ class ContentKeeper:
     ) -> None:
         self.store = store
         self._copies = copies
-        self._tables = state_service.tables
+        self._needed = _NeededByState(state_service.tables)
         self._coming: Counter[str] = Counter()
         """Contents that the state does not name yet."""
         self._dirty = asyncio.Event()
-        names = {self._tables.packages.name, self._tables.saved_states.name}
+        names = {table.name for table in (state_service.tables.packages, state_service.tables.saved_states)}
 
         def note(changes: Changes) -> None:
             if any(table in names for table, _ in changes.written()):
@@ -79,7 +80,7 @@ class ContentKeeper:
             OSError: It cannot be read, or not yet.
         """
         found = await self.store.read(sha256, offset, count)
-        if found is not None or self._copies is None or not self._is_needed(sha256):
+        if found is not None or self._copies is None or not self._needed.is_needed(sha256):
             return found
         await self._copies.obtain(sha256)
         return await self.store.read(sha256, offset, count)
@@ -105,14 +106,6 @@ class ContentKeeper:
             self._coming -= Counter((incoming.sha256,))
             self._dirty.set()
 
-    def _needed(self) -> set[str]:
-        tables = self._tables
-        return {one.sha256 for one in (*tables.packages, *tables.saved_states)}
-
-    def _is_needed(self, sha256: str) -> bool:
-        tables = self._tables
-        return bool(tables.packages.count("sha256", sha256) or tables.saved_states.count("sha256", sha256))
-
     async def _sweep(self) -> None:
         await asyncio.to_thread(self.store.forget_incoming)
         self._dirty.set()
@@ -128,8 +121,30 @@ class ContentKeeper:
             await asyncio.sleep(_PAUSE_S)
 
     async def _remove_unneeded(self) -> None:
-        # Looked at and set aside in one step: what comes or is needed again meanwhile stays.
-        held = await asyncio.to_thread(self.store.held)
-        unneeded = [one for one in held if one not in self._coming and not self._is_needed(one)]
-        for path in [self.store.set_aside(sha256) for sha256 in unneeded]:
-            await asyncio.to_thread(path.unlink, missing_ok=True)
+        for sha256 in await asyncio.to_thread(self.store.held):
+            # Looked at and set aside in one step: what comes or is needed again meanwhile stays.
+            if sha256 not in self._coming and not self._needed.is_needed(sha256):
+                await asyncio.to_thread(self.store.set_aside(sha256).unlink, missing_ok=True)
+
+
+class _NeededByState:
+    """The contents that the state names."""
+
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
+
+    async def look(self) -> None:
+        """Nothing has to be read."""
+
+    def hashes(self) -> set[str]:
+        """Return the hashes of all of them."""
+        return {one.sha256 for one in (*self._tables.packages, *self._tables.saved_states)}
+
+    def is_needed(self, sha256: str) -> bool:
+        """Tell whether a content is needed."""
+        tables = self._tables
+        return bool(tables.packages.count("sha256", sha256) or tables.saved_states.count("sha256", sha256))
+
+    def is_complete(self) -> bool:
+        """Tell whether all are known."""
+        return True

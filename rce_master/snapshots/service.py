@@ -16,6 +16,7 @@ from rce.aio.tasks import TaskScope
 from rce.control import SnapshotError
 from rce.control.snapshots import MAX_MANIFEST, Kept, Offer, Wanted, decode_manifest
 from rce_master.exceptions import FencedError, MasterError, StoreError
+from rce_master.snapshots.needed import NeededSnapshots
 from rce_master.state import commands
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
     from rce.control import VolumeSaved
-    from rce.control.snapshots import Manifest
     from rce_master.packages.contents import ContentStore
     from rce_master.packages.copies import ArchiveCopies
     from rce_master.state.changes import Changes
@@ -66,8 +66,7 @@ class SnapshotService:
         self._store = store
         self._clock = clock
         self._copies = copies
-        self._named: dict[str, frozenset[str]] = {}
-        """The contents that each needed manifest names, as far as this master has read it."""
+        self._needed = NeededSnapshots(state_service.tables.volumes, store)
         self._lock = asyncio.Lock()
         """Held while contents are compared with what the state needs."""
         self._dirty = asyncio.Event()
@@ -82,8 +81,7 @@ class SnapshotService:
         await self._forget_lost()
         async with TaskScope() as tasks:
             if self._copies is not None:
-                work = self._copies.run(self._needed, self._is_complete)
-                tasks.spawn(work, name="copies of snapshots")
+                tasks.spawn(self._copies.run(self._needed), name="copies of snapshots")
             await self._sweep()
 
     async def _forget_lost(self) -> None:
@@ -100,10 +98,10 @@ class SnapshotService:
         while True:
             self._dirty.clear()
             async with self._lock:
-                needed = self._needed()
-                if self._is_complete():
+                await self._needed.look()
+                if self._needed.is_complete():
                     try:
-                        await asyncio.to_thread(self._store.sweep, needed, SPARED_S)
+                        await asyncio.to_thread(self._store.sweep, self._needed.hashes(), SPARED_S)
                     except OSError as error:
                         _log.error("snapshots that are needed no more stay on the disk: %s", error)
             if self._copies is not None:
@@ -111,22 +109,6 @@ class SnapshotService:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(SPARED_S):
                     await self._dirty.wait()
-
-    # What is needed
-
-    def _needed(self) -> set[str]:
-        snapshots = {known.snapshot for known in self._state_service.tables.volumes if known.snapshot}
-        self._named = {sha256: named for sha256, named in self._named.items() if sha256 in snapshots}
-        for sha256 in snapshots - self._named.keys():
-            with contextlib.suppress(OSError, SnapshotError):  # another master may still have it
-                manifest = decode_manifest(self._store.path(sha256).read_bytes())
-                self._named[sha256] = frozenset(manifest.contents)
-        return snapshots.union(*self._named.values())
-
-    def _is_complete(self) -> bool:
-        """Whether all manifests are known; else it is not known which contents are needed."""
-        volumes = self._state_service.tables.volumes
-        return all(known.snapshot in self._named for known in volumes if known.snapshot)
 
     def _note(self, changes: Changes) -> None:
         if any(table == "volumes" for table, _ in changes.written()):
@@ -144,10 +126,15 @@ class SnapshotService:
             OSError: It cannot be read, or not yet.
         """
         found = await self._store.read(sha256, offset, count)
-        if found is not None or self._copies is None or sha256 not in self._needed():
+        if found is not None or self._copies is None or not await self._is_needed(sha256):
             return found
         await self._copies.obtain(sha256)
         return await self._store.read(sha256, offset, count)
+
+    async def _is_needed(self, sha256: str) -> bool:
+        if not self._needed.is_needed(sha256):
+            await self._needed.look()
+        return self._needed.is_needed(sha256)
 
     async def take(self, socket: ServerConnection) -> None:
         """Take the contents of a snapshot that a task set sends; return when it has hung up."""
@@ -215,13 +202,13 @@ class SnapshotService:
 
     async def _keep(self, taken: commands.SnapshotTaken) -> None:
         async with self._lock:
-            manifest = await asyncio.to_thread(self._check, taken.snapshot)
-            self._named[taken.snapshot] = frozenset(manifest.contents)
-            async with self._spread(taken.snapshot, *manifest.contents):
-                await self._state_service.submit(replace(taken, size=manifest.size))
+            size, contents = await asyncio.to_thread(self._check, taken.snapshot)
+            self._needed.add(taken.snapshot, contents)
+            async with self._spread(taken.snapshot, *contents):
+                await self._state_service.submit(replace(taken, size=size))
 
-    def _check(self, sha256: str) -> Manifest:
-        """Return the manifest of a snapshot that this master has as a whole. Blocks.
+    def _check(self, sha256: str) -> tuple[int, set[str]]:
+        """Return the size and the contents of a snapshot that this master has as a whole. Blocks.
 
         Raises:
             SnapshotError: It has not, or the manifest names what may not be made.
@@ -232,10 +219,11 @@ class SnapshotService:
             manifest = decode_manifest(self._store.path(sha256).read_bytes())
         except OSError as error:
             raise SnapshotError(f"the master cannot read its list of files: {error.strerror}") from error
-        missing = self._missing(sorted(manifest.contents))
+        contents = manifest.contents
+        missing = self._missing(sorted(contents))
         if missing:
             raise SnapshotError(f"the master does not hold {len(missing)} of its contents")
-        return manifest
+        return manifest.size, contents
 
     def _spread(self, *contents: str) -> AbstractAsyncContextManager[None]:
         return contextlib.nullcontext() if self._copies is None else self._copies.spread(*contents)

@@ -105,6 +105,7 @@ class Tables:
             key=lambda v: v.id,
             user=lambda v: [v.user],
             process=lambda v: [v.process],
+            snapshot=lambda v: [v.snapshot] if v.snapshot else [],
         )
         self.volume_removals = Table[VolumeRemoval](
             "volume_removals", type_=VolumeRemoval, key=lambda r: r.id, process=lambda r: [r.process]

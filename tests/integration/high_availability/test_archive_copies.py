@@ -1,0 +1,150 @@
+"""The leading master compares its contents with those of a stand-by that listens."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+from collections import Counter
+from collections.abc import AsyncIterator, Iterable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import cast
+
+import aiohttp
+import pytest
+from aiohttp import web
+from aiohttp.test_utils import TestServer
+from support.engine import until
+
+from rce.aio.tasks import cancel_and_wait
+from rce_master.http.archives import ArchiveRoutes
+from rce_master.http.leader_check import LeaderCheck
+from rce_master.leadership.core import Fence, LeadershipCore, LeaseSettings
+from rce_master.leadership.registry import MasterRegistry
+from rce_master.leadership.request_key import RequestKey
+from rce_master.leadership.standby_client import StandbyClient
+from rce_master.packages.contents import ARCHIVES_PATH, ContentStore
+from rce_master.packages.copies import ArchiveCopies
+from rce_master.packages.transfer import ArchiveClient
+from rce_master.store.etcd.layout import OtherMaster
+
+MANY = 20_000
+KEY = RequestKey(b"key")
+
+
+def hashes(count: int, what: str = "needed") -> list[str]:
+    return [hashlib.sha256(f"{what} {number}".encode()).hexdigest() for number in range(count)]
+
+
+def fill(folder: Path, names: Iterable[str]) -> None:
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        (folder / name).touch()
+
+
+class OneOther:
+    """A registry that knows one other master."""
+
+    def __init__(self, url: str) -> None:
+        self._other = OtherMaster("other", url)
+
+    async def others(self) -> list[OtherMaster]:
+        return [self._other]
+
+
+class Counted:
+    """Needed contents, and how often they were asked for."""
+
+    def __init__(self, needed: Iterable[str]) -> None:
+        self.needed = set(needed)
+        self.complete = True
+        self.calls: Counter[str] = Counter()
+
+    async def look(self) -> None:
+        self.calls["look"] += 1
+
+    def hashes(self) -> set[str]:
+        self.calls["hashes"] += 1
+        return set(self.needed)
+
+    def is_needed(self, sha256: str) -> bool:
+        self.calls["is_needed"] += 1
+        return sha256 in self.needed
+
+    def is_complete(self) -> bool:
+        return self.complete
+
+
+class Pair:
+    """A leading master's copies, and the folder of a stand-by."""
+
+    def __init__(self, copies: ArchiveCopies, own: Path, others: Path) -> None:
+        self.copies = copies
+        self.own = own
+        self.others = others
+
+    @asynccontextmanager
+    async def comparing(self, needed: Counted) -> AsyncIterator[None]:
+        running = asyncio.create_task(self.copies.run(needed))
+        try:
+            yield
+        finally:
+            await cancel_and_wait(running)
+
+
+@pytest.fixture
+async def pair(tmp_path: Path) -> AsyncIterator[Pair]:
+    own, others = tmp_path / "own", tmp_path / "others"
+    app = web.Application()
+    ArchiveRoutes(ContentStore(others), LeaderCheck(KEY, lambda: 1), ARCHIVES_PATH).add_to(app)
+    core = LeadershipCore(LeaseSettings())
+    core.granted(0.0, 3.0)
+    core.elected(1, 0.0)
+    async with TestServer(app) as server, aiohttp.ClientSession() as session:
+        registry = cast("MasterRegistry", OneOther(str(server.make_url("/"))))
+        client = StandbyClient(session, KEY, Fence(core, lambda: 0.0, "leader"))
+        yield Pair(
+            ArchiveCopies(ContentStore(own), registry, ArchiveClient(client, ARCHIVES_PATH)), own, others
+        )
+
+
+async def test_many_held_contents_are_listed_once(pair: Pair) -> None:
+    """The work of a comparison grows with the number of contents, not with its square."""
+    needed, unneeded = hashes(MANY), hashes(3, "unneeded")
+    fill(pair.own, needed)
+    fill(pair.others, [*needed, *unneeded])
+    counted = Counted(needed)
+    async with pair.comparing(counted):
+        await until(lambda: not any((pair.others / name).exists() for name in unneeded))
+    assert counted.calls["hashes"] <= 4, "at most two comparisons, of two lists each"
+    assert counted.calls["is_needed"] <= 2 * len(unneeded)
+    assert len(list(pair.others.iterdir())) == MANY
+
+
+async def test_contents_that_are_sent_are_not_removed(pair: Pair) -> None:
+    pushed, unneeded = hashes(50, "pushed"), hashes(1, "unneeded")
+    fill(pair.own, pushed)
+    fill(pair.others, [*pushed, *unneeded])
+    async with pair.comparing(Counted(())):
+        async with pair.copies.spread(*pushed):
+            await until(lambda: not (pair.others / unneeded[0]).exists())
+            assert len(list(pair.others.iterdir())) == len(pushed)
+        # A second push of the same contents is counted for itself.
+        async with pair.copies.spread(*pushed[:2]), pair.copies.spread(*pushed[:1]):
+            await until(lambda: not (pair.others / pushed[2]).exists())
+            assert (pair.others / pushed[0]).exists()
+
+
+async def test_contents_stay_while_it_is_unknown_what_is_needed(pair: Pair) -> None:
+    unneeded = hashes(2, "unneeded")
+    fill(pair.others, unneeded)
+    counted = Counted(())
+    counted.complete = False
+    async with pair.comparing(counted):
+        await until(lambda: counted.calls["look"] >= 2)  # each comparison looks twice
+        pair.copies.look()
+        await until(lambda: counted.calls["look"] >= 3)  # the first one has ended
+        assert len(list(pair.others.iterdir())) == len(unneeded)
+        counted.complete = True
+        pair.copies.look()
+        await until(lambda: not list(pair.others.iterdir()))
