@@ -20,6 +20,7 @@
     +-- TransitionError            an event that a life cycle does not allow in the present state
     +-- StoreError                 the store cannot be read or written
     |   +-- StoreBusyError         another process owns the state folder
+    |   +-- EndedError             this master ends, and takes no commands any more
     |   +-- FencedError            this master leads no more, and must not write
     |       +-- StaleTermError     another master has begun a newer term
     +-- TaskSetAwayError           the task set that is to be asked is not there
@@ -163,6 +164,16 @@ class StoreError(MasterError):
 
 class StoreBusyError(StoreError):
     """Another process owns the state folder."""
+
+
+class EndedError(StoreError):
+    """This master ends: it takes no commands any more.
+
+    What it wrote last may have been stored or not; only the next one knows.
+    """
+
+    def __str__(self) -> str:
+        return "this master ends; ask again when it, or another one, has started"
 
 
 class FencedError(StoreError):

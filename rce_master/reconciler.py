@@ -240,8 +240,10 @@ class Reconciler:
             self._send(copy[0], Put(endpoint=copy[1]))
 
     def _send_whole(self, process: str, id_: str) -> None:
-        peer = self._peers.get(process)
-        if peer is not None and not self._state_service.is_held(id_):
+        peer, endpoint = self._peers.get(process), self._state_service.tables.endpoints.get(id_)
+        if peer is None or endpoint is None or endpoint.task_set != process:
+            return  # a later command of the same batch may have removed it, or placed it elsewhere
+        if not self._state_service.is_held(id_):
             spec = self._state_service.spec(id_)
             self._sent[process][id_] = spec.revision
             peer.send(Put(endpoint=spec))

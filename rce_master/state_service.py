@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rce_master.exceptions import FencedError, MasterError, RefusedError, StoreError
+from rce_master.exceptions import EndedError, FencedError, MasterError, RefusedError, StoreError
 from rce_master.state.changes import Changes, Touched, make_row
 from rce_master.state.commands import Continue
 from rce_master.state.core import State, without_collections
@@ -97,7 +97,7 @@ class StateService:
         self._store_fault = ""
         self._is_unfinished = False
         """Whether a command left work that is continued after the commands that wait."""
-        self._end: FencedError | None = None
+        self._end: StoreError | None = None
         """Why nothing is done any more."""
 
     @classmethod
@@ -171,6 +171,7 @@ class StateService:
 
         Raises:
             FencedError: This master leads no more; some of it may have been stored or not.
+            EndedError: This master ends; the same holds.
         """
         await self._settled.wait()
         if self._end is not None:
@@ -192,6 +193,7 @@ class StateService:
         Raises:
             RefusedError: It cannot be done; nothing changed.
             StoreError: It cannot be stored; nothing changed.
+            EndedError: This master ends.
         """
         (outcome,) = await self.submit_all([command])
         if outcome is not None:
@@ -218,24 +220,25 @@ class StateService:
         return job.done
 
     async def run(self) -> None:
-        """Work until cancelled.
+        """Work until cancelled. However this ends, commands fail from then on.
 
         Raises:
-            FencedError: This master leads no more; what it did last may have been stored or not. From then on
-                commands fail with this error.
+            FencedError: This master leads no more; what it did last may have been stored or not.
         """
-        while True:
-            continues = self._is_unfinished
-            if continues:
-                # Without this, work that writes nothing would leave the event loop to no other task.
-                await asyncio.sleep(0)
-            jobs = [] if continues else [await self._jobs.get()]
-            try:
+        jobs: list[_Job] = []
+        try:
+            while True:
+                continues = self._is_unfinished
+                if continues:
+                    # Without this, work that writes nothing would leave the event loop to no other task.
+                    await asyncio.sleep(0)
+                jobs = [] if continues else [await self._jobs.get()]
                 await self._work(jobs, takes_more=True, continues=continues)
-            except FencedError as error:
-                self._end = error
-                self._refuse(jobs, error)
-                raise
+        except BaseException as error:
+            # The servers wait for the commands of their peers while they close.
+            self._end = error if isinstance(error, FencedError) else EndedError()
+            self._refuse(jobs, self._end)
+            raise
 
     async def _work(self, jobs: list[_Job], *, takes_more: bool = False, continues: bool = False) -> None:
         """Do jobs in one transaction of the store.
@@ -334,8 +337,8 @@ class StateService:
             return MasterError(f"internal error: {error!r}")
         return None
 
-    def _refuse(self, jobs: list[_Job], error: FencedError) -> None:
-        """Let commands fail, and those that wait: the servers wait for them while they close."""
+    def _refuse(self, jobs: list[_Job], error: StoreError) -> None:
+        """Let commands fail, and those that wait."""
         while not self._jobs.empty():
             jobs.append(self._jobs.get_nowait())
         for job in jobs:

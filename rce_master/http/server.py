@@ -13,6 +13,7 @@ from rce.web.openapi import PREFIX
 from rce.web.origin import ServerNames
 from rce_master.exceptions import (
     AuthError,
+    EndedError,
     FencedError,
     MasterError,
     RefusedError,
@@ -169,7 +170,7 @@ def _headers(error: MasterError) -> dict[str, str]:
     match error:
         case TooManyFailuresError() | TooMuchError():
             return {hdrs.RETRY_AFTER: str(math.ceil(error.retry_after))}
-        case TooManyLoginsError() | FencedError() | UnderWayError():
+        case TooManyLoginsError() | EndedError() | FencedError() | UnderWayError():
             return {hdrs.RETRY_AFTER: "1"}
         case AuthError():
             return {hdrs.WWW_AUTHENTICATE: "Bearer"}

@@ -217,7 +217,7 @@ class ArchiveCopies:
                     own.add(sha256)
         except FencedError:
             raise
-        except (StoreError, StandbyError) as error:
+        except (OSError, StoreError, StandbyError) as error:
             self._note("this master", f"packages are incomplete: {error}")
             others = []
         else:

@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed
 from rce.aio.tasks import TaskScope
 from rce.control import SnapshotError
 from rce.control.snapshots import MAX_MANIFEST, Kept, Offer, Wanted, decode_manifest
-from rce_master.exceptions import FencedError, MasterError, StoreError
+from rce_master.exceptions import EndedError, FencedError, MasterError, StoreError
 from rce_master.snapshots.needed import NeededSnapshots
 from rce_master.state import commands
 
@@ -88,10 +88,17 @@ class SnapshotService:
         """Forget snapshots that no master can have, as after a backup was restored."""
         if self._copies is not None:
             return
-        for known in list(self._state_service.tables.volumes):
-            if known.snapshot and not await asyncio.to_thread(self._store.path(known.snapshot).exists):
+        for known in [one for one in self._state_service.tables.volumes if one.snapshot]:
+            if await asyncio.to_thread(self._is_lost, known.snapshot):
                 lost = commands.SnapshotLost(volume=known.id, snapshot=known.snapshot)
                 await self._state_service.submit_all([lost])
+
+    def _is_lost(self, sha256: str) -> bool:
+        try:
+            return not self._store.path(sha256).exists()
+        except OSError as error:
+            _log.error("it is not known whether the snapshot %s is there: %s", sha256, error)
+            return False
 
     async def _sweep(self) -> None:
         await asyncio.to_thread(self._store.forget_incoming)
@@ -192,7 +199,7 @@ class SnapshotService:
             if not message.error:
                 await self._keep(taken)
                 return
-        except FencedError:
+        except (EndedError, FencedError):
             return  # the next leader is told again
         except (SnapshotError, StoreError) as error:
             taken = replace(taken, snapshot="", error=str(error))
@@ -213,14 +220,14 @@ class SnapshotService:
         Raises:
             SnapshotError: It has not, or the manifest names what may not be made.
         """
-        if not self._store.touch(sha256):
-            raise SnapshotError("the master does not hold its list of files")
         try:
+            if not self._store.touch(sha256):
+                raise SnapshotError("the master does not hold its list of files")
             manifest = decode_manifest(self._store.path(sha256).read_bytes())
+            contents = manifest.contents
+            missing = self._missing(sorted(contents))
         except OSError as error:
-            raise SnapshotError(f"the master cannot read its list of files: {error.strerror}") from error
-        contents = manifest.contents
-        missing = self._missing(sorted(contents))
+            raise SnapshotError(f"the master cannot read it: {error.strerror}") from error
         if missing:
             raise SnapshotError(f"the master does not hold {len(missing)} of its contents")
         return manifest.size, contents

@@ -148,3 +148,17 @@ async def test_contents_stay_while_it_is_unknown_what_is_needed(pair: Pair) -> N
         counted.complete = True
         pair.copies.look()
         await until(lambda: not list(pair.others.iterdir()))
+
+
+async def test_own_folder_that_cannot_be_read_is_looked_at_again(
+    pair: Pair, caplog: pytest.LogCaptureFixture
+) -> None:
+    unneeded = hashes(1, "unneeded")
+    fill(pair.others, unneeded)
+    pair.own.touch()  # a file, which has no entries
+    async with pair.comparing(Counted(())):
+        await until(lambda: "packages are incomplete: [Errno 20]" in caplog.text)
+        pair.own.unlink()
+        pair.own.mkdir()
+        pair.copies.look()
+        await until(lambda: not (pair.others / unneeded[0]).exists())

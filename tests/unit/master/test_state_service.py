@@ -7,14 +7,17 @@ import asyncio
 import pytest
 from support.master_cloud import Cloud, FragileStore, running, wire
 
+from rce.aio.tasks import cancel_and_wait
 from rce.control.messages import (
+    Drop,
     Put,
     Status,
 )
 from rce.control.model import EndpointState, EndpointStatus, LinkAddress
-from rce_master.exceptions import MasterError, NotFoundError, StoreError
+from rce_master.exceptions import EndedError, MasterError, NotFoundError, StoreError
 from rce_master.state import commands
 from rce_master.state.settings import StateSettings
+from rce_master.state_service import MAX_WAITING, StateService
 
 # StateService
 
@@ -143,7 +146,53 @@ async def test_a_fault_of_ours_is_no_end(cloud: Cloud, caplog: pytest.LogCapture
     await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="c"))
 
 
+async def test_commands_fail_once_a_listener_failed() -> None:
+    """Its master ends; what waits for it must not wait for ever."""
+    store = FragileStore()
+    service = await StateService.open(store)
+
+    def fail(_: object) -> None:
+        raise RuntimeError("a bug")
+
+    service.listeners.append(fail)
+    tasks = [asyncio.create_task(service.submit(commands.Tick())) for _ in range(MAX_WAITING + 10)]
+    await asyncio.sleep(0)
+    with pytest.raises(RuntimeError, match="a bug"):
+        await service.run()
+    outcomes = await asyncio.gather(*tasks, return_exceptions=True)
+    assert {type(outcome) for outcome in outcomes} == {EndedError}
+    with pytest.raises(EndedError):
+        await service.submit(commands.Tick())
+    with pytest.raises(EndedError):
+        await service.settled()
+
+
+async def test_commands_fail_after_the_service_was_cancelled() -> None:
+    service = await StateService.open(FragileStore())
+    running = asyncio.create_task(service.run())
+    await service.submit(commands.Tick())
+    await cancel_and_wait(running)
+    with pytest.raises(EndedError):
+        await service.submit(commands.Tick())
+
+
 # Reconciling
+
+
+async def test_spec_of_endpoint_removed_in_same_batch(cloud: Cloud) -> None:
+    """The listener hears of the request when the endpoint is gone already."""
+    containers = cloud.containers()
+    await containers.hello()
+    await cloud.state_service.submit(commands.CreateContainer(user="anna", tag="c"))
+    outcomes = await cloud.state_service.submit_all(
+        [
+            commands.SpecRequested(process="c1", id="anna/c"),
+            commands.DestroyContainer(user="anna", tag="c"),
+        ]
+    )
+    assert outcomes == [None, None]
+    assert (await containers.get(Drop)).id == "anna/c"
+    await cloud.flush()
 
 
 async def test_a_restarted_master_takes_over_what_runs() -> None:
