@@ -43,6 +43,10 @@ BURST = 2000
 """Records of one user that are written one by one, however fast they come."""
 PER_SECOND = 2.0
 """Records of one user beyond the burst; more of an action and an address within a minute are one record."""
+MAX_KINDS = 20
+"""Actions and addresses of one user that are counted each for itself beyond the burst."""
+OTHER_ACTIONS = "other_actions"
+"""The action of a record that counts those beyond :data:`MAX_KINDS`."""
 MAX_TEXT = 300
 IDS_OF_TERM = 10**10
 """Each term of leadership has ids of its own, so that the records of several masters have one order."""
@@ -137,9 +141,9 @@ class AuditLog:
         continues.
         """
         now = self._clock()
-        if outcome == DONE and self._rates.take(user, now):
-            key = user, action, address, DONE
-            self._add_missed(key, self._count(key, now))
+        address = _clean(address)
+        if self._is_too_much(user, outcome, now):
+            self._count_more((user, action, address, outcome), now, times)
             return
         self._add(
             user,
@@ -161,22 +165,44 @@ class AuditLog:
 
     def refuse(self, user: str, action: str, *, detail: str = "", address: str = "") -> None:
         """Record a refusal; repetitions are counted and written at most once a minute."""
-        times = self._count((user, action, address, REFUSED), self._clock())
-        if times:
-            self.add(user, action, detail=detail, address=address, outcome=REFUSED, times=times)
+        now = self._clock()
+        address = _clean(address)
+        key = user, action, address, REFUSED
+        times = self._count(key, now)
+        if not times:
+            return
+        if self._is_too_much(user, REFUSED, now):
+            del self._repeated[key]
+            self._count_more(key, now, times)
+        else:
+            detail = _clean(detail)
+            self._add(user, action, now, detail=detail, address=address, outcome=REFUSED, times=times)
 
-    def _count(self, key: _Key, now: float) -> int:
+    def _is_too_much(self, user: str, outcome: str, now: float) -> bool:
+        # Not one limit for both: others can cause refusals of a user, by wrong passwords.
+        return bool(self._rates.take(f"{outcome} {user}", now))
+
+    def _count_more(self, key: _Key, now: float, times: int) -> None:
+        """Count what is too much to be written one by one."""
+        user, _, _, outcome = key
+        if key not in self._repeated:
+            kinds = sum(1 for one in self._repeated if (one[0], one[3]) == (user, outcome))
+            if kinds >= MAX_KINDS:
+                key = user, OTHER_ACTIONS, "", outcome
+        self._add_missed(key, self._count(key, now, times))
+
+    def _count(self, key: _Key, now: float, times: int = 1) -> int:
         """Count a repetition; return how many are to be written now: one or more once a minute, else 0."""
         since, count = self._repeated.get(key, (0.0, 0))
         if now - since < REPEAT_S:
-            self._repeated[key] = (since, count + 1)
+            self._repeated[key] = (since, count + times)
             return 0
         self._repeated.pop(key, None)
         while len(self._repeated) >= MAX_REPEATS:
             oldest, (_, missed) = self._repeated.popitem(last=False)
             self._add_missed(oldest, missed)
         self._repeated[key] = (now, 0)
-        return count + 1
+        return count + times
 
     def flush(self) -> None:
         """Write the repetitions that are due."""
@@ -198,7 +224,8 @@ class AuditLog:
     def _add_missed(self, key: _Key, count: int) -> None:
         user, action, address, outcome = key
         if count:
-            detail = "again" if outcome == REFUSED else "too often to be listed"
+            is_known = outcome == REFUSED and action != OTHER_ACTIONS
+            detail = "again" if is_known else "too often to be listed"
             self._add(
                 user, action, self._clock(), detail=detail, address=address, outcome=outcome, times=count
             )

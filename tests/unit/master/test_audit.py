@@ -3,7 +3,9 @@ from __future__ import annotations
 import stat
 from typing import TYPE_CHECKING
 
-from rce_master.audit import BURST, MAX_TEXT, PER_SECOND, AuditLog, describe
+import pytest
+
+from rce_master.audit import BURST, MAX_KINDS, MAX_TEXT, OTHER_ACTIONS, PER_SECOND, AuditLog, describe
 from rce_master.state import commands
 
 if TYPE_CHECKING:
@@ -84,6 +86,39 @@ def test_flood_of_changes_leaves_the_records_of_others(tmp_path: Path) -> None:
     log.close()
 
 
+@pytest.mark.parametrize("outcome", ["done", "refused"])
+def test_flood_of_different_records_leaves_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, outcome: str
+) -> None:
+    """A caller of ``POST /audit`` chooses outcome, action and address."""
+    monkeypatch.setattr("rce_master.audit.KEPT", BURST + 100)
+    log = AuditLog(tmp_path, Clock())
+    log.add("bob", "create_container", "bob/c")
+    count = BURST + 1000
+    for number in range(count):
+        action = "steer_" + "abcdefghij"[number % 10] * (number // 10 % 64)
+        log.add("anna", action, address=f"10.0.{number // 256}.{number % 256}", outcome=outcome)
+    log.close()
+    found = log.since(0, 2 * count)
+    assert found[0].user == "bob"
+    assert sum(record.times for record in found) == count + 1
+    assert found[-1].action == OTHER_ACTIONS
+    assert len(found) <= BURST + 2 * MAX_KINDS + 3
+
+
+def test_refusals_from_too_many_addresses_are_counted(tmp_path: Path) -> None:
+    log = AuditLog(tmp_path, Clock())
+    log.add("bob", "log_in")
+    for number in range(BURST + 5000):
+        log.refuse("anna", "log_in", address=f"10.1.{number // 256}.{number % 256}")
+    log.add("anna", "log_in")
+    assert log.since(-1, 1)[0].outcome == "done", "refusals that others cause hide no record of the user"
+    log.close()
+    found = log.since(0, 10_000)
+    assert sum(record.times for record in found) == BURST + 5002
+    assert len(found) <= BURST + 2 * MAX_KINDS + 5
+
+
 def test_records_by_user(tmp_path: Path) -> None:
     log = AuditLog(tmp_path, Clock())
     for name in ("anna", "bob", "anna"):
@@ -96,11 +131,11 @@ def test_records_by_user(tmp_path: Path) -> None:
 def test_text_is_bounded_one_line_and_without_tokens(tmp_path: Path) -> None:
     log = AuditLog(tmp_path, Clock())
     token = "rce_" + "x" * 43
-    log.add("anna", "revoke_token", f"anna/{token}", detail="\x1b[2J\n" + "y" * 5000)
+    log.add("anna", "revoke_token", f"anna/{token}", detail="\x1b[2J\n" + "y" * 5000, address="\x1b[2J")
     (record,) = log.since(0, 1)
     assert token not in record.subject
     assert len(record.detail) <= MAX_TEXT
-    assert not {"\n", "\x1b"} & set(record.detail)
+    assert not {"\n", "\x1b"} & set(record.detail + record.address)
     log.close()
     assert token not in (tmp_path / "audit.jsonl").read_text()
 
