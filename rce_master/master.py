@@ -211,6 +211,7 @@ class Master:
                     for work in (
                         state_service.run(),
                         control_handler.run(),
+                        reconciler.run(),
                         keeper.run(),
                         snapshots.run(),
                         services.tokens.run(state_service),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from typing import TYPE_CHECKING, Protocol, assert_never
 
@@ -37,8 +38,9 @@ from rce.control import (
     VolumeRestored,
     VolumeSaved,
 )
-from rce_master.exceptions import NotFoundError, RefusedError, TaskSetAwayError
+from rce_master.exceptions import MasterError, NotFoundError, RefusedError, TaskSetAwayError
 from rce_master.logs import LogReader, LogRequest, read_log
+from rce_master.reports import Report, ReportQueue
 from rce_master.state import commands, volume_moves
 from rce_master.state.lifecycle import RobotSession
 from rce_master.usage import UsageBook
@@ -91,7 +93,12 @@ class Reconciler:
         """The last revision of each endpoint that was sent to a connected task set, by process and id."""
         self._asked: set[tuple[str, str]] = set()
         """Endpoints whose whole status was requested, with their process."""
+        self._reports = ReportQueue(state_service, self._ask_status)
         state_service.listeners.append(self.on_changes)
+
+    async def run(self) -> None:
+        """Repeat reports that the store did not take, until cancelled."""
+        await self._reports.run()
 
     # From the task sets
 
@@ -102,17 +109,24 @@ class Reconciler:
             PeerRefusedError: Its name cannot be used.
             StoreError: It cannot be stored; the task set is refused.
         """
-        self._arriving[peer.process] = peer
+        process = peer.process
+        self._arriving[process] = peer
+        self._reports.forget(process)
         try:
             await self._state_service.submit(commands.TaskSetArrived(hello=hello))
-        except RefusedError as error:
-            raise PeerRefusedError(str(error)) from error
+        except MasterError as error:
+            if process not in self._peers and self._state_service.tables.is_connected(process):
+                # Its last departure is not stored yet.
+                self._reports.repeat_later(process, commands.TaskSetLeft(process=process))
+            if isinstance(error, RefusedError):
+                raise PeerRefusedError(str(error)) from error
+            raise
         finally:
             self._arriving.pop(peer.process, None)
 
     async def on_message(self, process: str, message: ToMaster) -> None:
         """Queue a report. Reports are applied in the order of arrival, after this returns."""
-        command: commands.Command
+        command: Report
         match message:
             case Status():
                 self._asked.discard((process, message.status.id))
@@ -138,14 +152,15 @@ class Reconciler:
                 return
             case _:
                 assert_never(message)
-        await self._state_service.enqueue([command])
+        await self._reports.submit(process, command)
 
     async def on_gone(self, peer: Peer) -> None:
-        """Note that a task set's channel ended."""
+        """Note that a task set's channel ended; what is not stored now is stored later."""
         if self._peers.get(peer.process) is peer:
             self._forget(peer.process)
             self.book.forget(peer.process)
-            await self._state_service.submit(commands.TaskSetLeft(process=peer.process))
+            left = commands.TaskSetLeft(process=peer.process)
+            await asyncio.wait([await self._reports.submit(peer.process, left)])
 
     async def read_log(
         self,
@@ -314,7 +329,7 @@ class Reconciler:
             peer.send(message)
 
 
-def _command_of(process: str, message: VolumeRemoved | VolumeRestored) -> commands.Command:
+def _command_of(process: str, message: VolumeRemoved | VolumeRestored) -> Report:
     if isinstance(message, VolumeRemoved):
         return commands.VolumeRemoved(process=process, volume=message.volume)
     return commands.VolumeRestored(

@@ -166,6 +166,11 @@ class StateService:
         """Tell whether an endpoint is a container that is to run nowhere now (:meth:`State.is_held`)."""
         return self.state.is_held(endpoint)
 
+    @property
+    def is_full(self) -> bool:
+        """Whether so many commands wait that :meth:`enqueue` would wait too."""
+        return self._jobs.full()
+
     async def settled(self) -> None:
         """Wait until all that the tables show now is stored, or is taken back, which :attr:`reverts` tells.
 
@@ -262,7 +267,7 @@ class StateService:
             self._settled.set()
             # The next tick does what was left over: a store that fails is not asked again at once.
             self._is_unfinished = False
-            await self._stand_alone(jobs, error)
+            await self._stand_alone(jobs, error, was_alone=not continues)
             return
         except BaseException:
             self._revert(done)
@@ -317,9 +322,15 @@ class StateService:
             self._store_fault = str(error)
             raise
 
-    async def _stand_alone(self, jobs: list[_Job], error: StoreError) -> None:
-        """Do jobs one by one after their common transaction failed: reports need no store."""
-        if len(jobs) <= 1:
+    async def _stand_alone(self, jobs: list[_Job], error: StoreError, *, was_alone: bool) -> None:
+        """Do jobs one by one after their common transaction failed: reports need no store.
+
+        Args:
+            jobs: The jobs.
+            error: Of the transaction.
+            was_alone: Whether it had nothing beside the jobs.
+        """
+        if not jobs or (len(jobs) == 1 and was_alone):
             _log.error("%s", error)
             self._answer(jobs, error)
             return

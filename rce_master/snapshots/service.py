@@ -16,6 +16,7 @@ from rce.aio.tasks import TaskScope
 from rce.control import SnapshotError
 from rce.control.snapshots import MAX_MANIFEST, Kept, Offer, Wanted, decode_manifest
 from rce_master.exceptions import EndedError, FencedError, MasterError, StoreError
+from rce_master.reports import REPEAT_S
 from rce_master.snapshots.needed import NeededSnapshots
 from rce_master.state import commands
 
@@ -203,9 +204,18 @@ class SnapshotService:
             return  # the next leader is told again
         except (SnapshotError, StoreError) as error:
             taken = replace(taken, snapshot="", error=str(error))
-        (outcome,) = await self._state_service.submit_all([taken])
-        if outcome is not None:
-            _log.error("the end of a snapshot was not noted: %s", outcome)
+        await self._note_end(taken)
+
+    async def _note_end(self, taken: commands.SnapshotTaken) -> None:
+        """Note a snapshot that failed; a container may wait for it. The store may fail for a while too."""
+        while True:
+            (outcome,) = await self._state_service.submit_all([taken])
+            if outcome is None or isinstance(outcome, EndedError | FencedError):
+                return
+            if not isinstance(outcome, StoreError):
+                _log.error("the end of a snapshot was not noted: %s", outcome)
+                return
+            await asyncio.sleep(REPEAT_S)
 
     async def _keep(self, taken: commands.SnapshotTaken) -> None:
         async with self._lock:

@@ -161,6 +161,7 @@ async def running(store: FragileStore, settings: StateSettings | None = None) ->
         workers = [
             group.create_task(cloud.state_service.run()),
             group.create_task(cloud.control_handler.run()),
+            group.create_task(cloud.reconciler.run()),
         ]
         await asyncio.sleep(0)
         if "anna" not in cloud.state_service.tables.users:
