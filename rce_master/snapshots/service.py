@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 import time
+from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -21,7 +22,7 @@ from rce_master.snapshots.needed import NeededSnapshots
 from rce_master.state import commands
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Collection, Iterator
     from contextlib import AbstractAsyncContextManager
 
     from websockets.asyncio.server import ServerConnection
@@ -40,7 +41,8 @@ SNAPSHOTS_PATH: Final = "/snapshots"
 """Where a stand-by takes and gives them."""
 SNAPSHOT: Final = "snapshot"
 SPARED_S = 900.0
-"""Contents that no volume needs are kept for so long: a task set may be sending a snapshot that has them."""
+"""Contents that no volume needs are kept for so long after the connection on which they were sent has ended:
+the task set that sent them is about to report the snapshot that has them."""
 _SLACK = 16 << 20
 """Bytes that a snapshot may have beyond the size of its volume: sizes of folders are only watched."""
 _CLOSE_CODE = 1008
@@ -68,6 +70,8 @@ class SnapshotService:
         self._clock = clock
         self._copies = copies
         self._needed = NeededSnapshots(state_service.tables.volumes, store)
+        self._coming: Counter[str] = Counter()
+        """Contents of snapshots that are being sent, or wait for being accepted."""
         self._lock = asyncio.Lock()
         """Held while contents are compared with what the state needs."""
         self._dirty = asyncio.Event()
@@ -108,8 +112,9 @@ class SnapshotService:
             async with self._lock:
                 await self._needed.look()
                 if self._needed.is_complete():
+                    known = self._needed.hashes() | self._coming.keys()
                     try:
-                        await asyncio.to_thread(self._store.sweep, self._needed.hashes(), SPARED_S)
+                        await asyncio.to_thread(self._store.sweep, known, SPARED_S)
                     except OSError as error:
                         _log.error("snapshots that are needed no more stay on the disk: %s", error)
             if self._copies is not None:
@@ -155,11 +160,26 @@ class SnapshotService:
             known = self._state_service.tables.volumes.get(offer.volume)
             if known is None:
                 answer = Wanted(error=f"there is no volume {offer.volume!r}")
-            else:
+                await socket.send(msgspec.json.encode(answer).decode())
+                return
+            with self._sparing(offer.contents):
                 answer = Wanted(contents=await asyncio.to_thread(self._missing, offer.contents))
-            await socket.send(msgspec.json.encode(answer).decode())
-            if known is not None:
-                await self._receive(socket, known.size)
+                try:
+                    await socket.send(msgspec.json.encode(answer).decode())
+                    await self._receive(socket, known.size)
+                finally:
+                    # The task set has yet to report the snapshot: the contents are spared from now.
+                    with contextlib.suppress(OSError):
+                        await asyncio.to_thread(self._missing, offer.contents)
+
+    @contextlib.contextmanager
+    def _sparing(self, contents: Collection[str]) -> Iterator[None]:
+        """Keep contents that no volume needs yet, as long as the block takes."""
+        self._coming.update(contents)
+        try:
+            yield
+        finally:
+            self._coming -= Counter(contents)
 
     def _missing(self, contents: list[str]) -> list[str]:
         return [sha256 for sha256 in contents if not self._store.touch(sha256)]
@@ -218,29 +238,40 @@ class SnapshotService:
             await asyncio.sleep(REPEAT_S)
 
     async def _keep(self, taken: commands.SnapshotTaken) -> None:
-        async with self._lock:
-            size, contents = await asyncio.to_thread(self._check, taken.snapshot)
-            self._needed.add(taken.snapshot, contents)
-            async with self._spread(taken.snapshot, *contents):
-                await self._state_service.submit(replace(taken, size=size))
+        size, contents = await asyncio.to_thread(self._read_manifest, taken.snapshot)
+        with self._sparing((taken.snapshot, *contents)):
+            async with self._lock:
+                await asyncio.to_thread(self._check, contents)
+                self._needed.add(taken.snapshot, contents)
+                async with self._spread(taken.snapshot, *contents):
+                    await self._state_service.submit(replace(taken, size=size))
 
-    def _check(self, sha256: str) -> tuple[int, set[str]]:
-        """Return the size and the contents of a snapshot that this master has as a whole. Blocks.
+    def _read_manifest(self, sha256: str) -> tuple[int, set[str]]:
+        """Return the size and the contents of a snapshot. Blocks.
 
         Raises:
-            SnapshotError: It has not, or the manifest names what may not be made.
+            SnapshotError: Its manifest is not there, or names what may not be made.
         """
         try:
             if not self._store.touch(sha256):
                 raise SnapshotError("the master does not hold its list of files")
             manifest = decode_manifest(self._store.path(sha256).read_bytes())
-            contents = manifest.contents
+        except OSError as error:
+            raise SnapshotError(f"the master cannot read its list of files: {error.strerror}") from error
+        return manifest.size, manifest.contents
+
+    def _check(self, contents: set[str]) -> None:
+        """Check that this master has all contents of a snapshot. Blocks.
+
+        Raises:
+            SnapshotError: It has not.
+        """
+        try:
             missing = self._missing(sorted(contents))
         except OSError as error:
-            raise SnapshotError(f"the master cannot read it: {error.strerror}") from error
+            raise SnapshotError(f"the master cannot read its contents: {error.strerror}") from error
         if missing:
             raise SnapshotError(f"the master does not hold {len(missing)} of its contents")
-        return manifest.size, contents
 
     def _spread(self, *contents: str) -> AbstractAsyncContextManager[None]:
         return contextlib.nullcontext() if self._copies is None else self._copies.spread(*contents)
