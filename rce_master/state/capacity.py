@@ -43,6 +43,11 @@ def _of_group(tables: Tables, container: Container) -> list[Container]:
     return [other for other in found if isinstance(other, Container) and other.id != container.id]
 
 
+def is_tied_elsewhere(tables: Tables, container: Container, process: str) -> bool:
+    """Whether the others of a container's group network are on another machine."""
+    return any(mate.task_set not in ("", process) for mate in group_mates(tables, container))
+
+
 def tied_to(tables: Tables, container: Container) -> Collection[str] | None:
     """Return the processes of the only machines where a container may be; None: it may be on any.
 

@@ -300,7 +300,10 @@ def _proceed(tx: Transaction, id_: str) -> bool:
     container = tx.tables.container(id_)
     if container is None or id_ not in tx.tables.moves:
         return False
-    moves = [m for each in _unit(tx.tables, container) if (m := tx.tables.moves.get(each.id)) is not None]
+    unit = _unit(tx.tables, container)
+    if not _bring_along(tx, tx.tables.moves[id_], unit):
+        return False
+    moves = [tx.tables.moves[each.id] for each in unit]
     company = frozenset(m.id for m in moves)
     if not all(_is_ready(tx, m) for m in moves):
         return False
@@ -315,6 +318,24 @@ def _proceed(tx: Transaction, id_: str) -> bool:
     for m in moves:
         _switch(tx, m, company)
     return True
+
+
+def _bring_along(tx: Transaction, move: Move, unit: list[Container]) -> bool:
+    """Begin the moves of those that joined the group later; return whether all of a unit move already."""
+    tables = tx.tables
+    late = [each for each in unit if each.id not in tables.moves]
+    for each in late:
+        why = volume_moves.why_not(tables, each) if each.resources.volumes else ""
+        if not why and not capacity.admission(tables, each)(move.to):
+            why = "a container of its name is still ending there"
+        if not why and not _takes_all(tables.rooms.get(move.to), late):
+            why = "there is no room for it"
+        if why:
+            give_up(tx, move, f"cannot move without container {each.tag!r}, which joined its group: {why}")
+            return False
+    for each in late:
+        _begin(tx, each, move.to)
+    return not late
 
 
 def _is_ready(tx: Transaction, move: Move) -> bool:
@@ -358,29 +379,45 @@ def _settle(tx: Transaction, container: Container, move: Move) -> None:
 def promote(tx: Transaction, container: Container) -> bool:
     """Let a container's copy take over at once, because the container itself has ended.
 
+    The copies of those that move together with it take over, too.
+
     Returns:
-        Whether a copy exists.
+        Whether a copy exists. One whose company has no copies yet is dropped.
     """
     move = tx.tables.moves.get(container.id)
     if move is None:
         return False
-    tx.delete(tx.tables.moves, move.id)
-    _settle(tx, container, move)
-    tx.put(replace(tx.tables.container_live(move.id), status=None))
-    activity.forget(tx, move.id)
-    tx.happen("container_moved", move.id, f"to {move.to}, before it was up there")
+    unit = _unit(tx.tables, container)
+    if any(each.id not in tx.tables.moves for each in unit):
+        give_up(tx, move, "ended before all of its group had copies there")
+        return False
+    for each in unit:
+        move = tx.tables.moves[each.id]
+        if each.id != container.id:
+            handing_over.depart(tx, each, frozenset())
+        tx.delete(tx.tables.moves, each.id)
+        _settle(tx, each, move)
+        tx.put(replace(tx.tables.container_live(each.id), status=None))
+        activity.forget(tx, each.id)
+        tx.happen("container_moved", each.id, f"to {move.to}, before it was up there")
     return True
 
 
 def give_up(tx: Transaction, move: Move, why: str) -> None:
-    """End a move: the container stays where it is for now, and its copy is dropped."""
-    endpoints.drop_copy(tx, move.id, "the move was given up")
-    live = tx.tables.container_live(move.id)
-    tx.put(replace(live, rest_until=tx.now + tx.settings.move_rest))
+    """End a move: the container stays where it is for now, and its copy is dropped.
+
+    So do those that move together with it. Without effect if the move has ended already.
+    """
     container = tx.tables.container(move.id)
-    assert container is not None
+    if container is None or move.id not in tx.tables.moves:
+        return
     again = f"; tried again in {tx.settings.move_rest:.0f} s" if _is_draining(tx, container) else ""
-    _stay(tx, container, f"{move.to}: it {why}{again}")
+    for each in _unit(tx.tables, container):
+        endpoints.drop_copy(tx, each.id, "the move was given up")
+        live = tx.tables.container_live(each.id)
+        tx.put(replace(live, rest_until=tx.now + tx.settings.move_rest))
+        whose = "it" if each.id == container.id else f"container {container.tag!r} of its group"
+        _stay(tx, each, f"{move.to}: {whose} {why}{again}")
 
 
 def left(tx: Transaction, process: str) -> None:

@@ -6,12 +6,13 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from rce.control import TaskSetKind
-from rce.model import EndpointId, Form, InterfaceType, Resources, Role
+from rce.model import EndpointId, Form, InterfaceType, Network, Resources, Role
 from rce_master.state import capacity, endpoints
 from rce_master.state.lifecycle import RobotSession, VolumeMovePhase
 from rce_master.state.placement import Room
 from rce_master.state.promises import Promises
 from rce_master.state.records import Container, ContainerLive, Endpoint, Robot, RobotLive
+from rce_master.state.waiting import group_key
 
 if TYPE_CHECKING:
     from rce_master.state.tables import Tables
@@ -33,6 +34,7 @@ def validate(tables: Tables) -> None:
         _check_link(tables, link)
     _check_connections(tables)
     _check_observed(tables)
+    _check_groups(tables)
     _check_moves(tables)
     _check_volumes(tables)
     for state in tables.saved_states:
@@ -207,6 +209,16 @@ def _check_container(tables: Tables, live: ContainerLive) -> None:
     if container.task_set:
         tombstone = f"{container.task_set} {container.id}"
         assert tombstone not in tables.tombstones, f"{live.id}: placed where its former self still ends"
+
+
+def _check_groups(tables: Tables) -> None:
+    """Check that the network of a group is on one machine: the nodes reach each other only there."""
+    places: dict[str, set[str]] = {}
+    for container in tables.containers():
+        if container.resources.network is Network.GROUP and container.task_set:
+            places.setdefault(group_key(container), set()).add(container.task_set)
+    for key, found in places.items():
+        assert len(found) == 1, f"the network of group {key!r} is on several machines: {sorted(found)}"
 
 
 def _check_moves(tables: Tables) -> None:

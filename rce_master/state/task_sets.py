@@ -129,18 +129,19 @@ def _adopt(tx: Transaction, process: str, status: EndpointStatus) -> None:
 def _find_again(tx: Transaction, process: str, container: Container, status: EndpointStatus) -> None:
     """Let a container that is placed nowhere continue where it is, unless it grew too much meanwhile.
 
-    One of the same name that was there before it is none of its lives: ``Sync`` has it dropped, and the
-    container may be placed there when it is gone.
+    It may not if its files, or the others of its group's network, are on another machine. One of the same
+    name that was there before it is none of its lives: ``Sync`` has it dropped, and the container may be
+    placed there when it is gone.
     """
     task_set = tx.tables.task_sets[process]
     if task_set.kind is not TaskSetKind.CONTAINER or status.state is EndpointState.STOPPING:
         return
-    if status.revision < container.born or not _is_given(tx, status):
+    is_former = status.revision < container.born or not _is_given(tx, status)
+    belongs_elsewhere = volumes.come_from_elsewhere(
+        tx.tables, container, process
+    ) or capacity.is_tied_elsewhere(tx.tables, container, process)
+    if is_former or belongs_elsewhere:
         tx.put(Tombstone(process=process, id=container.id))
-    elif volumes.come_from_elsewhere(tx.tables, container, process):
-        tx.put(
-            Tombstone(process=process, id=container.id)
-        )  # its files count no more, or are another machine's
     elif not capacity.room_at(tx.tables, task_set).shortages(container.resources):
         volumes.end_move(tx, container)
         placing.bind(tx, container, process)

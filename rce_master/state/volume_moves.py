@@ -158,6 +158,9 @@ def _hand_over(tx: Transaction, container: Container, move: VolumeMove) -> None:
     if tombstone_key(move.to, container.id) in tx.tables.tombstones:
         give_up(tx, move, f"{move.to}: a container of its name is still ending there")
         return
+    if capacity.is_tied_elsewhere(tx.tables, container, move.to):
+        give_up(tx, move, f"{move.to}: a container joined its group meanwhile, on another machine")
+        return
     _advance(tx, move, VolumeMoveEvent.RESTORED)
     placing.bind(tx, container, move.to)
 
@@ -186,6 +189,8 @@ def _go_back(tx: Transaction, container: Container, why: str) -> None:
     home = next((known.former[-1] for known in volumes.volumes_of(tables, container) if known.former), "")
     task_set = tables.task_sets.get(home)
     if task_set is None or not task_set.snapshots or not tables.is_connected(home):
+        return
+    if capacity.is_tied_elsewhere(tables, container, home):
         return
     if tombstone_key(home, container.id) in tables.tombstones or _is_removing(tables, container, home):
         return

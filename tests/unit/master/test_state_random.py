@@ -215,9 +215,14 @@ class Histories(RuleBasedStateMachine):
         )
         self.do(commands.CreateContainer(user=user, tag=tag, resources=requested, wait=wait))
 
-    @rule(user=USERS, tag=TAGS, name=st.sampled_from(["v", "w"]), wait=st.booleans())
-    def create_with_volume(self, user: str, tag: str, name: str, wait: bool) -> None:
-        resources = Resources(volumes=(Volume(name=name, path="/v", size=64 << 20),))
+    @rule(user=USERS, tag=TAGS, name=st.sampled_from(["v", "w"]), wait=st.booleans(), grouped=st.booleans())
+    def create_with_volume(self, user: str, tag: str, name: str, wait: bool, grouped: bool) -> None:
+        volumes = (Volume(name=name, path="/v", size=64 << 20),)
+        resources = (
+            Resources(volumes=volumes, network=Network.GROUP, group="g")
+            if grouped
+            else Resources(volumes=volumes)
+        )
         self.do(commands.CreateContainer(user=user, tag=tag, resources=resources, wait=wait))
 
     @rule(user=USERS, name=st.sampled_from(["v", "w"]))

@@ -29,10 +29,13 @@ OLD, NEW = "a" * 64, "b" * 64
 class Moving(World):
     """Two machines or more; container ``c`` with a volume runs at ``c1``."""
 
-    def __init__(self, volume: Volume = JOURNAL, options: StateSettings | None = None) -> None:
+    def __init__(
+        self, volume: Volume = JOURNAL, options: StateSettings | None = None, *, group: str = ""
+    ) -> None:
         super().__init__(options)
         self.machine("c1")
-        self.container("c", volumes=(volume,))
+        network = Network.GROUP if group else Network.NONE
+        self.container("c", volumes=(volume,), network=network, group=group)
         self.run("c", "c1")
         self.machine("c2")
 
@@ -295,6 +298,17 @@ def test_volumes_of_a_group_and_of_older_machines_stay() -> None:
     older.machine("c2", snapshots=False)
     with pytest.raises(NoRoomError, match="runs an earlier release"):
         older.move()
+
+
+def test_it_stays_with_a_container_that_joins_its_group_meanwhile() -> None:
+    world = Moving(group="g")
+    world.up_to(VolumeMovePhase.RESTORING)
+    world.container("d", network=Network.GROUP, group="g")
+    assert world.state.tables.endpoints["anna/d"].task_set == "c1"
+    world.restored()
+    assert world.runs_at("c1")
+    assert "a container joined its group meanwhile" in world.stays
+    assert world.removals() == {"c2"}
 
 
 # Lost machines
