@@ -193,6 +193,8 @@ class UserVolume(Struct, frozen=True, kw_only=True):
     """Whether this placement began with the files of a snapshot."""
     former: tuple[str, ...] = ()
     """Task sets with folders of earlier placements, which are kept until its container is up at this one."""
+    is_returned: bool = False
+    """Whether this placement is at a machine of an earlier one, because its container failed at the last."""
     snapshots: int = 0
     """Seconds between two snapshots, as its newest container asked for; 0: none."""
     snapshot: str = ""

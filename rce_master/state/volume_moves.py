@@ -10,8 +10,8 @@ run it.
 4. It belongs to the next machine. The former folders are removed when it is up there.
 
 A failure before the last step lets the container start again at its machine, whose files are as it left them.
-If it fails to start after the last step, it goes back by a move in the other direction. The record is stored,
-so another master continues in the same phase.
+If it fails to start after the last step, it goes back by a move in the other direction. If it fails there,
+too, it stays. The record is stored, so another master continues in the same phase.
 """
 
 from __future__ import annotations
@@ -161,8 +161,13 @@ def _hand_over(tx: Transaction, container: Container, move: VolumeMove) -> None:
     if capacity.is_tied_elsewhere(tx.tables, container, move.to):
         give_up(tx, move, f"{move.to}: a container joined its group meanwhile, on another machine")
         return
+    returns = any(move.to in known.former for known in volumes.volumes_of(tx.tables, container))
     _advance(tx, move, VolumeMoveEvent.RESTORED)
     placing.bind(tx, container, move.to)
+    if returns:
+        for known in volumes.volumes_of(tx.tables, container):
+            tx.put(replace(known, is_returned=True))
+        _rest(tx, container)
 
 
 def reported(tx: Transaction, container: Container, *, is_up: bool, failed: str) -> None:
@@ -184,9 +189,18 @@ def reported(tx: Transaction, container: Container, *, is_up: bool, failed: str)
 
 
 def _go_back(tx: Transaction, container: Container, why: str) -> None:
-    """Move a container that failed at its new machine back to the one before, if that can have it."""
+    """Move a container that failed at its new machine back to the one before, if that can have it.
+
+    One that came back already stays: it would fail there again.
+    """
     tables = tx.tables
-    home = next((known.former[-1] for known in volumes.volumes_of(tables, container) if known.former), "")
+    known = next((known for known in volumes.volumes_of(tables, container) if known.former), None)
+    if known is None:
+        return
+    home = known.former[-1]
+    if known.is_returned:
+        _stay(tx, container, f"it failed at {home}, and after its return here, too: {why}")
+        return
     task_set = tables.task_sets.get(home)
     if task_set is None or not task_set.snapshots or not tables.is_connected(home):
         return
@@ -226,8 +240,7 @@ def give_up(tx: Transaction, move: VolumeMove, why: str) -> None:
     volumes.discard_restored(tx, container, move)
     if container.task_set:
         _resume(tx, container, move)
-        again = tx.now + tx.settings.move_rest
-        tx.put(replace(tx.tables.container_live(move.id), rest_until=again))
+        _rest(tx, container)
         _stay(tx, container, why)
         return
     tx.put(
@@ -257,8 +270,17 @@ def _resume(tx: Transaction, container: Container, move: VolumeMove) -> None:
     tx.touch(container.id)
 
 
+def _rest(tx: Transaction, container: Container) -> None:
+    """Let no drain move a container for a while."""
+    again = tx.now + tx.settings.move_rest
+    tx.put(replace(tx.tables.container_live(container.id), rest_until=again))
+
+
 def _stay(tx: Transaction, container: Container, why: str) -> None:
-    tx.put(replace(tx.tables.container_live(container.id), stays=why))
+    live = tx.tables.container_live(container.id)
+    if live.stays == why:
+        return
+    tx.put(replace(live, stays=why))
     tx.happen("container_stays", container.id, f"at {container.task_set}: {why}", user="")
 
 

@@ -103,6 +103,7 @@ def bind(tx: Transaction, container: Container, process: str) -> None:
                 process=process,
                 placement=known.placement + 1,
                 is_restored=bool(known.process),
+                is_returned=False,
                 former=tuple(one for one in dict.fromkeys(former) if one != process),
             )
         )
@@ -155,7 +156,7 @@ def remove_former(tx: Transaction, container: Container) -> bool:
         for process in known.former:
             _remove_files(tx, known, process)
         moved = True
-        kept = replace(known, former=())
+        kept = replace(known, former=(), is_returned=False)
         # What is not declared is not kept: this snapshot was made for the move.
         tx.put(kept if known.snapshots else replace(kept, snapshot="", kept=0, taken=0.0))
     return moved

@@ -256,20 +256,57 @@ def test_answers_of_others_count_for_nothing() -> None:
     assert world.volume.snapshot == NEW
 
 
-def test_it_goes_back_if_it_fails_at_the_new_machine() -> None:
+FAILED = EndpointStatus(id="anna/c", revision=1, state=EndpointState.FAILED, detail="no such package")
+
+
+def returned() -> Moving:
+    """A container that failed at ``c2``, and was brought back to ``c1``."""
     world = Moving()
     world.up_to(VolumeMovePhase.RESTORING)
     world.restored()
-    failed = EndpointStatus(id="anna/c", revision=1, state=EndpointState.FAILED, detail="no such package")
-    world.report("c2", failed)
+    world.report("c2", FAILED)
     assert world.phase_of_move() is VolumeMovePhase.STOPPING
     world.gone("c2")
     assert world.orders("c2") == [SaveVolume(volume="anna/journal", placement=2)]
     world.saved()
     world.restored("c1")
     assert world.runs_at("c1")
+    return world
+
+
+def test_it_goes_back_if_it_fails_at_the_new_machine() -> None:
+    world = returned()
     world.run("c", "c1")
     assert (world.removals(), world.volume.placement) == ({"c2"}, 3)
+
+
+def test_it_stays_if_it_fails_after_its_return_too() -> None:
+    """Else it would move between two machines without end."""
+    world = returned()
+    world.restart_master()
+    world.machine("c1", FAILED)
+    world.machine("c2")
+    world.report("c1", FAILED)
+    assert world.phase_of_move() is None
+    assert world.runs_at("c1")
+    assert world.stays == "it failed at c2, and after its return here, too: no such package"
+    assert world.report("c1", FAILED).events == [], "that is told once"
+    world.run("c", "c1")
+    assert world.removals() == {"c2"}
+    world.do(commands.VolumeRemoved(process="c2", volume="anna/journal"))
+    world.up_to(VolumeMovePhase.RESTORING)
+    world.restored()
+    world.report("c2", FAILED)
+    assert world.phase_of_move() is VolumeMovePhase.STOPPING, "it was up meanwhile: it may return again"
+
+
+def test_a_drain_rests_after_a_return() -> None:
+    world = returned()
+    world.do(commands.SetDraining(machine="m1", draining=True))
+    world.report("c1", FAILED)
+    assert world.phase_of_move() is None
+    world.tick(world.state.settings.move_rest + 1)
+    assert world.phase_of_move() is VolumeMovePhase.STOPPING
 
 
 def test_files_are_removed_only_when_it_is_up() -> None:
