@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
+import stat
 import subprocess
 from pathlib import Path
+
+from rce_container.descent import stats_below
 
 UNFINISHED = ".new"
 """Suffix of a file that is being written. One that is left is of a process that was killed meanwhile."""
@@ -34,18 +36,13 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def size_of(folder: Path) -> int:
-    """Return how many bytes the files in a folder take; does not follow links."""
-    total = 0
-    waiting = [str(folder)]
-    while waiting:
-        with contextlib.suppress(OSError), os.scandir(waiting.pop()) as entries:
-            for entry in entries:
-                with contextlib.suppress(OSError):
-                    if entry.is_dir(follow_symlinks=False):
-                        waiting.append(entry.path)
-                    else:
-                        total += entry.stat(follow_symlinks=False).st_size
-    return total
+    """Return how many bytes the files in a folder hold; follows no links below it."""
+    return sum(found.st_size for found in stats_below(folder) if not stat.S_ISDIR(found.st_mode))
+
+
+def room_of(folder: Path) -> int:
+    """Return how many bytes on disk the files and folders in a folder take; follows no links below it."""
+    return sum(found.st_blocks * 512 for found in stats_below(folder))
 
 
 def remove(folder: Path) -> None:

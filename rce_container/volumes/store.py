@@ -16,6 +16,7 @@ from typing import NamedTuple
 from rce.control import VolumePlacement
 from rce.model import Volume, about
 from rce_container.exceptions import VolumeError
+from rce_container.files import room_of
 from rce_container.volumes import images
 from rce_container.volumes.places import SETTLE_S, VolumePlaces
 
@@ -237,7 +238,7 @@ class VolumeStore:
         place, image = self.places.folder(id_), self.places.image(id_)
         with contextlib.suppress(OSError, VolumeError):  # it was removed, or its container ended just now
             if place.is_dir():
-                self.used[id_] = _size_of(place)
+                self.used[id_] = room_of(place)
             elif pid:
                 found = os.statvfs(f"/proc/{pid}/root{path}")
                 if found.f_blocks * found.f_frsize <= image.stat().st_size:  # else it is not mounted yet
@@ -253,7 +254,7 @@ class VolumeStore:
         if self._holder(id_) is not None:
             raise VolumeError(f"volume {volume.name!r} belongs to a container that has not ended yet")
         if self.places.folder(id_).is_dir():
-            self.used[id_] = _size_of(self.places.folder(id_))
+            self.used[id_] = room_of(self.places.folder(id_))
             if self.used[id_] > volume.size:
                 raise VolumeError(_too_full(id_, self.used[id_], volume.size))
 
@@ -289,16 +290,3 @@ def _too_full(id_: str, used: int, size: int) -> str:
         f"volume {name!r} holds {about(used)} and may hold {about(size)}; create the container with a larger "
         f"size for it, or remove the volume (rce volume remove {name})"
     )
-
-
-def _size_of(folder: Path) -> int:
-    """Return the bytes on disk of all files below a folder."""
-    total, waiting = 0, [os.fspath(folder)]
-    while waiting:
-        with contextlib.suppress(OSError), os.scandir(waiting.pop()) as entries:
-            for entry in entries:
-                with contextlib.suppress(OSError):
-                    total += entry.stat(follow_symlinks=False).st_blocks * 512
-                    if entry.is_dir(follow_symlinks=False):
-                        waiting.append(entry.path)
-    return total

@@ -14,7 +14,7 @@ import os
 import shutil
 import stat
 from collections.abc import Awaitable, Callable, Iterator
-from typing import Self, TypeAlias, assert_never
+from typing import TypeAlias, assert_never
 
 from rce.control import SnapshotError
 from rce.control.snapshots import (
@@ -29,6 +29,7 @@ from rce.control.snapshots import (
     permissions,
     pieces_of,
 )
+from rce_container.descent import FOLDER, Descent, names_in
 from rce_container.forkserver.kernel import sync_file_system
 
 Fetch: TypeAlias = Callable[[str], Awaitable[bytes]]
@@ -37,65 +38,98 @@ Fetch: TypeAlias = Callable[[str], Awaitable[bytes]]
 _CLONE = 0x40049409
 """``FICLONE`` (Linux, ``include/uapi/linux/fs.h``): share the blocks of another file."""
 _READ = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-_FOLDER = _READ | os.O_DIRECTORY
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
 _CHANGED = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 _OWN = 0o700
 
 
-class _Access:
+class _Access(Descent):
     """Opens files of a volume, also those that a node made unreadable; permissions stay as they are."""
 
     def __init__(self, root: int) -> None:
-        self._root = root
-        self._changed: list[tuple[bytes, int]] = []
+        super().__init__(root)
+        self._modes: dict[int, int] = {}
+        """Former permissions of folders that are open, by descriptor."""
 
-    def __enter__(self) -> Self:
-        return self
+    def open(self, path: bytes) -> int:
+        """Open a file to read it; the caller closes it.
 
-    def __exit__(self, *_: object) -> None:
-        for path, mode in reversed(self._changed):
-            with contextlib.suppress(OSError):
-                os.chmod(path, mode, dir_fd=self._root)
-
-    def open(self, path: bytes, found: os.stat_result, flags: int) -> int:
-        """Open a file or a folder; the caller closes it."""
-        mode = stat.S_IMODE(found.st_mode)
-        if stat.S_ISDIR(found.st_mode) and mode & _OWN != _OWN and os.geteuid() != 0:
-            self._change(path, mode)
+        Raises:
+            SnapshotError: It is not a file any more.
+            OSError: It cannot be opened.
+        """
+        folder, name = self.parent(path)
         try:
-            return os.open(path, flags, dir_fd=self._root)
+            fd = os.open(name, _READ, dir_fd=folder)
         except PermissionError:
-            self._change(path, mode)
-            return os.open(path, flags, dir_fd=self._root)
+            fd, mode = _open_forbidden(folder, name, _READ)
+            os.fchmod(fd, mode)
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
+            os.close(fd)
+            raise SnapshotError(f"the file {os.fsdecode(path)} changed while it was read")
+        return fd
 
-    def _change(self, path: bytes, mode: int) -> None:
-        os.chmod(path, mode | _OWN, dir_fd=self._root)
-        self._changed.append((path, mode))
+    def _enter(self, above: int, name: bytes) -> int:
+        found = os.stat(name, dir_fd=above, follow_symlinks=False)
+        if found.st_mode & _OWN == _OWN or os.geteuid() == 0:
+            try:
+                return super()._enter(above, name)
+            except PermissionError:
+                pass
+        fd, mode = _open_forbidden(above, name, FOLDER)
+        self._modes[fd] = mode
+        return fd
+
+    def _leave(self, folder: int) -> None:
+        mode = self._modes.pop(folder, None)
+        if mode is not None:
+            with contextlib.suppress(OSError):
+                os.fchmod(folder, mode)
+        super()._leave(folder)
 
 
-def _walk(root: int, access: _Access) -> Iterator[tuple[bytes, os.stat_result]]:
+def _open_forbidden(folder: int, name: bytes, flags: int) -> tuple[int, int]:
+    """Allow the owner everything with a file or a folder, and open it.
+
+    Returns:
+        Its descriptor, and its former permissions.
+    """
+    held = os.open(name, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
+    try:
+        found = os.fstat(held).st_mode
+        if not (stat.S_ISREG(found) or stat.S_ISDIR(found)):
+            raise SnapshotError(f"{os.fsdecode(name)} changed while it was read")
+        this, mode = f"/proc/self/fd/{held}", stat.S_IMODE(found)  # what is held, whatever has its name now
+        os.chmod(this, mode | _OWN)  # noqa: PTH101 - like its neighbours
+        try:
+            return os.open(this, flags & ~os.O_NOFOLLOW), mode
+        except OSError:
+            os.chmod(this, mode)  # noqa: PTH101 - like its neighbours
+            raise
+    finally:
+        os.close(held)
+
+
+def _walk(access: _Access) -> Iterator[tuple[bytes, os.stat_result]]:
     """Iterate over what is in a volume, each folder before what is in it, always in the same order."""
-    waiting: list[tuple[bytes, os.stat_result | None]] = [(b"", None)]
+    waiting = [b""]
     count = 0
     while waiting:
-        folder, found = waiting.pop()
-        fd = os.dup(root) if found is None else access.open(folder, found, _FOLDER)
-        try:
-            with os.scandir(fd) as entries:
-                names = sorted(os.fsencode(entry.name) for entry in entries)
-        finally:
-            os.close(fd)
-        prefix = folder + b"/" if folder else b""
-        for name in names:
+        folder = waiting.pop()
+        for name in names_in(access.folder(folder)):
             count += 1
             if count > MAX_ENTRIES:
                 raise SnapshotError(f"it has more than {MAX_ENTRIES} files")
-            path = prefix + name
-            found = os.stat(path, dir_fd=root, follow_symlinks=False)
+            path = folder + b"/" + name if folder else name
+            found = access.stat(path)
             yield path, found
             if stat.S_ISDIR(found.st_mode):
-                waiting.append((path, found))
+                waiting.append(path)
+
+
+def _leads_to(access: Descent, path: bytes) -> bytes:
+    folder, name = access.parent(path)
+    return os.readlink(name, dir_fd=folder)
 
 
 def scan(root: int) -> Manifest:
@@ -107,19 +141,19 @@ def scan(root: int) -> Manifest:
     """
     entries: list[Entry] = []
     with _Access(root) as access:
-        for path, found in _walk(root, access):
+        for path, found in _walk(access):
             if stat.S_ISDIR(found.st_mode):
                 mode = permissions(found.st_mode)
                 entries.append(FolderEntry(path=path, mode=mode, modified_ns=found.st_mtime_ns))
             elif stat.S_ISLNK(found.st_mode):
-                entries.append(LinkEntry(path=path, target=os.readlink(path, dir_fd=root)))
+                entries.append(LinkEntry(path=path, target=_leads_to(access, path)))
             elif stat.S_ISREG(found.st_mode):
                 entries.append(_read_file(access, path, found))
     return Manifest(entries=tuple(entries))
 
 
 def _read_file(access: _Access, path: bytes, found: os.stat_result) -> FileEntry:
-    fd = access.open(path, found, _READ)
+    fd = access.open(path)
     try:
         size = os.fstat(fd).st_size
         pieces = tuple(
@@ -174,8 +208,7 @@ class Pieces:
         """
         file, offset, length = self._places[sha256]
         with _Access(self._root) as access:
-            found = os.stat(file.path, dir_fd=self._root, follow_symlinks=False)
-            fd = access.open(file.path, found, _READ)
+            fd = access.open(file.path)
             try:
                 data = _read(fd, offset, length)
             finally:
@@ -196,67 +229,88 @@ def copy(root: int, target: int) -> Manifest:
         OSError: It cannot be copied.
     """
     entries: dict[bytes, Entry] = {}
-    with _Access(root) as access:
-        for path, found in _walk(root, access):
+    with _Access(root) as access, Descent(target) as made:
+        for path, found in _walk(access):
             mode, modified_ns = permissions(found.st_mode), found.st_mtime_ns
             if stat.S_ISDIR(found.st_mode):
-                if not _has(target, path, found):
-                    os.mkdir(path, _OWN, dir_fd=target)
+                if not _has(made, path, found):
+                    folder, name = made.parent(path)
+                    os.mkdir(name, _OWN, dir_fd=folder)
                 entries[path] = FolderEntry(path=path, mode=mode, modified_ns=modified_ns)
             elif stat.S_ISLNK(found.st_mode):
-                leads = os.readlink(path, dir_fd=root)
-                if not _has(target, path, found) or os.readlink(path, dir_fd=target) != leads:
-                    _discard(target, path)
-                    os.symlink(leads, path, dir_fd=target)
+                leads = _leads_to(access, path)
+                if not _has(made, path, found) or _leads_to(made, path) != leads:
+                    _discard(made, path)
+                    folder, name = made.parent(path)
+                    os.symlink(leads, name, dir_fd=folder)
                 entries[path] = LinkEntry(path=path, target=leads)
             elif stat.S_ISREG(found.st_mode):
-                _has(target, path, found)
-                size = _copy_file(access, path, found, target)
+                _has(made, path, found)
+                size = _copy_file(access, path, made)
                 entries[path] = FileEntry(path=path, mode=mode, modified_ns=modified_ns, size=size, pieces=())
     with _Access(target) as access:
-        left = [path for path, _ in _walk(target, access) if path not in entries]
-    for path in reversed(left):
-        _discard(target, path)
+        left = [path for path, _ in _walk(access) if path not in entries]
+    with Descent(target) as made:
+        for path in reversed(left):
+            _discard(made, path)
     return Manifest(entries=tuple(entries.values()))
 
 
 def finish_copy(copied: Manifest, target: int) -> None:
     """Give the files of a copy the permissions and times of what they are copies of."""
-    for entry in reversed(copied.entries):
-        if not isinstance(entry, LinkEntry):
-            os.chmod(entry.path, entry.mode, dir_fd=target)
-            os.utime(entry.path, ns=(entry.modified_ns, entry.modified_ns), dir_fd=target)
+    with Descent(target) as made:
+        for entry in reversed(copied.entries):
+            if not isinstance(entry, LinkEntry):
+                _finish_at(made, entry)
 
 
-def _has(target: int, path: bytes, found: os.stat_result) -> bool:
+def _finish_at(made: Descent, entry: FileEntry | FolderEntry) -> None:
+    folder, name = made.parent(entry.path)
+    fd = os.open(name, _READ, dir_fd=folder)
+    try:
+        _finish(fd, entry)
+    finally:
+        os.close(fd)
+
+
+def _finish(fd: int, entry: FileEntry | FolderEntry) -> None:
+    """Give a file or a folder its permissions and times."""
+    os.fchmod(fd, permissions(entry.mode))
+    os.utime(fd, ns=(entry.modified_ns, entry.modified_ns))
+
+
+def _has(made: Descent, path: bytes, found: os.stat_result) -> bool:
     """Whether a copy has something of the same kind at a path; what is of another kind is removed."""
     try:
-        there = os.stat(path, dir_fd=target, follow_symlinks=False)
+        there = made.stat(path)
     except FileNotFoundError:
         return False
     if stat.S_IFMT(there.st_mode) == stat.S_IFMT(found.st_mode):
         if not stat.S_ISLNK(there.st_mode):
-            os.chmod(path, _OWN, dir_fd=target)
+            folder, name = made.parent(path)
+            os.chmod(name, _OWN, dir_fd=folder)
         return True
-    _discard(target, path)
+    _discard(made, path)
     return False
 
 
-def _discard(target: int, path: bytes) -> None:
+def _discard(made: Descent, path: bytes) -> None:
     """Remove a file, or a folder with what is in it, of a copy."""
+    folder, name = made.parent(path)
     try:
-        os.unlink(path, dir_fd=target)
+        os.unlink(name, dir_fd=folder)
     except FileNotFoundError:
         return
     except IsADirectoryError:
-        shutil.rmtree(path, dir_fd=target)
+        shutil.rmtree(name, dir_fd=folder)
 
 
-def _copy_file(access: _Access, path: bytes, found: os.stat_result, target: int) -> int:
+def _copy_file(access: _Access, path: bytes, made: Descent) -> int:
     """Copy a file; return its size."""
-    source = access.open(path, found, _READ)
+    source = access.open(path)
     try:
-        fd = os.open(path, _CHANGED, 0o600, dir_fd=target)
+        folder, name = made.parent(path)
+        fd = os.open(name, _CHANGED, 0o600, dir_fd=folder)
         try:
             size = os.fstat(source).st_size
             try:
@@ -281,36 +335,36 @@ async def write(manifest: Manifest, root: int, fetch: Fetch) -> None:
         SnapshotError: A content is missing, or is not what its hash says.
         OSError: A file cannot be written.
     """
-    for entry in manifest.entries:
-        match entry:
-            case FolderEntry():
-                os.mkdir(entry.path, _OWN, dir_fd=root)
-            case LinkEntry():
-                os.symlink(entry.target, entry.path, dir_fd=root)
-            case FileEntry():
-                await _write_file(entry, root, fetch)
-            case _:
-                assert_never(entry)
-    for entry in reversed(manifest.entries):
-        if isinstance(entry, FolderEntry):
-            os.chmod(entry.path, permissions(entry.mode), dir_fd=root)
-            os.utime(entry.path, ns=(entry.modified_ns, entry.modified_ns), dir_fd=root)
+    with Descent(root) as made:
+        for entry in manifest.entries:
+            folder, name = made.parent(entry.path)
+            match entry:
+                case FolderEntry():
+                    os.mkdir(name, _OWN, dir_fd=folder)
+                case LinkEntry():
+                    os.symlink(entry.target, name, dir_fd=folder)
+                case FileEntry():
+                    fd = os.open(name, _NEW, 0o600, dir_fd=folder)
+                    try:
+                        await _write_file(entry, fd, fetch)
+                    finally:
+                        os.close(fd)
+                case _:
+                    assert_never(entry)
+        for entry in reversed(manifest.entries):
+            if isinstance(entry, FolderEntry):
+                _finish_at(made, entry)
     await asyncio.to_thread(sync_file_system, root)
 
 
-async def _write_file(file: FileEntry, root: int, fetch: Fetch) -> None:
-    fd = os.open(file.path, _NEW, 0o600, dir_fd=root)
-    try:
-        os.ftruncate(fd, file.size)
-        for piece, offset, length in pieces_of(file):
-            data = await fetch(piece.hex())
-            if len(data) != length or digest(data) != piece:
-                raise SnapshotError(f"a piece of {os.fsdecode(file.path)} is not what its hash says")
-            await asyncio.to_thread(_write_all, fd, data, offset)
-        os.fchmod(fd, permissions(file.mode))
-        os.utime(fd, ns=(file.modified_ns, file.modified_ns))
-    finally:
-        os.close(fd)
+async def _write_file(file: FileEntry, fd: int, fetch: Fetch) -> None:
+    os.ftruncate(fd, file.size)
+    for piece, offset, length in pieces_of(file):
+        data = await fetch(piece.hex())
+        if len(data) != length or digest(data) != piece:
+            raise SnapshotError(f"a piece of {os.fsdecode(file.path)} is not what its hash says")
+        await asyncio.to_thread(_write_all, fd, data, offset)
+    _finish(fd, file)
 
 
 def _write_all(fd: int, data: bytes, offset: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import shutil
 import signal
@@ -11,14 +12,17 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rce.control import SnapshotError
-from rce.control.snapshots import HOLE, PIECE, FileEntry, Manifest, digest
+from rce.control.snapshots import HOLE, PIECE, FileEntry, LinkEntry, Manifest, digest
 from rce.model import MEGABYTE
+from rce_container.descent import MAX_DEPTH, stats_below
+from rce_container.files import room_of, size_of
 from rce_container.volumes import images, tree
 from rce_container.volumes.freezing import frozen
 from rce_container.volumes.mounted import open_image, open_inside
@@ -187,6 +191,110 @@ def test_nothing_is_made_over_what_exists(tmp_path: Path) -> None:
     finally:
         os.close(root)
     assert not (tmp_path / "outside").exists()
+
+
+@pytest.fixture
+def attacked(tmp_path: Path) -> tuple[Path, Path, Callable[[], None]]:
+    """A volume, a folder beside it, and what exchanges a folder of the volume for a link to that one."""
+    volume, outside = tmp_path / "volume", tmp_path / "outside"
+    for folder in (volume / "p", outside):
+        folder.mkdir(parents=True)
+    (volume / "p" / "file").write_text("of the node")
+    (outside / "file").write_text("of the machine")
+    (outside / "file").chmod(0o400)
+
+    def swap() -> None:
+        (volume / "p").rename(volume / "q")
+        (volume / "p").symlink_to(outside)
+
+    return volume, outside, swap
+
+
+@pytest.mark.parametrize("step", [b"p", b"p/file"])
+def test_a_copy_follows_no_folder_that_becomes_a_link(
+    attacked: tuple[Path, Path, Callable[[], None]],
+    step: bytes,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A node may do that while its volume is copied, and root would read the machine's files."""
+    volume, outside, swap = attacked
+    walk = tree._walk
+
+    def walk_and_swap(*args: Any) -> Iterator[tuple[bytes, os.stat_result]]:
+        for path, found in walk(*args):
+            if path == step and not (volume / "q").exists():
+                swap()
+            yield path, found
+
+    monkeypatch.setattr(tree, "_walk", walk_and_swap)
+    (tmp_path / "copy").mkdir()
+    with contextlib.suppress(OSError, SnapshotError):
+        copy(volume, tmp_path / "copy")
+    copied = [path.read_text() for path in (tmp_path / "copy").rglob("*") if path.is_file()]
+    assert "of the machine" not in copied
+    assert (outside / "file").stat().st_mode & 0o777 == 0o400
+
+
+def test_measuring_follows_no_folder_that_becomes_a_link(
+    attacked: tuple[Path, Path, Callable[[], None]],
+) -> None:
+    volume, _, swap = attacked
+    found = stats_below(volume)
+    next(found)
+    swap()
+    assert list(found) == []
+    assert size_of(volume) == len("of the node") + len(str(attacked[1]))
+
+
+def test_nothing_is_made_below_a_link(tmp_path: Path) -> None:
+    """Not even if the manifest says so."""
+    (tmp_path / "target").mkdir()
+    (tmp_path / "outside").mkdir()
+    link = LinkEntry(path=b"p", target=os.fsencode(tmp_path / "outside"))
+    file = FileEntry(path=b"p/file", mode=0o644, modified_ns=0, size=0, pieces=())
+    root = opened(tmp_path / "target")
+
+    async def fetch(_: str) -> bytes:
+        return b""
+
+    try:
+        with pytest.raises(NotADirectoryError):
+            asyncio.run(tree.write(Manifest(entries=(link, file)), root, fetch))
+    finally:
+        os.close(root)
+    assert list((tmp_path / "outside").iterdir()) == []
+
+
+def test_folders_that_are_nested_too_deep_are_refused(tmp_path: Path) -> None:
+    """A descriptor is open for each of them."""
+    folder = os.open(tmp_path, os.O_RDONLY)
+    for _ in range(MAX_DEPTH + 2):
+        os.mkdir("d", dir_fd=folder)
+        inner = os.open("d", os.O_RDONLY, dir_fd=folder)
+        os.close(folder)
+        folder = inner
+    os.close(folder)
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    with pytest.raises(OSError, match="nested more than 500 deep"):
+        scan(tmp_path)
+    assert room_of(tmp_path) >= 0
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+def test_what_a_node_made_unreadable_is_copied_and_stays_so(made: Path, tmp_path: Path) -> None:
+    (made / "deep" / "deeper" / "file").chmod(0)
+    (made / "deep").chmod(0)
+    try:
+        (tmp_path / "copy").mkdir()
+        copy(made, tmp_path / "copy")
+        copy(made, tmp_path / "copy")
+        assert scan(tmp_path / "copy") == scan(made)
+        assert (made / "deep").stat().st_mode & 0o777 == 0
+    finally:
+        for root in (made, tmp_path / "copy"):
+            (root / "deep").chmod(0o700)
+            (root / "deep" / "deeper" / "file").chmod(0o600)
 
 
 def test_a_folder_of_a_container_is_not_reached_by_links(tmp_path: Path) -> None:
