@@ -140,7 +140,7 @@ class VolumePlaces:
             The volume, and a descriptor of its folder.
 
         Raises:
-            VolumeError: It cannot be made.
+            VolumeError: It cannot be made; nothing is left of it.
         """
         try:
             if not self._images:
@@ -148,13 +148,20 @@ class VolumePlaces:
                 return path, os.open(path, _FOLDER)
             self.make_folder(self._scratch)
             path = self._scratch / f"{secrets.token_hex(8)}.img"
-            images.make(path, size)
-            root = open_image(path, self._point(), read_only=False)
-            with contextlib.suppress(OSError):
-                os.rmdir("lost+found", dir_fd=root)
+            return path, self._make_image(path, size)
         except OSError as error:
             raise VolumeError(f"its files cannot be made: {error}") from error
-        return path, root
+
+    def _make_image(self, path: Path, size: int) -> int:
+        try:
+            images.make(path, size)
+            root = open_image(path, self._point(), read_only=False)
+        except BaseException:  # the image takes its whole size from the disk
+            path.unlink(missing_ok=True)
+            raise
+        with contextlib.suppress(OSError):
+            os.rmdir("lost+found", dir_fd=root)
+        return root
 
     def replace(self, id_: str, new: Path, placement: int) -> None:
         """Put a filled volume in the place of a former one, which is discarded. Blocks.
