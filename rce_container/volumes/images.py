@@ -23,6 +23,7 @@ _TIMEOUT_S = 60.0
 _POLL_S = 0.02
 _SUPERBLOCK = 1024
 """Offset of ext4's superblock; the fields below are relative to it (Linux, ``fs/ext4/ext4.h``)."""
+_SUPERBLOCK_BYTES = 1024
 _MAGIC = 0xEF53
 _PROBE_BYTES = 4 << 20
 
@@ -107,23 +108,29 @@ def is_attached(image: Path) -> bool:
 
 
 def used(image: Path) -> int:
-    """Return how many bytes the files of an image that is not mounted take."""
-    with image.open("rb") as file:
-        file.seek(_SUPERBLOCK)
-        block = file.read(1024)
-    (magic,) = struct.unpack_from("<H", block, 0x38)
-    if magic != _MAGIC:
-        raise VolumeError(f"{image} does not hold a file system")
+    """Return how many bytes the files of an image that is not mounted take.
+
+    Raises:
+        VolumeError: No file system is in it.
+    """
+    block = _superblock(image)
     free, overhead = (int(struct.unpack_from("<I", block, offset)[0]) for offset in (0xC, 0x248))
     return max(0, _blocks(block) - free - overhead) * _block_size(block)
 
 
 def _is_smaller_inside(image: Path) -> bool:
     """Whether the file grew, but not the file system in it: growing was interrupted."""
+    block = _superblock(image)
+    return (_blocks(block) + 1) * _block_size(block) <= image.stat().st_size
+
+
+def _superblock(image: Path) -> bytes:
     with image.open("rb") as file:
         file.seek(_SUPERBLOCK)
-        block = file.read(1024)
-    return (_blocks(block) + 1) * _block_size(block) <= image.stat().st_size
+        block = file.read(_SUPERBLOCK_BYTES)
+    if len(block) < _SUPERBLOCK_BYTES or struct.unpack_from("<H", block, 0x38) != (_MAGIC,):
+        raise VolumeError(f"{image} does not hold a file system")
+    return block
 
 
 def _blocks(block: bytes) -> int:

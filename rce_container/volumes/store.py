@@ -63,8 +63,8 @@ class VolumeStore:
     def __init__(self, folder: Path, *, images: bool) -> None:
         self.places = VolumePlaces(folder, images=images)
         self._images = images
-        self._claims: dict[str, tuple[Claim, ...]] = {}
-        """By incarnation."""
+        self._claims: Mapping[str, tuple[Claim, ...]] = {}
+        """By incarnation. Replaced with each change: a thread that measures may be reading it."""
         self._doomed: set[str] = set()
         """Volumes to be removed when their container has ended."""
         self.used: dict[str, int] = {}
@@ -101,7 +101,7 @@ class VolumeStore:
             mounts.append(self._mount_of(id_, volume))
             claims.append(_claim_of(id_, volume, placement))
         if claims:
-            self._claims[incarnation_id] = tuple(claims)
+            self._note_claims(incarnation_id, tuple(claims))
         return tuple(mounts)
 
     def adopt(self, user: str, incarnation_id: str, volumes: Mapping[str, str]) -> None:
@@ -114,7 +114,7 @@ class VolumeStore:
         """
         if volumes:
             claims = (Claim(f"{user}/{name}", path, 0) for name, path in volumes.items())
-            self._claims[incarnation_id] = tuple(claims)
+            self._note_claims(incarnation_id, tuple(claims))
 
     def note(
         self,
@@ -132,7 +132,7 @@ class VolumeStore:
         }
         known = self._claims.get(incarnation_id, ())
         if known:
-            self._claims[incarnation_id] = tuple(desired.get(claim.id, claim) for claim in known)
+            self._note_claims(incarnation_id, tuple(desired.get(claim.id, claim) for claim in known))
 
     def claims(self, incarnation_id: str) -> tuple[Claim, ...]:
         """Return the volumes of a container."""
@@ -147,12 +147,13 @@ class VolumeStore:
         if id_ in self._doomed or self._holder(id_) is not None:
             raise VolumeError(f"volume {id_!r} belongs to a container that has not ended yet")
         holder = f"hold {id_}"
-        self._claims[holder] = (Claim(id_, "", 0),)
+        self._note_claims(holder, (Claim(id_, "", 0),))
         return holder
 
     def release(self, incarnation_id: str) -> list[str]:
         """Take the volumes of a container that has ended; return those that are to be deleted now."""
-        ended = [claim.id for claim in self._claims.pop(incarnation_id, ()) if claim.id in self._doomed]
+        ended = [claim.id for claim in self.claims(incarnation_id) if claim.id in self._doomed]
+        self._claims = {id_: own for id_, own in self._claims.items() if id_ != incarnation_id}
         self._doomed.difference_update(ended)
         return [id_ for id_ in ended if self._discard(id_)]
 
@@ -220,15 +221,12 @@ class VolumeStore:
             The incarnations with a folder that holds more than its size, and what to tell their users.
         """
         over = []
-        for incarnation_id, claims in list(self._claims.items()):
+        for incarnation_id, claims in self._claims.items():
             for claim in claims:
                 self._measure(claim.id, pids.get(incarnation_id, 0), claim.path)
-                if (
-                    claim.size
-                    and self.places.folder(claim.id).is_dir()
-                    and self.used.get(claim.id, 0) > claim.size
-                ):
-                    over.append((incarnation_id, _too_full(claim.id, self.used[claim.id], claim.size)))
+                used = self.used.get(claim.id, 0)
+                if claim.size and used > claim.size and self.places.folder(claim.id).is_dir():
+                    over.append((incarnation_id, _too_full(claim.id, used, claim.size)))
         for id_ in self.places.existing():
             if id_ not in self.used:
                 self._measure(id_, 0, "")
@@ -277,6 +275,9 @@ class VolumeStore:
 
     def _holder(self, id_: str) -> str | None:
         return next((holder for holder, own in self._claims.items() if any(c.id == id_ for c in own)), None)
+
+    def _note_claims(self, holder: str, claims: tuple[Claim, ...]) -> None:
+        self._claims = {**self._claims, holder: claims}
 
 
 def _claim_of(id_: str, volume: Volume, placement: VolumePlacement | None) -> Claim:

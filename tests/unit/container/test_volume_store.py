@@ -1,7 +1,10 @@
-"""The volumes of a machine: what is left after faults."""
+"""The volumes of a machine: what is left after faults, and what threads and the event loop share."""
 
 from __future__ import annotations
 
+import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,6 +13,7 @@ from rce.model import MEGABYTE
 from rce_container.exceptions import VolumeError
 from rce_container.volumes import images
 from rce_container.volumes.places import VolumePlaces
+from rce_container.volumes.store import VolumeStore
 
 
 def test_a_volume_that_cannot_be_opened_takes_no_disk(
@@ -22,3 +26,42 @@ def test_a_volume_that_cannot_be_opened_takes_no_disk(
         with pytest.raises(VolumeError, match="cannot be mounted"):  # no file system is in it
             places.make_new(MEGABYTE)
     assert [path for path in (tmp_path / "volumes" / ".scratch").rglob("*") if path.is_file()] == []
+
+
+@pytest.fixture
+def often_switched() -> Iterator[None]:
+    """Threads take turns as often as they can."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(before)
+
+
+@pytest.mark.usefixtures("often_switched")
+def test_volumes_come_and_go_while_they_are_measured(tmp_path: Path) -> None:
+    """A thread measures; the event loop gives volumes to containers meanwhile.
+
+    No file system is in the images, as after a power failure: that is no reason to stop either.
+    """
+    store = VolumeStore(tmp_path, images=True)
+    (tmp_path / "anna").mkdir()
+    for number in range(20):
+        (tmp_path / "anna" / f"v{number}.img").touch()
+    is_done = threading.Event()
+    faults: list[Exception] = []
+
+    def measure() -> None:
+        try:
+            while not is_done.is_set():
+                store.measure({})
+        except Exception as error:  # noqa: BLE001 - reported by the test
+            faults.append(error)
+
+    thread = threading.Thread(target=measure)
+    thread.start()
+    holders = [store.hold(f"anna/held{number}") for number in range(1000)]
+    for holder in holders:
+        store.release(holder)
+    is_done.set()
+    thread.join()
+    assert faults == []
