@@ -127,11 +127,11 @@ def check_resources(tx: Transaction, user: str, id_: str, requested: Resources) 
     if tx.tables.users[user].role is not UserRole.ADMIN:
         _check_privileges(requested)
     known = tx.tables.container(id_)
-    total = tx.tables.requested.sum_of(user)
+    before, total = tx.tables.requested.sum_of(user), tx.tables.requested.sum_of(user)
     if known is not None:
         total.add(known.resources, -1)
     total.add(requested)
-    limits.check_all_resources(tx, user, total)
+    limits.check_all_resources(tx, user, before, total)
 
 
 def _check_privileges(requested: Resources) -> None:

@@ -98,15 +98,25 @@ def check_containers(tx: Transaction, user: str) -> None:
         )
 
 
-def check_all_resources(tx: Transaction, user: str, total: Promise) -> None:
-    """Check the total of the requests of a user's containers.
+def check_all_resources(tx: Transaction, user: str, before: Promise, total: Promise) -> None:
+    """Check the total of the requests of a user's containers, as far as it grows.
+
+    A limit may be smaller than what a user has: it was changed, or a machine is gone.
+
+    Args:
+        tx: The transaction.
+        user: The user.
+        before: The total without the request.
+        total: The total with it.
 
     Raises:
         LimitReachedError: It exceeds a limit.
     """
     for kind in _OF_MACHINES:
-        limit = limit_of(tx.tables, tx.settings, user, kind)
         asked = _asked(total, kind)
+        if asked <= _asked(before, kind):
+            continue
+        limit = limit_of(tx.tables, tx.settings, user, kind)
         if limit.most and asked > limit.most + _EPSILON:
             share = (
                 f", {tx.settings.user_share:.0%} of what the machines have"

@@ -4,6 +4,7 @@ import pytest
 from support.master_world import World
 
 from rce.model.quantities import MEGABYTE as MB
+from rce.model.specs import ResourceChanges
 from rce_master.exceptions import LimitReachedError, NotFoundError
 from rce_master.state import commands
 from rce_master.state.limits import limit_of, used_of
@@ -71,6 +72,29 @@ def test_limits_of_one_user_win_until_they_are_taken_back() -> None:
     assert len(world.state.tables.user_limits) == 0
     with pytest.raises(NotFoundError):
         allow(world, "nobody", slots=1)
+
+
+def test_a_user_over_a_new_limit_may_shrink_and_not_grow() -> None:
+    world = World()
+    world.container_set("c1", slots=10, cores=8, memory=8000 * MB)
+    tags = [f"c{number}" for number in range(4)]
+    for tag in tags:
+        world.container(tag, cpu=1, memory=100 * MB)
+    allow(world, cpu=2, slots=4)
+
+    def resize(tag: str, changes: ResourceChanges) -> None:
+        world.do(commands.ResizeContainer(user="anna", tag=tag, changes=changes))
+
+    resize("c0", ResourceChanges(bandwidth=1000))
+    resize("c0", ResourceChanges(cpu=0.5))
+    resize("c1", ResourceChanges(memory=200 * MB))
+    assert used_of(world.state.tables, "anna")["cpu"] == 3.5
+    with pytest.raises(LimitReachedError, match=r"would have 3.6 cores in all, and you may have 2"):
+        resize("c0", ResourceChanges(cpu=0.6))
+    with pytest.raises(LimitReachedError, match="5 slots"):
+        resize("c0", ResourceChanges(size=2, cpu=0.1))
+    with pytest.raises(LimitReachedError):
+        world.container("more", cpu=0.1)
 
 
 def test_administrators_have_none_unless_it_is_set() -> None:
