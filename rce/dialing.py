@@ -9,6 +9,7 @@ until the name server has answered (:mod:`rce.lookups`).
 from __future__ import annotations
 
 import asyncio
+import errno
 import socket
 from typing import Any
 from urllib.parse import urlsplit
@@ -92,6 +93,9 @@ async def _connect(family: socket.AddressFamily, address: Any) -> socket.socket:
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         await asyncio.get_running_loop().sock_connect(sock, address)
+    except (OverflowError, ValueError) as error:  # an address that cannot be, such as port 70000
+        sock.close()
+        raise OSError(errno.EINVAL, f"cannot connect to {address}: {error}") from error
     except BaseException:
         sock.close()
         raise

@@ -25,7 +25,7 @@ Info = tuple[socket.AddressFamily, socket.SocketKind, int, str, Any]
 """Family, type, protocol, canonical name and socket address, as ``socket.getaddrinfo`` returns them."""
 
 Question = Callable[[], Any]
-"""Blocks until it has the answer or raises an ``OSError`` or ``UnicodeError``."""
+"""Blocks until it has the answer or raises an exception."""
 
 _Key = tuple[Any, ...]
 _Waiter = tuple[asyncio.AbstractEventLoop, "asyncio.Future[Any]"]
@@ -133,6 +133,8 @@ class Lookups:
                 result = question()
             except (OSError, UnicodeError) as error:
                 result = error
+            except Exception as error:  # noqa: BLE001 - such as a name with a null character
+                result = socket.gaierror(socket.EAI_FAIL, str(error) or type(error).__name__)
             with self._lock:
                 waiters = self._open.pop(key)
             _answer(waiters, result)

@@ -150,7 +150,7 @@ class Ros1Graph:
         try:
             _, _, pid = await client.call(uri, "getPid", (OWN_NODE,), timeout=_GET_PID_TIMEOUT_S)
             listener.node_identified(name, int(pid))
-        except (RosError, TypeError, ValueError) as error:
+        except (RosError, TypeError, ValueError, OverflowError) as error:
             _log.info("node %s does not tell its process: %s", name, error)
 
 

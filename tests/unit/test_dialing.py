@@ -5,7 +5,10 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 
+import pytest
 from support.sources import ROOT, files, text_of
+
+from rce.dialing import open_socket
 
 CALLS = ("create_connection", "open_connection", "connect")
 
@@ -36,3 +39,9 @@ def test_every_connecting_call_is_given_a_socket() -> None:
         where for where, call in found.items() if not any(keyword.arg == "sock" for keyword in call.keywords)
     ]
     assert without == [], "resolve the name first: rce.dialing.open_socket, then sock=..."
+
+
+async def test_port_that_cannot_be_is_an_os_error() -> None:
+    """Ports come from other programs: who dials expects an ``OSError``."""
+    with pytest.raises(OSError, match="70000"):
+        await open_socket("127.0.0.1", 70_000)

@@ -130,3 +130,12 @@ def test_closed_event_loop_is_passed_over() -> None:
     asyncio.run(leave())
     assert asyncio.run(stay()) == [ADDRESS]
     assert names.asked == ["a"]
+
+
+async def test_any_exception_of_a_lookup_is_an_answer() -> None:
+    """A port beyond all limits ends neither the thread nor the wait for it."""
+    lookups = Lookups(1)
+    async with asyncio.timeout(60):
+        with pytest.raises(socket.gaierror, match="too large"):
+            await lookups.addresses("localhost", 10**40)
+        assert await lookups.addresses("127.0.0.1", 80)

@@ -39,7 +39,7 @@ class MasterClient:
         except XmlRpcError as error:
             raise MasterUnreachableError(self.uri, str(error)) from error
         except (TypeError, ValueError) as error:
-            raise MasterUnreachableError(self.uri, f"{method} was answered in no known form") from error
+            raise self._unknown_form(method) from error
         if status != SUCCESS:
             raise MasterRefusedError(method, status, text)
         return value
@@ -54,7 +54,9 @@ class MasterClient:
 
     async def register_subscriber(self, topic: str, message_type: str) -> list[str]:
         """Register the node as a subscriber of ``topic``; return the slave APIs of its publishers."""
-        publishers: list[str] = await self.call("registerSubscriber", topic, message_type, self.slave_uri)
+        publishers = await self.call("registerSubscriber", topic, message_type, self.slave_uri)
+        if not isinstance(publishers, list) or not all(isinstance(uri, str) for uri in publishers):
+            raise self._unknown_form("registerSubscriber")
         return publishers
 
     async def unregister_subscriber(self, topic: str) -> None:
@@ -80,7 +82,12 @@ class MasterClient:
     async def lookup_service(self, name: str) -> str | None:
         """Return the ``rosrpc`` URI of a service's provider, if there is one."""
         try:
-            uri: str = await self.call("lookupService", name)
+            uri = await self.call("lookupService", name)
         except MasterRefusedError:
             return None
+        if not isinstance(uri, str):
+            raise self._unknown_form("lookupService")
         return uri
+
+    def _unknown_form(self, method: str) -> MasterUnreachableError:
+        return MasterUnreachableError(self.uri, f"{method} was answered in no known form")

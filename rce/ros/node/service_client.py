@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import (
     HandshakeRefusedError,
+    MalformedFrameError,
     NodeClosedError,
     ServiceFaultError,
     ServiceLostError,
@@ -153,14 +154,16 @@ class ServiceClient:
         }
         if self._persistent:
             header["persistent"] = "1"
-        answer = decode_header(await call.exchange((encode_header(header),)))
         try:
+            answer = decode_header(await call.exchange((encode_header(header),)))
             raise_error_field(answer)
             check_type(
                 answer, md5sum=self.type.md5sum, type_name=self.type.name, subject=f"service {self.name}"
             )
         except HandshakeRefusedError as error:
             raise ServiceFaultError(self.name, str(error)) from error
+        except MalformedFrameError as error:
+            raise ServiceLostError(self.name, f"the provider answers in no known form: {error}") from error
         call.connection.header_done(has_lead=True)
 
 
@@ -176,7 +179,7 @@ async def answers(runtime: Runtime, name: str) -> bool:
             return "error" not in decode_header(await call.exchange((encode_header(probe),)))
         finally:
             await call.close()
-    except ServiceLostError:
+    except (ServiceLostError, MalformedFrameError):
         return False
 
 
@@ -192,9 +195,9 @@ class _Call:
     async def open(cls, service: str, uri: str, scratch: memoryview) -> _Call:
         """Connect to a ``rosrpc`` URI."""
         call = cls(service)
-        address = urlsplit(uri)
         loop = asyncio.get_running_loop()
         try:
+            address = urlsplit(uri)
             host, port = address.hostname, address.port
             if host is None or port is None:
                 raise ServiceLostError(

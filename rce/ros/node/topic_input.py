@@ -14,9 +14,9 @@ from rce.ros.node.input_link import HeaderReader, InputLink, says_latching
 from rce.ros.node.local import LocalLink, LocalMessage, find_neighbour
 from rce.ros.node.runtime import Runtime
 from rce.ros.node.subscriber import Subscriber
+from rce.ros.tcpros.address import ask_address
 from rce.ros.tcpros.connection import Connection, Owner
 from rce.ros.tcpros.header import ANY, encode_header
-from rce.ros.xmlrpc.dispatch import SUCCESS
 
 if TYPE_CHECKING:
     from rce.ros.node.topics import Topics
@@ -194,7 +194,7 @@ class TopicInput:
             await connection.gone.wait()
 
     async def _connect(self, owner: Owner, uri: str) -> Connection:
-        host, port = await self._ask_for_address(uri)
+        host, port = await ask_address(self._runtime.rpc, uri, self.topic, self._runtime.name)
         loop = asyncio.get_running_loop()
         async with asyncio.timeout(CONNECT_TIMEOUT):
             _, connection = await loop.create_connection(
@@ -223,20 +223,6 @@ class TopicInput:
         except (RosError, OSError, TimeoutError) as error:
             _log.debug("%s from %s: not known whether it latches: %r", self.topic, uri, error)
             return False
-
-    async def _ask_for_address(self, uri: str) -> tuple[str, int]:
-        protocols = [["TCPROS"]]
-        answer = await self._runtime.rpc.call(
-            uri, "requestTopic", (self._runtime.name, self.topic, protocols)
-        )
-        try:
-            status, text, protocol = answer
-            if status != SUCCESS:
-                raise TcprosError(f"{uri} does not offer {self.topic}: {text}")
-            _, host, port = protocol
-        except (TypeError, ValueError) as error:
-            raise TcprosError(f"{uri} answers requestTopic in no known form: {answer!r}") from error
-        return str(host), int(port)
 
     def _header(self) -> dict[str, str]:
         return {

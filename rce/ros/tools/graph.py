@@ -10,9 +10,9 @@ from urllib.parse import urlsplit
 
 from rce.dialing import open_socket
 from rce.ros.errors import RosError, TcprosError, ToolError
+from rce.ros.tcpros.address import ask_address
 from rce.ros.tcpros.header import ANY, MAX_HEADER, decode_header, encode_header, raise_error_field
 from rce.ros.types.exceptions import TypesError
-from rce.ros.xmlrpc.dispatch import SUCCESS
 
 if TYPE_CHECKING:
     from rce.ros.node.master import MasterClient
@@ -100,12 +100,12 @@ async def service_type(name: str, master: MasterClient) -> str:
         raise ToolError(
             f"no node provides the service {name}; 'service list' shows the services of this graph"
         )
-    place = urlsplit(uri)
     probe = {"callerid": master.caller, "service": name, "md5sum": ANY, "probe": "1"}
     try:
+        place = urlsplit(uri)
         fields = await _exchange_headers(place.hostname or "", place.port or 0, probe)
         return fields["type"]
-    except (OSError, TimeoutError, EOFError, TcprosError, KeyError) as error:
+    except (OSError, TimeoutError, EOFError, TcprosError, KeyError, ValueError) as error:
         raise ToolError(f"the provider of {name} at {uri} does not answer: {error}") from error
 
 
@@ -115,13 +115,10 @@ async def _definition(topic: str, node: str, master: MasterClient, rpc: RpcClien
     if uri is None:
         return ""
     try:
-        status, _, protocol = await rpc.call(uri, "requestTopic", (master.caller, topic, [["TCPROS"]]))
-        if status != SUCCESS:
-            return ""
-        _, host, port = protocol
+        host, port = await ask_address(rpc, uri, topic, master.caller)
         fields = {"callerid": master.caller, "topic": topic, "type": ANY, "md5sum": ANY}
-        return (await _exchange_headers(str(host), int(port), fields)).get("message_definition", "")
-    except (RosError, OSError, TimeoutError, EOFError, TypeError, ValueError):
+        return (await _exchange_headers(host, port, fields)).get("message_definition", "")
+    except (RosError, OSError, TimeoutError, EOFError, ValueError):
         return ""
 
 

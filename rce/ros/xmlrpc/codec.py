@@ -11,7 +11,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 from xml.parsers import expat
-from xmlrpc.client import Error, Fault, Marshaller, Unmarshaller
+from xmlrpc.client import Fault, Marshaller, Unmarshaller
 
 from rce.ros.errors import MalformedDocumentError, RemoteFaultError
 
@@ -125,5 +125,5 @@ def _close(target: Unmarshaller) -> tuple[Any, ...]:
         return target.close()
     except Fault as fault:
         raise RemoteFaultError(fault.faultCode, str(fault.faultString)) from fault
-    except Error as error:
+    except Exception as error:  # among them those of a fault without code and text
         raise MalformedDocumentError(f"not XML-RPC: {error}") from error

@@ -58,6 +58,17 @@ def test_faults_arrive() -> None:
         decode_response(encode_fault(7, "no \x00"))
 
 
+@pytest.mark.parametrize("value", ["<int>5</int>", "<struct></struct>", "<array><data></data></array>"])
+def test_fault_without_code_and_text_is_malformed(value: str) -> None:
+    with pytest.raises(MalformedDocumentError):
+        decode_response(f"<methodResponse><fault><value>{value}</value></fault></methodResponse>".encode())
+
+
+def test_empty_fault_is_malformed() -> None:
+    with pytest.raises(MalformedDocumentError):
+        decode_response(b"<methodResponse><fault></fault></methodResponse>")
+
+
 def test_entities_are_not_expanded() -> None:
     bomb = b"""<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]>
     <methodCall><methodName>m</methodName><params><param><value>&b;</value></param></params></methodCall>"""

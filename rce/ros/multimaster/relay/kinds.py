@@ -11,9 +11,9 @@ from urllib.parse import urlsplit
 from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import TcprosError, XmlRpcError
 from rce.ros.multimaster.errors import NothingToRelayError
+from rce.ros.tcpros.address import ask_address
 from rce.ros.tcpros.header import ANY, MAX_HEADER, decode_header, encode_header, raise_error_field
 from rce.ros.xmlrpc import RpcClient
-from rce.ros.xmlrpc.dispatch import SUCCESS
 
 if TYPE_CHECKING:
     from rce.ros.types import MessageType, ServiceType
@@ -80,7 +80,7 @@ async def learn_topic(rpc: RpcClient, caller: str, topic: str, publishers: Itera
     for uri in publishers:
         try:
             async with asyncio.timeout(PROBE_TIMEOUT):
-                host, port = await _topic_address(rpc, caller, topic, uri)
+                host, port = await ask_address(rpc, uri, topic, caller)
                 fields = await _greet(
                     host, port, {"callerid": caller, "topic": topic, "type": ANY, "md5sum": ANY}
                 )
@@ -118,15 +118,6 @@ async def learn_service(caller: str, service: str, uri: str) -> ServiceKind:
         raise NothingToRelayError(
             f"the type of service {service} cannot be learned: {uri}: {reason}"
         ) from error
-
-
-async def _topic_address(rpc: RpcClient, caller: str, topic: str, uri: str) -> tuple[str, int]:
-    answer = await rpc.call(uri, "requestTopic", (caller, topic, [["TCPROS"]]))
-    match answer:
-        case [status, _, ["TCPROS", str() as host, int() as port]] if status == SUCCESS:
-            return host, port
-        case _:
-            raise TcprosError(f"does not offer the topic: {answer!r}")
 
 
 async def _greet(host: str, port: int, header: Mapping[str, str]) -> dict[str, str]:
