@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from types import TracebackType
 from typing import Any, Self
@@ -26,6 +26,9 @@ MAX_ANSWER = 64 * 2**20
 MAX_IDLE = 4
 """How many idle connections are kept to one server."""
 
+IDLE_TIME = 30.0
+"""Seconds that an idle connection is kept."""
+
 DEFAULT_TIMEOUT = 10.0
 
 _CHUNK = 65536
@@ -34,7 +37,9 @@ _CHUNK = 65536
 class RpcClient:
     """Calls XML-RPC servers. An async context manager; leaving it closes the connections.
 
-    Any number of calls may run at once; those to one server each take a connection of their own.
+    Any number of calls may run at once; those to one server each take a connection of their own. It is kept
+    for the next call until the server ends it, or for :data:`IDLE_TIME`: nodes come and go, each with ports
+    of its own.
     """
 
     def __init__(self) -> None:
@@ -49,9 +54,15 @@ class RpcClient:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._closed = True
-        self._idle.clear()
+        for connection in [one for idle in self._idle.values() for one in idle]:
+            self._end_idleness(connection)
         for connection in list(self._open):
             await self._discard(connection)
+
+    @property
+    def connections(self) -> int:
+        """How many connections it has now, idle ones among them."""
+        return len(self._open)
 
     async def call(
         self, uri: str, method: str, arguments: Sequence[Any], *, timeout: float = DEFAULT_TIMEOUT
@@ -117,14 +128,13 @@ class RpcClient:
 
     async def _exchange(self, uri: str, document: bytes) -> bytes:
         address = _address(uri)
-        while (idle := self._idle.get(address)) and not self._closed:
-            connection = idle.pop()
+        while (idle := self._take_idle(address)) is not None:
             try:
-                return await self._post(connection, document)
+                return await self._post(idle, document)
             except (ConnectionError, EOFError, h11.RemoteProtocolError) as error:
                 # The server closed the idle connection, as it may at any time. ROS calls may be repeated.
                 _log.debug("reconnecting to %s: %s", uri, error)
-        connection = await _Connection.open(*address)
+        connection = await _Connection.open(*address, on_eof=self._drop_idle, on_lost=self._lost)
         self._open.add(connection)
         return await self._post(connection, document)
 
@@ -138,15 +148,63 @@ class RpcClient:
         return answer
 
     async def _give_back(self, connection: _Connection) -> None:
-        idle = self._idle.setdefault(connection.address, [])
+        idle = self._idle.get(connection.address, [])
         if self._closed or not connection.reusable or len(idle) >= MAX_IDLE:
             await self._discard(connection)
-        else:
-            idle.append(connection)
+            return
+        self._idle[connection.address] = [*idle, connection]
+        connection.idle_end = asyncio.get_running_loop().call_later(IDLE_TIME, self._drop_idle, connection)
+
+    def _take_idle(self, address: tuple[str, int]) -> _Connection | None:
+        idle = self._idle.get(address)
+        if not idle:
+            return None
+        connection = idle[-1]
+        self._end_idleness(connection)
+        return connection
+
+    def _end_idleness(self, connection: _Connection) -> bool:
+        """Remove a connection from the idle ones; return whether it was one of them."""
+        idle = self._idle.get(connection.address, [])
+        if connection not in idle:
+            return False
+        idle.remove(connection)
+        if not idle:
+            del self._idle[connection.address]
+        if connection.idle_end is not None:
+            connection.idle_end.cancel()
+        return True
+
+    def _drop_idle(self, connection: _Connection) -> None:
+        """Close a connection, if it is idle: its server has ended it, or its time is over."""
+        if self._end_idleness(connection):
+            connection.abort()
+
+    def _lost(self, connection: _Connection) -> None:
+        self._end_idleness(connection)
+        self._open.discard(connection)
 
     async def _discard(self, connection: _Connection) -> None:
         self._open.discard(connection)
         await connection.close()
+
+
+class _Protocol(asyncio.StreamReaderProtocol):
+    """Reports that the server ended its side, which a stream tells only those who read."""
+
+    def __init__(self, reader: asyncio.StreamReader) -> None:
+        super().__init__(reader)
+        self.on_eof: Callable[[], None] = lambda: None
+        self.on_lost: Callable[[], None] = lambda: None
+
+    def eof_received(self) -> bool:
+        stays_open = bool(super().eof_received())
+        self.on_eof()
+        return stays_open
+
+    def connection_lost(self, error: Exception | None) -> None:
+        super().connection_lost(error)
+        self.on_lost()
 
 
 class _Connection:
@@ -156,23 +214,51 @@ class _Connection:
         self, address: tuple[str, int], reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> None:
         self.address = address
+        self.idle_end: asyncio.TimerHandle | None = None
+        """Closes it, if it is still idle then."""
         self._reader = reader
         self._writer = writer
         self._http = h11.Connection(h11.CLIENT)
 
     @classmethod
-    async def open(cls, host: str, port: int) -> _Connection:
-        reader, writer = await asyncio.open_connection(sock=await open_peer_socket(host, port))
-        return cls((host, port), reader, writer)
+    async def open(
+        cls,
+        host: str,
+        port: int,
+        *,
+        on_eof: Callable[[_Connection], None],
+        on_lost: Callable[[_Connection], None],
+    ) -> _Connection:
+        """Connect to a server.
+
+        Args:
+            host: Of the server.
+            port: Of the server.
+            on_eof: Called when the server ends its side.
+            on_lost: Called when the connection is closed.
+        """
+        loop = asyncio.get_running_loop()
+        reader = asyncio.StreamReader()
+        transport, protocol = await loop.create_connection(
+            lambda: _Protocol(reader), sock=await open_peer_socket(host, port)
+        )
+        connection = cls((host, port), reader, asyncio.StreamWriter(transport, protocol, reader, loop))
+        protocol.on_eof = lambda: on_eof(connection)
+        protocol.on_lost = lambda: on_lost(connection)
+        return connection
 
     @property
     def reusable(self) -> bool:
         """Whether another call may follow."""
         return self._http.our_state is h11.IDLE and not self._reader.at_eof()
 
+    def abort(self) -> None:
+        """Close at once."""
+        self._writer.transport.abort()
+
     async def close(self) -> None:
         """Close at once and wait until it is closed."""
-        self._writer.transport.abort()
+        self.abort()
         with contextlib.suppress(OSError):  # it may have been lost already, which counts as closed
             await self._writer.wait_closed()
 
