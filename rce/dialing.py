@@ -87,6 +87,21 @@ async def connect_first(addresses: list[Address]) -> socket.socket:
     raise OSError("; ".join(map(str, errors)) or "no address")
 
 
+def set_keepalive(sock: socket.socket, *, idle: int, interval: int, count: int) -> None:
+    """Have the system end a TCP connection whose other end is gone without a word.
+
+    Args:
+        sock: A TCP socket, or what an event loop gives in its place.
+        idle: Seconds without data until the system asks the other end.
+        interval: Seconds between two questions.
+        count: How many of them stay unanswered until the connection is lost.
+    """
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in (("TCP_KEEPIDLE", idle), ("TCP_KEEPINTVL", interval), ("TCP_KEEPCNT", count)):
+        if hasattr(socket, option):
+            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+
+
 async def _connect(family: socket.AddressFamily, address: Any) -> socket.socket:
     sock = socket.socket(family, socket.SOCK_STREAM)
     try:

@@ -80,7 +80,8 @@ class ServiceClient:
     ) -> bytes:
         """Call the service with a serialized request; return the serialized response.
 
-        A call that is cancelled or times out closes its connection, so its late answer is discarded.
+        A call that is cancelled or times out closes its connection, so its late answer is discarded. One that
+        times out closes the idle connections too: their provider may be gone without a word.
 
         Raises:
             ServiceNotFoundError: The service has no provider.
@@ -94,6 +95,7 @@ class ServiceClient:
             async with asyncio.timeout(timeout), self._slots:
                 return await self._exchange(payload)
         except TimeoutError as error:
+            await self._drop_idle()
             raise ServiceTimeoutError(self.name) from error
 
     async def close(self) -> None:
@@ -123,6 +125,12 @@ class ServiceClient:
                 return call
             self._open.discard(call)
         return None
+
+    async def _drop_idle(self) -> None:
+        idle, self._idle = self._idle, []
+        for call in idle:
+            self._open.discard(call)
+            await call.close()
 
     async def _give_back(self, call: _Call) -> None:
         if self._persistent and not self._closed and len(self._idle) < MAX_IDLE:

@@ -10,6 +10,7 @@ import logging
 from typing import TYPE_CHECKING, Protocol, cast
 
 from rce.buffers import write_together
+from rce.dialing import set_keepalive
 from rce.ros.errors import TcprosError
 from rce.ros.tcpros.framing import MAX_FRAME, Chunks, FrameReader
 from rce.ros.tcpros.header import MAX_HEADER
@@ -134,6 +135,7 @@ class Connection(asyncio.BufferedProtocol):
         self._transport = cast("asyncio.Transport", transport)  # uvloop's only behave like one
         self._transport.set_write_buffer_limits(high=WRITE_HIGH)
         self._peer = str(transport.get_extra_info("peername"))
+        set_keepalive(transport.get_extra_info("socket"), idle=60, interval=10, count=9)  # as rospy, roscpp
         if self._siblings is not None:
             self._siblings.add(self)
         self.owner.connection_made(self)

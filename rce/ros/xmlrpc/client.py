@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import socket
 from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from types import TracebackType
@@ -14,6 +13,7 @@ from urllib.parse import urlsplit
 
 import h11
 
+from rce.dialing import set_keepalive
 from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import RpcTimeoutError, RpcUnreachableError
 from rce.ros.xmlrpc.codec import decode_response, encode_call
@@ -117,7 +117,7 @@ class RpcClient:
             reader, writer = await asyncio.open_connection(sock=await open_peer_socket(*_address(uri)))
         except (OSError, ValueError) as error:
             raise RpcUnreachableError(uri, str(error)) from error
-        _keep_alive(writer.get_extra_info("socket"))
+        set_keepalive(writer.get_extra_info("socket"), idle=10, interval=5, count=4)  # half a minute
         try:
             with contextlib.suppress(OSError):  # lost, whatever the reason
                 await reader.read(1)
@@ -300,14 +300,6 @@ class _Connection:
                     raise ValueError(f"the answer is longer than {MAX_ANSWER} bytes")
             elif isinstance(event, h11.EndOfMessage):
                 return bytes(body)
-
-
-def _keep_alive(connection: socket.socket) -> None:
-    """Set TCP keep-alive, so that the system notices within half a minute that the other machine is gone."""
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for option, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 4)):
-        if hasattr(socket, option):
-            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
 
 
 def _address(uri: str) -> tuple[str, int]:

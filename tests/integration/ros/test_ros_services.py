@@ -17,8 +17,9 @@ from rce.ros.errors import (
     ServiceTimeoutError,
     TypeMismatchError,
 )
+from rce.ros.tcpros.framing import answer_frame
 from rce.ros.tcpros.header import decode_header, encode_header
-from rce.ros.types import Message, SerializationError
+from rce.ros.types import Message, SerializationError, TypeRegistry
 
 SET_BOOL = "std_srvs/SetBool"
 
@@ -134,6 +135,38 @@ async def test_a_handler_that_fails_answers_with_an_error(
         with pytest.raises(ServiceFaultError, match="oops"):
             await client(data=False)
         assert "ZeroDivisionError" in caplog.text
+
+
+async def test_call_after_a_timeout_goes_to_the_new_provider(core: Core, make_node: MakeNode) -> None:
+    """The first provider fell silent, as a machine does that lost its power, with three idle connections."""
+    all_there = asyncio.Barrier(3)
+    set_bool = TypeRegistry().service(SET_BOOL)
+    header = encode_header({"callerid": "/old", "md5sum": set_bool.md5sum, "type": SET_BOOL})
+    answer = b"".join(answer_frame(set_bool.response.serialize({"message": "old"}), ok=True))
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            await reader.readexactly(int.from_bytes(await reader.readexactly(4), "little"))
+            writer.write(header)
+            await reader.readexactly(5)
+            await all_there.wait()
+            writer.write(answer)
+            await reader.read()
+        finally:
+            writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1")
+    async with server, make_node("new") as new, make_node("client") as node, asyncio.timeout(120):
+        uri = f"rosrpc://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        core.graph.register_service("/switch", uri, "/old", "http://127.0.0.1:1/")
+        client = node.service_client("/switch", SET_BOOL)
+        answers = await asyncio.gather(*(client(data=True) for _ in range(3)))
+        assert [one.message for one in answers] == ["old"] * 3
+        await new.advertise_service("/switch", SET_BOOL, switch)
+        with pytest.raises(ServiceTimeoutError):
+            await client.call({"data": True}, timeout=0.3)
+        assert (await client.call({"data": True}, timeout=30)).message == "on"
+        await client.close()
 
 
 async def test_a_provider_that_dies_ends_its_calls_and_may_come_back(make_node: MakeNode) -> None:
