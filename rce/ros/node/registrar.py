@@ -59,10 +59,8 @@ class Registrar:
             if topic not in topics.outputs:  # closed meanwhile
                 await master.unregister_publisher(topic)
         for topic, source in list(topics.inputs.items()):
-            publishers = await master.register_subscriber(topic, source.message_type_name)
-            if topics.inputs.get(topic) is source:
-                source.set_publishers(publishers, of_new_master=True)
-            else:
+            await source.register(of_new_master=True)
+            if topics.inputs.get(topic) is not source:
                 await master.unregister_subscriber(topic)
         for name in list(self.services):
             await master.register_service(name, self.service_uri)

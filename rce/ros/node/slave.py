@@ -82,7 +82,7 @@ class SlaveApi:
         source = self.topics.inputs.get(graph_name("topic", topic, caller))
         uris = node_uris("publishers", publishers)
         if source is not None:
-            source.set_publishers(uris)
+            source.take_update(uris)
         return SUCCESS, "", 0
 
     def _param_update(self, _caller: str, key: Any, value: Any) -> Answer:

@@ -30,6 +30,8 @@ ASKING = "_asks"
 """Appended to the node's name where a publisher is asked only for its header."""
 RETRY = Backoff(first=0.05, longest=5.0, jitter=0.5)
 """Seconds between attempts to reach a publisher: the first wait and the longest."""
+MAX_REGISTRATIONS = 3
+"""How often the master is asked for the publishers while it reports changes of them meanwhile."""
 
 
 class TopicInput:
@@ -49,6 +51,9 @@ class TopicInput:
         self._following: dict[str, asyncio.Task[None]] = {}
         self._orphans: set[str] = set()
         """Publishers that a restarted master has not named yet: followed until their connection ends."""
+        self._updates = 0
+        """How many changes of the publishers the master has reported."""
+        self._joins_new_master = False
 
     @property
     def tells_latched(self) -> bool:
@@ -104,6 +109,40 @@ class TopicInput:
                 subscriber.sink.deliver(link.kept.payload(), True, link.uri)
             elif link.kept is not None:
                 subscriber.sink.deliver(link.kept, True, link.uri)
+
+    async def register(self, *, of_new_master: bool = False) -> None:
+        """Register the subscription at the master, and follow the publishers that it names.
+
+        An answer is older or newer than a change that the master reports before it comes. If they differ,
+        the master is asked again.
+
+        Args:
+            of_new_master: As for :meth:`set_publishers`.
+
+        Raises:
+            MasterError: The registration at the master failed.
+        """
+        self._joins_new_master = of_new_master
+        try:
+            for _ in range(MAX_REGISTRATIONS):
+                before = self._updates
+                publishers = await self._runtime.master.register_subscriber(
+                    self.topic, self.message_type_name
+                )
+                if not self.subscribers:  # closed meanwhile
+                    return
+                if self._updates == before:
+                    self.set_publishers(publishers, of_new_master=of_new_master)
+                    return
+                if set(publishers) == self._publishers:
+                    return
+        finally:
+            self._joins_new_master = False
+
+    def take_update(self, uris: Iterable[str]) -> None:
+        """Follow the publishers that the master reports after a change."""
+        self._updates += 1
+        self.set_publishers(uris, of_new_master=self._joins_new_master)
 
     def set_publishers(self, uris: Iterable[str], *, of_new_master: bool = False) -> None:
         """Follow these publishers, given by their slave APIs, and no others.

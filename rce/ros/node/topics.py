@@ -113,7 +113,7 @@ class Topics:
         source.subscribers = [*source.subscribers, subscriber]  # a new list: one may be in use by a delivery
         if is_first:
             try:
-                source.set_publishers(await runtime.master.register_subscriber(topic, name))
+                await source.register()
             except BaseException:
                 self.inputs.pop(topic, None)
                 raise
