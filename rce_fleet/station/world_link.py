@@ -166,8 +166,11 @@ class WorldLink:
     async def _call(self, name: str, type_name: str, request: dict[str, Any]) -> str:
         """Call a service of the world; return what it says."""
         try:
-            client = self._node.service_client(f"/simulation/{name}", type_name)
-            answer = await client(request, timeout=CALL_S)
+            client = self._node.service_client(f"/simulation/{name}", type_name, persistent=False)
+            try:
+                answer = await client.call(request, timeout=CALL_S)
+            finally:
+                await client.close()
         except RosError as error:
             raise WorldError(f"the simulated world does not answer: {error}") from error
         if not getattr(answer, "success", True):

@@ -75,6 +75,8 @@ class OriginsReader:
     async def read(self, snapshot: Snapshot) -> Origins:
         """Ask all synchronizations among the registrations in ``snapshot``."""
         hosts = self._hosts()
+        for service in self._clients.keys() - snapshot.service_uris.keys():
+            await self._clients.pop(service).close()
         found: list[Any] = []
         for service, uri in snapshot.service_uris.items():
             if service.endswith(SYNC_INFO) and host_of(uri) in hosts:

@@ -44,7 +44,10 @@ async def masters_known_at(node: Node, master: MasterClient) -> list[Neighbour]:
     """
     service = await find_service(master, LIST_SERVICE)
     client = node.service_client(service, messages.DISCOVER_MASTERS, persistent=False)
-    answer = await client.call({}, timeout=ASK_TIMEOUT)
+    try:
+        answer = await client.call({}, timeout=ASK_TIMEOUT)
+    finally:
+        await client.close()
     return [messages.read_ros_master(entry) for entry in answer.masters]
 
 

@@ -84,7 +84,7 @@ class GraphMember:
         self._master_timeout = master_timeout
         self._topics = Topics()
         self._services: dict[str, Service] = {}
-        self._clients: list[ServiceClient] = []
+        self._clients: set[ServiceClient] = set()
         self._stop = asyncio.Event()
         self._stack = AsyncExitStack()
         self._runtime: Runtime | None = None
@@ -311,7 +311,7 @@ class GraphMember:
                 await self._parameters.unwatch_all()
         except (MasterError, TimeoutError) as error:
             _log.info("%s left without telling its master: %s", self.name, str(error) or "it took too long")
-        for client in self._clients:
+        for client in list(self._clients):
             await client.close()
 
     # Inside

@@ -261,7 +261,7 @@ class Node(GraphMember):
     def service_client(
         self, name: str, service_type: str | ServiceType, *, persistent: bool = True
     ) -> ServiceClient:
-        """Make a client of a service, which need not be there yet.
+        """Make a client of a service, which need not be there yet; close it when it is not needed any more.
 
         Args:
             name: The service.
@@ -273,9 +273,13 @@ class Node(GraphMember):
         """
         runtime = self._running
         client = ServiceClient(
-            runtime, self.resolve(name), runtime.types.service(service_type), persistent=persistent
+            runtime,
+            self.resolve(name),
+            runtime.types.service(service_type),
+            self._clients.discard,
+            persistent=persistent,
         )
-        self._clients.append(client)
+        self._clients.add(client)
         return client
 
     async def wait_for_service(self, name: str, *, timeout: float | None = None) -> None:

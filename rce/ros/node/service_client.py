@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -39,11 +39,20 @@ class ServiceClient:
     while it lasts; when it is lost, the provider is looked up again.
     """
 
-    def __init__(self, runtime: Runtime, name: str, service_type: ServiceType, *, persistent: bool) -> None:
+    def __init__(
+        self,
+        runtime: Runtime,
+        name: str,
+        service_type: ServiceType,
+        release: Callable[[ServiceClient], None],
+        *,
+        persistent: bool,
+    ) -> None:
         self.name = name
         """The service's global name."""
         self.type = service_type
         self._runtime = runtime
+        self._release = release
         self._persistent = persistent
         self._idle: list[_Call] = []
         self._open: set[_Call] = set()
@@ -99,8 +108,12 @@ class ServiceClient:
             raise ServiceTimeoutError(self.name) from error
 
     async def close(self) -> None:
-        """Close the kept connections; calls under way end with ServiceLostError."""
+        """Close the kept connections; calls under way end with ServiceLostError.
+
+        The node keeps a client until it is closed.
+        """
         self._closed = True
+        self._release(self)
         for call in list(self._open):
             await call.close()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import shutil
 import sys
 from pathlib import Path
@@ -17,7 +18,9 @@ from rce.ros.errors import MasterUnreachableError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.discovery import Discovery
 from rce.ros.multimaster.errors import NoDiscoveryError
-from rce.ros.multimaster.listing import list_masters
+from rce.ros.multimaster.listing import list_masters, masters_known_at
+from rce.ros.node import ServiceClient
+from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import RpcClient
 
 
@@ -38,6 +41,29 @@ async def test_a_core_of_the_same_process_is_watched(network: DiscoveryNetwork) 
                             break
             assert discovery.info is not None
             assert discovery.info.nodes["/n"].is_local
+
+
+async def test_question_for_masters_leaves_no_client(network: DiscoveryNetwork) -> None:
+    """A synchronization asks every few seconds, for as long as it runs."""
+
+    def clients() -> int:
+        gc.collect()
+        return sum(isinstance(one, ServiceClient) for one in gc.get_objects())
+
+    async with (
+        Core(port=0) as core,
+        Discovery(network.settings(core.uri, name="a")) as discovery,
+        node("n", core.uri, types=messages.registry()) as asking,
+        RpcClient() as rpc,
+        asyncio.timeout(60),
+    ):
+        master = MasterClient(core.uri, asking.name, asking.uri, rpc)
+        while discovery.info is None:
+            await asyncio.sleep(0.01)
+        before = clients()
+        for _ in range(5):
+            assert [one.name for one in await masters_known_at(asking, master)] == ["a"]
+        assert clients() == before
 
 
 async def test_masters_and_changes_are_shown_in_the_graph(network: DiscoveryNetwork) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import weakref
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -17,6 +19,7 @@ from rce.ros.errors import (
     ServiceTimeoutError,
     TypeMismatchError,
 )
+from rce.ros.node import ServiceClient
 from rce.ros.tcpros.framing import answer_frame
 from rce.ros.tcpros.header import decode_header, encode_header
 from rce.ros.types import Message, SerializationError, TypeRegistry
@@ -253,3 +256,19 @@ async def test_a_header_that_comes_in_pieces_is_answered(
             assert ("error" in decode_header(answer[4:])) is bool(wrong)
             writer.close()
             await writer.wait_closed()
+
+
+async def test_closed_clients_are_not_kept(make_node: MakeNode) -> None:
+    """A node that makes a client for each call does not grow."""
+    async with make_node("a") as a, make_node("b") as b:
+        service = await a.advertise_service("switch", SET_BOOL, switch)
+        clients: weakref.WeakSet[ServiceClient] = weakref.WeakSet()
+        for number in range(100):
+            client = b.service_client("switch", SET_BOOL, persistent=number % 2 == 0)
+            clients.add(client)
+            await client.call({"data": True}, timeout=60)
+            await client.close()
+        del client
+        gc.collect()
+        assert service.calls == 100
+        assert len(clients) == 0
