@@ -15,7 +15,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from rce.ros.node import MasterError, Message, Node, Publisher, RosError, run
+from rce.ros.node import MasterError, Message, Node, Publisher, RosError, ServiceClient, run
 from rce.ros.tools.plain import plain
 from rce_fleet.journal.journal import Journal
 from rce_fleet.manager.fleet_routes import ROUTES as FLEET_ROUTES
@@ -85,9 +85,9 @@ class PlannerServices:
         zones, remove = ([], [name]) if zone is None else ([zone_fields(zone, now)], [])
         return await self._call(self._set_zones, zones=zones, remove=remove, revision=-1)
 
-    async def _call(self, client: Any, **request: Any) -> str:
+    async def _call(self, client: ServiceClient, **request: Any) -> str:
         try:
-            answer = await client(request, timeout=CALL_TIMEOUT_S)
+            answer = await client.call(request, timeout=CALL_TIMEOUT_S)
         except RosError as error:
             return f"{NO_ANSWER}: {error}"
         return "" if answer.ok else str(answer.message)
@@ -202,7 +202,7 @@ class ManagerNode:
             await self._state_needed.wait()
             self._state_needed.clear()
             try:
-                answer = await client({}, timeout=CALL_TIMEOUT_S)
+                answer = await client.call({}, timeout=CALL_TIMEOUT_S)
             except RosError as error:
                 throttled.warn("planner", f"the planner does not answer: {error}")
                 self._state_needed.set()

@@ -131,7 +131,7 @@ async def _fail_on_shutdown(node: Node) -> None:
 def _caller(client: ServiceClient) -> Call:
     async def call(request: dict[str, Any]) -> dict[str, Any]:
         try:
-            return plain(await client(request, timeout=CALL_TIMEOUT_S))
+            return plain(await client.call(request, timeout=CALL_TIMEOUT_S))
         except ServiceError as error:
             raise PlannerUnavailableError(f"the planner did not answer: {error}") from error
         except RosError as error:

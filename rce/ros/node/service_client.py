@@ -64,8 +64,16 @@ class ServiceClient:
 
         Raises:
             ServiceError: The call got no response; the subclasses give the reason.
+            TypeError: There are a request and fields; a ``timeout`` is an argument of :meth:`call`.
         """
-        return await self.call(self.type.request.new(**fields) if request is None else request)
+        if request is None:
+            return await self.call(self.type.request.new(**fields))
+        if fields:
+            raise TypeError(
+                f"service {self.name}: give a request or its fields, not both ({', '.join(fields)});"
+                " call(request, timeout=...) has a time limit"
+            )
+        return await self.call(request)
 
     async def call(self, request: Message | Mapping[str, Any], *, timeout: float | None = None) -> Message:
         """Call the service.

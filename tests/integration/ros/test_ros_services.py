@@ -258,6 +258,14 @@ async def test_a_header_that_comes_in_pieces_is_answered(
             await writer.wait_closed()
 
 
+async def test_request_and_fields_together_are_refused(make_node: MakeNode) -> None:
+    """A ``timeout`` beside a request was taken for a field, and there was no time limit."""
+    async with make_node("a") as a:
+        client = a.service_client("switch", SET_BOOL)
+        with pytest.raises(TypeError, match="timeout"):
+            await client({"data": True}, timeout=1)
+
+
 async def test_closed_clients_are_not_kept(make_node: MakeNode) -> None:
     """A node that makes a client for each call does not grow."""
     async with make_node("a") as a, make_node("b") as b:
