@@ -58,6 +58,9 @@ class Policy(Protocol):
     def ended(self, goal_id: str) -> list[Step]:
         """Take note that the work on a goal has ended."""
 
+    def note_time_jump(self) -> None:
+        """Take note that time jumped back: later goals have earlier stamps."""
+
 
 @dataclass(slots=True)
 class ManyGoals:
@@ -81,6 +84,9 @@ class ManyGoals:
         """Make room."""
         self.running.discard(goal_id)
         return []
+
+    def note_time_jump(self) -> None:
+        """Do nothing: stamps are not compared."""
 
 
 @dataclass(slots=True)
@@ -122,3 +128,7 @@ class SingleGoal:
             return []
         self.current, self.waiting = self.waiting, None
         return [Start(self.current.id)] if self.current is not None else []
+
+    def note_time_jump(self) -> None:
+        """Take the next goal as the newest, whatever its stamp is."""
+        self.newest = 0

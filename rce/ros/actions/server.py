@@ -173,6 +173,7 @@ class ActionServer:
         nanoseconds = now.to_nsec()
         if nanoseconds < self._latest:
             self._ledger.note_time_jump()
+            self._policy.note_time_jump()
         self._latest = nanoseconds
         return now
 

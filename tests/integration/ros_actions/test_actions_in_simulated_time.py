@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager
 import pytest
 from support.ros_nodes import MakeNode
 
-from rce.ros.actions import ActionClient, ActionServer, GoalState, ServerGoal
+from rce.ros.actions import ActionClient, ActionServer, GoalState, ServerGoal, SimpleActionServer
 from rce.ros.actions.tracker import SilenceClock
 from rce.ros.core import Core
 from rce.ros.node import Node, Publisher
@@ -113,6 +113,23 @@ async def test_goals_after_a_jump_back_are_new_ones(core: Core, make_node: MakeN
         await world.set(5.0)
         again = await client.send(order=2)
         assert list((await again.result()).sequence) == [2]
+
+
+async def test_simple_server_works_after_a_jump_back(core: Core, make_node: MakeNode) -> None:
+    async def handler(goal: ServerGoal) -> dict[str, list[int]]:
+        return {"sequence": [goal.request.order]}
+
+    async with (
+        simulation(core, make_node) as (world, a, b),
+        SimpleActionServer(a, "job", FIBONACCI, handler),
+        ActionClient(b, "job", FIBONACCI) as client,
+        asyncio.timeout(60),
+    ):
+        for seconds in (500.0, 1.0):
+            await world.set(seconds)
+            goal = await client.send(order=2)
+            assert goal.stamp == Time(int(seconds), 0)
+            assert list((await goal.result()).sequence) == [2]
 
 
 def test_silence_counts_what_passed_for_both() -> None:

@@ -61,6 +61,23 @@ def test_an_old_goal_is_dropped_even_if_nothing_is_done() -> None:
     assert policy.offer(goal(2)) == [Start("g2")]
 
 
+def test_goal_after_a_jump_back_of_time_starts() -> None:
+    """A simulation that begins again gives goals earlier stamps."""
+    policy = SingleGoal()
+    policy.offer(goal(500))
+    policy.ended("g500")
+    policy.note_time_jump()
+    assert policy.offer(goal(1)) == [Start("g1")]
+
+
+def test_goal_of_before_a_jump_back_is_replaced() -> None:
+    policy = SingleGoal()
+    policy.offer(goal(500))
+    policy.note_time_jump()
+    assert policy.offer(goal(1)) == [Stop("g500")]
+    assert policy.ended("g500") == [Start("g1")]
+
+
 def test_cancellations_of_the_present_and_the_waiting_goal() -> None:
     policy = SingleGoal()
     policy.offer(goal(1))
