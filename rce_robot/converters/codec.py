@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from rce.ros.types.codegen import Code
-from rce.ros.types.readers import Reader, ReaderBuilder
+from rce.ros.types.readers import OnBadText, Reader, ReaderBuilder
 from rce.ros.types.values import NUMBERS
 from rce.ros.types.writers import WriterBuilder
 from rce_robot.converters.stamps import (
@@ -26,11 +26,13 @@ _MISSING: Any = object()
 _NO_FIELDS: dict[str, Any] = {}
 
 
-def make_reader(kind: MessageType, customs: Mapping[str, CustomConverter]) -> Reader:
+def make_reader(
+    kind: MessageType, customs: Mapping[str, CustomConverter], on_bad_text: OnBadText = "strict"
+) -> Reader:
     """Make the function that reads JSON objects of ``kind`` from their bytes on the wire."""
 
     def reader_of(needed: MessageType) -> Reader:
-        return ReaderBuilder(_JsonReading(customs), reader_of).build(needed)
+        return ReaderBuilder(_JsonReading(customs), reader_of, on_bad_text).build(needed)
 
     return reader_of(kind)
 

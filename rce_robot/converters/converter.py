@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 from rce.ros.types.codegen import FAULTS
 from rce.ros.types.faults import read_fault
 from rce.ros.types.fields import LARGE
+from rce.ros.types.readers import LenientReader
 from rce_robot.converters.codec import make_reader, make_writer
 from rce_robot.converters.custom import CustomConverter, load_custom_converters
 from rce_robot.converters.faults import find_fault, unknown_fields
@@ -46,6 +47,7 @@ class Converter:
         self.kind = kind
         self._customs = load_custom_converters() if customs is None else customs
         self._read = make_reader(kind, self._customs)
+        self._read_lenient = LenientReader(kind.name, lambda: make_reader(kind, self._customs, "replace"))
         self._write = make_writer(kind, self._customs)
 
     def __repr__(self) -> str:
@@ -86,7 +88,8 @@ class Converter:
         """Turn a message's bytes into its JSON form.
 
         Returns:
-            An object of the fields, or the result of the class's custom converter. Binary values in it are
+            An object of the fields, or the result of the class's custom converter. Bytes of a string that are
+            not UTF-8 become U+FFFD. Binary values in it are
             ``memoryview`` (of ``payload``, which must not change while they are used) or ``bytes``.
 
         Raises:
@@ -95,7 +98,10 @@ class Converter:
         if len(payload) > LARGE:
             payload = memoryview(payload)
         try:
-            value, end = self._read(payload, 0)
+            try:
+                value, end = self._read(payload, 0)
+            except UnicodeDecodeError:
+                value, end = self._read_lenient(payload, 0)
         except FAULTS as error:
             raise self._unreadable(payload) from error
         if end != len(payload):

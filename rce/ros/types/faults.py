@@ -148,12 +148,7 @@ def _walk_element(field: Field, buffer: memoryview, position: int, root: str, pa
         return _walk(field.message, buffer, position, root, path + ".")
     if field.type == "string":
         size, position = _length(buffer, position, root, path)
-        end = _skip(buffer, position, size, root, path)
-        try:
-            str(buffer[position:end], "utf-8")
-        except UnicodeDecodeError as error:
-            raise SerializationError(root, path, f"is not UTF-8: {error.reason}") from None
-        return end
+        return _skip(buffer, position, size, root, path)
     return _skip(buffer, position, 8 if field.type in STAMPS else NUMBERS[field.type].size, root, path)
 
 

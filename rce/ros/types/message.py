@@ -103,8 +103,10 @@ class MessageType:
     def deserialize(self, buffer: Buffer) -> Message:
         """Read a message from exactly the bytes of ``buffer``; nothing of the result shares its memory.
 
+        Bytes of a string that are not UTF-8 become U+FFFD, as in rospy.
+
         Raises:
-            SerializationError: The buffer is too short or too long, or a string is not UTF-8.
+            SerializationError: The buffer is too short or too long.
         """
         return self._codec[1](buffer)
 

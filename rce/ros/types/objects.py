@@ -11,7 +11,7 @@ from rce.ros.types.codegen import FAULTS, Code
 from rce.ros.types.exceptions import SerializationError
 from rce.ros.types.faults import array_fault, find_fault, read_fault
 from rce.ros.types.fields import LARGE, Buffer, Field, attribute
-from rce.ros.types.readers import Reader, ReaderBuilder
+from rce.ros.types.readers import LenientReader, OnBadText, Reader, ReaderBuilder
 from rce.ros.types.values import NUMBERS, STAMPS, Duration, Message, Time
 from rce.ros.types.writers import WriterBuilder
 
@@ -52,7 +52,8 @@ def make_class(message_type: MessageType) -> type[Message]:
 
 def make_codec(message_type: MessageType) -> tuple[Callable[[Message], bytes], Callable[[Buffer], Message]]:
     """Make the functions that serialize and deserialize objects of ``message_type``."""
-    write, read, cls = _writer_of(message_type), _reader_of(message_type), message_type.cls
+    write, read, cls = _writer_of(message_type), _reader_of(message_type, "strict"), message_type.cls
+    lenient = LenientReader(message_type.name, lambda: _reader_of(message_type, "replace"))
 
     def serialize(message: Message) -> bytes:
         if message.__class__ is not cls:
@@ -70,7 +71,10 @@ def make_codec(message_type: MessageType) -> tuple[Callable[[Message], bytes], C
         if len(buffer) > LARGE:
             buffer = memoryview(buffer)
         try:
-            message, end = read(buffer, 0)
+            try:
+                message, end = read(buffer, 0)
+            except UnicodeDecodeError:
+                message, end = lenient(buffer, 0)
         except FAULTS as error:
             raise read_fault(message_type, buffer) from error
         if end != len(buffer):
@@ -149,8 +153,10 @@ class _ObjectWriting:
         return value
 
 
-def _reader_of(message_type: MessageType) -> Reader:
-    return ReaderBuilder(_ObjectReading(), _reader_of).build(message_type)
+def _reader_of(message_type: MessageType, on_bad_text: OnBadText) -> Reader:
+    return ReaderBuilder(_ObjectReading(), lambda nested: _reader_of(nested, on_bad_text), on_bad_text).build(
+        message_type
+    )
 
 
 def _writer_of(message_type: MessageType) -> Any:

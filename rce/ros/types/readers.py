@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import struct
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 from rce.ros.types.codegen import Code
 from rce.ros.types.fields import Buffer, Field, element_min_size
@@ -15,8 +16,13 @@ if TYPE_CHECKING:
 
     from rce.ros.types.message import MessageType
 
+_log = logging.getLogger(__name__)
+
 Reader: TypeAlias = Callable[[Buffer, int], tuple[Any, int]]
 """Reads a value at a position and returns it with the position after it."""
+
+OnBadText: TypeAlias = Literal["strict", "replace"]
+"""What happens to bytes of a string that are not UTF-8: ``UnicodeDecodeError``, or U+FFFD in their place."""
 
 MAX_EMPTY_ELEMENTS = 1 << 16
 """Longest array of messages without content: its length is not bounded by the size of the buffer."""
@@ -41,12 +47,54 @@ class ReadDialect(Protocol):
         """Make a message of the expressions of its fields."""
 
 
-class ReaderBuilder:
-    """Generates the reader of one message type."""
+class LenientReader:
+    """Reads messages with strings that are not UTF-8, as rospy does; made when the first one comes.
 
-    def __init__(self, dialect: ReadDialect, reader_of: Callable[[MessageType], Reader]) -> None:
+    A driver in C++ may publish text of its device in any encoding.
+
+    Args:
+        type_name: The messages' type, for the log.
+        make: Makes the reader that replaces what cannot be read.
+    """
+
+    def __init__(self, type_name: str, make: Callable[[], Reader]) -> None:
+        self._type_name = type_name
+        self._make = make
+        self._read: Reader | None = None
+        self._was_logged = False
+
+    def __call__(self, buffer: Buffer, position: int) -> tuple[Any, int]:
+        """Read a message; the first one that is complete is logged."""
+        if self._read is None:
+            self._read = self._make()
+        found = self._read(buffer, position)
+        if found[1] == len(buffer) and not self._was_logged:
+            self._was_logged = True
+            _log.warning(
+                "a string of a %s is not UTF-8: what cannot be read is replaced by U+FFFD; logged once",
+                self._type_name,
+            )
+        return found
+
+
+class ReaderBuilder:
+    """Generates the reader of one message type.
+
+    Args:
+        dialect: Makes Python values.
+        reader_of: Makes the readers of nested types.
+        on_bad_text: What happens to strings that are not UTF-8.
+    """
+
+    def __init__(
+        self,
+        dialect: ReadDialect,
+        reader_of: Callable[[MessageType], Reader],
+        on_bad_text: OnBadText = "strict",
+    ) -> None:
         self._dialect = dialect
         self._reader_of = reader_of
+        self._on_bad_text = on_bad_text
         self._code = Code()
         self._pending: list[tuple[str, str]] = []
 
@@ -87,7 +135,7 @@ class ReaderBuilder:
             code.line(f"for _ in range({count}):")
             code.line(f"    n, = {code.bind(struct.Struct('<I').unpack_from)}(b, p)")
             code.line("    e = p + 4 + n")
-            code.line(f"    {value}.append(str(b[p + 4:e], 'utf-8'))")
+            code.line(f"    {value}.append(str(b[p + 4:e], 'utf-8', {self._on_bad_text!r}))")
             code.line("    p = e")
         else:
             code.line(f"e = p + {count} * {element_min_size(field)}")
@@ -117,7 +165,7 @@ class ReaderBuilder:
         self._flush()
         value = self._code.variable()
         self._code.line(f"e = p + {size}")
-        self._code.line(f"{value} = str(b[p:e], 'utf-8')")
+        self._code.line(f"{value} = str(b[p:e], 'utf-8', {self._on_bad_text!r})")
         self._code.line("p = e")
         return value
 

@@ -441,3 +441,17 @@ async def _keep_publishing(publisher: Publisher) -> None:
     while True:
         publisher.publish(data="x")
         await asyncio.sleep(0)
+
+
+async def test_text_that_is_not_utf8_arrives(make_node: MakeNode) -> None:
+    """Read with replacements, and untouched where it is passed on."""
+    payload = b"\x04\0\0\0caf\xe9"
+    async with make_node("a") as a, make_node("b") as b, asyncio.timeout(60):
+        forwarded: asyncio.Queue[bytes] = asyncio.Queue()
+        await b.subscribe_serialized("t", STRING, lambda data, _latched: forwarded.put_nowait(data))
+        heard = await b.subscribe("t", STRING)
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers()
+        publisher.publish_serialized(payload)
+        assert await collect(heard, 1) == ["caf\ufffd"]
+        assert await forwarded.get() == payload

@@ -307,12 +307,21 @@ def test_durations_are_seconds(value: object, secs: int, nsecs: int) -> None:
     [
         (b"\x04\0\0\0abc", "data: the message ends after 7 bytes, 1 are missing"),
         (b"\x01\0\0\0abc", "std_msgs/String: 2 bytes too many"),
-        (b"\x01\0\0\0\xff", "data: is not UTF-8"),
+        (b"\x05\0\0\0\xffabc", "data: the message ends after 8 bytes, 1 are missing"),
     ],
 )
 def test_bytes_that_are_no_message_are_refused(payload: bytes, text: str) -> None:
     with pytest.raises(ConversionError, match=text):
         converter("std_msgs/String").encode(payload)
+
+
+def test_text_that_is_not_utf8_leaves_with_replacements(caplog: pytest.LogCaptureFixture) -> None:
+    """A driver's text in Latin-1 does not cost the whole message; the first one of a type is logged."""
+    payload = b"\x04\0\0\0caf\xe9"
+    made = Converter(TYPES.message("std_msgs/String"), {})
+    for _ in range(2):
+        assert made.encode(payload) == {"data": "caf\ufffd"}
+    assert caplog.text.count("a string of a std_msgs/String is not UTF-8") == 1
 
 
 def test_services_are_converted_by_their_two_types() -> None:

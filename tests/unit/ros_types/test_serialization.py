@@ -193,7 +193,8 @@ def test_unfit_value_is_refused_by_its_field(name: str, values: Any, text: str) 
             b"\xff\xff\xff\xffabc",
             "data: the message ends after 7 bytes, 4294967292 are missing",
         ),
-        ("std_msgs/String", b"\x01\0\0\0\xff", "data: is not UTF-8"),
+        ("std_msgs/String", b"\x02\0\0\0\xff", "data: the message ends after 5 bytes, 1 are missing"),
+        ("std_msgs/String", b"\x01\0\0\0\xff\0", "std_msgs/String: 1 bytes too many"),
         ("geometry_msgs/PoseArray", bytes(16) + b"\xff" * 4, r"poses\[0\].position.x: the message ends"),
         ("sensor_msgs/Image", bytes(36) + b"\xff" * 4, "the message ends"),
         ("std_msgs/Empty", b"x", "std_msgs/Empty: 1 bytes too many"),
@@ -202,6 +203,32 @@ def test_unfit_value_is_refused_by_its_field(name: str, values: Any, text: str) 
 def test_a_wrong_buffer_is_refused_by_the_name_of_the_field(name: str, payload: bytes, text: str) -> None:
     with pytest.raises(SerializationError, match=text):
         TYPES.message(name).deserialize(payload)
+
+
+def test_text_that_is_not_utf8_is_read_with_replacements(caplog: pytest.LogCaptureFixture) -> None:
+    """As rospy does: a driver's text in Latin-1 does not cost the whole message. Logged once for the type."""
+    text = b"\x04\0\0\0caf\xe9"
+    kind = TYPES.from_definition(
+        "mine/Texts",
+        "string one\nstring[] many\nNested[] nested\nint8 last\n"
+        f"{SEPARATOR}\nMSG: mine/Nested\nstring text\n",
+    )
+    payload = text + b"\x02\0\0\0" + text * 2 + b"\x01\0\0\0" + text + b"\x07"
+    for _ in range(2):
+        message = kind.deserialize(payload)
+        assert (message.one, message.many) == ("caf\ufffd", ["caf\ufffd"] * 2)
+        assert (message.nested[0].text, message.last) == ("caf\ufffd", 7)
+    assert caplog.text.count("a string of a mine/Texts is not UTF-8") == 1
+    with pytest.raises(SerializationError, match="last: the message ends"):
+        kind.deserialize(payload[:-1])
+    assert kind.deserialize(kind.serialize(message)).one == "caf\ufffd"
+
+
+def test_cut_text_is_refused_and_not_logged(caplog: pytest.LogCaptureFixture) -> None:
+    kind = TYPES.from_definition("mine/Text", "string text\n")
+    with pytest.raises(SerializationError, match="text: the message ends"):
+        kind.deserialize(b"\x05\0\0\0caf\xc3")
+    assert "UTF-8" not in caplog.text
 
 
 def test_a_hostile_length_of_empty_messages_costs_nothing() -> None:
