@@ -15,6 +15,7 @@ from typing import Self, cast
 import h11
 
 from rce.aio.servers import close_servers, open_server
+from rce.dialing import set_keepalive
 from rce.ros.closing import OpenConnections
 from rce.ros.xmlrpc.dispatch import Dispatcher
 
@@ -85,6 +86,7 @@ class _Connection(asyncio.Protocol):
             _log.warning("more than %d connections: one is turned away", MAX_CONNECTIONS)
             self._transport.abort()
             return
+        set_keepalive(transport.get_extra_info("socket"), idle=60, interval=10, count=9)
         self._siblings.add(self)
 
     def connection_lost(self, error: Exception | None) -> None:

@@ -4,11 +4,31 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from pathlib import Path
 
 from rce.dialing import open_socket
 from rce.ros.node.input_link import HeaderReader
 from rce.ros.tcpros.connection import Connection
 from rce.ros.tcpros.framing import SCRATCH_SIZE
+from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
+
+
+def options_of(sock: socket.socket) -> list[int]:
+    """Return whether a socket is kept alive, and the seconds and number of questions."""
+    return [
+        sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE),
+        *(
+            sock.getsockopt(socket.IPPROTO_TCP, option)
+            for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+        ),
+    ]
+
+
+def waits_to_ask(port: int) -> bool:
+    """Return whether the system will ask the peer of a server's connection, by its table of connections."""
+    rows = (line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:])
+    (timer,) = (row[5] for row in rows if row[1] == f"0100007F:{port:04X}" and row[2] != "00000000:0000")
+    return timer.startswith("02:")
 
 
 class Open(Connection):
@@ -16,14 +36,19 @@ class Open(Connection):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
-        sock = transport.get_extra_info("socket")
-        self.options = [
-            sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE),
-            *(
-                sock.getsockopt(socket.IPPROTO_TCP, option)
-                for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
-            ),
-        ]
+        self.options = options_of(transport.get_extra_info("socket"))
+
+
+async def test_api_asks_a_silent_client() -> None:
+    """Clients that lost their network would fill the table of a core's connections."""
+    async with (
+        RpcServer(Dispatcher({"get": lambda _: (1, "", 0)}), "127.0.0.1") as server,
+        RpcClient() as rpc,
+        asyncio.timeout(60),
+    ):
+        await rpc.call(f"http://127.0.0.1:{server.port}/", "get", ("/a",))
+        while not waits_to_ask(server.port):  # until its answer is acknowledged
+            await asyncio.sleep(0.01)
 
 
 async def test_both_ends_ask_a_silent_peer() -> None:
