@@ -17,6 +17,7 @@ from support.multimaster import STRING, DiscoveryNetwork, node
 from rce.ros.core import Core, Graph
 from rce.ros.errors import ServiceFaultError
 from rce.ros.multimaster.filters import SyncLists
+from rce.ros.multimaster.relay.frames import PROTOCOL
 from rce.ros.multimaster.relay.link import UNAUTHENTICATED_PER_ADDRESS
 from rce.ros.multimaster.relay.throttle import MessageThrottle
 from rce.ros.multimaster.relay.topic import TopicRelay
@@ -269,6 +270,53 @@ async def test_another_token_is_refused(caplog: pytest.LogCaptureFixture) -> Non
         assert "/said" not in cloud.graph.topic_types
 
 
+@asynccontextmanager
+async def sync_of(core: Core, **settings: Any) -> AsyncIterator[MasterSync]:
+    async with MasterSync(SyncSettings(core.uri, relay_token="t", **settings)) as sync:
+        yield sync
+
+
+async def until_linked(sync: MasterSync, *names: str) -> None:
+    async with asyncio.timeout(60):
+        while sync._links.connected != set(names):
+            await asyncio.sleep(0.02)
+
+
+async def test_links_are_taken_after_a_proof_that_is_no_text() -> None:
+    """Half a surrogate pair, which JSON can carry and UTF-8 cannot."""
+    async with (
+        Core(port=0) as cloud,
+        Core(port=0) as robot,
+        sync_of(cloud, relay_listen=0, relay_addr="127.0.0.1", relay_name="cloud") as one,
+    ):
+        reader, writer = await asyncio.open_connection("127.0.0.1", one.relay_port)
+        hello = {"protocol": PROTOCOL, "name": "stranger", "nonce": "ab" * 32, "proof": ""}
+        writer.write(greeting("H", hello) + greeting("R", {"proof": "\ud800"}))
+        await read_all(reader)
+        writer.close()
+        async with sync_of(robot, relay_to=(("127.0.0.1", one.relay_port),), relay_name="robot") as other:
+            await until_linked(one, "robot")
+            await until_linked(other, "cloud")
+
+
+async def test_dialing_goes_on_after_a_false_server() -> None:
+    came: asyncio.Queue[None] = asyncio.Queue()
+
+    async def lie(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        came.put_nowait(None)
+        hello = {"protocol": PROTOCOL, "name": "cloud", "nonce": "", "proof": "\ud800"}
+        writer.write(greeting("N", {"nonce": "ab" * 32}) + greeting("H", hello))
+        await read_all(reader)
+        writer.close()
+
+    server = await asyncio.start_server(lie, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    async with server, Core(port=0) as robot, sync_of(robot, relay_to=(("127.0.0.1", port),)):
+        async with asyncio.timeout(60):
+            await came.get()
+            await came.get()
+
+
 async def read_all(reader: asyncio.StreamReader) -> bytes:
     """Read until the connection ends, however it does."""
     try:
@@ -291,7 +339,9 @@ async def test_stranger_learns_nothing_but_a_nonce(says: str, caplog: pytest.Log
         if says == "the old hello":
             writer.write(greeting("H", {"protocol": 1, "name": "stranger", "token": ""}))
         elif says != "nothing":
-            writer.write(greeting("H", {"protocol": 2, "name": "stranger", "nonce": "ab" * 32, "proof": ""}))
+            writer.write(
+                greeting("H", {"protocol": PROTOCOL, "name": "stranger", "nonce": "ab" * 32, "proof": ""})
+            )
         if "proof" in says:
             writer.write(greeting("R", {"proof": "00" * 32}))
         answer = await read_all(reader)

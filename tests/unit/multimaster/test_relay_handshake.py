@@ -6,7 +6,7 @@ import pytest
 
 from rce.ros.multimaster.errors import LinkBrokenError, MultimasterError
 from rce.ros.multimaster.relay.frames import MAX_GREETING, Decoder, Frame, Hello, Ping, Proof, encode
-from rce.ros.multimaster.relay.handshake import DialerHandshake, ListenerHandshake
+from rce.ros.multimaster.relay.handshake import MAX_NAME, DialerHandshake, ListenerHandshake
 from rce.ros.multimaster.relay.link import check_listening
 from rce.ros.multimaster.sync import SyncSettings
 
@@ -75,6 +75,29 @@ def test_recorded_proof_is_of_no_use() -> None:
     another.challenge(begin)
     with pytest.raises(LinkBrokenError, match="another token"):
         another.finish(recorded)
+
+
+@pytest.mark.parametrize("proof", ["", "\ud800", "\u00fc" * 64, "0" * 63])
+def test_proof_that_is_no_digest_is_a_wrong_one(proof: str) -> None:
+    dialing, listening = DialerHandshake("robot", "secret"), ListenerHandshake("cloud", "secret")
+    challenge = listening.challenge(dialing.begin())
+    with pytest.raises(LinkBrokenError, match="robot has another token"):
+        listening.finish(Proof(proof))
+    dialing.prove(challenge)
+    with pytest.raises(LinkBrokenError, match="cloud has another token"):
+        dialing.finish(Hello("cloud", proof=proof))
+
+
+@pytest.mark.parametrize("name", ["x" * (MAX_NAME + 1), "a\nb", "\x1b[31mred"])
+def test_name_that_cannot_be_logged_is_refused(name: str) -> None:
+    """It comes from a peer that has not proved anything, and goes to the log."""
+    with pytest.raises(LinkBrokenError, match="name is too long or has control characters"):
+        ListenerHandshake("cloud", "secret").challenge(DialerHandshake(name, "secret").begin())
+
+
+def test_token_from_the_environment_may_be_any_bytes() -> None:
+    token = b"\xff\xfe".decode(errors="surrogateescape")
+    assert greet(DialerHandshake("robot", token), ListenerHandshake("cloud", token)) == ("cloud", "robot")
 
 
 def test_own_connection_is_refused() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import struct
 
 import pytest
 from hypothesis import given
@@ -75,6 +76,37 @@ def test_any_bytes_are_frames_or_break_the_link(stream: bytes) -> None:
 )
 def test_broken_frames(stream: bytes) -> None:
     with pytest.raises(LinkBrokenError):
+        list(Decoder().feed(stream))
+
+
+@pytest.mark.parametrize(
+    ("kind", "body"),
+    [
+        ("H", '{"protocol":Infinity,"name":"x"}'),
+        ("H", '{"protocol":1e999,"name":"x"}'),
+        ("H", '{"protocol":NaN,"name":"x"}'),
+        ("H", '{"protocol":2,"name":["x"]}'),
+        ("H", '{"protocol":2,"name":"\\ud800"}'),
+        ("N", '{"nonce":"\\udfff"}'),
+        ("N", '{"nonce":null}'),
+        ("R", '{"proof":"\\ud800"}'),
+        ("R", '{"proof":' + "[" * 1000 + "}"),
+        ("W", "[Infinity]"),
+        ("W", "[-1]"),
+        ("W", "[4294967296]"),
+        ("W", "[1.5]"),
+        ("W", "7"),
+        ("O", '{"topics":[[Infinity,"/a","t","m","d"]],"services":[]}'),
+        ("O", '{"topics":[[4294967296,"/a","t","m","d"]],"services":[]}'),
+        ("O", '{"topics":[[1,"/a","t","m","\\ud800"]],"services":[]}'),
+        ("O", '{"topics":[[1,"/a","t","m"]],"services":[]}'),
+        ("O", '{"topics":[],"services":[[-1,"/a","t","m","q","r"]]}'),
+        ("O", '{"topics":[],"services":[[1,null,"t","m","q","r"]]}'),
+    ],
+)
+def test_values_that_no_side_sends_break_the_link(kind: str, body: str) -> None:
+    stream = struct.pack("<IB", 1 + len(body), ord(kind)) + body.encode()
+    with pytest.raises(LinkBrokenError, match="cannot be read"):
         list(Decoder().feed(stream))
 
 

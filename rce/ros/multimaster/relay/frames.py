@@ -37,6 +37,8 @@ MAX_FRAME_SIZE = MAX_FRAME + 64
 """Bytes of the longest frame."""
 MAX_GREETING = 4096
 """Bytes of a frame of the handshake."""
+_MAX_NUMBER = 2**32 - 1
+"""Highest number of a topic, service or call."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,31 +227,54 @@ def _decode(code: bytes, body: bytes) -> Frame:
                 return Ping()
             case _:
                 return _decode_json(code, json.loads(body))
-    except (struct.error, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except (
+        struct.error,
+        ValueError,
+        TypeError,
+        KeyError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+    ) as error:
         raise LinkBrokenError(f"a frame {code!r} that cannot be read: {error}") from error
 
 
 def _decode_json(code: bytes, values: Any) -> Frame:
     match code:
         case Hello.CODE:
-            nonce, proof = str(values.get("nonce", "")), str(values.get("proof", ""))
-            return Hello(str(values["name"]), nonce, proof, int(values["protocol"]))
+            nonce, proof = _text(values.get("nonce", "")), _text(values.get("proof", ""))
+            return Hello(_text(values["name"]), nonce, proof, _number(values["protocol"]))
         case Challenge.CODE:
-            return Challenge(str(values["nonce"]))
+            return Challenge(_text(values["nonce"]))
         case Proof.CODE:
-            return Proof(str(values["proof"]))
+            return Proof(_text(values["proof"]))
         case Want.CODE:
-            return Want(frozenset(map(int, values)))
+            return Want(frozenset(map(_number, values)))
         case Offer.CODE:
             topics = {
-                int(key): (str(name), TopicKind(*map(str, kind))) for key, name, *kind in values["topics"]
+                _number(key): (_text(name), TopicKind(*map(_text, kind)))
+                for key, name, *kind in values["topics"]
             }
             services = {
-                int(key): (str(name), ServiceKind(*map(str, kind))) for key, name, *kind in values["services"]
+                _number(key): (_text(name), ServiceKind(*map(_text, kind)))
+                for key, name, *kind in values["services"]
             }
             return Offer(topics, services)
         case _:
             raise ValueError("an unknown kind of frame")
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"expected a text, found {type(value).__name__}")
+    value.encode()  # JSON can carry half a surrogate pair, which no other part can write
+    return value
+
+
+def _number(value: Any) -> int:
+    if not isinstance(value, int) or not 0 <= value <= _MAX_NUMBER:
+        raise ValueError(f"expected a number of 0 to {_MAX_NUMBER}")
+    return value
 
 
 def _json(values: Any) -> bytes:

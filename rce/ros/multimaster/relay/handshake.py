@@ -19,10 +19,13 @@ import hmac
 import json
 import secrets
 
+from rce.printable import one_line
 from rce.ros.multimaster.errors import LinkBrokenError
 from rce.ros.multimaster.relay.frames import PROTOCOL, Challenge, Frame, Hello, Proof
 
 NONCE_BYTES = 32
+MAX_NAME = 255
+"""Characters of a side's name."""
 _DIALING, _LISTENING = "dialing", "listening"
 
 
@@ -51,7 +54,7 @@ class DialerHandshake:
             LinkBrokenError: The other side does not speak this protocol.
         """
         if isinstance(frame, Hello):
-            _check_protocol(frame)
+            _check_hello(frame)
         if not isinstance(frame, Challenge) or not _is_nonce(frame.nonce):
             raise LinkBrokenError("the other side does not begin with a challenge")
         self._theirs = frame.nonce
@@ -65,7 +68,7 @@ class DialerHandshake:
         """
         if not isinstance(frame, Hello):
             raise LinkBrokenError("the other side does not answer with a hello")
-        _check_protocol(frame)
+        _check_hello(frame)
         wanted = _sign(self._token, _LISTENING, self.nonce, self._theirs, self._name, frame.name)
         _compare(wanted, frame.proof, frame.name)
         return frame.name
@@ -95,7 +98,7 @@ class ListenerHandshake:
         """
         if not isinstance(frame, Hello):
             raise LinkBrokenError("the other side does not begin with a hello")
-        _check_protocol(frame)
+        _check_hello(frame)
         if not _is_nonce(frame.nonce):
             raise LinkBrokenError(f"{frame.name} sends no nonce of {NONCE_BYTES} bytes")
         if frame.nonce in self._own:
@@ -121,7 +124,9 @@ class ListenerHandshake:
         return name, Hello(self._name, proof=proof)
 
 
-def _check_protocol(hello: Hello) -> None:
+def _check_hello(hello: Hello) -> None:
+    if len(hello.name) > MAX_NAME or one_line(hello.name) != hello.name:
+        raise LinkBrokenError("the other side's name is too long or has control characters")
     if hello.protocol != PROTOCOL:
         raise LinkBrokenError(
             f"{hello.name} speaks relay protocol {hello.protocol}, not {PROTOCOL}; update the older rce"
@@ -129,12 +134,12 @@ def _check_protocol(hello: Hello) -> None:
 
 
 def _compare(wanted: str, given: str, name: str) -> None:
-    if not hmac.compare_digest(wanted.encode(), given.encode("utf-8", "surrogateescape")):
+    if not given.isascii() or not hmac.compare_digest(wanted, given):
         raise LinkBrokenError(f"{name} has another token; give both sides the same --relay-token")
 
 
 def _sign(token: str, *said: str) -> str:
-    return hmac.digest(token.encode(), json.dumps(said).encode(), "sha256").hex()
+    return hmac.digest(token.encode(errors="surrogateescape"), json.dumps(said).encode(), "sha256").hex()
 
 
 def _is_nonce(text: str) -> bool:

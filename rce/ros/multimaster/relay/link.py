@@ -147,6 +147,8 @@ class RelayLinks:
                     name = await greet(link)
             except TimeoutError as error:
                 raise LinkBrokenError("the other side does not say who it is") from error
+            except (ValueError, TypeError, ArithmeticError, LookupError) as error:
+                raise LinkBrokenError(f"a handshake that cannot be understood: {error}") from error
             link.become_known()
             await self._run(link, name)
         finally:
