@@ -6,7 +6,8 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from rce.ros.errors import MasterError, ServiceError, XmlRpcError
+from rce.printable import one_line
+from rce.ros.errors import RosError, XmlRpcError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.errors import MalformedStateError
 from rce.ros.multimaster.filters import SyncFilter
@@ -25,6 +26,9 @@ STATE_TIMEOUT = 20.0
 ORIGINS_TIMEOUT = 3.0
 """Seconds that others may take to answer."""
 
+MAX_TEXT = 1024
+"""Characters of a URI or name in a contact."""
+
 SYNC_INFO = "get_sync_info"
 
 
@@ -39,11 +43,17 @@ async def ask_contact(rpc: RpcClient, key: PeerKey) -> Contact:
         stamp, master_uri, name, node, _ = answer
         if float(stamp) == 0:
             raise MalformedStateError(f"the discovery at {key.monitor_uri} does not know its master yet")
-    except (XmlRpcError, TypeError, ValueError) as error:
+        return Contact(_text(master_uri), _text(name), _text(node))
+    except (XmlRpcError, TypeError, ValueError, OverflowError) as error:
         raise MalformedStateError(
             f"the discovery at {key.monitor_uri} does not say who it is: {error}"
         ) from error
-    return Contact(str(master_uri), str(name), str(node))
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or len(value) > MAX_TEXT or one_line(value) != value:
+        raise TypeError("a URI or name is not a text, is too long or has control characters")
+    return value
 
 
 async def ask_state(rpc: RpcClient, monitor_uri: str, chosen: SyncFilter) -> MasterInfo:
@@ -90,7 +100,7 @@ class OriginsReader:
             self._clients[service] = client
         try:
             answer = await client.call({}, timeout=ORIGINS_TIMEOUT)
-        except (ServiceError, MasterError, SerializationError) as error:
+        except (RosError, SerializationError) as error:
             _log.warning("what is registered by others is not known: %s", error)
             return []
         return list(answer.hosts)

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from rce.ros.core import Core, GraphWatch
 from rce.ros.errors import MasterUnreachableError, XmlRpcError
-from rce.ros.multimaster.state import Names
+from rce.ros.multimaster.state import Names, read_names
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc.dispatch import SUCCESS
 
@@ -64,8 +64,10 @@ class RpcSource:
         """
         state, types, pid = await self._many([("getSystemState",), ("getTopicTypes",), ("getPid",)])
         try:
-            publishers, subscribers, services = (_names(part) for part in state)
-            topic_types = {topic: kind for topic, kind in types if isinstance(kind, str)}
+            publishers, subscribers, services = (read_names(part) for part in state)
+            topic_types = {
+                topic: kind for topic, kind in types if isinstance(topic, str) and isinstance(kind, str)
+            }
         except (TypeError, ValueError) as error:
             raise MasterUnreachableError(self._master.uri, "its state has no known form") from error
         nodes = sorted(
@@ -164,7 +166,7 @@ class CoreSource:
     async def read(self) -> Snapshot:
         """Read everything; never fails."""
         graph = self._core.graph
-        publishers, subscribers, services = (_names(part) for part in graph.system_state())
+        publishers, subscribers, services = (read_names(part) for part in graph.system_state())
         addresses = {name: graph.service(name) for name in services}
         return Snapshot(
             publishers,
@@ -200,10 +202,6 @@ async def open_source(master: MasterClient, core: Core | None) -> AsyncIterator[
         return
     with core.watch() as watch:
         yield CoreSource(core, watch)
-
-
-def _names(part: Any) -> dict[str, tuple[str, ...]]:
-    return {name: tuple(nodes) for name, nodes in part}
 
 
 def _known(names: Sequence[str], uris: Sequence[Any]) -> dict[str, str]:

@@ -145,9 +145,9 @@ class MasterInfo:
                 _text(name),
                 Stamp.from_seconds(float(stamp)),
                 Stamp.from_seconds(float(local)),
-                _names(publishers),
-                _names(subscribers),
-                _names(services),
+                read_names(publishers),
+                read_names(subscribers),
+                read_names(services),
                 {_text(topic): _text(kind) for topic, kind in types if kind and kind not in _NO_TYPES},
                 _providers(nodes),
                 _providers(providers),
@@ -159,6 +159,16 @@ class MasterInfo:
 def stamp_text(stamp: Stamp) -> str:
     """Write a stamp as the RPC methods do: seconds with nine decimals."""
     return f"{stamp.secs}.{stamp.nsecs:09d}"
+
+
+def read_names(entries: Any) -> dict[str, tuple[str, ...]]:
+    """Read ``[[name, [node, ...]], ...]``.
+
+    Raises:
+        TypeError: A name is not a text, or this is not a list.
+        ValueError: An entry is not a pair.
+    """
+    return {_text(name): tuple(_text(node) for node in nodes) for name, nodes in entries}
 
 
 def host_of(uri: str) -> str:
@@ -180,12 +190,8 @@ def _place(provider: Provider) -> str:
 
 def _text(value: Any) -> str:
     if not isinstance(value, str):
-        raise TypeError(f"{value!r} is not a text")
+        raise TypeError(f"expected a text, found {type(value).__name__}")
     return value
-
-
-def _names(entries: Any) -> dict[str, tuple[str, ...]]:
-    return {_text(name): tuple(_text(node) for node in nodes) for name, nodes in entries}
 
 
 def _providers(entries: Any) -> dict[str, Provider]:

@@ -11,10 +11,9 @@ from types import TracebackType
 from typing import Any, Self
 
 from rce.aio.tasks import TaskScope
-from rce.ros.errors import MasterError, ServiceError
+from rce.ros.errors import MasterError, RosError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.addresses import master_name
-from rce.ros.multimaster.errors import NoDiscoveryError
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.listing import masters_known_at
 from rce.ros.multimaster.peer_table import Neighbour, PeerChange, PeerEvent
@@ -175,7 +174,7 @@ class MasterSync:
                 await self._listen_for_changes()
                 masters = await masters_known_at(self._node, self._master)
                 self._own_uri = await self._ask_own_uri()
-            except (NoDiscoveryError, ServiceError, MasterError, TypesError) as error:
+            except (RosError, TypesError) as error:
                 if has_discovery:
                     _log.warning("%s", error)
                 has_discovery = False

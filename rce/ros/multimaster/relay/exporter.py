@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rce.aio.tasks import TaskScope
-from rce.ros.errors import MasterError, ServiceError
+from rce.ros.errors import MasterError, RosError, ServiceError
 from rce.ros.multimaster.errors import NothingToRelayError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.relay.frames import Answer, Call, Data, Frame, Offer, Want
@@ -202,7 +202,7 @@ class Exporter:
         try:
             response = await self._client(call.service).call_serialized(call.payload, timeout=CALL_TIMEOUT)
             self._send(Answer(call.call, ok=True, payload=response))
-        except (ServiceError, MasterError, NothingToRelayError) as error:
+        except RosError as error:
             text = error.text if isinstance(error, ServiceError) else str(error)
             self._send(Answer(call.call, ok=False, payload=text.encode()))
         finally:

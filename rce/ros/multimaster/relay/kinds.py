@@ -85,7 +85,7 @@ async def learn_topic(rpc: RpcClient, caller: str, topic: str, publishers: Itera
                     host, port, {"callerid": caller, "topic": topic, "type": ANY, "md5sum": ANY}
                 )
             return TopicKind(fields["type"], fields["md5sum"], fields.get("message_definition", ""))
-        except (TcprosError, XmlRpcError, OSError, EOFError, KeyError) as error:
+        except (TcprosError, XmlRpcError, OSError, EOFError, KeyError, ValueError, OverflowError) as error:
             reason = f"{uri}: {str(error) or type(error).__name__}"
     raise NothingToRelayError(f"the type of {topic} cannot be learned: {reason}")
 
@@ -103,9 +103,8 @@ async def learn_service(caller: str, service: str, uri: str) -> ServiceKind:
     """
     header = {"callerid": caller, "service": service, "md5sum": ANY, "probe": "1"}
     try:
-        parts = urlsplit(uri)
         async with asyncio.timeout(PROBE_TIMEOUT):
-            fields = await _greet(parts.hostname or "", parts.port or 0, header)
+            fields = await _greet(*_service_address(uri), header)
         name = fields["type"]
         return ServiceKind(
             name,
@@ -113,11 +112,18 @@ async def learn_service(caller: str, service: str, uri: str) -> ServiceKind:
             fields.get("request_type", f"{name}Request"),
             fields.get("response_type", f"{name}Response"),
         )
-    except (TcprosError, OSError, EOFError, KeyError, ValueError) as error:
+    except (TcprosError, OSError, EOFError, KeyError, ValueError, OverflowError) as error:
         reason = str(error) or type(error).__name__
         raise NothingToRelayError(
             f"the type of service {service} cannot be learned: {uri}: {reason}"
         ) from error
+
+
+def _service_address(uri: str) -> tuple[str, int]:
+    parts = urlsplit(uri)
+    if not parts.hostname or not parts.port:
+        raise TcprosError("not a URI of the form rosrpc://host:port")
+    return parts.hostname, parts.port
 
 
 async def _greet(host: str, port: int, header: Mapping[str, str]) -> dict[str, str]:
