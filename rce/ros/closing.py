@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import Generic, Protocol, TypeVar
+from collections.abc import Coroutine, Iterable
+from typing import Any, Generic, Protocol, TypeVar
 
-from rce.ros.errors import MasterError
+from rce.aio.tasks import cancel_and_wait
+from rce.ros.errors import MasterError, MasterUnreachableError
 
 CLOSE_TIMEOUT = 1.0
 """Seconds that peers may take to read written data before their connections are aborted."""
@@ -72,8 +74,8 @@ _log = logging.getLogger(__name__)
 class Handle(Protocol):
     """A publisher, subscriber or service of a node."""
 
-    async def close(self) -> None:
-        """Close the handle."""
+    def close(self) -> Coroutine[Any, Any, None]:
+        """Close the handle, then tell the master."""
 
 
 async def release(handle: Handle) -> None:
@@ -82,3 +84,22 @@ async def release(handle: Handle) -> None:
         await handle.close()
     except MasterError as error:
         _log.info("closed without telling the master: %s", error)
+
+
+async def release_all(handles: Iterable[Handle]) -> None:
+    """Close handles one after the other, as :func:`release` does.
+
+    A master that hangs is waited for once, not for each handle: the others are closed without telling it.
+    """
+    is_reachable = True
+    for handle in handles:
+        if is_reachable:
+            try:
+                await handle.close()
+            except MasterError as error:
+                _log.info("closed without telling the master: %s", error)
+                is_reachable = not isinstance(error, MasterUnreachableError)
+        else:
+            closing = asyncio.create_task(handle.close())
+            await asyncio.sleep(0)  # its first step closes the handle and begins to tell the master
+            await cancel_and_wait(closing)

@@ -7,15 +7,17 @@ import json
 import struct
 import sys
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 from support.multimaster import STRING, DiscoveryNetwork, node
 
 from rce.ros.core import Core, Graph
 from rce.ros.errors import ServiceFaultError
+from rce.ros.multimaster.discovery import Discovery
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.relay.frames import PROTOCOL
 from rce.ros.multimaster.relay.link import UNAUTHENTICATED_PER_ADDRESS
@@ -258,6 +260,71 @@ async def test_a_broken_link_takes_back_and_comes_back() -> None:
                     back = gone and (event.name, event.change.value) == ("/said", "publisher added")
                     if back:
                         break
+
+
+@pytest.mark.parametrize("what", ["the offer shrinks", "the link breaks"])
+async def test_link_outlives_a_master_that_is_away(what: str, caplog: pytest.LogCaptureFixture) -> None:
+    """It cannot tell that master what went away meanwhile; when it is back, everything is relayed."""
+    caplog.set_level("INFO", "rce.ros.closing")
+    async with AsyncExitStack() as cores, Core(port=0) as robot, node("base", robot.uri) as base:
+        cloud = await cores.enter_async_context(Core(port=0))
+        port = urlsplit(cloud.uri).port or 0
+        async with (
+            sync_of(cloud, relay_listen=0, relay_addr="127.0.0.1", relay_name="cloud") as one,
+            sync_of(robot, relay_to=(("127.0.0.1", one.relay_port),), relay_name="robot"),
+        ):
+            said = [await base.advertise(name, STRING) for name in ("said", "also")]
+            service = await base.advertise_service("clear", "roscpp/Empty", lambda _: None)
+            await cloud.wait_until(partial(_has_all, {"/said", "/also"}, "/clear"), timeout=30)
+            await cores.aclose()
+            if what == "the offer shrinks":
+                await said[0].close()
+                await service.close()
+            else:
+                (link,) = one._links._running
+                assert link._transport is not None
+                link._transport.abort()
+            async with asyncio.timeout(60):
+                while "closed without telling the master" not in caplog.text:
+                    await asyncio.sleep(0.02)
+            async with Core(port=port) as again:
+                if what == "the offer shrinks":
+                    await base.advertise("said", STRING)
+                    await base.advertise_service("clear", "roscpp/Empty", lambda _: None)
+                await again.wait_until(partial(_has_all, {"/said", "/also"}, "/clear"), timeout=60)
+                async with node("planner", again.uri) as planner:
+                    heard = await planner.subscribe("also", STRING)
+                    assert (await published_until_heard(said[1], heard, data="back")).data == "back"
+                    await planner.service_client("clear", "roscpp/Empty").call({}, timeout=20)
+
+
+def _has_all(topics: set[str], service: str, graph: Graph) -> bool:
+    return topics <= graph.topic_types.keys() and graph.service(service) is not None
+
+
+async def test_namespace_outlives_its_master(
+    network: DiscoveryNetwork, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "rce.ros.closing")
+    async with AsyncExitStack() as cores, network.machine(namespaces={"robot": "Robot1"}) as station:
+        core = await cores.enter_async_context(Core(port=0))
+        async with (
+            Discovery(network.settings(core.uri, name="robot")),
+            node("planner", station.uri) as planner,
+            node("base", core.uri) as base,
+        ):
+            await base.advertise("said", STRING)
+            goal = await planner.advertise("/Robot1/goal", STRING)
+            await station.until(lambda graph: "/Robot1/said" in graph.topic_types)
+            await core.wait_until(lambda graph: "/goal" in graph.topic_types, timeout=20)
+            await cores.aclose()
+            await goal.close()
+            async with asyncio.timeout(60):
+                while "closed without telling the master" not in caplog.text:
+                    await asyncio.sleep(0.02)
+            async with Core(port=urlsplit(core.uri).port or 0) as again:
+                await planner.advertise("/Robot1/other", STRING)
+                await again.wait_until(lambda graph: "/other" in graph.topic_types, timeout=60)
 
 
 async def test_another_token_is_refused(caplog: pytest.LogCaptureFixture) -> None:

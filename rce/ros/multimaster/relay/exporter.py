@@ -7,8 +7,9 @@ import logging
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from rce.aio.tasks import TaskScope
-from rce.ros.errors import MasterError, RosError, ServiceError
+from rce.aio.tasks import TaskScope, finish
+from rce.ros.closing import release_all
+from rce.ros.errors import InvalidNameError, RosError, ServiceError, TypeMismatchError
 from rce.ros.multimaster.errors import NothingToRelayError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.relay.frames import Answer, Call, Data, Frame, Offer, Want
@@ -74,6 +75,7 @@ class Exporter:
         self._clients: dict[int, ServiceClient] = {}
         self._changed = asyncio.Event()
         self._calls = 0
+        self._complained: set[str] = set()
 
     async def run(self) -> None:
         """Offer topics and services, and send the wanted messages, until cancelled."""
@@ -86,7 +88,7 @@ class Exporter:
                         next_look = loop.time() + PERIOD
                         await self._look()
                     await self._serve_wants()
-                except MasterError as error:
+                except RosError as error:
                     _log.info("%s", error)
                 try:
                     async with asyncio.timeout_at(next_look):
@@ -95,7 +97,7 @@ class Exporter:
                     continue
                 self._changed.clear()
         finally:
-            await self._close()
+            await finish(self._close())
 
     def take(self, frame: Frame) -> None:
         """Take a frame of the other end, if it is for this one."""
@@ -181,16 +183,19 @@ class Exporter:
     # Wanted messages and calls
 
     async def _serve_wants(self) -> None:
-        for number in self._subscribers.keys() - (self._wanted & self._names.keys()):
-            await self._subscribers.pop(number).close()
+        unwanted = self._subscribers.keys() - (self._wanted & self._names.keys())
+        await release_all(self._subscribers.pop(number) for number in unwanted)
         for number in self._clients.keys() - self._names.keys():
             await self._clients.pop(number).close()
         kinds = {number: (topic, kind) for topic, (number, kind) in self._topics.items()}
         for number in (self._wanted & kinds.keys()) - self._subscribers.keys():
             topic, kind = kinds[number]
-            self._subscribers[number] = await self._node.subscribe_serialized(
-                topic, kind.as_type(), self._sender(number)
-            )
+            try:
+                self._subscribers[number] = await self._node.subscribe_serialized(
+                    topic, kind.as_type(), self._sender(number)
+                )
+            except (InvalidNameError, TypeMismatchError) as error:
+                self._complain(f"topic {topic} is not relayed: {error}")
 
     def _sender(self, number: int) -> Callable[[bytes, bool], None]:
         def send(payload: bytes, latched: bool) -> None:
@@ -222,8 +227,9 @@ class Exporter:
     async def _close(self) -> None:
         for client in self._clients.values():
             await client.close()
-        try:
-            for subscriber in self._subscribers.values():
-                await subscriber.close()
-        except MasterError as error:
-            _log.info("the master does not learn that a relay ended: %s", error)
+        await release_all(self._subscribers.values())
+
+    def _complain(self, text: str) -> None:
+        if text not in self._complained:
+            self._complained.add(text)
+            _log.warning("%s", text)

@@ -7,6 +7,8 @@ import itertools
 import logging
 from collections.abc import Callable
 
+from rce.aio.tasks import finish
+from rce.ros.closing import release_all
 from rce.ros.errors import MasterError, RosError, ServiceFaultError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.relay.exporter import CALL_TIMEOUT, Rename
@@ -61,15 +63,15 @@ class Importer:
         try:
             while True:
                 self._changed.clear()
-                is_complete = await self._keep_topics() and await self._keep_services()
+                has_topics, has_services = await self._keep_topics(), await self._keep_services()
                 self._tell_wants()
                 try:
-                    async with asyncio.timeout(None if is_complete else RETRY):
+                    async with asyncio.timeout(None if has_topics and has_services else RETRY):
                         await self._changed.wait()
                 except TimeoutError:
                     continue
         finally:
-            await self._close()
+            await finish(self._close())
 
     def take(self, frame: Frame) -> None:
         """Take a frame of the other end, if it is for this one."""
@@ -107,10 +109,8 @@ class Importer:
 
     async def _keep_topics(self) -> bool:
         offered = self._offer.topics
-        for number, (name, kind, publisher) in list(self._topics.items()):
-            if offered.get(number) != (name, kind):
-                del self._topics[number]
-                await publisher.close()
+        gone = [number for number, known in self._topics.items() if offered.get(number) != known[:2]]
+        await release_all(self._topics.pop(number)[2] for number in gone)
         is_complete = True
         for number in offered.keys() - self._topics.keys():
             name, kind = offered[number]
@@ -133,10 +133,8 @@ class Importer:
 
     async def _keep_services(self) -> bool:
         offered = self._offer.services
-        for number, (name, kind, service) in list(self._services.items()):
-            if offered.get(number) != (name, kind):
-                del self._services[number]
-                await service.close()
+        gone = [number for number, known in self._services.items() if offered.get(number) != known[:2]]
+        await release_all(self._services.pop(number)[2] for number in gone)
         is_complete = True
         for number in offered.keys() - self._services.keys():
             name, kind = offered[number]
@@ -182,13 +180,11 @@ class Importer:
         for waiting in self._calls.values():
             if not waiting.done():
                 waiting.set_exception(ServiceFaultError("", "the relay was closed"))
-        try:
-            for _, _, publisher in self._topics.values():
-                await publisher.close()
-            for _, _, service in self._services.values():
-                await service.close()
-        except MasterError as error:
-            _log.info("the master does not learn that a relay ended: %s", error)
+        # A message that still comes must not reach a closed publisher.
+        topics, self._topics = self._topics, {}
+        services, self._services = self._services, {}
+        publishers = [publisher for _, _, publisher in topics.values()]
+        await release_all([*publishers, *(service for _, _, service in services.values())])
 
     def _complain(self, text: str) -> None:
         if text not in self._complained:

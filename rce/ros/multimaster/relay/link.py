@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 from rce.aio.backoff import Backoff
 from rce.aio.servers import close_servers, open_server
-from rce.aio.tasks import TaskScope
+from rce.aio.tasks import TaskScope, errors_in
 from rce.dialing import open_socket
 from rce.guard import Lobby, LogThrottle
+from rce.ros.errors import RosError
 from rce.ros.multimaster.errors import LinkBrokenError, MultimasterError
 from rce.ros.multimaster.relay.connection import RelayConnection
 from rce.ros.multimaster.relay.exporter import Exporter
@@ -63,6 +64,14 @@ def check_listening(host: str, token: str) -> None:
             f"relay connections on {host or 'all addresses'} need a token: give --relay-token"
             " (or RCE_RELAY_TOKEN) at both ends, or listen on this machine only with --relay-addr 127.0.0.1"
         )
+
+
+def broken_by(group: ExceptionGroup[Exception]) -> LinkBrokenError:
+    """Turn the errors of a link's ends into the one that ends this link, and no other."""
+    error = next(errors_in(group))
+    if not isinstance(error, RosError | OSError):
+        _log.error("an end of a relay failed", exc_info=group)
+    return LinkBrokenError(f"an end of the relay failed: {str(error) or type(error).__name__}")
 
 
 class RelayLinks:
@@ -194,6 +203,8 @@ class RelayLinks:
                     await link.ended
                 finally:
                     link.stop()  # a scope that is being left must not be given new tasks
+        except ExceptionGroup as group:
+            raise broken_by(group) from group
         finally:
             self.connected.discard(name)
             self._running.discard(link)

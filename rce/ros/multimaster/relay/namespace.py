@@ -13,6 +13,7 @@ from rce.ros.multimaster.peer_table import Neighbour
 from rce.ros.multimaster.relay.exporter import Exporter
 from rce.ros.multimaster.relay.frames import Frame
 from rce.ros.multimaster.relay.importer import Importer
+from rce.ros.multimaster.relay.link import broken_by
 from rce.ros.multimaster.remote import Remote
 from rce.ros.names import SEPARATOR, canonical
 from rce.ros.node import Node
@@ -88,6 +89,8 @@ class NamespaceRemote(Remote):
             async with self._make_node() as there, TaskScope() as tasks:
                 remote = MasterClient(self.master.uri, there.name, there.uri, self._rpc)
                 await self._join(there, remote, tasks)
+        except ExceptionGroup as group:
+            _log.warning("the relay of %s ends: %s", self.master.name, broken_by(group))
         except (RosError, OSError, ValueError) as error:
             _log.warning("the relay of %s ends: %s", self.master.name, error)
 
