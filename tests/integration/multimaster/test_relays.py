@@ -86,6 +86,69 @@ async def test_what_is_latched_stays_latched(core: Core) -> None:
                     assert (await anext(aiter(heard))).data == "kept"
 
 
+async def heard_at_once(uri: str, topic: str, count: int) -> set[str]:
+    """Subscribe, and wait for so many messages, without any being published."""
+    async with node(f"late_{count}", uri) as late:
+        heard = aiter(await late.subscribe(topic, STRING))
+        async with asyncio.timeout(60):
+            return {(await anext(heard)).data for _ in range(count)}
+
+
+async def latching(core: Core, name: str, topic: str, nodes: AsyncExitStack) -> Publisher:
+    """A node that has latched its name."""
+    started = await nodes.enter_async_context(node(name, core.uri))
+    publisher = await started.advertise(topic, STRING, latch=True)
+    publisher.publish(data=name)
+    return publisher
+
+
+async def check_that_all_that_is_latched_is_heard(source: Core, target: str, topics: tuple[str, str]) -> None:
+    """Each of two publishers, by each of two subscribers; then no longer the one that ended."""
+    here, there = topics
+    async with AsyncExitStack() as nodes, AsyncExitStack() as brief:
+        one = await latching(source, "one", here, nodes)
+        await latching(source, "two", here, brief)
+        async with node("listener", target) as listener:
+            heard = aiter(await listener.subscribe(there, STRING))
+            async with asyncio.timeout(60):
+                assert {(await anext(heard)).data, (await anext(heard)).data} == {"one", "two"}
+            assert await heard_at_once(target, there, 2) == {"one", "two"}
+            await brief.aclose()
+            async with asyncio.timeout(60):
+                while "two" in await heard_before_a_mark(one, target, there):
+                    pass
+
+
+async def heard_before_a_mark(marking: Publisher, uri: str, topic: str) -> set[str]:
+    """Return what a new subscriber is given before something that is published then."""
+    found: set[str] = set()
+    async with node("asking", uri) as asking:
+        subscriber = await asking.subscribe(topic, STRING)
+        await subscriber.wait_for_publishers(timeout=60)
+        mark = f"mark {id(subscriber)}"
+        marking.publish(data=mark)
+        while mark not in found:
+            found.add((await anext(aiter(subscriber))).data)
+    return found
+
+
+async def test_relay_keeps_what_each_publisher_latched(core: Core) -> None:
+    async with relaying(core, TopicRelay("from", "to")):
+        await check_that_all_that_is_latched_is_heard(core, core.uri, ("/from", "/to"))
+
+
+async def test_lazy_relay_forgets_what_nobody_listens_to(core: Core) -> None:
+    async with relaying(core, TopicRelay("from", "to", lazy=True)), node("talker", core.uri) as talker:
+        publisher = await talker.advertise("from", STRING, latch=True)
+        publisher.publish(data="old")
+        assert await heard_at_once(core.uri, "/to", 1) == {"old"}
+        async with asyncio.timeout(60):
+            while publisher.connections:
+                publisher.publish(data="new")
+                await asyncio.sleep(0.02)
+        assert await heard_at_once(core.uri, "/to", 1) == {"new"}
+
+
 async def test_a_lazy_relay_listens_only_while_somebody_listens_to_it(core: Core) -> None:
     async with (
         node("talker", core.uri) as talker,
@@ -240,6 +303,47 @@ async def test_a_link_brings_messages_only_while_somebody_listens() -> None:
             while said.connections:
                 said.publish(data="nobody listens")
                 await asyncio.sleep(0.02)
+
+
+async def test_link_keeps_what_each_publisher_latched() -> None:
+    async with linked() as (cloud, robot, _, _):
+        await check_that_all_that_is_latched_is_heard(robot, cloud.uri, ("/tf_static", "/tf_static"))
+
+
+async def test_link_forgets_what_nobody_listens_to() -> None:
+    """A later subscriber gets what is latched then, and not what was when somebody listened last."""
+    async with linked() as (cloud, robot, one, _), node("base", robot.uri) as base:
+        publisher = await base.advertise("said", STRING, latch=True)
+        publisher.publish(data="old")
+        assert await heard_at_once(cloud.uri, "/said", 1) == {"old"}
+        async with asyncio.timeout(60):
+            while publisher.connections:
+                publisher.publish(data="new")
+                await asyncio.sleep(0.02)
+            publisher.publish(data="newest")
+            (relayed,) = one._node._topics.outputs["/said"].publishers
+            while relayed.latched:
+                await asyncio.sleep(0.02)
+        assert await heard_at_once(cloud.uri, "/said", 1) == {"newest"}
+
+
+async def test_topic_of_both_sides_is_not_sent_back() -> None:
+    async with (
+        linked() as (cloud, robot, _, _),
+        node("planner", cloud.uri) as planner,
+        node("base", robot.uri) as base,
+    ):
+        first, second = await base.advertise("said", STRING), await planner.advertise("said", STRING)
+        at_robot, at_cloud = await base.subscribe("said", STRING), await planner.subscribe("said", STRING)
+        for subscriber in (at_robot, at_cloud):
+            await subscriber.wait_for_publishers(2, timeout=30)  # the one of that side, and the relay
+        for publisher in (first, second):
+            await publisher.wait_for_subscribers(2, timeout=30)
+        for word in ("one", "two", "three"):
+            first.publish(data=word)
+            async with asyncio.timeout(60):
+                assert (await anext(aiter(at_robot))).data == word
+                assert (await anext(aiter(at_cloud))).data == word
 
 
 async def test_a_broken_link_takes_back_and_comes_back() -> None:

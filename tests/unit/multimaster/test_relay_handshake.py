@@ -110,7 +110,7 @@ def test_own_connection_is_refused() -> None:
 def test_older_protocol_is_refused_by_both_sides() -> None:
     """It sent the token to every client that connected."""
     older = Hello("old", protocol=1)
-    with pytest.raises(LinkBrokenError, match="old speaks relay protocol 1, not 2; update the older rce"):
+    with pytest.raises(LinkBrokenError, match="old speaks relay protocol 1, not 3; update the older rce"):
         ListenerHandshake("cloud", "secret").challenge(older)
     with pytest.raises(LinkBrokenError, match="protocol 1"):
         DialerHandshake("robot", "secret").prove(older)

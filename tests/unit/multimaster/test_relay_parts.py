@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
+import socket
 import struct
 
 import pytest
@@ -10,7 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rce.ros.multimaster.errors import LinkBrokenError
+from rce.ros.multimaster.relay.connection import QUEUE, RelayConnection
 from rce.ros.multimaster.relay.frames import (
+    NO_SOURCE,
     Answer,
     Call,
     Challenge,
@@ -21,6 +25,7 @@ from rce.ros.multimaster.relay.frames import (
     Offer,
     Ping,
     Proof,
+    Sources,
     Want,
     encode,
 )
@@ -37,7 +42,8 @@ FRAMES: st.SearchStrategy[Frame] = st.one_of(
     st.builds(Challenge, TEXT),
     st.builds(Proof, TEXT),
     st.builds(Want, st.frozensets(NUMBERS, max_size=3)),
-    st.builds(Data, NUMBERS, st.booleans(), st.binary(max_size=50)),
+    st.builds(Data, NUMBERS, NUMBERS, st.binary(max_size=50)),
+    st.builds(Sources, NUMBERS, st.frozensets(NUMBERS, max_size=3)),
     st.builds(Call, NUMBERS, NUMBERS, st.binary(max_size=50)),
     st.builds(Answer, NUMBERS, st.booleans(), st.binary(max_size=50)),
     st.builds(Ping),
@@ -59,7 +65,7 @@ def test_frames_arrive_however_they_are_cut(frames: list[Frame], size: int) -> N
 
 def test_a_message_is_not_copied_on_its_way_out() -> None:
     payload = b"x" * 100_000
-    assert encode(Data(1, False, payload))[-1] is payload
+    assert encode(Data(1, NO_SOURCE, payload))[-1] is payload
 
 
 @given(st.binary(max_size=60))
@@ -68,6 +74,39 @@ def test_any_bytes_are_frames_or_break_the_link(stream: bytes) -> None:
         list(Decoder().feed(stream))
     except LinkBrokenError:
         return
+
+
+async def sent_by_a_full_connection(*frames: Frame) -> list[Frame]:
+    """Send frames over a connection that is full, then let it write; return what arrives."""
+    loop = asyncio.get_running_loop()
+    ours, theirs = socket.socketpair()
+    with theirs:
+        theirs.setblocking(False)
+        _, connection = await loop.create_connection(RelayConnection, sock=ours)
+        connection.pause_writing()
+        for frame in frames:
+            connection.send(frame)
+        connection.resume_writing()
+        connection.send(Ping())
+        decoder, found = Decoder(), list[Frame]()
+        while Ping() not in found:
+            found += decoder.feed(await loop.sock_recv(theirs, 65536))
+        connection.abort()
+        await connection.gone.wait()
+    return found[:-1]
+
+
+async def test_full_connection_keeps_latched_messages() -> None:
+    """A map that is published once outlives a stream of images."""
+    the_map, images = Data(1, 7, b"map"), [Data(2, NO_SOURCE, b"%d" % number) for number in range(200)]
+    assert await sent_by_a_full_connection(the_map, *images) == [the_map, *images[-QUEUE:]]
+
+
+async def test_full_connection_keeps_the_newest_of_each_source() -> None:
+    frames = [Data(1, source, b"%d" % number) for number in range(200) for source in (1, 2)]
+    found = await sent_by_a_full_connection(*frames, Sources(1, frozenset({2})))
+    assert found[-3:] == [*frames[-2:], Sources(1, frozenset({2}))]
+    assert len(found) <= QUEUE + 3
 
 
 @pytest.mark.parametrize(
@@ -96,6 +135,9 @@ def test_broken_frames(stream: bytes) -> None:
         ("W", "[4294967296]"),
         ("W", "[1.5]"),
         ("W", "7"),
+        ("S", "[1]"),
+        ("S", "[1,[Infinity]]"),
+        ("S", '["1",[]]'),
         ("O", '{"topics":[[Infinity,"/a","t","m","d"]],"services":[]}'),
         ("O", '{"topics":[[4294967296,"/a","t","m","d"]],"services":[]}'),
         ("O", '{"topics":[[1,"/a","t","m","\\ud800"]],"services":[]}'),

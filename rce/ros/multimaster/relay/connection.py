@@ -20,6 +20,7 @@ from rce.ros.multimaster.relay.frames import (
     Hello,
     Ping,
     Proof,
+    Sources,
     encode,
 )
 from rce.ros.node.settings import MAX_QUEUED_BYTES
@@ -29,7 +30,7 @@ SILENCE = 3.5
 """Seconds without a frame after which the other side counts as gone."""
 
 WRITE_HIGH = 2**20
-"""Bytes waiting to be sent from which on messages wait, the newest :data:`QUEUE` of them."""
+"""Bytes waiting to be sent from which on messages wait, the newest :data:`QUEUE` besides the latched ones."""
 
 QUEUE = 100
 MAX_BACKLOG = 16
@@ -65,16 +66,19 @@ class RelayConnection(asyncio.Protocol):
         self._early: list[Frame] = []
         self._backlog: list[Frame] = []
         self._decoder = Decoder(MAX_GREETING)
-        self._waiting: BoundedQueue[Data] = BoundedQueue(QUEUE, MAX_QUEUED_BYTES)
+        self._waiting: BoundedQueue[Data | Sources] = BoundedQueue(QUEUE, MAX_QUEUED_BYTES)
         self._full = False
         self._heard = loop.time()
 
     # For the owner
 
     def send(self, frame: Frame) -> None:
-        """Send a frame; a message waits, and may be dropped for newer ones, while the connection is full."""
-        if isinstance(frame, Data) and self._full:
-            self._waiting.put(frame, len(frame.payload))
+        """Send a frame; while the connection is full, a message waits, and may be dropped for newer ones.
+
+        A latched message is dropped only for a newer one of its source.
+        """
+        if self._full and isinstance(frame, Data | Sources):
+            self._waiting.put(frame, len(frame.payload) if isinstance(frame, Data) else 0, frame.key)
         elif self._transport is not None and not self._transport.is_closing():
             for piece in encode(frame):
                 self._transport.write(piece)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from rce.aio.tasks import TaskScope, finish
@@ -12,7 +13,7 @@ from rce.ros.closing import release_all
 from rce.ros.errors import InvalidNameError, RosError, ServiceError, TypeMismatchError
 from rce.ros.multimaster.errors import NothingToRelayError
 from rce.ros.multimaster.filters import SyncFilter
-from rce.ros.multimaster.relay.frames import Answer, Call, Data, Frame, Offer, Want
+from rce.ros.multimaster.relay.frames import NO_SOURCE, Answer, Call, Data, Frame, Offer, Sources, Want
 from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind, learn_service, learn_topic
 from rce.ros.multimaster.source import RpcSource, Snapshot
 from rce.ros.node import Node, ServiceClient, Subscriber
@@ -72,6 +73,8 @@ class Exporter:
         self._next = 0
         self._wanted: frozenset[int] = frozenset()
         self._subscribers: dict[int, Subscriber] = {}
+        self._senders: dict[int, _TopicSender] = {}
+        self._source_numbers = itertools.count(NO_SOURCE + 1)
         self._clients: dict[int, ServiceClient] = {}
         self._changed = asyncio.Event()
         self._calls = 0
@@ -185,23 +188,19 @@ class Exporter:
     async def _serve_wants(self) -> None:
         unwanted = self._subscribers.keys() - (self._wanted & self._names.keys())
         await release_all(self._subscribers.pop(number) for number in unwanted)
+        for number in unwanted:
+            self._senders.pop(number).end()
         for number in self._clients.keys() - self._names.keys():
             await self._clients.pop(number).close()
         kinds = {number: (topic, kind) for topic, (number, kind) in self._topics.items()}
         for number in (self._wanted & kinds.keys()) - self._subscribers.keys():
             topic, kind = kinds[number]
+            sender = _TopicSender(number, self._source_numbers, self._send)
             try:
-                self._subscribers[number] = await self._node.subscribe_serialized(
-                    topic, kind.as_type(), self._sender(number)
-                )
+                self._subscribers[number] = await self._node.listen(topic, kind.as_type(), sender)
+                self._senders[number] = sender
             except (InvalidNameError, TypeMismatchError) as error:
                 self._complain(f"topic {topic} is not relayed: {error}")
-
-    def _sender(self, number: int) -> Callable[[bytes, bool], None]:
-        def send(payload: bytes, latched: bool) -> None:
-            self._send(Data(number, latched, payload))
-
-        return send
 
     async def _call(self, call: Call) -> None:
         try:
@@ -233,3 +232,35 @@ class Exporter:
         if text not in self._complained:
             self._complained.add(text)
             _log.warning("%s", text)
+
+
+class _TopicSender:
+    """Sends the messages of one topic while it is subscribed to; numbers the sources of the latched ones."""
+
+    def __init__(self, topic: int, numbers: Iterator[int], send: Callable[[Frame], None]) -> None:
+        self._topic = topic
+        self._numbers = numbers
+        self._send = send
+        self._sources: dict[str, int] = {}
+
+    def received(self, payload: bytes) -> None:
+        """Send a message."""
+        self._send(Data(self._topic, NO_SOURCE, payload))
+
+    def received_latched(self, payload: bytes, source: str) -> None:
+        """Send a latched message."""
+        number = self._sources.get(source)
+        if number is None:
+            number = self._sources[source] = next(self._numbers)
+        self._send(Data(self._topic, number, payload))
+
+    def source_ended(self, source: str) -> None:
+        """Tell the other end that a publisher's latched message is void."""
+        if self._sources.pop(source, None) is not None:
+            self._send(Sources(self._topic, frozenset(self._sources.values())))
+
+    def end(self) -> None:
+        """Tell the other end that all are void: the next subscription brings those that are in force then."""
+        if self._sources:
+            self._sources.clear()
+            self._send(Sources(self._topic))

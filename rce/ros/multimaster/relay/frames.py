@@ -3,13 +3,14 @@
 A frame on the wire is its length (uint32, little-endian, of everything after it), one byte for its kind, and
 its body: JSON for rare frames, a fixed header and the untouched message for frequent ones::
 
-    H  hello     {"protocol": 2, "name": ..., "nonce": ..., "proof": ...}: see :mod:`.handshake`
+    H  hello     {"protocol": 3, "name": ..., "nonce": ..., "proof": ...}: see :mod:`.handshake`
     N  challenge {"nonce": ...}
     R  proof     {"proof": ...}
     O  offer     {"topics": [[id, name, type, md5sum, definition], ...],
                   "services": [[id, name, type, md5sum, request type, response type], ...]}: all there is now
     W  want      [topic id, ...]: all topics whose messages shall come now
-    D  data      uint32 topic id, uint8 latched, message
+    D  data      uint32 topic id, uint32 source (0: not latched), message
+    S  sources   [topic id, [source, ...]]: the sources of latched messages that are in force now
     C  call      uint32 service id, uint32 call id, request
     A  answer    uint32 call id, uint8 success, response (or the error's text)
     P  ping      nothing: the sender is there
@@ -27,10 +28,10 @@ from rce.ros.multimaster.errors import LinkBrokenError
 from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind
 from rce.ros.tcpros.framing import MAX_FRAME
 
-PROTOCOL = 2
+PROTOCOL = 3
 
 _HEAD = struct.Struct("<IB")
-_DATA = struct.Struct("<IB")
+_DATA = struct.Struct("<II")
 _CALL = struct.Struct("<II")
 _ANSWER = struct.Struct("<IB")
 MAX_FRAME_SIZE = MAX_FRAME + 64
@@ -38,7 +39,9 @@ MAX_FRAME_SIZE = MAX_FRAME + 64
 MAX_GREETING = 4096
 """Bytes of a frame of the handshake."""
 _MAX_NUMBER = 2**32 - 1
-"""Highest number of a topic, service or call."""
+"""Highest number of a topic, source, service or call."""
+NO_SOURCE = 0
+"""In place of a source: the message is not latched."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,12 +124,36 @@ class Data:
 
     CODE: ClassVar[bytes] = b"D"
     topic: int
-    latched: bool
+    source: int
+    """The publisher of a latched message, as the sender numbers it."""
     payload: bytes
 
     def body(self) -> tuple[bytes, ...]:
         """Write the body."""
-        return _DATA.pack(self.topic, self.latched), self.payload
+        return _DATA.pack(self.topic, self.source), self.payload
+
+    @property
+    def key(self) -> tuple[int, int] | None:
+        """Key under which a queue keeps it; None: it may be dropped."""
+        return None if self.source == NO_SOURCE else (self.topic, self.source)
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """The sources of a topic whose latched messages are in force; the messages of others are void."""
+
+    CODE: ClassVar[bytes] = b"S"
+    topic: int
+    sources: frozenset[int] = frozenset()
+
+    def body(self) -> tuple[bytes, ...]:
+        """Write the body."""
+        return (_json([self.topic, sorted(self.sources)]),)
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Key under which a queue keeps it."""
+        return self.topic, NO_SOURCE
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +197,7 @@ class Ping:
 
 Greeting = Hello | Challenge | Proof
 """A frame of the handshake."""
-Frame = Greeting | Offer | Want | Data | Call | Answer | Ping
+Frame = Greeting | Offer | Want | Data | Sources | Call | Answer | Ping
 
 
 def encode(frame: Frame) -> tuple[bytes, ...]:
@@ -215,8 +242,8 @@ def _decode(code: bytes, body: bytes) -> Frame:
     try:
         match code:
             case Data.CODE:
-                topic, latched = _DATA.unpack_from(body)
-                return Data(topic, bool(latched), body[_DATA.size :])
+                topic, source = _DATA.unpack_from(body)
+                return Data(topic, source, body[_DATA.size :])
             case Call.CODE:
                 service, call = _CALL.unpack_from(body)
                 return Call(service, call, body[_CALL.size :])
@@ -250,6 +277,9 @@ def _decode_json(code: bytes, values: Any) -> Frame:
             return Proof(_text(values["proof"]))
         case Want.CODE:
             return Want(frozenset(map(_number, values)))
+        case Sources.CODE:
+            topic, sources = values
+            return Sources(_number(topic), frozenset(map(_number, sources)))
         case Offer.CODE:
             topics = {
                 _number(key): (_text(name), TopicKind(*map(_text, kind)))

@@ -12,7 +12,7 @@ from rce.ros.closing import release_all
 from rce.ros.errors import MasterError, RosError, ServiceFaultError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.relay.exporter import CALL_TIMEOUT, Rename
-from rce.ros.multimaster.relay.frames import Answer, Call, Data, Frame, Offer, Want
+from rce.ros.multimaster.relay.frames import NO_SOURCE, Answer, Call, Data, Frame, Offer, Sources, Want
 from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind
 from rce.ros.node import Node, Publisher, Service
 from rce.ros.node.master import MasterClient
@@ -21,6 +21,9 @@ _log = logging.getLogger(__name__)
 
 RETRY = 1.0
 """Seconds until something that could not be advertised is tried again."""
+
+MAX_SOURCES = 1024
+"""Publishers of one topic whose latched messages are kept for later subscribers."""
 
 
 class Importer:
@@ -77,6 +80,8 @@ class Importer:
         """Take a frame of the other end, if it is for this one."""
         if isinstance(frame, Data):
             self._publish(frame)
+        elif isinstance(frame, Sources):
+            self._retain(frame)
         elif isinstance(frame, Answer):
             waiting = self._calls.get(frame.call)
             if waiting is not None and not waiting.done():
@@ -95,9 +100,22 @@ class Importer:
         if known is None:
             return
         publisher = known[2]
-        publisher.publish_serialized(data.payload, latch=data.latched)
+        if data.source == NO_SOURCE:
+            publisher.publish_serialized(data.payload)
+        else:
+            publisher.publish_serialized(data.payload, latch=True, source=str(data.source))
+            if len(publisher.latched) > MAX_SOURCES:
+                publisher.unlatch(next(iter(publisher.latched)))
         if publisher.connections == 0:
             self._changed.set()
+
+    def _retain(self, frame: Sources) -> None:
+        """Forget the latched messages of sources that are not in force any longer."""
+        known = self._topics.get(frame.topic)
+        if known is not None:
+            publisher = known[2]
+            for source in publisher.latched.keys() - set(map(str, frame.sources)):
+                publisher.unlatch(source)
 
     def _tell_wants(self) -> None:
         wanted = frozenset(

@@ -73,19 +73,37 @@ class TopicRelay:
             if self._lazy:
                 await self._publisher.wait_for_subscribers()
             self._idle.clear()
-            subscriber = await node.subscribe_serialized(
-                source, kind.as_type(), self._pass_on, queue_size=QUEUE
-            )
+            subscriber = await node.listen(source, kind.as_type(), self)
             await self._idle.wait()
             await subscriber.close()
+            if not self._latch:  # the next subscription brings the messages that are in force then
+                for origin in list(self._publisher.latched):
+                    self._publisher.unlatch(origin)
 
-    def _pass_on(self, payload: bytes, latched: bool) -> None:
+    # For the subscriber
+
+    def received(self, payload: bytes) -> None:
+        """Pass a message on."""
+        self._pass_on(payload)
+
+    def received_latched(self, payload: bytes, source: str) -> None:
+        """Pass a latched message on; it stays latched beside those of other publishers."""
+        self._pass_on(payload, latched=True, source=source)
+
+    def source_ended(self, source: str) -> None:
+        """Forget the latched message of a publisher that ended, unless the last one of all is kept anyway."""
+        if not self._latch:
+            self._publisher.unlatch(source)
+
+    # Inside
+
+    def _pass_on(self, payload: bytes, *, latched: bool = False, source: str = "") -> None:
         if self._lazy and self._publisher.connections == 0:
             self._idle.set()
             return
         if self._throttle.passes(asyncio.get_running_loop().time(), len(payload)):
             self.passed += 1
-            self._publisher.publish_serialized(payload, latch=latched)
+            self._publisher.publish_serialized(payload, latch=latched, source="" if self._latch else source)
         else:
             self.held_back += 1
 
