@@ -158,3 +158,23 @@ async def test_relay_outlives_a_publisher_without_a_port() -> None:
             await base.advertise("said", STRING)
             await cloud.wait_until(lambda graph: "/said" in graph.topic_types, timeout=30)
             assert "/nowhere" not in cloud.graph.topic_types
+
+
+async def test_namespaces_outlive_a_master_that_answers_true(
+    network: DiscoveryNetwork, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Also to the question for the publishers of a topic."""
+    async with (
+        answering(array("<int>1</int>", text(""), "<boolean>1</boolean>")) as master,
+        answering(array(text("5.0"), text(master), text("false"), *map(text, HONEST[3:]))) as false,
+        network.machine(namespaces={"*": "Far"}) as station,
+    ):
+        beat = Heartbeat(Kind.STATE, key_of(false).rpc_port, 1.0, Stamp(1, 0), Stamp(1, 0))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.sendto(beat.encode(), ("127.0.0.1", network.port))
+        async with asyncio.timeout(60):
+            while "the relay of false ends" not in caplog.text:
+                await asyncio.sleep(0.02)
+        async with network.machine(name="robot") as robot, node("base", robot.uri) as base:
+            await base.advertise("said", STRING)
+            await station.until(lambda graph: "/Far/said" in graph.topic_types, timeout=60)

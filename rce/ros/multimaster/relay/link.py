@@ -66,12 +66,12 @@ def check_listening(host: str, token: str) -> None:
         )
 
 
-def broken_by(group: ExceptionGroup[Exception]) -> LinkBrokenError:
-    """Turn the errors of a link's ends into the one that ends this link, and no other."""
-    error = next(errors_in(group))
+def broken_by(failure: Exception) -> LinkBrokenError:
+    """Turn the failure of an end, or a group of them, into the error that ends this link, and no other."""
+    error = next(errors_in(failure)) if isinstance(failure, ExceptionGroup) else failure
     if not isinstance(error, RosError | OSError):
-        _log.error("an end of a relay failed", exc_info=group)
-    return LinkBrokenError(f"an end of the relay failed: {str(error) or type(error).__name__}")
+        _log.error("an end of a relay failed", exc_info=failure)
+    return LinkBrokenError(str(error) or type(error).__name__)
 
 
 class RelayLinks:

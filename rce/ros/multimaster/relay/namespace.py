@@ -6,7 +6,6 @@ import asyncio
 import logging
 
 from rce.aio.tasks import TaskScope
-from rce.ros.errors import RosError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.peer_table import Neighbour
@@ -89,10 +88,8 @@ class NamespaceRemote(Remote):
             async with self._make_node() as there, TaskScope() as tasks:
                 remote = MasterClient(self.master.uri, there.name, there.uri, self._rpc)
                 await self._join(there, remote, tasks)
-        except ExceptionGroup as group:
-            _log.warning("the relay of %s ends: %s", self.master.name, broken_by(group))
-        except (RosError, OSError, ValueError) as error:
-            _log.warning("the relay of %s ends: %s", self.master.name, error)
+        except Exception as error:  # noqa: BLE001 - a master's answers must not end the relays of others
+            _log.warning("the relay of %s ends: %s", self.master.name, broken_by(error))
 
     def _make_node(self) -> Node:
         return Node(
