@@ -73,6 +73,7 @@ class Discovery:
         self._is_listening = False
         """Whether heartbeats are handled; earlier and later ones are ignored, as they are repeated."""
         self._last_request = 0.0
+        self._types = messages.registry()
         self._stack = AsyncExitStack()
         self._monitor: MasterMonitor
         self._node: Node
@@ -169,7 +170,7 @@ class Discovery:
             self.settings.node_name,
             argv=[],
             master_uri=self._master_uri,
-            types=messages.registry(),
+            types=self._types,
             master_timeout=None,
         )
 
@@ -196,7 +197,7 @@ class Discovery:
 
     def _md5sum(self, kind: str) -> str | None:
         try:
-            return messages.registry().message(kind).md5sum
+            return self._types.message(kind).md5sum
         except TypesError:
             return None
 

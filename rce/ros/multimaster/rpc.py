@@ -20,7 +20,7 @@ from rce.ros.xmlrpc.dispatch import Dispatcher
 _log = logging.getLogger(__name__)
 
 _FAULT = 1
-MAX_TYPES = 10_000
+MAX_TYPES = 1000
 """For how many types checksums may be asked at once."""
 
 PlainMethod = Callable[..., Any]
@@ -105,9 +105,12 @@ class DiscoveryApi:
         return [self.uri, False, time.time(), "this discovery does not set the machine's clock"]
 
     def _get_topics_md5sum(self, types: Any) -> list[list[str]]:
-        if not isinstance(types, list) or len(types) > MAX_TYPES:
+        if not isinstance(types, list):
             raise _RefusedError("a list of message types is needed")
-        pairs = [(kind, self.md5sum(kind)) for kind in types if isinstance(kind, str)]
+        asked = dict.fromkeys(kind for kind in types if isinstance(kind, str))
+        if len(asked) > MAX_TYPES:
+            raise _RefusedError(f"at most {MAX_TYPES} message types are answered at once, not {len(asked)}")
+        pairs = [(kind, self.md5sum(kind)) for kind in asked]
         return [[kind, md5sum] for kind, md5sum in pairs if md5sum is not None]
 
     def _known(self) -> MasterInfo:

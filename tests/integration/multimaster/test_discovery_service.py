@@ -14,11 +14,12 @@ from support.multimaster import STRING, DiscoveryNetwork, node
 from support.ports import free_ports
 
 from rce.ros.core import Core
-from rce.ros.errors import MasterUnreachableError
+from rce.ros.errors import MasterUnreachableError, RemoteFaultError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.discovery import Discovery
 from rce.ros.multimaster.errors import NoDiscoveryError
 from rce.ros.multimaster.listing import list_masters, masters_known_at
+from rce.ros.multimaster.rpc import MAX_TYPES
 from rce.ros.node import ServiceClient
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import RpcClient
@@ -100,6 +101,20 @@ async def test_masters_and_changes_are_shown_in_the_graph(network: DiscoveryNetw
                 assert pair == [STRING, "992ce8a1687cec8c8bd883ec73ca41d1"]
     with pytest.raises(MasterUnreachableError):
         await list_masters(a.uri)
+
+
+async def test_checksums_are_answered_from_definitions_read_before(
+    network: DiscoveryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Any host may ask for many: reading all definitions for each would stop the heartbeats meanwhile."""
+    async with Core(port=0) as core, Discovery(network.settings(core.uri)) as discovery, RpcClient() as rpc:
+        monkeypatch.delattr(messages, "registry")
+        asked = [STRING] * 2 * MAX_TYPES
+        pairs = await rpc.call(discovery.monitor_uri, "getTopicsMd5sum", (asked,))
+        assert pairs == [[STRING, "992ce8a1687cec8c8bd883ec73ca41d1"]]
+        many = [f"no/Such{number}" for number in range(MAX_TYPES + 1)]
+        with pytest.raises(RemoteFaultError, match="at most 1000 message types"):
+            await rpc.call(discovery.monitor_uri, "getTopicsMd5sum", (many,))
 
 
 async def test_installed_messages_of_fkie_win(
