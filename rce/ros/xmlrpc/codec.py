@@ -18,6 +18,9 @@ from rce.ros.errors import MalformedDocumentError, RemoteFaultError
 MAX_DEPTH = 200
 """How deep elements may be nested; each level of a list or dictionary costs four."""
 
+_DECIMAL = "bigdecimal"
+"""An extension that only Python's library reads. The short text 1e99999999 becomes an integer of 40 MB."""
+
 _HEAD = b"<?xml version='1.0'?>\n"
 _NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
@@ -96,6 +99,8 @@ def _parse(document: bytes) -> Unmarshaller:
         depth += 1
         if depth > MAX_DEPTH:
             raise MalformedDocumentError(f"elements are nested deeper than {MAX_DEPTH}")
+        if tag == _DECIMAL:
+            raise MalformedDocumentError("decimals are not accepted")
         target.start(tag, attributes)
 
     def end(tag: str) -> None:

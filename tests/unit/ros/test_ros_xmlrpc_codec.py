@@ -47,6 +47,16 @@ def test_garbage_is_refused_not_crashed_on(document: bytes) -> None:
         decode_response(document)
 
 
+@pytest.mark.parametrize("number", ["1", "1e99999999", "NaN", "sNaN"])
+def test_decimals_are_refused(number: str) -> None:
+    """One of a few bytes would keep the reader busy for minutes when it is made an integer."""
+    value = f"<params><param><value><bigdecimal>{number}</bigdecimal></value></param></params>"
+    with pytest.raises(MalformedDocumentError, match="decimals are not accepted"):
+        decode_response(f"<methodResponse>{value}</methodResponse>".encode())
+    with pytest.raises(MalformedDocumentError, match="decimals are not accepted"):
+        decode_call(f"<methodCall><methodName>m</methodName>{value}</methodCall>".encode())
+
+
 @pytest.mark.parametrize("value", [None, 2**31, object(), "bell \x07", {1: 2}])
 def test_refuses_to_write_what_has_no_form(value: object) -> None:
     with pytest.raises(MalformedDocumentError):
