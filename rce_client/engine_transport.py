@@ -17,6 +17,7 @@ from websockets.exceptions import ConnectionClosed
 from rce.aio.backoff import Backoff
 from rce.aio.tasks import TaskScope
 from rce.dialing import open_url_socket
+from rce.liveness import Liveness, Outflow, Step
 from rce.masters import Masters
 from rce.protocol import (
     FEATURES,
@@ -31,7 +32,6 @@ from rce.protocol import (
 from rce_client.discovery import VERSION, locate
 from rce_client.exceptions import ClientError, InUseError, LostError, RefusedError, UntrustedError
 from rce_client.failures import judge
-from rce_client.liveness import Liveness, Outflow, Step
 from rce_client.sendqueue import QueuedMessage, QueueLimits, SendQueue
 from rce_client.socket import EngineSocket
 
@@ -105,7 +105,7 @@ class Timing:
     """Seconds without a sign of life after which the engine is pinged; None for no pings."""
     ping_timeout: float | None = 4.0
     """Seconds without a sign of life after a ping; then the connection counts as lost. None for no limit. Any
-    data is a sign of life, so a slow link needs no more (:mod:`rce_client.liveness`)."""
+    data is a sign of life, so a slow link needs no more (:mod:`rce.liveness`)."""
     close: float = 3.0
     """Seconds for the closing handshake."""
     flush: float = 5.0

@@ -13,9 +13,11 @@ class SessionSettings:
     """The settings of one robot's connection."""
 
     ping_interval: float | None = 10.0
-    """Time between pings; None for no pings: a silent loss of the connection is then not detected."""
+    """Time between pings; None for no pings: a silent loss of the connection is then not detected. A full
+    connection is pinged only if it gives no sign of life for this time."""
     ping_timeout: float | None = 10.0
-    """Time within which a robot has to answer a ping; else it is disconnected."""
+    """Time after a ping within which a robot has to give a sign of life; else it is disconnected. Any data
+    from it is one, also that it takes data that waits for it (:mod:`rce.liveness`). None for no limit."""
     probe_timeout: float = 2.0
     """The same for a probe because the robot seems to connect a second time."""
     close_timeout: float = 2.0

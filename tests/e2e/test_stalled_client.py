@@ -102,9 +102,12 @@ def packages(tmp_path: Path) -> Path:
 class Stream:
     """Sends images from the camera and sees to it that the healthy client gets each of them."""
 
-    def __init__(self, engine: Engine, camera: Stranger, healthy: Stranger) -> None:
+    def __init__(
+        self, engine: Engine, camera: Stranger, healthy: Stranger, stalled: ClientConnection
+    ) -> None:
         self.camera = camera
         self.healthy = healthy
+        self.stalled = stalled
         self.sent = 0
         self._path = engine.processes_of("rce-robot") + engine.processes_of("rce_container.environment")
         self._path += engine.processes_of("relay.py")
@@ -120,6 +123,7 @@ class Stream:
             await self.camera.socket.send_bytes(id_.encode() + image(self.sent))
             assert number_of(await self.healthy.receive("in")) == self.sent
             peak = max(peak, self._memory())
+            await self.stalled.pong()  # a sign of life, without which its connection would end after 20 s
             await pause
         return peak
 
@@ -158,7 +162,7 @@ async def test_a_client_that_stops_reading_harms_only_itself(packages: Path) -> 
         await until(lambda: established(engine) == 3, what="all connections")
         stalled.transport.pause_reading()
 
-        stream = Stream(engine, camera, healthy)
+        stream = Stream(engine, camera, healthy, stalled)
         before = await stream.run(FILLING)
         after = await stream.run(MORE)
 

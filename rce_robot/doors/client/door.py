@@ -64,8 +64,7 @@ class ClientDoor:
             create_connection=behind_gate(guarded(RobotSocket, self._lobby), handshakes),
             compression=None,
             open_timeout=settings.open_timeout,
-            ping_interval=session.ping_interval,
-            ping_timeout=session.ping_timeout,
+            ping_interval=None,  # Session.run starts a watch of its own
             close_timeout=session.close_timeout,
             max_size=session.max_message,
             write_limit=session.write_buffer,

@@ -114,6 +114,7 @@ class Session:
             async with asyncio.TaskGroup() as self._tasks:
                 worker = self._tasks.create_task(self._requests.carry_out())
                 if not self.lost:
+                    self._watch()
                     self._owner.joined(self)
                 await self._socket.wait_closed()
                 for call in self._calls:
@@ -326,6 +327,10 @@ class Session:
             self._end()
 
     # Private
+
+    def _watch(self) -> None:
+        if self._settings.ping_interval is not None:
+            self._socket.watch(self._settings.ping_interval, self._settings.ping_timeout)
 
     def _end(self) -> None:
         if not self.ended.is_set():

@@ -1,7 +1,9 @@
 """A WebSocket connection without a task between the network and the engine.
 
-The ``websockets`` library does the handshake, the parsing, pings and the end of a connection. Three things
-differ here, because they take a large part of a message's time in the engine:
+The ``websockets`` library does the handshake, the parsing, answers to pings and the end of a connection. It
+waits only for answers to its own pings, which wait behind a large message on a slow link, so
+:class:`rce_robot.doors.client.watch.Watch` replaces its keepalive. Three things differ here, because they
+take a large part of a message's time in the engine:
 
 * A message in one frame is taken from the received data without the library's parser
   (:mod:`rce_robot.doors.client.frames`).
@@ -37,6 +39,7 @@ from rce_robot.doors.client.frames import (
     find_message,
 )
 from rce_robot.doors.client.steps import LARGE_FRAME, Steps
+from rce_robot.doors.client.watch import Watch
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -90,6 +93,9 @@ class RobotSocket(GuardedConnection):
 
     _share: LoopShare | None = None
     _user = ""
+    _watch: Watch | None = None
+    _count_heard = 0
+    """How often data had come at the last look of the watch."""
     _begin = 0
     """How much of the oldest received data has been handled."""
     receiver: Receiver | None = None
@@ -137,14 +143,29 @@ class RobotSocket(GuardedConnection):
         self._fragment_bytes = 0
         self._forget_work()
         self._forget_input()
+        self._end_soon()  # first: over TLS, sending a close frame closes the transport, which may take long
         if self.protocol.state is State.OPEN:
             self.protocol.fail(code, reason)
             self.send_data()
-        self._end_soon()
+
+    async def close(self, code: CloseCode | int = CloseCode.NORMAL_CLOSURE, reason: str = "") -> None:
+        """Close the connection; return when it has ended, after the close timeout at the latest."""
+        self._end_soon()  # the library's time limit does not include the wait until the robot takes data
+        await super().close(code, reason)
 
     def abort(self) -> None:
         """Drop the connection at once, without waiting for the robot."""
         self.transport.abort()
+
+    def watch(self, ping_interval: float, ping_timeout: float | None) -> None:
+        """Ping the robot from now on, and end the connection if it gives no sign of life.
+
+        Args:
+            ping_interval: Seconds from one ping to the next.
+            ping_timeout: Seconds without a sign of life after a ping; None: no limit.
+        """
+        if self.protocol.state is State.OPEN:
+            self._watch = Watch(self, ping_interval, ping_timeout)
 
     async def probe(self, timeout_s: float) -> bool:
         """Ping the robot; return whether any data comes from it within ``timeout_s`` seconds.
@@ -182,6 +203,23 @@ class RobotSocket(GuardedConnection):
             return True
         self._end_of_input()
         return False
+
+    # Called by the watch: rce_robot.doors.client.watch.Watched
+
+    def heard(self) -> bool:
+        """Return whether data came since the last call, or came before and waits for its turn."""
+        before, self._count_heard = self._count_heard, self._data_count
+        return self._data_count != before or self._waits
+
+    def send_ping(self) -> None:
+        """Write a ping, also if much waits already."""
+        if self.protocol.state is State.OPEN:
+            self.protocol.send_ping(b"")
+            self.send_data()
+
+    def give_up(self, silent: float) -> None:
+        """End the connection, which has been silent for so many seconds."""
+        self.fail(CloseCode.INTERNAL_ERROR, f"no sign of life for {silent:.0f} s")
 
     # Called by the base class
 
@@ -273,6 +311,9 @@ class RobotSocket(GuardedConnection):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Tell the receiver."""
+        if self._watch is not None:
+            self._watch.stop()
+            self._watch = None
         if self._deadline is not None:
             self._deadline.cancel()
         self._forget_work()

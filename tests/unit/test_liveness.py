@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rce_client.liveness import Liveness, Step
+from rce.liveness import Liveness, Step
 
 
 def steps(liveness: Liveness, seconds: float, *, heard: bool = False, moved: bool = False) -> list[Step]:
@@ -14,7 +14,7 @@ def steps(liveness: Liveness, seconds: float, *, heard: bool = False, moved: boo
     return [step for step in found if step is not Step.NOTHING]
 
 
-def test_silent_engine_is_pinged_and_given_up() -> None:
+def test_silent_peer_is_pinged_and_given_up() -> None:
     liveness = Liveness(2.0, 4.0)
     assert steps(liveness, 1.5) == []
     assert steps(liveness, 0.5) == [Step.PING]
@@ -30,7 +30,7 @@ def test_each_sign_of_life_begins_anew() -> None:
         assert liveness.look(liveness.period, heard=True) is Step.NOTHING
 
 
-def test_engine_that_sends_is_never_pinged() -> None:
+def test_peer_that_sends_is_never_pinged() -> None:
     assert steps(Liveness(2.0, 4.0), 100.0, heard=True) == []
 
 
@@ -44,7 +44,7 @@ def test_time_in_which_the_program_slept_counts_little() -> None:
     assert liveness.silent < 4.0
 
 
-def test_engine_that_takes_what_waits_is_not_given_up() -> None:
+def test_peer_that_takes_what_waits_is_not_given_up() -> None:
     liveness = Liveness(2.0, 4.0)
     assert steps(liveness, 100.0, moved=True) == []
     assert steps(liveness, 2.0) == [Step.PING]

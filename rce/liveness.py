@@ -1,13 +1,13 @@
-"""Whether the engine still takes part in a connection: what is a sign of life, and when it is missed.
+"""Whether the other side of a connection still takes part: what is a sign of life, and when it is missed.
 
-A robot's endpoint that hangs, or whose machine is gone without a word, closes no connection. So after a
-while without a sign of life the engine is pinged, and after some more the connection counts as lost. A slow
-link is no reason: behind a large message in either direction, a ping or its answer may take many seconds.
-Signs of life are therefore
+A program that hangs, or whose machine is gone without a word, closes no connection. So after a while without
+a sign of life it is pinged, and after some more the connection counts as lost. A slow link is no reason:
+behind a large message in either direction, a ping or its answer may take many seconds. Signs of life are
+therefore
 
-- any data from the engine, also a part of a message;
-- data that the engine's side took, if more of it waits here because the link or the engine is slow, or if the
-  ping itself is still on its way. (Without that condition it would be none: the kernel of a machine takes
+- any data from the other side, also a part of a message;
+- data that the other side took, if more of it waits here because the link or the other side is slow, or if
+  the ping itself is still on its way. (Without that condition it would be none: the kernel of a machine takes
   data for a program that hangs, as long as there is room.)
 """
 
@@ -67,7 +67,7 @@ class Liveness:
         Args:
             elapsed: Seconds since the last one. More than two periods count as two: this program slept, or
                 was busy, and could not see a sign of life either.
-            heard: Whether data came from the engine since.
+            heard: Whether data came from the other side since.
             moved: Whether data that waited went to it.
         """
         if heard:
