@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rce_robot.conversion.jobs import Job
     from rce_robot.doors.base import Queued
     from rce_robot.forms import Form
-    from rce_robot.outgoing import Buffer, Rendered
+    from rce_robot.outgoing import Buffer, Outgoing, Rendered
 
 URGENT_BELOW = 64 << 10
 """Service messages smaller than this (bytes) go in the control lane."""
@@ -204,6 +204,14 @@ class RobotInterface(Interface):
         error = RobotError.at(self.tag, msg_id, problem)
         self.robot.report(error.problem, error.call)
 
+    async def _show_large(self, payload: Buffer, msg_id: str) -> Outgoing:
+        """Convert a large service message in another process.
+
+        Raises:
+            UnreadableError: It is not a message of the type.
+        """
+        return await self.offload.show(payload, msg_id)
+
     async def _send_service(self, payload: Buffer, msg_id: str) -> bool:
         """Send a request or an answer to the robot; return False if too many wait.
 
@@ -211,7 +219,7 @@ class RobotInterface(Interface):
             UnreadableError: It is large and not a message of the type.
         """
         if self.form_out.is_heavy(payload):
-            outgoing = await self.offload.show(payload, msg_id)
+            outgoing = await self._show_large(payload, msg_id)
             return self.robot.send_data(self.tag, outgoing, OverflowPolicy.REFUSE)
         delivery = Delivery(self, payload, msg_id)
         if len(payload) < URGENT_BELOW:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from rce.protocol import DataMessage, LargeData
     from rce_robot.forms import Form
-
+    from rce_robot.outgoing import Outgoing
 
 _log = logging.getLogger(__name__)
 
@@ -76,6 +76,11 @@ class AskedByRobot(RobotInterface):
             holding.release()
             if given_up:
                 self._report("memory is short; the call was given up", msg_id)
+
+    async def _show_large(self, payload: Buffer, msg_id: str) -> Outgoing:
+        """Convert an answer, which is counted meanwhile: at other times a queue holds it, and counts it."""
+        with self._held(len(payload), msg_id):
+            return await super()._show_large(payload, msg_id)
 
     async def _call(self, payload: Buffer, msg_id: str) -> None:
         try:

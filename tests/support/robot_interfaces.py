@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable, Collection, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Sequence
 from typing import Any
 
 from rce.aio.queues import OverflowPolicy
@@ -73,6 +73,8 @@ class FakeRobot:
         self.knows_sources = True
         self.sources: list[tuple[str, ...]] = []
         self.awaited: list[tuple[LargeData, list[str]]] = []
+        self.converting: Callable[[], Awaitable[object]] = lambda: asyncio.sleep(0)
+        """What a conversion waits for."""
 
     def send_data(self, tag: str, message: Queued, overflow: OverflowPolicy) -> bool:
         rendered = message.render()
@@ -105,8 +107,8 @@ class FakeRobot:
         return self.holdings.hold(size, give_up)
 
     async def convert(self, job: Job, parts: Sequence[Any]) -> tuple[Result, list[memoryview]]:
-        """Do in this process what a worker process does."""
-        await asyncio.sleep(0)
+        """Do in this process what a worker process does, after :attr:`converting`."""
+        await self.converting()
         described, *rest = pack(job, parts)
         result, made = WORKER.do(
             decode_job(described[HEAD.size + 8 * (len(parts) + 1) :]), list(map(bytes, rest))

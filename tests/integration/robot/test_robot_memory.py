@@ -8,12 +8,15 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Unpack
 
+import psutil
 import pytest
+from support.client_types import ros_string
 from support.cloud import DIGEST, Cloud, RobotOptions, running_cloud
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 
 from rce.link import OverloadedError
+from rce_robot.conversion.pool import ConversionSettings
 from rce_robot.settings import SessionSettings
 
 if TYPE_CHECKING:
@@ -230,3 +233,37 @@ async def test_a_call_dropped_while_it_comes_in_ends_at_its_caller() -> None:
             with pytest.raises(OverloadedError, match="the request was dropped: memory is short"):
                 await end.port.call(bytes(30 * MIB))
             assert end.losses == 0
+
+
+async def test_answers_that_wait_for_conversion_count(robot_of: type[Robot]) -> None:
+    """The process that converts them hangs; over the user's limit the oldest calls are given up."""
+    service, text = "std_srvs/SetBool", "ö" * MIB
+    size = 2 * MIB
+    conversion = ConversionSettings(workers=1, timeout=600.0)
+    before = set(psutil.Process().children())
+    async with running_cloud(PATIENT, user_memory=8 * MIB, conversion=conversion) as cloud:
+        end = await cloud.wire("ask", "ServiceProviderConverter", service)
+
+        async def answer(_: bytes) -> bytes:
+            return b"\x01" + ros_string(text)
+
+        end.answer = answer
+        async with dial(cloud, "testUser", "testRobot") as socket:
+            await end.until_active()
+            robot = robot_of(socket)
+            await robot.say("ask", service, {"data": True}, "first")
+            assert (await robot.get("DM"))["msgID"] == "first"
+            (converter,) = set(psutil.Process().children()) - before
+            converter.suspend()
+
+            for number in range(3):
+                await robot.say("ask", service, {"data": True}, f"id{number}")
+            await cloud.master.changed.until(
+                lambda: cloud.master.usage is not None and cloud.master.usage.held >= 3 * size
+            )
+            for number in range(3, 6):
+                await robot.say("ask", service, {"data": True}, f"id{number}")
+            report = await robot.get("ER")
+            assert "memory is short; the call was given up" in str(report)
+            converter.resume()
+            assert (await robot.get("DM"))["msgID"] in {f"id{number}" for number in range(6)}

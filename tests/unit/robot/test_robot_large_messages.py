@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+from typing import TYPE_CHECKING
 
+from support.client_types import ros_string as utf8_string
 from support.robot_interfaces import SERVICE, STRING, Setup, ros_string, shown
 
 from rce.protocol.stream import LargeData
 from rce.protocol.weight import Address
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+async def until(done: Callable[[], bool]) -> None:
+    async with asyncio.timeout(60):
+        while not done():
+            await asyncio.sleep(0)
 
 
 def large(msg: str, tag: str = "tag", cls: str = STRING, msg_id: str = "nil") -> LargeData:
@@ -75,6 +86,24 @@ async def test_a_call_is_given_up_when_memory_is_short() -> None:
     await asyncio.gather(*setup.robot.work, return_exceptions=True)
     assert setup.robot.holdings.bytes == 0
     assert setup.robot.reports == ["tag, msgID id1: memory is short; the call was given up"]
+
+
+async def test_answers_that_wait_for_conversion_are_held() -> None:
+    setup = Setup("ServiceProviderConverter", SERVICE)
+    setup.port.answer = b"\x01" + utf8_string("ö" * (1 << 20))
+    size = len(setup.port.answer)
+    converted = asyncio.Event()
+    setup.robot.converting = converted.wait
+    for number in range(3):
+        setup.take({"data": True}, f"id{number}")
+    await until(lambda: setup.robot.holdings.bytes == 3 * size)
+    setup.robot.holdings.shed(1)
+    assert setup.robot.holdings.bytes == 2 * size
+    converted.set()
+    await asyncio.gather(*setup.robot.work, return_exceptions=True)
+    assert setup.robot.holdings.bytes == 0
+    assert setup.robot.reports == ["tag, msgID id0: memory is short; the call was given up"]
+    assert [shown(message)["msgID"] for message, _ in setup.robot.data] == ["id1", "id2"]
 
 
 def test_a_latched_message_is_held_until_another_takes_its_place() -> None:
