@@ -8,6 +8,7 @@ import itertools
 import logging
 from typing import TYPE_CHECKING, assert_never
 
+from rce.aio.backoff import Backoff
 from rce.model import Role
 from rce.ros.closing import release
 from rce.ros.node import MasterError, Node, RosError, TypeRegistry
@@ -30,6 +31,9 @@ MASTER_TIMEOUT = 2.0
 
 REMINDER = 5.0
 """Seconds between two messages about interfaces that are not connected yet."""
+
+RETRY = Backoff(first=0.5, longest=10.0, jitter=0.5)
+"""Pauses between attempts to subscribe to a topic."""
 
 CALL_TIMEOUT = 30.0
 """Seconds that a service of the robot's graph, or of the cloud, may take."""
@@ -134,6 +138,8 @@ class Uplink:
         """
         changed = asyncio.Event()
         needed = False
+        pauses = RETRY.start()
+        pause: float | None = None
 
         def take_demand(now: bool) -> None:
             nonlocal needed
@@ -142,15 +148,22 @@ class Uplink:
 
         self._publisher.watch_demand(take_demand)
         while True:
-            await changed.wait()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(pause):
+                    await changed.wait()
             changed.clear()
+            pause = None
             if not needed:
+                pauses.reset()
                 continue
             try:
                 subscriber = await node.listen(span.addr, span.message_type, self)
             except RosError as error:
+                if isinstance(error, MasterError):  # the robot's master restarts, perhaps
+                    pause = pauses.next()
                 _log.warning("topic %s cannot be subscribed to: %s", span.addr, error)
                 continue
+            pauses.reset()
             try:
                 while needed:
                     await changed.wait()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,7 +12,12 @@ from support.client_types import ros_string
 from support.ports import free_port
 from support.ros_real import GRAPHS
 
+from rce.aio.tasks import TaskScope
+from rce.model import Role
+from rce.ros.core import Core
 from rce.ros.node import Node
+from rce_client.ros_bridge.bridge import Uplink
+from rce_client.ros_bridge.plan import Span
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -56,3 +62,33 @@ async def test_a_restarted_master_is_told_everything_again(kind: str, engine: En
             await everything_flows(graph, engine)
         assert bridge.process.returncode is None
         assert not any("Traceback" in line for line in bridge.lines)
+
+
+async def test_uplink_subscribes_once_its_master_is_back(
+    engine: Engine, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The master restarts while a topic is asked for: the demand does not change any more."""
+    port = free_port()
+    span = Span("say", Role.SUBSCRIBER, STRING, "/say", on_demand=True)
+    async with engine.connection() as conn, contextlib.AsyncExitStack() as stack:
+        publisher = await conn.publisher("say", STRING, raw=True)
+        await publisher.wait_active(60)
+        async with Core(host="127.0.0.1", port=port) as core:
+            node = await stack.enter_async_context(
+                Node("bridge", argv=(), master_uri=core.uri, signals=False)
+            )
+        tasks = await stack.enter_async_context(TaskScope())
+        tasks.spawn(Uplink(conn, publisher).listen_on_demand(node, span), name="uplink")
+        async with asyncio.timeout(60):
+            while "/say cannot be subscribed to" not in caplog.text:
+                await asyncio.sleep(0.01)
+        async with (
+            Core(host="127.0.0.1", port=port) as core,
+            Node("robot", argv=(), master_uri=core.uri, signals=False) as robot,
+        ):
+            sayer = await robot.advertise("/say", STRING)
+            await sayer.wait_for_subscribers(1, timeout=60)
+            sayer.publish(data="up")
+            async with asyncio.timeout(60):
+                assert await engine.end("say").received.get() == ros_string("up")
+            await stack.aclose()
