@@ -192,7 +192,8 @@ class Connection(Requests, OwnInterfaces):
     async def repeat_requests(self) -> None:
         """Send all stored requests again, because something that they need may exist by now.
 
-        The engine silently accepts requests for items that exist. Cancelling does not affect existing items.
+        The engine silently accepts requests for items that exist. Without a connection it returns at once, as
+        all requests are sent after the reconnect anyway. Cancelling does not affect existing items.
 
         Raises:
             RefusedError: The engine refused this client permanently.
@@ -204,8 +205,7 @@ class Connection(Requests, OwnInterfaces):
             await robot.repeat_requests()
             ```
         """
-        for request in self._session.desired.restore():
-            await self.request(request)
+        await self._session.repeat()
 
     # Own interfaces
 

@@ -59,6 +59,12 @@ CONNECTING = "looking for the engine"
 """The words of the first report of an attempt; the reports of failures tell what went wrong."""
 
 
+def _take_note(sent: asyncio.Future[None]) -> None:
+    """Retrieve the error of a message that need not be sent again."""
+    if not sent.cancelled():
+        sent.exception()
+
+
 def is_failure(state: State, words: str) -> bool:
     """Return whether a report of a state says that an attempt to connect failed."""
     return state is State.CONNECTING and words != CONNECTING
@@ -155,6 +161,17 @@ class Session:
             sent = self.transport.deliver(encode(part))
             sent.add_done_callback(partial(self._note_unsent, part))
             await asyncio.wait((sent,))
+
+    async def repeat(self) -> None:
+        """Send all stored requests again; without a connection none, :meth:`on_connected` sends them."""
+        self.check_open()
+        for request in self.desired.restore():
+            for part in parts_of(request):
+                if not self.transport.connected:
+                    return
+                sent = self.transport.deliver(encode(part))
+                sent.add_done_callback(_take_note)
+                await asyncio.wait((sent,))
 
     def check_open(self) -> None:
         """Raise unless the program may use the connection.

@@ -156,6 +156,44 @@ async def test_what_is_removed_while_away_is_removed_on_return(engine: Engine) -
     assert ("CC", "c1") not in made
 
 
+async def test_requests_repeated_while_away_are_sent_once(engine: Engine) -> None:
+    """Repeating them for hours does not flood the engine, and what was removed meanwhile is removed."""
+    lost, back = asyncio.Event(), asyncio.Event()
+
+    def watch(state: State, _: str) -> None:
+        if state is State.LOST:
+            lost.set()
+        elif state is State.RESTORED:
+            back.set()
+
+    async with engine.connection(on_state=watch) as conn:
+        for tag in ("c1", "c2"):
+            await conn.create_container(tag)
+        await conn.connect("testRobot/say", "other/hear")
+        await engine.master.changed.until(lambda: len(engine.master.requests) == 3)
+        engine.door.status = 503
+        await engine.kick()
+        async with asyncio.timeout(60):
+            await lost.wait()
+        engine.master.requests.clear()
+        for _ in range(100):
+            await conn.repeat_requests()
+        await conn.destroy_container("c2")
+        engine.door.status = 200
+        async with asyncio.timeout(60):
+            await back.wait()
+        await conn.create_container("last")
+
+        def is_last() -> bool:
+            _, kind, data = engine.master.requests[-1] if engine.master.requests else ("", "", {})
+            return kind == "CC" and data["containerTag"] == "last"
+
+        await engine.master.changed.until(is_last)
+        sent = [(kind, str(data)) for _, kind, data in engine.master.requests]
+        assert all(sent.count(item) <= 2 for item in sent)
+        assert [data for kind, data in sent if kind == "DC"] == ["{'containerTag': 'c2'}"]
+
+
 async def test_a_refusal_on_the_way_back_closes_the_connection(engine: Engine) -> None:
     async with engine.connection() as conn:
         subscriber = await conn.subscriber("hear", STRING)
