@@ -21,6 +21,11 @@ if TYPE_CHECKING:
     from rce_robot.forms import Form
 
 
+_SOURCES = ""
+"""The key of the sources that remain; no source has this name."""
+_TOO_FAST = "messages come faster than they can be converted; one was dropped"
+
+
 class _Converted(NamedTuple):
     """A converted message of the robot, or the sources that remain."""
 
@@ -49,17 +54,18 @@ class FromRobot(RobotInterface):
             packed = pack_value(message.msg)
         except UnreadableError as error:
             raise UnreadableError.at(self.tag, message.msg_id, str(error)) from error
-        self._put(len(packed), partial(self._convert_value, packed, message.msg_id, message.latch))
+        work = partial(self._convert_value, packed, message.msg_id, message.latch)
+        self._put(len(packed), work, message.latch)
 
     def take_large(self, large: LargeData) -> None:
         """Send the message after its conversion; later messages wait for it."""
-        self._put(large.size, partial(self._convert_text, large))
+        self._put(large.size, partial(self._convert_text, large), large.address.latch)
 
     def keep_latched(self, sources: Sequence[str]) -> None:
         """End other sources, after the messages that wait to be converted."""
         if self._queue.busy:
-            if not self._queue.put(0, partial(self._note_sources, sources)):
-                self._dropped()
+            if not self._queue.put(0, partial(self._note_sources, sources), _SOURCES):
+                self.robot.report(f"{self.tag}: {_TOO_FAST}")
         else:
             self.port.keep_latched(sources)
 
@@ -73,9 +79,9 @@ class FromRobot(RobotInterface):
         """Forget what waits to be converted."""
         self._queue.clear()
 
-    def _put(self, size: int, work: partial[Coroutine[Any, Any, _Converted]]) -> None:
-        if not self._queue.put(size, work):
-            raise BusyError(f"{self.tag}: messages come faster than they can be converted; one was dropped")
+    def _put(self, size: int, work: partial[Coroutine[Any, Any, _Converted]], latch: str) -> None:
+        if not self._queue.put(size, work, latch or None):
+            raise BusyError(f"{self.tag}: {_TOO_FAST}")
 
     async def _convert_value(self, packed: bytes, msg_id: str, latch: str) -> _Converted:
         return _Converted(await self.offload.read_value(packed), msg_id, latch)
@@ -174,20 +180,22 @@ class ToRobot(RobotInterface):
         kept = self._latched.pop(source, None)
         if kept is not None and kept.holding is not None:
             kept.holding.release()
+            self._queue.count(source)
 
     def _give_up(self, source: str, kept: _Kept) -> None:
         """Drop the message because memory is short, and report it to the robot's user."""
         if self._latched.get(source) is kept:
             del self._latched[source]
+        self._queue.drop(source)
         self.robot.drop_latched(self.tag, source)
         self.robot.count_dropped(self.tag)
         self.robot.report(f"{self.tag}: memory is short; the latched message was dropped")
 
     def _send(self, payload: bytes, source: str) -> None:
         if self._queue.busy or self.form_out.is_heavy(payload):
-            if self.robot.connected and not self._queue.put(
-                len(payload), partial(self._show, payload, source)
-            ):
+            key = source if source in self._latched else None  # which counts its bytes
+            work = partial(self._show, payload, source)
+            if self.robot.connected and not self._queue.put(len(payload), work, key, shared=key is not None):
                 self.robot.count_dropped(self.tag)
         elif source in self._latched:
             self.robot.send_latched(self.tag, source, Delivery(self, payload, NO_ID), shared=True)

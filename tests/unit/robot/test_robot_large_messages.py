@@ -10,6 +10,8 @@ from support.robot_interfaces import SERVICE, STRING, Setup, ros_string, shown
 
 from rce.protocol.stream import LargeData
 from rce.protocol.weight import Address
+from rce_robot.exceptions import BusyError
+from rce_robot.topics import ToRobot
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,9 +23,9 @@ async def until(done: Callable[[], bool]) -> None:
             await asyncio.sleep(0)
 
 
-def large(msg: str, tag: str = "tag", cls: str = STRING, msg_id: str = "nil") -> LargeData:
+def large(msg: str, tag: str = "tag", cls: str = STRING, msg_id: str = "nil", latch: str = "") -> LargeData:
     text = f'{{"type":"DM","data":{{"iTag":"{tag}","type":"{cls}","msgID":"{msg_id}","msg":{msg}}}}}'
-    return LargeData(Address(tag, cls, msg_id), text.encode())
+    return LargeData(Address(tag, cls, msg_id, latch), text.encode())
 
 
 async def test_a_large_message_is_converted_elsewhere_and_in_order() -> None:
@@ -90,7 +92,7 @@ async def test_a_call_is_given_up_when_memory_is_short() -> None:
 
 async def test_answers_that_wait_for_conversion_are_held() -> None:
     setup = Setup("ServiceProviderConverter", SERVICE)
-    setup.port.answer = b"\x01" + utf8_string("ö" * (1 << 20))
+    setup.port.answer = b"\x01" + heavy("ö")
     size = len(setup.port.answer)
     converted = asyncio.Event()
     setup.robot.converting = converted.wait
@@ -104,6 +106,86 @@ async def test_answers_that_wait_for_conversion_are_held() -> None:
     assert setup.robot.holdings.bytes == 0
     assert setup.robot.reports == ["tag, msgID id0: memory is short; the call was given up"]
     assert [shown(message)["msgID"] for message, _ in setup.robot.data] == ["id1", "id2"]
+
+
+def heavy(letter: str) -> bytes:
+    """A message whose text takes long to write."""
+    return utf8_string(letter * (1 << 20))
+
+
+def joined_with_latched(setup: Setup) -> ToRobot:
+    """Latch six heavy messages, then let the robot come, and more messages; no conversion is done yet."""
+    assert isinstance(setup.interface, ToRobot)
+    setup.robot.connected = False
+    for source, letter in enumerate("äöüéèà"):
+        setup.interface.receive_latched(heavy(letter), str(source))
+    setup.robot.connected = True
+    setup.interface.robot_joined()
+    return setup.interface
+
+
+def texts(setup: Setup) -> list[str]:
+    """Return the first letters of what the robot got."""
+    return [shown(message)["msg"]["data"][:1] for message, _ in setup.robot.data]
+
+
+async def test_robot_that_comes_gets_every_latched_message() -> None:
+    """More of them wait for their conversion than other messages may."""
+    setup = Setup("PublisherConverter")
+    converted = asyncio.Event()
+    setup.robot.converting = converted.wait
+    interface = joined_with_latched(setup)
+    assert setup.robot.holdings.bytes == 6 * len(heavy("ä")), "each is counted once"
+    for letter in "abcdef":
+        interface.receive(ros_string(letter), latched=False)
+    assert setup.robot.dropped == 2
+    converted.set()
+    await asyncio.gather(*setup.robot.work)
+    assert texts(setup) == [*"äöüéèà", *"cdef"]
+    assert setup.robot.holdings.bytes == 6 * len(heavy("ä"))
+
+
+async def test_latched_message_that_ends_while_it_waits_is_counted() -> None:
+    setup = Setup("PublisherConverter")
+    converted = asyncio.Event()
+    setup.robot.converting = converted.wait
+    size = len(heavy("ä"))
+    interface = joined_with_latched(setup)
+    await asyncio.sleep(0)
+    interface.unlatch(["0", "1"])  # the first is converted, the second waits
+    interface.receive_latched(heavy("ß"), "2")
+    assert setup.robot.holdings.bytes == 7 * size
+    setup.robot.holdings.shed(1)  # the latched message of source 3 is the oldest that can be dropped
+    assert setup.robot.holdings.bytes == 6 * size
+    assert setup.robot.latched_dropped == 1
+    converted.set()
+    await asyncio.gather(*setup.robot.work)
+    assert texts(setup) == [*"äöüèàß"]
+    assert setup.robot.holdings.bytes == 3 * size
+
+
+async def test_latched_messages_of_the_robot_are_not_dropped_to_make_room() -> None:
+    """Neither are the sources that remain."""
+    setup = Setup("SubscriberConverter")
+    converted = asyncio.Event()
+    setup.robot.converting = converted.wait
+    for source in range(6):
+        setup.interface.take_large(large(f'{{"data":"m{source}"}}', latch=str(source)))
+    setup.interface.keep_latched(["0"])
+    setup.interface.keep_latched([str(source) for source in range(1, 6)])
+    refused = 0
+    for number in range(6):
+        try:
+            setup.interface.take_large(large(f'{{"data":"{number}"}}'))
+        except BusyError:
+            refused += 1
+    assert refused == 2
+    converted.set()
+    await asyncio.gather(*setup.robot.work)
+    assert setup.port.latched == {str(source): ros_string(f"m{source}") for source in range(1, 6)}
+    assert setup.port.sent[6:] == [ros_string(str(number)) for number in range(2, 6)]
+    assert setup.robot.reports == []
+    assert setup.robot.holdings.bytes == 0
 
 
 def test_a_latched_message_is_held_until_another_takes_its_place() -> None:
