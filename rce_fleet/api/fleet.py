@@ -6,7 +6,15 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
-from rce_fleet.api.tasks import ApiModel
+from rce_fleet.api.tasks import ApiModel, Cell, Moment
+from rce_fleet.limits import (
+    LEAST_CAPACITY,
+    LEAST_FACTOR,
+    LEAST_SPEED,
+    MOST_AMOUNT,
+    MOST_FACTOR,
+    MOST_SPEED,
+)
 
 ZoneKindName = Literal["blocked", "slow", "one_way", "limited", "cost"]
 _FORMER_KINDS = {"one-way": "one_way", "room": "limited"}
@@ -16,14 +24,27 @@ class ProfileModel(ApiModel):
     """What a robot can do, and what it takes out of its battery."""
 
     capabilities: list[str] = Field(default_factory=list, description="Names of what it has.", max_length=50)
-    payload: float = Field(default=5.0, description="Most that it carries, kilograms.", ge=0)
-    speed: float = Field(default=0.4, description="Mean speed, metres per second.", gt=0)
-    capacity: float = Field(default=60.0, description="Energy of the full battery, watt hours.", gt=0)
-    drive: float = Field(default=0.012, description="Watt hours for each metre.", ge=0)
-    idle: float = Field(default=8.0, description="Watts of electronics, sensors and computer.", ge=0)
-    acting: float = Field(default=5.0, description="Watts of an action at a stop, beside idle.", ge=0)
-    charging: float = Field(default=30.0, description="Watts that a charger gives.", gt=0)
-    zone_cost: dict[str, float] = Field(
+    payload: float = Field(default=5.0, description="Most that it carries, kilograms.", ge=0, le=MOST_AMOUNT)
+    speed: float = Field(
+        default=0.4, description="Mean speed, metres per second.", ge=LEAST_SPEED, le=MOST_SPEED
+    )
+    capacity: float = Field(
+        default=60.0,
+        description="Energy of the full battery, watt hours.",
+        ge=LEAST_CAPACITY,
+        le=MOST_AMOUNT,
+    )
+    drive: float = Field(default=0.012, description="Watt hours for each metre.", ge=0, le=MOST_AMOUNT)
+    idle: float = Field(
+        default=8.0, description="Watts of electronics, sensors and computer.", ge=0, le=MOST_AMOUNT
+    )
+    acting: float = Field(
+        default=5.0, description="Watts of an action at a stop, beside idle.", ge=0, le=MOST_AMOUNT
+    )
+    charging: float = Field(
+        default=30.0, description="Watts that a charger gives.", ge=LEAST_CAPACITY, le=MOST_AMOUNT
+    )
+    zone_cost: dict[str, Annotated[float, Field(ge=LEAST_FACTOR, le=MOST_FACTOR)]] = Field(
         default_factory=dict,
         description="How much a metre counts for it, by zone; 1 is as elsewhere.",
     )
@@ -76,11 +97,11 @@ class RobotChange(ApiModel):
 class ChargersModel(ApiModel):
     """Cells with a purpose, and who charges."""
 
-    chargers: list[int] = Field(default_factory=list, description="Cells with a charger.", max_length=10000)
-    parking: list[int] = Field(
+    chargers: list[Cell] = Field(default_factory=list, description="Cells with a charger.", max_length=10000)
+    parking: list[Cell] = Field(
         default_factory=list, description="Cells where idle robots wait.", max_length=10000
     )
-    returns: list[int] = Field(
+    returns: list[Cell] = Field(
         default_factory=list, description="Where loads of cancelled tasks are brought.", max_length=10000
     )
 
@@ -105,13 +126,13 @@ class ZoneRequest(ApiModel):
         description="The rule: blocked: robots do not enter it; slow: with at most this speed; one_way: not"
         " against this direction; limited: for so many robots; cost: a metre counts so much."
     )
-    cells: list[int] = Field(default_factory=list, max_length=100000)
+    cells: list[Cell] = Field(default_factory=list, max_length=100000)
     value: float | None = Field(
         default=None,
         description="Metres per second, radians from the grid's columns (0, pi/2, pi, -pi/2), number of"
         " robots, or a factor; as the kind needs it.",
     )
-    edges: list[Annotated[list[int], Field(min_length=2, max_length=2)]] = Field(
+    edges: list[Annotated[list[Cell], Field(min_length=2, max_length=2)]] = Field(
         default_factory=list,
         description="Of a blocked zone: moves [from, to] that no robot makes.",
         max_length=100000,
@@ -120,7 +141,7 @@ class ZoneRequest(ApiModel):
         default_factory=list, description="Robots that the rule is for; empty: all.", max_length=10000
     )
     reason: str = Field(default="", max_length=500)
-    until: float | None = Field(default=None, description="When it ends, seconds since 1970.")
+    until: Moment | None = Field(default=None, description="When it ends, seconds since 1970.")
 
 
 class ZoneModel(ZoneRequest):
@@ -146,7 +167,7 @@ class CellChange(ApiModel):
 class GoalChange(ApiModel):
     """The goal of a robot."""
 
-    cell: int | None = Field(description="Number of the goal cell; null: stop and stay.", ge=0)
+    cell: Cell | None = Field(description="Number of the goal cell; null: stop and stay.")
 
 
 class GoalAnswer(ApiModel):

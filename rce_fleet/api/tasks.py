@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
-CELL = Field(ge=0, le=2**31 - 1)
+from rce_fleet.limits import MOST_AMOUNT, MOST_CELL, MOST_OCCURRENCES, MOST_TIME
+
+Cell: TypeAlias = Annotated[int, Field(ge=0, le=MOST_CELL)]
+Moment: TypeAlias = Annotated[float, Field(ge=0, le=MOST_TIME)]
+"""Seconds since 1970."""
 ActionName = Literal["go", "pick", "deliver", "charge", "park"]
 StateName = Literal[
     "queued", "assigned", "running", "held", "suspended", "cancelling", "done", "failed", "cancelled"
@@ -23,8 +27,8 @@ class StopModel(ApiModel):
     """One stop of a task. Give ``cell``, or ``cells`` of which any one serves."""
 
     action: ActionName = Field(default="go", description="What the robot does there.")
-    cell: int | None = Field(default=None, description="Where.", ge=0, le=2**31 - 1)
-    cells: list[int] = Field(
+    cell: Cell | None = Field(default=None, description="Where.")
+    cells: list[Cell] = Field(
         default_factory=list,
         description="Any one of these cells. A charge or park stop without cells takes any charger or"
         " parking place.",
@@ -40,7 +44,10 @@ class RepeatModel(ApiModel):
 
     every: float = Field(description="Seconds from one occurrence to the next.", ge=1, le=31622400)
     count: int | None = Field(
-        default=None, description="Occurrences in all; null: until it is cancelled.", ge=1
+        default=None,
+        description="Occurrences in all; null: until it is cancelled.",
+        ge=1,
+        le=MOST_OCCURRENCES,
     )
 
 
@@ -50,20 +57,22 @@ class OrderFields(ApiModel):
     name: str = Field(default="", description="For people.", max_length=200)
     rounds: int = Field(default=1, description="How often the stops are made: a patrol.", ge=1, le=500)
     priority: int = Field(default=0, description="Larger numbers come first.", ge=-100, le=100)
-    deadline: float | None = Field(default=None, description="When it should be done.")
+    deadline: Moment | None = Field(default=None, description="When it should be done.")
     when_late: Literal["continue", "fail"] = Field(
         default="continue", description="At the deadline: carry it out late, or fail if no robot has begun."
     )
-    earliest_start: float | None = Field(default=None, description="No robot begins before.")
+    earliest_start: Moment | None = Field(default=None, description="No robot begins before.")
     capabilities: list[str] = Field(
         default_factory=list, description="What the robot must have.", max_length=50
     )
-    payload: float = Field(default=0.0, description="What the robot must carry, kilograms.", ge=0)
+    payload: float = Field(
+        default=0.0, description="What the robot must carry, kilograms.", ge=0, le=MOST_AMOUNT
+    )
     after: list[str] = Field(
         default_factory=list, description="Tasks that must be done before, by id.", max_length=100
     )
     robot: str = Field(default="", description="The only robot that may do it; empty: any.", max_length=128)
-    return_cells: list[int] = Field(
+    return_cells: list[Cell] = Field(
         default_factory=list,
         description="Where the load is brought if the task is cancelled; empty: the fleet's return cells, or"
         " where it came from.",
@@ -91,14 +100,14 @@ class TaskChange(ApiModel):
     name: str | None = Field(default=None, max_length=200)
     rounds: int | None = Field(default=None, ge=1, le=500)
     priority: int | None = Field(default=None, ge=-100, le=100)
-    deadline: float | None = None
+    deadline: Moment | None = None
     when_late: Literal["continue", "fail"] | None = None
-    earliest_start: float | None = None
+    earliest_start: Moment | None = None
     capabilities: list[str] | None = Field(default=None, max_length=50)
-    payload: float | None = Field(default=None, ge=0)
+    payload: float | None = Field(default=None, ge=0, le=MOST_AMOUNT)
     after: list[str] | None = Field(default=None, max_length=100)
     robot: str | None = Field(default=None, max_length=128)
-    return_cells: list[int] | None = Field(default=None, max_length=100)
+    return_cells: list[Cell] | None = Field(default=None, max_length=100)
     repeat: RepeatModel | None = None
 
 
@@ -149,10 +158,8 @@ class TaskPage(ApiModel):
 class LoadRequest(ApiModel):
     """Where the load of a task is whose robot does not come back."""
 
-    cell: int | None = Field(
-        description="Any robot picks it up there, and continues; null: the load is lost, and the task fails.",
-        ge=0,
-        le=2**31 - 1,
+    cell: Cell | None = Field(
+        description="Any robot picks it up there, and continues; null: the load is lost, and the task fails."
     )
 
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from math import ceil, inf, isfinite
+from math import ceil, inf
 from typing import TYPE_CHECKING
 
 from rce_fleet.exceptions import ZoneError
+from rce_fleet.limits import LEAST_SPEED, MOST_ROOM, MOST_SPEED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -111,16 +112,16 @@ class Zone:
                 f"{where}: edges and one-way zones apply to all robots; leave its robots empty",
             ),
             (
-                self.kind is ZoneKind.SLOW and not (isfinite(self.speed) and self.speed > 0),
-                f"{where}: a slow zone needs a speed above 0 m/s, not {self.speed}",
+                self.kind is ZoneKind.SLOW and not LEAST_SPEED <= self.speed <= MOST_SPEED,
+                f"{where}: a slow zone needs {LEAST_SPEED} .. {MOST_SPEED:g} m/s, not {self.speed}",
             ),
             (
                 self.kind is ZoneKind.ONE_WAY and self.direction is None,
                 f"{where}: a one-way zone needs a direction: +x, -x, +y or -y",
             ),
             (
-                self.kind is ZoneKind.LIMITED and self.capacity < 1,
-                f"{where}: a limited zone needs a capacity of at least 1, not {self.capacity}",
+                self.kind is ZoneKind.LIMITED and not 1 <= self.capacity <= MOST_ROOM,
+                f"{where}: a limited zone needs a capacity of 1 .. {MOST_ROOM}, not {self.capacity}",
             ),
         )
         for is_wrong, text in checks:
@@ -213,7 +214,7 @@ class ZoneBook:
         if self._costs is None:
             costs: dict[int, int] = {}
             for zone in self.of_kind(ZoneKind.SLOW):
-                cost = min(max(ceil(NOMINAL_SPEED / zone.speed), 1), _MAX_COST)
+                cost = max(ceil(min(NOMINAL_SPEED / zone.speed, _MAX_COST)), 1)
                 for cell in zone.cells:
                     costs[cell] = max(costs.get(cell, 1), cost)
             self._costs = costs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from rce_fleet.api.fleet import ProfileModel
@@ -141,5 +142,7 @@ def read_profile(model: ProfileModel) -> RobotProfile:
 
 
 def show_profile(profile: RobotProfile) -> ProfileModel:
-    """Return a profile for the API."""
-    return ProfileModel(**{**asdict(profile), "capabilities": list(profile.capabilities)})
+    """Return a profile for the API, without zones that the robot may not enter."""
+    costs = {name: factor for name, factor in profile.zone_cost.items() if isfinite(factor)}
+    fields = {**asdict(profile), "capabilities": list(profile.capabilities), "zone_cost": costs}
+    return ProfileModel(**fields)

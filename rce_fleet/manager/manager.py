@@ -18,6 +18,7 @@ from rce_fleet.manager.hand_goals import HandGoals
 from rce_fleet.manager.planner_sync import BlockCell, PlannerCall, PlannerSync, SetMode, SetZone
 from rce_fleet.manager.statistics import BUCKET_S, BUCKETS, FleetStatistics, Minute
 from rce_fleet.tasks.book import TaskBook
+from rce_fleet.tasks.clamping import clamped
 from rce_fleet.tasks.dispatch import Dispatcher, TaskRules
 from rce_fleet.tasks.facts import FleetFacts
 from rce_fleet.tasks.task import Task
@@ -124,7 +125,7 @@ class FleetManager:
         records, self.book.number = self._journal.load()
         self.written = self.book.number
         for record in sorted(records, key=lambda each: each.number if isinstance(each, Task) else 0):
-            self.book.put_record(record)
+            self.book.put_record(clamped(record))
         self.book.grid = self.facts.grid
         self.dispatcher = Dispatcher(self.book, self._rules)
 

@@ -15,6 +15,7 @@ from rce_fleet.api.fleet import (
     ZoneRequest,
 )
 from rce_fleet.exceptions import TaskRefusedError, UnknownTaskError
+from rce_fleet.limits import MOST_CELL
 from rce_fleet.manager.goals import NO_ANSWER
 from rce_fleet.manager.requests import Call, FleetAnswer, Route, problem, shown
 from rce_fleet.manager.zones import checked
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
     from rce_fleet.api.fleet import ZoneKindName
 
-MOST_DIGITS = 18
+MOST_DIGITS = 10
 """Digits of a cell's number."""
 
 
@@ -134,6 +135,8 @@ async def set_cell(call: Call) -> FleetAnswer:
     if not (name.isdecimal() and name.isascii() and len(name) <= MOST_DIGITS):
         return problem(404, f"{name[:MOST_DIGITS]!r} is not the number of a cell")
     cell, user = int(name), call.request.user
+    if cell > MOST_CELL:
+        return problem(404, f"cells have numbers up to {MOST_CELL}, not {cell}")
     check_cells(call, (cell,))
     was_blocked = cell in manager.book.blocked.cells
     made = manager.book.blocked.changed({cell: blocked}, unsent=True)

@@ -16,6 +16,8 @@ from math import isfinite, pi, tau
 from typing import TYPE_CHECKING, Any
 
 from rce_fleet.exceptions import TaskRefusedError
+from rce_fleet.limits import MOST_TIME, within
+from rce_fleet.tasks.clamping import ZONE_VALUES
 from rce_fleet.tasks.records import Zone
 
 if TYPE_CHECKING:
@@ -96,9 +98,9 @@ def read_zone(message: dict[str, Any], now: float) -> Zone:
     kind = message["kind"]
     value = None
     if kind == "slow":
-        value = float(message["speed"])
+        value = within(float(message["speed"]), *ZONE_VALUES[kind])
     elif kind == "limited":
-        value = float(message["capacity"])
+        value = within(float(message["capacity"]), *ZONE_VALUES[kind])
     elif kind == "one_way":
         value = _quarters(_DIRECTIONS.index(message["direction"]) * pi / 2) * pi / 2
     edges = message["edges"]
@@ -111,7 +113,7 @@ def read_zone(message: dict[str, Any], now: float) -> Zone:
         robots=tuple(sorted(message["robots"])),
         reason=message["reason"],
         user=message["by"],
-        until=now + message["lifetime"] if message["lifetime"] else None,
+        until=min(now + message["lifetime"], MOST_TIME) if message["lifetime"] else None,
     )
 
 
@@ -142,14 +144,19 @@ def _problems(zone: Zone, grid: GridMap | None, now: float) -> Iterator[str]:
 def _problems_of_value(kind: str, value: float) -> Iterator[str]:
     if not isfinite(value):
         yield "its value must be a number"
-    elif kind == "slow" and value <= 0:
-        yield f"a slow zone needs a speed above 0 m/s, not {value:g}"
-    elif kind == "limited" and (value < 1 or value != int(value)):
-        yield f"limited is a whole number of robots from 1 on, not {value:g}"
-    elif kind == COST and value < 1:
-        yield f"in a cost zone a metre counts at least 1, not {value:g}"
+    elif kind == "slow" and within(value, *ZONE_VALUES[kind]) != value:
+        yield f"a slow zone needs a speed of {_range(kind)} m/s, not {value:g}"
+    elif kind == "limited" and (within(value, *ZONE_VALUES[kind]) != value or value != int(value)):
+        yield f"limited is a whole number of robots within {_range(kind)}, not {value:g}"
+    elif kind == COST and within(value, *ZONE_VALUES[kind]) != value:
+        yield f"in a cost zone a metre counts {_range(kind)}, not {value:g}"
     elif kind == "one_way" and abs(value / (pi / 2) - round(value / (pi / 2))) > _NEAR / (pi / 2):
         yield f"a direction is 0, pi/2, pi or -pi/2 radians from the grid's columns, not {value:g}"
+
+
+def _range(kind: str) -> str:
+    least, most = ZONE_VALUES[kind]
+    return f"{least:.7g} .. {most:.7g}"
 
 
 def _quarters(radians: float) -> int:

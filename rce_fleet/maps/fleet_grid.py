@@ -19,6 +19,12 @@ MAX_CELLS = 4_000_000
 """Maximum number of cells, so that a wrong cell size does not fill the memory."""
 BLOCKED_SHARE = 0.1
 """A cell is blocked if a greater share of its area is occupied or unknown."""
+LEAST_CELL_SIZE, MOST_CELL_SIZE = 0.001, 1000.0
+"""Smallest and largest edge of a cell, metres."""
+_FAR = 1e9
+"""Metres or radians."""
+_MOST_POINTS = 400
+"""Points along an edge of a cell that are looked at: a large cell does not fill the memory."""
 _FINE = 0.05
 """Edge of a pixel of a grid's map, metres, so that other cells can be laid over it."""
 _PIXELS = 4_000_000
@@ -53,11 +59,17 @@ def fleet_grid(
     """
     if not (cell_size > 0 and isfinite(cell_size)):
         raise MapError(f"the cell size must be a positive number of metres, not {cell_size}")
+    if not LEAST_CELL_SIZE <= cell_size <= MOST_CELL_SIZE:
+        raise MapError(
+            f"the cell size must be within {LEAST_CELL_SIZE} .. {MOST_CELL_SIZE:g} m, not {cell_size}"
+        )
     if not 0 <= blocked_share <= 1:
         raise MapError(f"the share that blocks a cell must be within 0 .. 1, not {blocked_share}")
     place = drawn.origin if origin is None else origin
     if not all(map(isfinite, (place.x, place.y, place.yaw))):
         raise MapError(f"the origin must be three finite numbers, not {place}")
+    if max(map(abs, (place.x, place.y, place.yaw))) > _FAR:
+        raise MapError(f"the origin's numbers must be within -{_FAR:g} .. {_FAR:g}, not {place}")
     needed_rows, needed_columns = _size(drawn, place, cell_size)
     rows = needed_rows if rows is None else rows
     columns = needed_columns if columns is None else columns
@@ -100,7 +112,7 @@ def _size(drawn: OccupancyMap, place: Pose, cell_size: float) -> tuple[int, int]
 
 def _taken(drawn: OccupancyMap, place: Pose, cell_size: float, row: int, columns: int) -> NDArray[np.float64]:
     """Return the shares of a row's cells that are not free, shape (columns,), from evenly spaced points."""
-    points = max(floor(cell_size / drawn.resolution + 1e-6), 1)
+    points = min(max(floor(cell_size / drawn.resolution + 1e-6), 1), _MOST_POINTS)
     inside = (np.arange(points) + 0.5) / points
     along = (np.arange(columns)[:, None] + inside).reshape(-1) * cell_size
     up = (row + inside) * cell_size

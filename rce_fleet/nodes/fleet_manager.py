@@ -17,6 +17,7 @@ from typing import Any
 
 from rce.ros.node import MasterError, Message, Node, Publisher, RosError, ServiceClient, run
 from rce.ros.tools.plain import plain
+from rce.ros.types import TypesError
 from rce_fleet.journal.journal import Journal
 from rce_fleet.manager.fleet_routes import ROUTES as FLEET_ROUTES
 from rce_fleet.manager.goals import NO_ANSWER
@@ -88,7 +89,7 @@ class PlannerServices:
     async def _call(self, client: ServiceClient, **request: Any) -> str:
         try:
             answer = await client.call(request, timeout=CALL_TIMEOUT_S)
-        except RosError as error:
+        except (RosError, TypesError) as error:  # a request that has no message form gets no answer either
             return f"{NO_ANSWER}: {error}"
         return "" if answer.ok else str(answer.message)
 

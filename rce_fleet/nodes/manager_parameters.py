@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 
+from rce_fleet.limits import LEAST_CAPACITY, LEAST_SPEED, MOST_AMOUNT, MOST_CELL, MOST_SPEED
 from rce_fleet.tasks.assignment import AssignmentRules
 from rce_fleet.tasks.dispatch import TaskRules
 from rce_fleet.tasks.energy import BatteryLevels
@@ -12,6 +13,9 @@ from rce_fleet.tasks.records import RobotProfile
 
 _SHARE = {"minimum": 0.0, "maximum": 1.0}
 _POSITIVE = {"above": 0.0}
+_CELLS = {"minimum": 0, "maximum": MOST_CELL}
+_AMOUNT = {"minimum": 0.0, "maximum": MOST_AMOUNT}
+_POWER = {"minimum": LEAST_CAPACITY, "maximum": MOST_AMOUNT}
 _LEAST_ZERO = {"minimum": 0.0}
 
 
@@ -48,13 +52,13 @@ class RobotParameters:
     """
 
     capabilities: tuple[str, ...] = ()
-    payload: float = field(default=5.0, metadata=_LEAST_ZERO)
-    speed: float = field(default=0.4, metadata=_POSITIVE)
-    capacity: float = field(default=60.0, metadata=_POSITIVE)
-    drive: float = field(default=0.012, metadata=_LEAST_ZERO)
-    idle: float = field(default=8.0, metadata=_LEAST_ZERO)
-    acting: float = field(default=5.0, metadata=_LEAST_ZERO)
-    charging: float = field(default=30.0, metadata=_POSITIVE)
+    payload: float = field(default=5.0, metadata=_AMOUNT)
+    speed: float = field(default=0.4, metadata={"minimum": LEAST_SPEED, "maximum": MOST_SPEED})
+    capacity: float = field(default=60.0, metadata=_POWER)
+    drive: float = field(default=0.012, metadata=_AMOUNT)
+    idle: float = field(default=8.0, metadata=_AMOUNT)
+    acting: float = field(default=5.0, metadata=_AMOUNT)
+    charging: float = field(default=30.0, metadata=_POWER)
 
 
 @dataclass(frozen=True)
@@ -78,9 +82,9 @@ class ManagerParameters:
     """
 
     journal: str = ""
-    chargers: tuple[int, ...] = field(default=(), metadata={"minimum": 0})
-    parking: tuple[int, ...] = field(default=(), metadata={"minimum": 0})
-    return_cells: tuple[int, ...] = field(default=(), metadata={"minimum": 0})
+    chargers: tuple[int, ...] = field(default=(), metadata=_CELLS)
+    parking: tuple[int, ...] = field(default=(), metadata=_CELLS)
+    return_cells: tuple[int, ...] = field(default=(), metadata=_CELLS)
     lost_after: float = field(default=15.0, metadata=_LEAST_ZERO)
     stuck_after: float = field(default=120.0, metadata=_POSITIVE)
     unreachable_after: float = field(default=20.0, metadata=_LEAST_ZERO)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from enum import Enum
-from math import inf, isfinite
+from math import inf
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rce_fleet.coordination.events import ModeSet, ZonesSet
 from rce_fleet.coordination.modes import read_mode
 from rce_fleet.coordination.zones import Direction, Zone, ZoneKind
 from rce_fleet.exceptions import ZoneError
+from rce_fleet.limits import MOST_LIFETIME
 
 if TYPE_CHECKING:
     from rce.ros.types import Message
@@ -32,8 +33,8 @@ def read_zone(message: Message, now: float) -> Zone:
         raise ZoneError(
             f"{where}: edges are pairs of cells, and {len(message.edges)} is an odd number of cells"
         )
-    if not isfinite(message.lifetime) or message.lifetime < 0:
-        raise ZoneError(f"{where}: its lifetime must be at least 0 s, not {message.lifetime}")
+    if not 0 <= message.lifetime <= MOST_LIFETIME:
+        raise ZoneError(f"{where}: its lifetime must be 0 .. {MOST_LIFETIME:g} s, not {message.lifetime}")
     edges = zip(message.edges[::2], message.edges[1::2], strict=True)
     return Zone(
         id=message.id,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from rce_fleet.limits import MOST_LATE, within
 from rce_fleet.tasks.energy import BatteryLevels, Effort, charges, effort_of, share_needed
 from rce_fleet.tasks.matching import cheapest_pairs
 
@@ -87,10 +88,10 @@ class Assigner:
         """
         rules = self._rules
         since = max(task.created_at, task.order.earliest_start or 0.0)
-        worth = task.order.priority * rules.priority + max(0.0, now - since) * rules.age
+        worth = task.order.priority * rules.priority + within(now - since, 0.0, MOST_LATE) * rules.age
         if task.order.deadline is not None:
             left = task.order.deadline - now - seconds
-            worth += max(0.0, rules.deadline_window - left) * rules.deadline
+            worth += within(rules.deadline_window - left, 0.0, MOST_LATE) * rules.deadline
         return worth
 
     def refuse(self, task: Task, robot: FreeRobot, effort: Effort, chargers: Sequence[int]) -> str:

@@ -11,6 +11,7 @@ from hashlib import sha256
 from typing import TYPE_CHECKING
 
 from rce_fleet.exceptions import KeyReusedError, TaskRefusedError, UnknownTaskError
+from rce_fleet.limits import MOST_TIME
 from rce_fleet.tasks.order import check_cells, check_order
 from rce_fleet.tasks.tables import FleetTables
 from rce_fleet.tasks.task import TASK_LIFE, Task, TaskCause, TaskState
@@ -246,7 +247,7 @@ class TaskBook(FleetTables):
         order = replace(
             task.order,
             earliest_start=due,
-            deadline=None if late is None else late + shift,
+            deadline=None if late is None else min(late + shift, MOST_TIME),
             after=(),
         )
         number = task.occurrence + 1

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rce_fleet.limits import LEAST_FACTOR
 from rce_fleet.tasks.travel_loops import measure_ways
 
 if TYPE_CHECKING:
@@ -191,7 +192,7 @@ class TravelCosts:
             if factor == inf:
                 free[inside] = False
             else:
-                weight[inside] *= factor
+                weight[inside] *= max(LEAST_FACTOR, factor)  # else no way would be the shortest
         keep = free[heads]
         heads, tails = heads[keep], tails[keep]
         order = np.argsort(heads, kind="stable")

@@ -30,6 +30,7 @@ TINY = {
     "rce_fleet/experiments/workloads/echo.py": "a program of its own, for a machine of its own",
     "rce_container/environment/exceptions.py": BASE,
     "rce_container/runtimes/process.py": "one runtime a file",
+    "rce_fleet/limits.py": BASE,
     "rce_fleet/mapping/mapper.py": "what two algorithms, in packages of their own, have in common",
     "rce_fleet/maps/distance.py": "one computation on a map; several rooms use only this one",
     "rce_fleet/offline/inputs.py": "chooses between two readers, one of which needs rosbags",

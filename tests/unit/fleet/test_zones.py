@@ -11,7 +11,7 @@ from rce_fleet.coordination.events import CellBlocked, CellFreed, GoalSet, SendC
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.coordination.snapshot import RobotSnapshot, RobotState
-from rce_fleet.coordination.zones import Direction, Zone, ZoneKind
+from rce_fleet.coordination.zones import Direction, Zone, ZoneBook, ZoneKind
 from rce_fleet.planning.grid import GridMap
 
 if TYPE_CHECKING:
@@ -187,12 +187,21 @@ def test_the_same_zone_twice_changes_nothing(make: Make) -> None:
         (blocked("a", 27), r"zone 'a': cells \[27\] are not on the map of 27 cells"),
         (blocked("a", edges=((0, 2),)), "are not neighbours"),
         (blocked("a", edges=((0, 1),), robots=("Robot1",)), "apply to all robots"),
-        (Zone("a", ZoneKind.SLOW, (1,)), "needs a speed above 0 m/s, not 0.0"),
+        (Zone("a", ZoneKind.SLOW, (1,)), "needs 0.01 .. 100 m/s, not 0.0"),
+        (Zone("a", ZoneKind.SLOW, (1,), speed=1e-320), "needs 0.01 .. 100 m/s, not 1e-320"),
+        (Zone("a", ZoneKind.LIMITED, (1,), capacity=2**31 - 1), "capacity of 1 .. 1000000, not 2147483647"),
         (Zone("a", ZoneKind.ONE_WAY, (1,)), "needs a direction"),
-        (Zone("a", ZoneKind.LIMITED, (1,)), "capacity of at least 1, not 0"),
+        (Zone("a", ZoneKind.LIMITED, (1,)), "capacity of 1 .. 1000000, not 0"),
         (Zone("a", ZoneKind.SLOW, (1,), ((0, 1),), speed=1.0), "only a blocked zone has edges"),
     ],
 )
 def test_a_zone_that_cannot_be_is_refused(zone: Zone, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         zone.check(LOOP)
+
+
+def test_the_slowest_zone_has_a_cost() -> None:
+    """A planner takes no such zone any more; its costs are finite all the same."""
+    book = ZoneBook()
+    book.put([Zone("a", ZoneKind.SLOW, (1,), speed=1e-320), Zone("b", ZoneKind.SLOW, (2,), speed=100.0)])
+    assert book.costs() == {1: 20, 2: 1}

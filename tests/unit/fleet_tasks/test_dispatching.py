@@ -39,6 +39,15 @@ def test_priority_age_and_deadline_come_first(floor: Floor) -> None:
     assert other.task(due).state is TaskState.RUNNING
 
 
+@pytest.mark.parametrize("deadline", [-1e308, 1e308])
+def test_extreme_deadlines_leave_costs_finite(floor: Floor, deadline: float) -> None:
+    floor.add("Robot1", 0)
+    task = floor.go(3, deadline=deadline)
+    other = floor.go(5)
+    floor.run_until_ended(task, other)
+    assert floor.task(other).state is TaskState.DONE
+
+
 def test_many_tasks_are_done_once_each(floor: Floor) -> None:
     for number, cell in enumerate((0, 7, 56, 63), 1):
         floor.add(f"Robot{number}", cell)

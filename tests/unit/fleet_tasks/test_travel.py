@@ -49,6 +49,18 @@ def test_compiled_loop_and_scipy_measure_the_same() -> None:
         assert measured(seed, measure_ways.compile()) == measured(seed, measure_ways.numpy)
 
 
+def test_a_factor_that_shortens_ways_is_not_used() -> None:
+    """Ways through a zone with a negative factor would grow shorter with each round."""
+    grid = GridMap(3, 3)
+    loops = [measure_ways.loop, measure_ways.numpy]
+    for loop in [*loops, measure_ways.compile()] if is_available() else loops:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(travel_module, "measure_ways", loop)
+            travel = TravelCosts()
+            travel.set_map(grid, frozenset(), {"z": Zone("z", "cost", (1, 2))}, 0)
+            assert travel.field(0, {"z": -2.0})[[0, 1, 2]].tolist() == pytest.approx([0.0, 0.505, 0.515])
+
+
 def test_together_and_alone_are_the_same() -> None:
     grid = GridMap(5, 9)
     both = []

@@ -72,6 +72,9 @@ def test_cells_of_a_turned_grid_are_found(cell: int, yaw: float, along: float, u
     [
         ({"cell_size": 0.0}, "must be a positive number of metres"),
         ({"cell_size": 0.001}, "is not within 1"),
+        ({"cell_size": 1e-320}, r"within 0\.001 \.\. 1000 m"),
+        ({"cell_size": 1e12}, r"within 0\.001 \.\. 1000 m"),
+        ({"origin": Pose(1e308, 0.0, 0.0)}, r"within -1e\+09 \.\. 1e\+09"),
         ({"blocked_share": 1.5}, r"within 0 \.\. 1"),
         ({"origin": Pose(50.0, 0.0, 0.0)}, "is not within 1"),
         ({"rows": -2}, "is not within 1"),
