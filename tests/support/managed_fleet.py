@@ -107,7 +107,7 @@ class ManagedFleet:
 
     async def planner_zones(self) -> list[str]:
         """Return the ids of the planner's zones."""
-        answer = await self._node.service_client("/fleet/get_state", "fleet/GetState").call({}, timeout=30)
+        answer = await self._node.service_client("/fleet/get_state", "fleet/GetState")({}, timeout=30)
         return [str(zone.id) for zone in answer.state.zones]
 
     async def lose_journal(self) -> None:
@@ -131,7 +131,7 @@ class ManagedFleet:
             while True:
                 try:
                     client = self._node.service_client("/fleet/request", "fleet/Request")
-                    answer = await client.call(request, timeout=5)
+                    answer = await client.call(request, timeout=30)
                 except Exception:  # noqa: BLE001 - the manager is away, in any way
                     await asyncio.sleep(0.1)
                     continue
@@ -140,7 +140,7 @@ class ManagedFleet:
     async def call(self, service: str, service_type: str, **fields: Any) -> Message | None:
         """Call a service; None: it does not answer now."""
         try:
-            return await self._node.service_client(service, service_type).call(fields, timeout=5)
+            return await self._node.service_client(service, service_type).call(fields, timeout=30)
         except RosError:
             return None
 
