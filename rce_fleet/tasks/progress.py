@@ -15,6 +15,11 @@ if TYPE_CHECKING:
     from rce_fleet.tasks.facts import FleetFacts, RobotFacts
 
 
+BATTERY_WAIT_S = 30.0
+"""A robot whose battery is not heard for so long has none that could be charged. After a restart of the
+manager, batteries are heard later than robots."""
+
+
 @dataclass(frozen=True, slots=True)
 class ProgressRules:
     """When a robot loses its task. Seconds.
@@ -52,6 +57,8 @@ class TaskProgress:
         self._rules = rules
         self.avoid: dict[tuple[int, str], float] = {}
         self._taken: dict[int, str] = {}
+        self._unknown_since: dict[str, float] = {}
+        """Of robots with a task that the planner does not know."""
         self._warned: dict[int, int] = {}
         """The stop before which people were told of a low battery, by task."""
 
@@ -73,11 +80,14 @@ class TaskProgress:
         self._nearest, self._short_of_energy = nearest, short_of_energy
         self.avoid = {pair: until for pair, until in self.avoid.items() if until > now}
         self._taken = self.targets()
+        self._unknown_since = {
+            name: since for name, since in self._unknown_since.items() if name not in facts.robots
+        }
         self._warned = {number: stop for number, stop in self._warned.items() if number in self._book.tasks}
         for task in self._book.active_tasks():
             robot = facts.robots.get(task.robot)
             if task.state is TaskState.HELD:
-                self._end_action(task, now)
+                self._end_action(task, now, robot if robot is not None and robot.is_there else None)
             elif robot is None or not robot.is_there:
                 self._miss(self._end_action(task, now), robot, now, facts)
             else:
@@ -188,9 +198,11 @@ class TaskProgress:
         visit = task.action
         if visit is None:
             return task
-        stop = Stop(Action.DELIVER) if visit.stop == RETURN else task.order.stop(visit.stop)
-        if not self._is_over(task, stop, visit, now, robot):
-            return task
+        stop = _stop_of_visit(task, visit)
+        return self._acted(task, stop, visit, now) if self._is_over(task, stop, visit, now, robot) else task
+
+    def _acted(self, task: Task, stop: Stop, visit: StopVisit, now: float) -> Task:
+        """Note that an action has ended."""
         loads = task.loads + (stop.action is Action.PICK) - (stop.action is Action.DELIVER)
         if visit.stop == RETURN:
             loads = 0
@@ -217,8 +229,12 @@ class TaskProgress:
     ) -> bool:
         if stop.confirm and not task.confirmed:
             return False
-        if stop.action is Action.CHARGE and not stop.duration:
-            return robot is None or robot.battery is None or robot.battery >= self._charged
+        if _fills_battery(stop):
+            if robot is None:  # it may be away for a moment only
+                return False
+            if robot.battery is None:
+                return now - max(robot.moved_at, visit.started_at) >= BATTERY_WAIT_S
+            return robot.battery >= self._charged
         duration = stop.duration
         if visit.stop == RETURN:
             duration = max((s.duration for s in task.order.stops if s.action is Action.DELIVER), default=0.0)
@@ -246,7 +262,7 @@ class TaskProgress:
         """Decide about a task whose robot does not answer."""
         if not facts.is_live or task.has_ended:
             return
-        since = robot.away_since if robot is not None else task.changed_at
+        since = robot.away_since if robot is not None else self._unknown_since.setdefault(task.robot, now)
         if robot is None:
             reason = f"{task.robot} is not known to the planner"
         else:
@@ -257,6 +273,8 @@ class TaskProgress:
     def _give_up(self, task: Task, now: float, reason: str) -> None:
         """Give a task to others; with its load on the robot it waits, and then fails."""
         self.avoid[task.number, task.robot] = now + self._rules.avoid_for
+        if (visit := task.action) is not None and _fills_battery(stop := _stop_of_visit(task, visit)):
+            task = self._acted(task, stop, visit, now)
         if not task.is_bound:
             if task.state is TaskState.CANCELLING:
                 self._book.advance(task, TaskCause.CANCEL, now, reason)
@@ -272,3 +290,12 @@ class TaskProgress:
             self._book.advance(
                 task, TaskCause.FAIL, now, f"its load is on {task.robot}, which did not come back: {reason}"
             )
+
+
+def _stop_of_visit(task: Task, visit: StopVisit) -> Stop:
+    return Stop(Action.DELIVER) if visit.stop == RETURN else task.order.stop(visit.stop)
+
+
+def _fills_battery(stop: Stop) -> bool:
+    """Return whether a stop ends by the battery, and not after a time."""
+    return stop.action is Action.CHARGE and not stop.duration

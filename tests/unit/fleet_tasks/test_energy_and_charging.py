@@ -122,6 +122,55 @@ def test_a_charge_stop_goes_to_a_charger(hungry: Floor) -> None:
     hungry.run_until_ended(task)
 
 
+@pytest.mark.parametrize("away", ["unknown", "joining", "silent", "held", "no battery", "not live"])
+def test_a_charge_stop_does_not_end_while_its_robot_is_away(hungry: Floor, away: str) -> None:
+    """The planner or the manager was restarted, or the robot is silent for a moment: it still charges."""
+    robot = hungry.add("Robot1", 0, battery=0.2)
+    task = hungry.book.create(Order((Stop(Action.CHARGE), Stop(Action.GO, (5,)))), hungry.now)
+    hungry.run(12)
+    if away == "unknown":
+        del hungry.facts.robots["Robot1"]
+    elif away == "held":
+        hungry.book.hold(task.id, hungry.now)
+    elif away == "no battery":
+        robot.battery, robot.moved_at = None, hungry.now
+    elif away == "not live":
+        hungry.facts.is_live = False
+        del hungry.facts.robots["Robot1"]
+    else:
+        robot.state, robot.away_since = away, hungry.now
+    hungry.run(5)
+    hungry.facts.is_live = True
+    hungry.facts.robots["Robot1"] = robot
+    robot.state, robot.away_since, robot.battery = "arrived", inf, 0.3
+    if away == "held":
+        hungry.book.resume(task.id, hungry.now)
+    hungry.run(3)
+    assert (robot.cell, hungry.task(task).target, hungry.task(task).position) == (56, 56, 0)
+    assert not [event for event in hungry.events if event.name == "acted"]
+    robot.battery = 0.97
+    hungry.run_until_ended(task)
+
+
+def test_a_lost_robots_charge_stop_ends(hungry: Floor) -> None:
+    """Another robot does the rest of the task."""
+    robot = hungry.add("Robot1", 0, battery=0.2)
+    task = hungry.book.create(Order((Stop(Action.CHARGE), Stop(Action.GO, (5,)))), hungry.now)
+    hungry.run(12)
+    robot.state, robot.away_since = "silent", hungry.now
+    hungry.run(10)
+    assert hungry.task(task).action is not None
+    hungry.add("Robot2", 3, battery=0.9)
+    hungry.run_until_ended(task)
+    assert hungry.task(task).visits[-1].robot == "Robot2"
+
+
+def test_a_charge_stop_of_a_robot_without_battery_ends(hungry: Floor) -> None:
+    hungry.add("Robot1", 0)
+    task = hungry.book.create(Order((Stop(Action.CHARGE), Stop(Action.GO, (5,)))), hungry.now)
+    hungry.run_until_ended(task)
+
+
 def test_thresholds_out_of_order_are_refused() -> None:
     with pytest.raises(ValueError, match="critical < sufficient <= full"):
         BatteryLevels(critical=0.5, sufficient=0.4)
