@@ -155,8 +155,10 @@ class Assigner:
                 costs[row_of[number], column_of[name]] = inf
         queued = [(row, task) for row, task in enumerate(urgent) if task.robot]
         for row, task in queued:
-            later = ways[row] / speeds + self._rules.keep >= begins(task)
             column = column_of.get(task.robot)
+            if column is not None and costs[row, column] == inf:
+                continue  # its robot is free, and cannot do it
+            later = ways[row] / speeds + self._rules.keep >= begins(task)
             if column is not None:
                 costs[row, column] -= self._rules.keep
                 later[column] = False

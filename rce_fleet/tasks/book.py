@@ -105,6 +105,9 @@ class TaskBook(FleetTables):
         if task.action is None and task.next_stop != changed.next_stop:
             changed = replace(changed, target=None)
         self.emit(changed, "changed", now, user=user, text=f"{task.id} was changed")
+        if task.robot and order.robot not in ("", task.robot):
+            text = f"{order.robot} is to do it, not {task.robot}"
+            return self.advance(changed, TaskCause.RELEASE, now, text, robot="", target=None)
         return changed
 
     def hold(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from math import inf
 from typing import TYPE_CHECKING
 
-from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot
+from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot, misfit
 from rce_fleet.tasks.charging import ChargerQueue, place_to_wait
 from rce_fleet.tasks.conditions import Conditions
 from rce_fleet.tasks.energy import BatteryLevels, effort_of
@@ -141,6 +141,7 @@ class Dispatcher:
         if facts.grid is not None:
             self._travel.set_map(facts.grid, facts.shut, book.zones, facts.map_revision)
         self._progress.update(now, facts, self._nearest, self._short_of_energy)
+        self._release_misfits(now)
         ready = self._conditions.update(now)
         if facts.grid is None or not facts.is_live:
             return
@@ -274,14 +275,22 @@ class Dispatcher:
         acted = now - task.action.started_at if task.action is not None else 0.0
         return max(0.0, effort.seconds(profile) - acted), effort.end
 
+    def _release_misfits(self, now: float) -> None:
+        """Take tasks from robots that do not fit any more, because task or profile was changed."""
+        for task in self._book.active_tasks():
+            if task.state is TaskState.RUNNING and not task.is_bound:
+                reason = misfit(task, task.robot, self.profile(task.robot))
+                if reason:
+                    text = f"{task.robot} cannot do it any more: {reason}"
+                    self._book.advance(task, TaskCause.RELEASE, now, text, robot="", target=None)
+
     def _fill_queues(self, now: float, facts: FleetFacts) -> None:
-        """Give tasks to the queues of busy robots, and take them from robots that are not there any more."""
+        """Give tasks to the queues of busy robots, and take them from robots that cannot do them."""
         assigned = self._book.queues()
         for name, tasks in assigned.items():
-            known = facts.robots.get(name)
-            if known is None or not known.is_there or self._book.entry(name).is_out:
-                for task in tasks:
-                    self._book.advance(task, TaskCause.RELEASE, now, f"{name} is not there", robot="")
+            for task in tasks:
+                if reason := self._why_not(task, name, facts.robots.get(name)):
+                    self._book.advance(task, TaskCause.RELEASE, now, reason, robot="")
         queues = []
         for robot in facts.robots.values():
             present = self._book.task_of(robot.id)
@@ -299,6 +308,17 @@ class Dispatcher:
         for task, name in self._queues.insert(waiting, queues, self._progress.avoid.keys()):
             text = f"{task.id} is in the queue of {name}"
             self._book.advance(task, TaskCause.ASSIGN, now, text, robot=name)
+
+    def _why_not(self, task: Task, name: str, robot: RobotFacts | None) -> str:
+        """Return why a robot cannot keep a task in its queue; empty if it can."""
+        if robot is None or not robot.is_there or self._book.entry(name).is_out:
+            return f"{name} is not there"
+        free = self._free(robot)
+        reason = misfit(task, name, free.profile)
+        if not reason and self._book.task_of(name) is None:
+            effort = effort_of(task, free.cell, self._travel, free.profile)
+            reason = self._assigner.refuse(task, free, effort, self._book.places.chargers)
+        return f"{name} cannot do it: {reason}" if reason else ""
 
     def _explain(self, facts: FleetFacts, now: float) -> None:
         """Say of tasks that wait why no robot can do them."""

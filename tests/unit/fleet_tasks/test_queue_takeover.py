@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -127,3 +128,68 @@ def test_a_refused_pair_leaves_the_robot_its_next_task() -> None:
     floor.run(1)
     assert floor.task(hard).state is not TaskState.RUNNING
     assert floor.task(easy).state is TaskState.RUNNING
+
+
+def unable() -> tuple[Floor, Task]:
+    """Return a floor where the battery of Robot1 is not enough for the task in its queue."""
+    hungry = RobotProfile(speed=1.0, capacity=1.0, drive=0.01, idle=0.0, acting=0.0)
+    floor = Floor(GridMap(1, 200), rules=TaskRules(profile=hungry))
+    robot = floor.add("Robot1", 0, battery=0.95)
+    floor.go(10)
+    floor.run(1)
+    task = floor.go(12, 60)
+    floor.run(3)
+    assert (floor.task(task).state, floor.task(task).robot) == (TaskState.ASSIGNED, "Robot1")
+    robot.battery = 0.3
+    return floor, task
+
+
+def test_a_full_robot_takes_what_the_idle_one_cannot_do() -> None:
+    """Robot1 stands beside the first stop, and its battery is too low: Robot2 comes from far away."""
+    floor, task = unable()
+    floor.add("Robot2", 20, battery=1.0)
+    floor.run(9)
+    assert floor.book.task_of("Robot1") is None
+    assert (floor.task(task).state, floor.task(task).robot) == (TaskState.RUNNING, "Robot2")
+
+
+def test_a_task_in_a_queue_that_nobody_can_do_says_why() -> None:
+    floor, task = unable()
+    floor.run(12)
+    assert (floor.task(task).state, floor.task(task).robot) == (TaskState.QUEUED, "")
+    assert "no robot's battery has enough energy" in floor.task(task).reason
+    told = [event.text for event in floor.events if event.id == task.id and event.name == "released"]
+    assert told[0].startswith("Robot1 cannot do it: its battery has 30%")
+
+
+def test_a_task_for_another_robot_leaves_its_robot(floor: Floor) -> None:
+    floor.add("Robot1", 0)
+    task = floor.go(40)
+    floor.run(2)
+    assert floor.task(task).robot == "Robot1"
+    changed = floor.book.change(task.id, replace(task.order, robot="Robot2"), floor.now, user="anna")
+    assert (changed.state, changed.robot, changed.target) == (TaskState.QUEUED, "", None)
+    floor.add("Robot2", 63)
+    floor.run_until_ended(task)
+    assert [visit.robot for visit in floor.task(task).visits] == ["Robot2"]
+
+
+@pytest.mark.parametrize("what", ["task", "profile"])
+def test_a_robot_that_does_not_fit_any_more_loses_its_task(floor: Floor, what: str) -> None:
+    floor.add("Robot1", 0)
+    task = floor.go(40, payload=4.0)
+    floor.run(2)
+    if what == "task":
+        floor.book.change(task.id, replace(task.order, capabilities=("lift",)), floor.now)
+    else:
+        floor.book.emit(RobotEntry("Robot1", profile=RobotProfile(payload=1.0)), "profile", floor.now)
+    floor.run(1)
+    assert (floor.task(task).state, floor.task(task).robot) == (TaskState.QUEUED, "")
+
+
+def test_a_changed_task_leaves_the_queue_of_its_robot() -> None:
+    floor, task = queued(50)
+    floor.book.change(task.id, replace(task.order, capabilities=("lift",)), floor.now)
+    floor.run(3)
+    assert (floor.task(task).state, floor.task(task).robot) == (TaskState.QUEUED, "")
+    assert "lift" in floor.task(task).reason
