@@ -287,8 +287,8 @@ class FleetManager:
             self._pending += events
             if self._next is None:
                 self._next = asyncio.get_running_loop().create_future()
-            if self._writer is None or self._writer.done():
-                self._writer = asyncio.create_task(self._write())
+        if self._next is not None and (self._writer is None or self._writer.done()):
+            self._writer = asyncio.create_task(self._write())
         waiting = self._next or self._current
         if waiting is not None:
             await asyncio.shield(waiting)
@@ -304,12 +304,22 @@ class FleetManager:
             except JournalError as error:
                 self._roll_back(error)
                 return
+            except Exception as error:  # noqa: BLE001 - those who wait for the batch must not wait for good
+                self._roll_back(JournalError(f"the journal cannot be written: {error!r}"))
+                return
             self._current = None
             self.written = batch[-1].number
             waiting.set_result(None)
-            self._publish(event_fields(batch))
-            if batch[-1].number // _TRIM_EVERY != (batch[0].number - 1) // _TRIM_EVERY:
-                await self._in_thread(self._journal.forget_events, batch[-1].number - KEEP_EVENTS)
+            try:
+                await self._after_write(batch)
+            except Exception as error:  # noqa: BLE001 - the next batch must be written all the same
+                self._log.error("after events %d .. %d: %s", batch[0].number, batch[-1].number, error)
+
+    async def _after_write(self, batch: list[FleetEvent]) -> None:
+        """Publish events that are in the journal, and forget old ones from time to time."""
+        self._publish(event_fields(batch))
+        if batch[-1].number // _TRIM_EVERY != (batch[0].number - 1) // _TRIM_EVERY:
+            await self._in_thread(self._journal.forget_events, batch[-1].number - KEEP_EVENTS)
 
     def _roll_back(self, error: JournalError) -> None:
         """Go back to what the journal has: nothing was accepted that is not in it."""

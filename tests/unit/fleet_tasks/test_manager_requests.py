@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
+import threading
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +13,9 @@ from typing import Any
 
 import pytest
 
+from rce_fleet.exceptions import JournalError
 from rce_fleet.journal.journal import Journal
+from rce_fleet.manager import manager as managers
 from rce_fleet.manager.fleet_routes import ROUTES as FLEET_ROUTES
 from rce_fleet.manager.goals import GoalKeeper
 from rce_fleet.manager.manager import FleetManager
@@ -306,6 +310,43 @@ async def test_a_full_disk_refuses_and_recovers(client: ManagerClient) -> None:
     assert (await client.ask("GET", "/tasks/T1"))[0] == 200
     client.journal._db.execute("PRAGMA max_page_count = 100000")
     await client.manager.step()
+    assert (await client.ask("POST", "/tasks", GO))[1]["id"] == "T2"
+
+
+async def test_old_events_that_cannot_be_removed_stop_nothing(
+    client: ManagerClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk is full while events are removed, and another request waits for the journal."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    def forget_events(_before: int) -> None:
+        begun.set()
+        go_on.wait(60)
+        raise JournalError("the disk is full")
+
+    monkeypatch.setattr(managers, "_TRIM_EVERY", 1)
+    monkeypatch.setattr(client.journal, "forget_events", forget_events)
+    assert (await client.ask("POST", "/tasks", GO))[0] == 201
+    await asyncio.to_thread(begun.wait, 60)
+    waiting = [asyncio.create_task(client.ask("POST", "/tasks", GO)) for _ in range(2)]
+    await asyncio.sleep(0)
+    go_on.set()
+    async with asyncio.timeout(60):
+        assert [(await each)[0] for each in waiting] == [201, 201]
+        await client.manager.step()
+    assert (client.manager.failure, len(client.manager.book.tasks)) == ("", 3)
+
+
+async def test_an_event_that_cannot_be_written_is_rolled_back(client: ManagerClient) -> None:
+    """A record without a form in the journal: whoever waits is told, and the next step recovers."""
+    assert (await client.ask("POST", "/tasks", GO))[0] == 201
+    book = client.manager.book
+    book.emit(replace(book.find("T1"), revision=2**70), "wrong", 1.0)
+    async with asyncio.timeout(60):
+        with pytest.raises(JournalError, match="cannot be written"):
+            await client.manager.commit()
+        assert client.manager.book.find("T1").revision == 1
+        await client.manager.step()
     assert (await client.ask("POST", "/tasks", GO))[1]["id"] == "T2"
 
 
