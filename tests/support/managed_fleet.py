@@ -107,7 +107,7 @@ class ManagedFleet:
 
     async def planner_zones(self) -> list[str]:
         """Return the ids of the planner's zones."""
-        answer = await self._node.service_client("/fleet/get_state", "fleet/GetState")({}, timeout=30)
+        answer = await self._node.service_client("/fleet/get_state", "fleet/GetState").call({}, timeout=30)
         return [str(zone.id) for zone in answer.state.zones]
 
     async def lose_journal(self) -> None:
