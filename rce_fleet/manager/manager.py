@@ -179,7 +179,9 @@ class FleetManager:
             run: The planner.
         """
         now, known = self.clock(), self.book.planner
-        is_other_floor = known.floor not in ("", run.floor)
+        is_other_floor = run.has_other_floor(known)
+        if is_other_floor:
+            self.dispatcher.leave_floor()
         is_same = run.started == known.started
         self.hand_goals.begin(now, is_same=is_same, is_other_floor=is_other_floor)
         remark = self._sync.begin(run, now)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from rce_fleet.manager.mirror import Mirror
 from rce_fleet.manager.zones import COST, rule
+from rce_fleet.tasks.other_floor import leave_floor
 from rce_fleet.tasks.records import AUTOMATIC, BlockedCells, FleetEntry, PlannerRun, RobotEntry, Zone
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ class PlannerSync:
         """
         book, known = self._book, self._book.planner
         is_same = run.started == known.started
-        is_other_floor = known.floor not in ("", run.floor)
+        is_other_floor = run.has_other_floor(known)
         self._modes.restart({**self._modes_kept(), **self._unsent_modes()} if is_same else {})
         keeps = is_same or is_other_floor
         unsent = self._unsent_zones() if not is_other_floor else {}
@@ -98,10 +99,13 @@ class PlannerSync:
         self._facts.requested = None if keeps else frozenset()  # a planner that begins has no requests
         self._run = run
         self._note_run(now)
+        if not is_other_floor:
+            return ""
         lost = len(book.zones) + len(book.blocked.cells)
-        if is_other_floor and lost:
-            return f"the planner has another grid: its zones and blocked cells replace the {lost} known ones"
-        return ""
+        return (
+            f"the planner has another grid: its zones and blocked cells replace the {lost} known ones, open"
+            " tasks are held, and chargers, parking places and return cells are removed"
+        )
 
     def adopt(self, now: float) -> None:
         """Take over into the book what was changed at the planner, and end zones whose time has come.
@@ -193,7 +197,10 @@ class PlannerSync:
     def _note_run(self, now: float) -> None:
         known = self._book.planner
         if self._run != known:
-            text = "the planner has another grid" if known.floor != self._run.floor else "the planner began"
+            is_other_floor = self._run.has_other_floor(known)
+            if is_other_floor:
+                leave_floor(self._book, now)
+            text = "the planner has another grid" if is_other_floor else "the planner began"
             self._book.emit(self._run, "planner", now, text=text)
 
     def _modes_kept(self) -> dict[str, str]:

@@ -10,7 +10,7 @@ from rce_fleet.coordination.following import ChangeFollower
 from rce_fleet.manager.zones import read_zone
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.facts import NOT_DRIVEN, FleetFacts, RobotFacts
-from rce_fleet.tasks.records import PlannerRun
+from rce_fleet.tasks.records import TURNED_BY, PlannerRun
 
 _DETAILS = re.compile(r"[^(]*\((.*)\)")
 """A mode as a reason, with what a person gave as reason: ``paused (visitors, by anna)``."""
@@ -32,12 +32,28 @@ class FactKeeper:
         self._blocked: set[int] = set()
         self._pending: set[int] = set()
         self._batteries: dict[str, tuple[float | None, bool | None]] = {}
+        self._turned: tuple[Any, float] = (None, 0.0)
+        """When a planner took its grid, and the direction of the grid's columns."""
         self.started: Any = None
 
     @property
     def is_behind(self) -> bool:
         """Whether the complete state is needed."""
         return self._follower.is_behind
+
+    def take_rotation(self, made: dict[str, int], yaw: float) -> None:
+        """Take over how a planner's grid is turned, which its state does not say.
+
+        Args:
+            made: When the planner took the grid: the ``map_load_time`` of ``/fleet/map``, which is the
+                ``started`` of its state.
+            yaw: Direction of the columns, radians.
+        """
+        self._turned = made, yaw
+
+    def knows_rotation(self, answer: dict[str, Any]) -> bool:
+        """Return whether it is known how the grid of a ``fleet/GetState`` response is turned."""
+        return bool(self._turned[0] == answer["state"]["started"])
 
     def take_state(self, answer: dict[str, Any], now: float) -> bool:
         """Take over a ``fleet/GetState`` response; return whether it is of another planner than before.
@@ -57,6 +73,7 @@ class FactKeeper:
             cell_size=state["cell_size"],
             origin=(state["origin_x"], state["origin_y"]),
             blocked=frozenset(state["walls"]),
+            yaw=self._turned[1] if self.knows_rotation(answer) else 0.0,
         )
         if self._facts.grid is None or grid != self._facts.grid:
             self._facts.grid = grid
@@ -84,9 +101,8 @@ class FactKeeper:
         grid, started = self._facts.grid, self.started
         if grid is None or started is None:
             return PlannerRun()
-        floor = (
-            f"{grid.rows} x {grid.columns} cells of {grid.cell_size:g} m at {grid.origin}, {grid.yaw:g} rad"
-        )
+        size = f"{grid.rows} x {grid.columns} cells of {grid.cell_size:g} m"
+        floor = f"{size} at {grid.origin}{TURNED_BY}{grid.yaw:g} rad"
         return PlannerRun(f"{started['secs']}.{started['nsecs']:09d}", floor)
 
     def take_changes(self, message: dict[str, Any], now: float) -> None:

@@ -27,6 +27,7 @@ from rce_fleet.manager.task_routes import ROUTES as TASK_ROUTES
 from rce_fleet.manager.zones import zone_fields
 from rce_fleet.nodes.fleet_facts import FactKeeper
 from rce_fleet.nodes.graph_look import GraphLook
+from rce_fleet.nodes.grid_messages import GRID_TOPIC, read_grid
 from rce_fleet.nodes.known_robots import VOLUME_VARIABLE
 from rce_fleet.nodes.manager_parameters import ManagerParameters, rules_of
 from rce_fleet.nodes.parameters import read_parameters
@@ -209,9 +210,42 @@ class ManagerNode:
                 self._state_needed.set()
                 await asyncio.sleep(1.0)
                 continue
+            state = plain(answer)
+            if not self._facts.knows_rotation(state):
+                self._manager.facts.is_live = False  # cells may have other numbers than in the state before
+                if not await self._read_rotation(state):
+                    throttled.warn("grid", f"the planner's grid does not come on {GRID_TOPIC}")
+                self._state_needed.set()
+                continue
             self._heard_at = time.monotonic()
-            if self._facts.take_state(plain(answer), self._manager.clock()):
+            if self._facts.take_state(state, self._manager.clock()):
                 self._begin()
+
+    async def _read_rotation(self, state: dict[str, Any]) -> bool:
+        """Wait until it is known how the grid of a state is turned; return whether it is.
+
+        The grid is received once for each start of the planner: each blocked cell publishes it anew.
+        """
+        came = asyncio.Event()
+
+        def take(message: Message) -> None:
+            made = message.info.map_load_time
+            try:
+                self._facts.take_rotation({"secs": made.secs, "nsecs": made.nsecs}, read_grid(message).yaw)
+            except ValueError as error:
+                self._node.log.warning("the planner's grid on %s cannot be read: %s", GRID_TOPIC, error)
+            if self._facts.knows_rotation(state):
+                came.set()
+
+        grid = await self._node.subscribe(GRID_TOPIC, "nav_msgs/OccupancyGrid", take)
+        try:
+            async with asyncio.timeout(CALL_TIMEOUT_S):
+                await came.wait()
+        except TimeoutError:
+            return False
+        finally:
+            await grid.close()
+        return True
 
     def _begin(self) -> None:
         """Begin with a planner that was started, or is heard for the first time."""

@@ -181,6 +181,11 @@ class Dispatcher:
         """Do not give a task to a robot again for a while."""
         self._progress.avoid[task.number, robot] = now + self.rules.progress.avoid_for
 
+    def leave_floor(self) -> None:
+        """Forget cells where robots charge or wait: the planner has another grid."""
+        self.chargers.charging.clear()
+        self._parking.clear()
+
     def activity(self, robot: str) -> str:
         """Return what a robot does for the manager, in one word."""
         entry, task = self._book.entry(robot), self._book.task_of(robot)

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 AUTOMATIC = "automatic"
 """The mode in which the planner drives a robot."""
+TURNED_BY = ", turned by "
+"""Separates size and place of a grid from its direction in :attr:`PlannerRun.floor`."""
 OUT_MODES = frozenset({"out_of_service", "dead"})
 """Modes in which a robot takes no goals."""
 
@@ -119,6 +121,14 @@ class PlannerRun:
 
     started: str = ""
     floor: str = ""
+
+    def has_other_floor(self, before: PlannerRun) -> bool:
+        """Return whether its grid is another one than that of a planner before.
+
+        Earlier releases did not know how the grid is turned, and wrote ``0 rad`` for all.
+        """
+        unturned = f"{self.floor.partition(TURNED_BY)[0]}, 0 rad"
+        return before.floor not in ("", self.floor, unturned)
 
 
 @dataclass(frozen=True, slots=True)

@@ -264,3 +264,13 @@ def test_a_changed_map_is_measured_in_slices() -> None:
         travel.begin_step()
         last = [travel.metres(0, goal) for goal in goals]
     assert last == [inf] * len(goals)
+
+
+def test_robots_leave_for_no_cell_of_another_floor(hungry: Floor) -> None:
+    hungry.book.emit(Places(chargers=(56,), parking=(7,)), "places", hungry.now)
+    hungry.add("Robot1", 0, battery=0.2)
+    hungry.add("Robot2", 20, battery=0.9)
+    hungry.run(8)
+    assert hungry.dispatcher.goals() == {"Robot1": 56, "Robot2": 7}
+    hungry.dispatcher.leave_floor()
+    assert hungry.dispatcher.goals() == {}

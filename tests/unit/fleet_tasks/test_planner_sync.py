@@ -14,7 +14,16 @@ from rce_fleet.tasks.book import TaskBook
 from rce_fleet.tasks.energy import effort_of
 from rce_fleet.tasks.facts import FleetFacts, RobotFacts
 from rce_fleet.tasks.order import Action, Order, Stop
-from rce_fleet.tasks.records import FleetEntry, PlannerRun, RobotEntry, RobotProfile, Zone
+from rce_fleet.tasks.records import (
+    FleetEntry,
+    GoalEntry,
+    Places,
+    PlannerRun,
+    RobotEntry,
+    RobotProfile,
+    Zone,
+)
+from rce_fleet.tasks.task import TaskState
 from rce_fleet.tasks.travel import TravelCosts
 from rce_fleet.tasks.zone_costs import zone_profiles
 
@@ -284,3 +293,39 @@ def test_ways_lead_around_a_robots_forbidden_cells() -> None:
     assert effort_of(task, 0, travel, profiles["Robot1"]).first == inf
     assert effort_of(task, 1, travel, profiles["Robot1"]).first < inf
     assert effort_of(task, 0, travel, profiles["Robot2"]).first == 5.0
+
+
+def test_another_grid_holds_tasks_and_removes_places() -> None:
+    """The cells that they name have other numbers there, or are none."""
+    both = Both()
+    book, go = both.book, (Stop(Action.GO, (3,)),)
+    waiting = book.create(Order(go), both.now)
+    loaded = book.create(Order((Stop(Action.PICK, (1,)), Stop(Action.DELIVER, (2,)))), both.now)
+    loaded = replace(loaded, state=TaskState.RUNNING, robot="Robot1", position=1, loads=1, target=2)
+    held = book.create(Order(go), both.now)
+    returning = replace(loaded, number=9, state=TaskState.CANCELLING, robot="Robot2")
+    done = replace(waiting, number=10, state=TaskState.DONE, order=Order(go, every=60.0), recurs_at=1e6)
+    for task in (loaded, returning, done):
+        book.put_record(task)
+    book.hold(held.id, both.now)
+    book.emit(Places((5,), (6,), (7,), 4), "places", both.now)
+    book.emit(GoalEntry("Robot1", 6), "goal", both.now)
+    both.sync.begin(PlannerRun("2.0", "16 x 16"), both.now)
+    states = {task.id: task.state.value for task in book.tasks.values()}
+    assert states == {"T1": "held", "T2": "held", "T3": "held", "T9": "failed", "T10": "done", "T11": "held"}
+    assert (book.find("T2").robot, book.find("T2").target) == ("Robot1", None)
+    assert all("another grid" in book.find(name).reason for name in ("T1", "T2", "T3", "T9", "T11"))
+    assert (book.places, book.goals) == (Places(revision=5), {})
+    names = [event.name for event in book.take_events()][-7:]
+    assert names[-2:] == ["places", "planner"]
+    both.sync.begin(PlannerRun("3.0", "16 x 16"), both.now)
+    assert [event.name for event in book.take_events()] == ["planner"]
+
+
+def test_a_floor_of_an_earlier_release_is_the_same_turned_or_not() -> None:
+    """Earlier releases wrote ``0 rad`` for every grid."""
+    run = PlannerRun("2.0", "8 x 8 cells of 1 m at (0.0, 0.0), turned by 0.3 rad")
+    assert not run.has_other_floor(PlannerRun("1.0", "8 x 8 cells of 1 m at (0.0, 0.0), 0 rad"))
+    assert not run.has_other_floor(PlannerRun())
+    assert run.has_other_floor(PlannerRun("1.0", "8 x 8 cells of 1 m at (1.0, 0.0), 0 rad"))
+    assert run.has_other_floor(PlannerRun("1.0", run.floor.replace("0.3", "1.2")))
