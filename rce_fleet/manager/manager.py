@@ -7,12 +7,12 @@ What changes the book is in the journal before it is answered or has an effect: 
 from __future__ import annotations
 
 import asyncio
-import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Protocol, assert_never
 
 from rce_fleet.exceptions import JournalError
 from rce_fleet.journal.journal import EventQuery, event_fields
+from rce_fleet.manager.clock import WallClock
 from rce_fleet.manager.goals import GoalKeeper
 from rce_fleet.manager.hand_goals import HandGoals
 from rce_fleet.manager.planner_sync import BlockCell, PlannerCall, PlannerSync, SetMode, SetZone
@@ -35,6 +35,10 @@ KEEP_ENDED = 10_000
 KEEP_EVENTS = 200_000
 """So many events are kept in the journal."""
 _TRIM_EVERY = 10_000
+LEAD_S = 60.0
+"""People are warned if the journal is so much ahead of the machine's clock, seconds."""
+CLOCK_STEP_S = 2.0
+"""A smaller step of the clock is one as time servers make it, seconds."""
 
 
 class PlannerLink(Protocol):
@@ -51,21 +55,6 @@ class PlannerLink(Protocol):
 
     async def set_zone(self, name: str, zone: Zone | None, now: float) -> str:
         """Make or replace a zone; None: remove it."""
-
-
-class WallClock:
-    """Seconds since 1970 that never go back: a clock of the machine that jumps does not move it.
-
-    Args:
-        least: It begins here at the earliest: the time of the last event of the journal.
-    """
-
-    def __init__(self, least: float = 0.0) -> None:
-        self._offset = max(time.time(), least) - time.monotonic()
-
-    def __call__(self) -> float:
-        """Return the time."""
-        return time.monotonic() + self._offset
 
 
 class FleetManager:
@@ -116,7 +105,14 @@ class FleetManager:
         self._sync = PlannerSync(self.book, self.facts)
         self.hand_goals = HandGoals(self.book, self.facts, self.goals)
         last = journal.events(EventQuery(after=self.book.number - 1, limit=1)) if self.book.number else []
-        self.clock = clock or WallClock(last[0]["time"] if last else 0.0)
+        self._wall = WallClock(last[0]["time"] if last else 0.0)
+        if clock is None and self._wall.lead > LEAD_S:
+            log.warning(
+                "the journal is %.0f s ahead of this machine's clock: the fleet's time runs slower until both"
+                " agree; set the machine's clock if it is wrong",
+                self._wall.lead,
+            )
+        self.clock = clock or self._wall
         self.statistics = FleetStatistics(self.clock(), (Minute(*row) for row in journal.minutes()))
 
     def _load(self) -> None:
@@ -147,6 +143,7 @@ class FleetManager:
             await self._try_journal()
             return
         now = self.clock()
+        self._follow_clock()
         self.book.grid = self.facts.grid or self.book.grid
         self._sync.adopt(now)
         if self.facts.is_live:
@@ -169,6 +166,15 @@ class FleetManager:
                 refusal = await self._planner.set_goal(robot, cell)
                 if refusal:
                     self.goals.refused(robot)
+
+    def _follow_clock(self) -> None:
+        """Count no step of the clock as time in which robots did not move or were away."""
+        step, self._wall.stepped = self._wall.stepped, 0.0
+        if step > CLOCK_STEP_S and self.clock is self._wall:
+            self._log.warning("the clock of this machine was set %.0f s forward", step)
+            for robot in self.facts.robots.values():
+                robot.moved_at += step
+                robot.away_since += step
 
     def planner_began(self, run: PlannerRun) -> None:
         """Begin with a planner that was started, or is heard for the first time.

@@ -287,11 +287,11 @@ async def test_zones_reach_the_planner(client: ManagerClient) -> None:
     planner.calls.clear()
     await manager.step()
     assert planner.calls == [], "it was sent again at once"
-    manager.clock._offset += REFUSED_S  # type: ignore[attr-defined]  # the clock is moved on
+    manager.clock._now += REFUSED_S  # type: ignore[attr-defined]  # the clock is moved on
     await manager.step()
     assert planner.calls == [("zone", "aisle", "slow")]
     manager.facts.zones["aisle"] = manager.book.zones["aisle"]
-    manager.clock._offset += 1000.0  # type: ignore[attr-defined]
+    manager.clock._now += 1000.0  # type: ignore[attr-defined]
     await manager.step()
     assert planner.calls[-1] == ("zone", "aisle", None)
     assert [zone["id"] for zone in (await client.ask("GET", "/zones"))[1]["zones"]] == ["dear"]
