@@ -156,7 +156,7 @@ class PlannerNode:
     async def _keep_known(self) -> None:
         """Write the robots and their cells, if they changed, beside the planner's work."""
         while self._known is not None and await self._node.sleep(KEEP_EVERY):
-            content = self._known.content(self._planner.state)
+            content = self._known.content(self._planner.state, time.time())
             if content is None:
                 continue
             try:

@@ -22,6 +22,8 @@ VOLUME_VARIABLE = "RCE_VOLUME_FLEET"
 FILE = "robots.json"
 KNOWN_FOR = 3600.0
 """Seconds; robots of an older file may have been moved by hand, so it is ignored."""
+WRITTEN_EVERY = 600.0
+"""Seconds after which the file of robots at rest is written again, so that it does not become old."""
 
 
 def file_of_robots(values: Mapping[str, Any]) -> Path | None:
@@ -59,6 +61,7 @@ class KnownRobots:
         self._path = path
         self._ahead = ahead
         self._written: dict[str, Any] = {}
+        self._written_at = 0.0
 
     def read(self, grid: GridMap, now: float) -> dict[str, tuple[int, ...]]:
         """Return the cells that each robot may be in; empty if the file is of another grid, or old.
@@ -75,7 +78,8 @@ class KnownRobots:
             return {}
         try:
             found = json.loads(self._path.read_text(encoding="utf-8"))
-            if found["grid"] != _describe(grid) or not 0 <= now - float(found["written"]) <= KNOWN_FOR:
+            age = abs(now - float(found["written"]))  # the clock may have been set back a little
+            if found["grid"] != _describe(grid) or not age <= KNOWN_FOR:
                 return {}
             return {str(robot): tuple(map(int, cells)) for robot, cells in found["robots"].items()}
         except (KeyError, TypeError, AttributeError, json.JSONDecodeError) as error:
@@ -83,11 +87,17 @@ class KnownRobots:
                 f"{self._path} does not hold the robots of a fleet ({error!r}): it is written anew"
             ) from error
 
-    def content(self, state: FleetState) -> dict[str, Any] | None:
-        """Return what to write; None if the file has it already."""
+    def content(self, state: FleetState, now: float) -> dict[str, Any] | None:
+        """Return what to write; None if the file has it already, and not for long.
+
+        Args:
+            state: The fleet.
+            now: Seconds since 1970.
+        """
         robots = {robot: list(cells) for robot, cells in cells_of_robots(state, self._ahead).items()}
         content = {"grid": _describe(state.grid), "robots": robots}
-        return None if content == self._written else content
+        is_new = abs(now - self._written_at) <= WRITTEN_EVERY
+        return None if is_new and content == self._written else content
 
     def write(self, content: dict[str, Any], now: float) -> None:
         """Replace the file.
@@ -102,7 +112,7 @@ class KnownRobots:
         beside = self._path.with_suffix(".new")
         beside.write_text(json.dumps({**content, "written": now}), encoding="utf-8")
         beside.replace(self._path)
-        self._written = content
+        self._written, self._written_at = content, now
 
 
 def _describe(grid: GridMap) -> list[float]:

@@ -9,7 +9,7 @@ import pytest
 from rce_fleet.coordination.events import GoalSet, PoseSeen, ReportSeen, RobotsExpected, SendCells, Tick
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.planner import FleetPlanner
-from rce_fleet.nodes.known_robots import KNOWN_FOR, KnownRobots
+from rce_fleet.nodes.known_robots import KNOWN_FOR, WRITTEN_EVERY, KnownRobots
 from rce_fleet.planning.grid import GridMap
 
 if TYPE_CHECKING:
@@ -119,11 +119,14 @@ def test_kept_robots_are_those_of_the_same_grid(tmp_path: Path) -> None:
     planner = FleetPlanner(GRID)
     join(planner, "Robot1", 8, 0.0, 2.0)
     kept = KnownRobots(tmp_path / "robots.json", ahead=4)
-    content = kept.content(planner.state)
+    content = kept.content(planner.state, 100.0)
     assert content is not None
     kept.write(content, 100.0)
-    assert kept.content(planner.state) is None
+    assert kept.content(planner.state, 101.0) is None
+    assert kept.content(planner.state, 101.0 + WRITTEN_EVERY) == content, "robots at rest become unknown"
     assert KnownRobots(tmp_path / "robots.json", 4).read(GRID, 101.0) == {"Robot1": (8,)}
+    assert kept.read(GRID, 97.0) == {"Robot1": (8,)}, "the clock was set back a little"
+    assert kept.read(GRID, 100.0 - KNOWN_FOR - 1) == {}
     assert kept.read(GridMap(4, 6), 101.0) == {}
     assert kept.read(GRID, 100.0 + KNOWN_FOR + 1) == {}
     (tmp_path / "robots.json").write_text("[1]")
