@@ -13,6 +13,9 @@ from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
 from rce.ros.errors import MasterUnreachableError, ServiceLostError
+from rce.ros.multimaster.contacts import ask_contact
+from rce.ros.multimaster.errors import MalformedStateError
+from rce.ros.multimaster.peer_table import PeerKey
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
@@ -134,3 +137,16 @@ async def test_master_with_a_bad_answer_is_an_unreachable_one(value: Any) -> Non
         if not isinstance(value, str):
             with pytest.raises(MasterUnreachableError, match="no known form"):
                 await master.lookup_service("/s")
+
+
+@pytest.mark.parametrize(
+    "stamp", [b"<int>1" + b"0" * 400 + b"</int>", b"<nil/>", b"x"], ids=["large", "nil", "text"]
+)
+async def test_discovery_with_a_bad_contact_is_one_error(stamp: bytes) -> None:
+    rest = b"<value>a</value>" * 4
+    document = (
+        b"<methodResponse><params><param><value><array><data><value>" + stamp + b"</value>" + rest
+    ) + b"</data></array></value></param></params></methodResponse>"
+    async with RpcServer(OneAnswer(document), "127.0.0.1") as server, RpcClient() as rpc:
+        with pytest.raises(MalformedStateError):
+            await ask_contact(rpc, PeerKey("127.0.0.1", server.port))
