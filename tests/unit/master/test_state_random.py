@@ -156,6 +156,8 @@ class Histories(RuleBasedStateMachine):
         specs = {e.id: self.state.spec(e.id) for e in self.state.tables.endpoints}
         self.state = State.load(self.stored, self.now, self.limits)
         assert {e.id: self.state.spec(e.id) for e in self.state.tables.endpoints} == specs
+        # Each master sets the times of these moves anew, and stores them with the next change.
+        self.stored["volume_moves"] = self.image(persistent_only=True)["volume_moves"]
 
     @rule(seconds=st.floats(0, 4))
     def tick(self, seconds: float) -> None:
