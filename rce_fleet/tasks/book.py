@@ -98,9 +98,7 @@ class TaskBook(FleetTables):
             )
         if task.robot and order.robot not in ("", task.robot) and task.is_bound:
             raise TaskRefusedError(f"{task.robot} has the load of {task.id}; another robot cannot take over")
-        recurs_at = task.recurs_at
-        if order.every != task.order.every:
-            recurs_at = None if order.every is None else now + order.every
+        recurs_at = _recurs_at(task, order, now)
         changed = replace(task, order=order, revision=task.revision + 1, recurs_at=recurs_at, late=False)
         if task.action is None and task.next_stop != changed.next_stop:
             changed = replace(changed, target=None)
@@ -271,6 +269,18 @@ class TaskBook(FleetTables):
             following, "created", now, text=f"occurrence {number} of the task that began with {task.id}"
         )
         return following
+
+
+def _recurs_at(task: Task, order: Order, now: float) -> float | None:
+    """Return when a task recurs after a change of its order; None: it does not."""
+    every, count = order.every, order.occurrences
+    if every is None or (count is not None and task.occurrence >= count):
+        return None
+    if every != task.order.every:
+        return now + every
+    if task.recurs_at is None:  # it was the last one
+        return (task.created_at if order.earliest_start is None else order.earliest_start) + every
+    return task.recurs_at
 
 
 def digest(order: Order) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -262,6 +264,38 @@ def test_a_task_recurs_without_piling_up(floor: Floor) -> None:
     assert [task.occurrence for task in tasks] == [1, 2, 3]
     assert all(task.state is TaskState.DONE for task in tasks)
     assert floor.task(first).recurs_at is None
+
+
+@pytest.mark.parametrize(
+    ("given", "changed", "number", "recurs_in"),
+    [
+        ((10.0, 10), (10.0, 1), 1, None),
+        ((10.0, 3), (10.0, 20), 3, 10.0),
+        ((10.0, 3), (25.0, 3), 3, None),
+        ((10.0, 3), (25.0, 4), 3, 26.0),
+        ((10.0, 3), (25.0, 3), 2, 26.0),
+        ((10.0, None), (10.0, None), 2, 10.0),
+        ((10.0, 3), (None, None), 1, None),
+        ((None, None), (10.0, 2), 1, 11.0),
+    ],
+)
+def test_a_change_of_the_recurrence_respects_its_count(
+    floor: Floor,
+    given: tuple[float | None, int | None],
+    changed: tuple[float | None, int | None],
+    number: int,
+    recurs_in: float | None,
+) -> None:
+    """The occurrence was created when it was due; its task is changed a second later."""
+    task = floor.go(1, every=given[0], occurrences=given[1])
+    while task.occurrence < number:
+        floor.book.put_record(replace(task, state=TaskState.DONE))
+        floor.now += 10.0
+        task = floor.book.recur(floor.task(task), floor.now)
+    begun = floor.now
+    order = replace(task.order, every=changed[0], occurrences=changed[1], name="changed")
+    task = floor.book.change(task.id, order, begun + 1.0)
+    assert task.recurs_at == (None if recurs_in is None else begun + recurs_in)
 
 
 @pytest.mark.parametrize(
