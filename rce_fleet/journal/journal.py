@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import msgspec
 
 from rce_fleet.exceptions import JournalError
-from rce_fleet.tasks.records import RECORD_TYPES, FleetEvent, Record, key_of
+from rce_fleet.tasks.records import RECORD_TYPES, FleetEvent, GoalEntry, Record, Zone, key_of
 from rce_fleet.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -115,13 +115,12 @@ class Journal:
         """
         newest = {(event.kind, event.id): event.record for event in events}
         rows = [event_row(event) for event in events]
-        records = [(kind, key, msgspec.json.encode(record)) for (kind, key), record in newest.items()]
+        write_records = _writer_of(newest.values(), forgotten)
 
         def write(db: sqlite3.Connection) -> None:
             with db:
                 db.executemany("INSERT INTO events VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
-                db.executemany("INSERT OR REPLACE INTO records VALUES (?, ?, ?)", records)
-                db.executemany("DELETE FROM records WHERE kind = ? AND id = ?", list(forgotten))
+                write_records(db)
 
         self._run(write, "written")
 
@@ -131,11 +130,11 @@ class Journal:
         Raises:
             JournalError: They could not be written.
         """
-        rows = [(*key_of(record), msgspec.json.encode(record)) for record in records]
+        write_records = _writer_of(records)
 
         def write(db: sqlite3.Connection) -> None:
             with db:
-                db.executemany("INSERT OR REPLACE INTO records VALUES (?, ?, ?)", rows)
+                write_records(db)
 
         self._run(write, "written")
 
@@ -272,6 +271,33 @@ class Journal:
         elif "malformed" in text or "not a database" in text:
             text = f"it is damaged ({text}); restore it, or move it away to begin without its tasks"
         return JournalError(f"the journal {self._path} cannot be {what}: {text}")
+
+
+def _writer_of(
+    records: Iterable[Record], forgotten: Collection[tuple[str, str]] = ()
+) -> Callable[[sqlite3.Connection], None]:
+    """Return what replaces records, and removes those that are forgotten or say nothing any more."""
+    kept, gone = [], list(forgotten)
+    for record in records:
+        if _says_nothing(record):
+            gone.append(key_of(record))
+        else:
+            kept.append((*key_of(record), msgspec.json.encode(record)))
+
+    def write(db: sqlite3.Connection) -> None:
+        db.executemany("INSERT OR REPLACE INTO records VALUES (?, ?, ?)", kept)
+        db.executemany("DELETE FROM records WHERE kind = ? AND id = ?", gone)
+
+    return write
+
+
+def _says_nothing(record: Record) -> bool:
+    """Return whether a manager without this record would do the same."""
+    match record:
+        case Zone(is_removed=True, unsent=False) | GoalEntry(cell=None, unsent=False):
+            return True
+        case _:
+            return False
 
 
 def _read_id(db: sqlite3.Connection) -> str:

@@ -297,6 +297,40 @@ async def test_zones_reach_the_planner(client: ManagerClient) -> None:
     assert [zone["id"] for zone in (await client.ask("GET", "/zones"))[1]["zones"]] == ["dear"]
 
 
+@pytest.mark.parametrize("zone", [{"kind": "blocked"}, {"kind": "cost", "value": 2.0}])
+async def test_a_removed_zone_leaves_the_journal(client: ManagerClient, zone: dict[str, Any]) -> None:
+    """Once the planner has confirmed it; what happened to it stays among the events."""
+    manager, planner = client.manager, client.planner
+    manager.facts.is_current = True
+    manager.planner_began(PlannerRun("1", "8 x 8"))
+    await client.ask("PUT", "/zones/z", {**zone, "cells": [3]})
+    if zone["kind"] == "blocked":
+        manager.facts.zones["z"] = manager.book.zones["z"]
+    await manager.step()
+    assert [record for record in client.journal.load()[0] if isinstance(record, Zone)]
+    planner.refusal = "the planner does not answer"
+    assert (await client.ask("DELETE", "/zones/z"))[0] == 200
+    kept = [record for record in client.journal.load()[0] if isinstance(record, Zone)]
+    assert [record.is_removed for record in kept] == [True]
+    manager.facts.zones.clear()
+    planner.refusal = ""
+    manager.clock._now += REFUSED_S  # type: ignore[attr-defined]  # the clock is moved on
+    for _ in range(2):
+        await manager.step()
+    assert not [record for record in client.journal.load()[0] if isinstance(record, Zone)]
+    events = (await client.ask("GET", "/events?id=z"))[1]["events"]
+    assert [event["name"] for event in events] == ["zone", "zone removed"]
+
+
+async def test_a_goal_that_ended_leaves_the_journal(client: ManagerClient) -> None:
+    book, now = client.manager.book, client.manager.clock()
+    for entry, count in ((GoalEntry("Robot1", 5), 1), (GoalEntry("Robot1"), 0)):
+        book.emit(entry, "goal", now)
+        await client.manager.commit()
+        found = [record for record in client.journal.load()[0] if isinstance(record, GoalEntry)]
+        assert len(found) == count
+
+
 async def test_a_full_disk_refuses_and_recovers(client: ManagerClient) -> None:
     """Nothing is accepted that is not in the journal; the book is as the journal has it."""
     assert (await client.ask("POST", "/tasks", GO))[0] == 201
