@@ -99,6 +99,8 @@ class FleetManager:
         """The same of the batch after that, to which events are added meanwhile."""
         self._writer: asyncio.Task[None] | None = None
         self._failure = ""
+        self._is_stale = False
+        """Whether the book may have what the journal has not, because that could not be read."""
         self.facts = FleetFacts()
         self.goals = GoalKeeper()
         self._load()
@@ -126,8 +128,14 @@ class FleetManager:
         self.dispatcher = Dispatcher(self.book, self._rules)
 
     def _reload(self) -> None:
-        """Make the book from the journal again."""
-        self._load()
+        """Make the book from the journal again; if it cannot be read, that is tried again later."""
+        try:
+            self._load()
+        except JournalError as error:
+            self._log.error("%s", error)
+            self._is_stale = True
+            return
+        self._is_stale = False
         self._sync.take_book(self.book)
         self.hand_goals.take_book(self.book)
 
@@ -343,6 +351,11 @@ class FleetManager:
 
     async def _try_journal(self) -> None:
         """Look whether the journal can be written again."""
+        if self._is_stale:
+            self._reload()
+        if self._is_stale:
+            await asyncio.sleep(1.0)
+            return
         places = self.book.places
         self.book.emit(places, "checked", self.clock(), text="the journal can be written again")
         batch = self.book.take_events()

@@ -384,6 +384,27 @@ async def test_an_event_that_cannot_be_written_is_rolled_back(client: ManagerCli
     assert (await client.ask("POST", "/tasks", GO))[1]["id"] == "T2"
 
 
+async def test_a_journal_that_cannot_be_read_is_read_later(
+    client: ManagerClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither written nor read: what was not accepted must not come into the journal afterwards."""
+    assert (await client.ask("POST", "/tasks", GO))[0] == 201
+
+    def fail(*_given: object) -> None:
+        raise JournalError("the disk is gone")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(client.journal, "append", fail)
+        patch.setattr(client.journal, "load", fail)
+        assert (await client.ask("POST", "/tasks", GO))[0] == 507
+        await client.manager.step()
+    await client.manager.step()
+    assert (client.manager.failure, list(client.manager.book.tasks)) == ("", [1])
+    assert (await client.ask("POST", "/tasks", GO))[1]["id"] == "T2"
+    events = (await client.ask("GET", "/events"))[1]["events"]
+    assert [event["number"] for event in events] == list(range(1, len(events) + 1))
+
+
 async def test_a_restarted_manager_knows_everything(tmp_path: Path) -> None:
     first = ManagerClient(tmp_path / "j.sqlite")
     await first.ask("POST", "/tasks", GO, key="order-1")
