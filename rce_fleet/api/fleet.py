@@ -13,6 +13,7 @@ from rce_fleet.limits import (
     LEAST_SPEED,
     MOST_AMOUNT,
     MOST_FACTOR,
+    MOST_REASON,
     MOST_SPEED,
 )
 
@@ -140,7 +141,7 @@ class ZoneRequest(ApiModel):
     robots: list[str] = Field(
         default_factory=list, description="Robots that the rule is for; empty: all.", max_length=10000
     )
-    reason: str = Field(default="", max_length=500)
+    reason: str = Field(default="", max_length=MOST_REASON)
     until: Moment | None = Field(default=None, description="When it ends, seconds since 1970.")
 
 

@@ -16,7 +16,7 @@ from math import isfinite, pi, tau
 from typing import TYPE_CHECKING, Any
 
 from rce_fleet.exceptions import TaskRefusedError
-from rce_fleet.limits import MOST_TIME, within
+from rce_fleet.limits import MOST_REASON, MOST_TIME, within
 from rce_fleet.tasks.clamping import ZONE_VALUES
 from rce_fleet.tasks.records import Zone
 
@@ -111,7 +111,7 @@ def read_zone(message: dict[str, Any], now: float) -> Zone:
         value=value,
         edges=tuple(sorted(zip(edges[::2], edges[1::2], strict=True))),
         robots=tuple(sorted(message["robots"])),
-        reason=message["reason"],
+        reason=message["reason"][:MOST_REASON],
         user=message["by"],
         until=min(now + message["lifetime"], MOST_TIME) if message["lifetime"] else None,
     )

@@ -205,7 +205,7 @@ class ManagerNode:
             self._state_needed.clear()
             try:
                 answer = await client.call({}, timeout=CALL_TIMEOUT_S)
-            except RosError as error:
+            except (RosError, TypesError) as error:
                 throttled.warn("planner", f"the planner does not answer: {error}")
                 self._state_needed.set()
                 await asyncio.sleep(1.0)

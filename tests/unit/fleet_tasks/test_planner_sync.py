@@ -329,3 +329,10 @@ def test_a_floor_of_an_earlier_release_is_the_same_turned_or_not() -> None:
     assert not run.has_other_floor(PlannerRun())
     assert run.has_other_floor(PlannerRun("1.0", "8 x 8 cells of 1 m at (1.0, 0.0), 0 rad"))
     assert run.has_other_floor(PlannerRun("1.0", run.floor.replace("0.3", "1.2")))
+
+
+def test_a_zone_of_the_planner_has_the_limits_of_the_api() -> None:
+    """The planner's service takes longer reasons, and zones that live longer."""
+    zone = zone_fields(Zone("ice", "slow", (3,), 0.2, reason="x" * 5000), 0.0)
+    seen = read_zone({**zone, "lifetime": 1e300, "speed": 1e-320}, 0.0)
+    assert (len(seen.reason), seen.until, seen.value) == (500, 1e11, 0.01)
