@@ -164,6 +164,15 @@ class FleetView:
         """Return whether the planner knows a robot."""
         return robot in self._robots
 
+    def mode_of(self, robot: str) -> str:
+        """Return the mode that counts for a robot, of its own and the fleet's; empty: the planner tells none."""
+        return str(self._robots.get(robot, {}).get("mode", ""))
+
+    def own_mode_of(self, robot: str) -> str:
+        """Return a robot's own mode. Under a fleet that is paused or stopped it is taken for automatic."""
+        mode = self.mode_of(robot)
+        return "automatic" if mode in ("", "lost", self.mode) else mode
+
     def map(self) -> dict[str, Any] | None:
         """Return the grid in the form of page and API."""
         if self._map is None:

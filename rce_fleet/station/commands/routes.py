@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import TYPE_CHECKING, Literal
 
 from aiohttp import WSMsgType, web
@@ -18,6 +18,7 @@ from rce_fleet.station.access import USER, AccessControl, problem
 from rce_fleet.station.api import Answer
 from rce_fleet.station.commands.driving import DEAD_S, DriveFrame, DriveGuard
 from rce_fleet.station.commands.kinds import VELOCITY, velocity_message
+from rce_fleet.station.commands.manual_mode import ManualModes
 from rce_fleet.station.commands.sources import CommandError
 from rce_fleet.station.planner_client import PlannerError
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from rce_fleet.station.commands.control import RobotControl
     from rce_fleet.station.commands.sources import CommandSender
     from rce_fleet.station.fleet_link import FleetLink
+    from rce_fleet.station.view import FleetView
 
 MAX_FRAME = 1 << 12
 _ERRORS = (400, 401, 403, 404, 408, 409, 413, 421, 503)
@@ -67,12 +69,16 @@ class ControlRoutes:
     Args:
         control: Reaches the robots; None: this station cannot.
         fleet: Tells the planner which robot is driven by hand.
+        view: Knows the robots' modes.
         access: Checks what users may do.
     """
 
-    def __init__(self, control: RobotControl | None, fleet: FleetLink, access: AccessControl) -> None:
+    def __init__(
+        self, control: RobotControl | None, fleet: FleetLink, view: FleetView, access: AccessControl
+    ) -> None:
         self._control = control
         self._fleet = fleet
+        self._modes = ManualModes(fleet, view)
         self._access = access
 
     @ROUTES.route(
@@ -179,27 +185,28 @@ class ControlRoutes:
         if not control.begin_driving(robot, user):
             await _refuse(socket, f"{robot} is driven by {control.driven[robot]}")
             return socket
-        sender = None
         try:
-            await self._set_manual(robot, user, manual=True)
-            sender = await control.open(robot, VELOCITY)
-            self._access.audit(request, "drive", robot, "begin")
-            await _drive(socket, sender)
+            async with self._modes.manual(robot, user), self._sender(request, control, robot) as sender:
+                await _drive(socket, sender)
         except (CommandError, PlannerError) as error:
             await _refuse(socket, str(error))
         finally:
-            control.end_driving(robot)
-            if sender is not None:
-                sender.send(velocity_message(0.0, 0.0))
-                await sender.close()
-                self._access.audit(request, "drive", robot, "end")
-            with contextlib.suppress(PlannerError):
-                await self._set_manual(robot, user, manual=False)
+            control.end_driving(robot)  # last: the next one to drive it shall not lose the mode manual
         return socket
 
-    async def _set_manual(self, robot: str, user: str, *, manual: bool) -> None:
-        mode = "manual" if manual else "automatic"
-        await self._fleet.set_mode(robot, mode, reason=f"driven by {user}" if manual else "", user=user)
+    @contextlib.asynccontextmanager
+    async def _sender(
+        self, request: web.Request, control: RobotControl, robot: str
+    ) -> AsyncIterator[CommandSender]:
+        """Give what sends velocities; the robot stands at the end."""
+        sender = await control.open(robot, VELOCITY)
+        self._access.audit(request, "drive", robot, "begin")
+        try:
+            yield sender
+        finally:
+            sender.send(velocity_message(0.0, 0.0))
+            await sender.close()
+            self._access.audit(request, "drive", robot, "end")
 
 
 async def _drive(socket: web.WebSocketResponse, sender: CommandSender) -> None:

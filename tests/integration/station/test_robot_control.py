@@ -23,6 +23,7 @@ from rce_fleet.station.commands.control import RobotControl
 from rce_fleet.station.commands.sources import RosCommandSource
 from rce_fleet.station.feed import Feed
 from rce_fleet.station.layers.ros_source import RosLayerSource
+from rce_fleet.station.planner_client import PlannerError
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 
@@ -35,11 +36,23 @@ class RecordingFleet:
 
     def __init__(self) -> None:
         self.modes: list[tuple[str, str]] = []
+        self.refuses: set[str] = set()
+        self.events: list[str] = []
+        self.may_restore = asyncio.Event()
+        self.may_restore.set()
 
     async def set_mode(self, robot: str, mode: str, *, reason: str, user: str) -> str:
         del reason, user
+        if mode in self.refuses:
+            raise PlannerError(f"{mode} is refused")
         self.modes.append((robot, mode))
+        if mode != "manual":
+            await self.may_restore.wait()
         return ""
+
+    def take_event(self, text: str, tone: str) -> None:
+        assert tone == "bad"
+        self.events.append(text)
 
 
 @dataclass
@@ -49,6 +62,7 @@ class Site:
     client: TestClient[Any, Any]
     fleet: RecordingFleet
     control: RobotControl
+    view: FleetView
     stops: deque[bool] = field(default_factory=deque)
     velocities: deque[tuple[float, float]] = field(default_factory=deque)
     poses: deque[Message] = field(default_factory=deque)
@@ -80,7 +94,7 @@ async def site() -> AsyncIterator[Site]:
         )
         station = Station(view, fleet, feed.pages, control=control)  # type: ignore[arg-type]  # as wide as what is called
         async with TestClient(TestServer(station.make_app())) as client:
-            made = Site(client, fleet, control)
+            made = Site(client, fleet, control, view)
             await node.subscribe(
                 "/Robot1/emergency_stop", "std_msgs/Bool", lambda said: made.stops.append(said.data)
             )
@@ -127,6 +141,15 @@ async def test_a_stop_that_cannot_be_read_is_refused(body: dict[str, Any]) -> No
         assert (status, made.control.stopped) == (400, {})
 
 
+async def _driven_shortly(made: Site, robot_id: str) -> None:
+    async with made.client.ws_connect(f"/api/v1/robots/{robot_id}/drive") as page:
+        if robot_id == "Robot1":
+            await _frame(page, 0)
+        else:
+            assert "raw_cmd_vel" in json.loads(await page.receive_str(timeout=LIMIT_S))["error"]
+    await made.until(lambda: robot_id not in made.control.driven)
+
+
 async def _frame(page: ClientWebSocketResponse, number: int, **fields: object) -> dict[str, Any]:
     sent = {"number": number, "sent": asyncio.get_running_loop().time(), "held": True, "speed": 0.2}
     await page.send_str(json.dumps({**sent, **fields}))
@@ -155,3 +178,69 @@ async def test_a_robot_is_driven_while_the_switch_is_held() -> None:
 async def test_a_robot_that_does_not_listen_is_not_driven() -> None:
     async with site() as made, made.client.ws_connect("/api/v1/robots/Robot2/drive") as page:
         assert "raw_cmd_vel" in json.loads(await page.receive_str(timeout=LIMIT_S))["error"]
+
+
+@pytest.mark.parametrize("robot_id", ["Robot1", "Robot2"])
+@pytest.mark.parametrize(
+    ("mode", "fleet_mode", "own"),
+    [
+        ("out_of_service", "automatic", "out_of_service"),
+        ("paused", "automatic", "paused"),
+        ("paused", "paused", "automatic"),
+        ("automatic", "automatic", "automatic"),
+    ],
+)
+async def test_driving_gives_a_robot_its_own_mode_back(
+    robot_id: str, mode: str, fleet_mode: str, own: str
+) -> None:
+    """Also if driving fails because the robot, as Robot2, does not listen."""
+    async with site() as made:
+        made.view.on_state(state(robot(robot_id, mode=mode), mode=fleet_mode))
+        await _driven_shortly(made, robot_id)
+        assert made.fleet.modes == [(robot_id, "manual"), (robot_id, own)]
+
+
+async def test_a_mode_that_is_set_while_driving_stays() -> None:
+    async with site() as made:
+        made.view.on_state(state(robot("Robot1", mode="automatic")))
+        async with made.client.ws_connect("/api/v1/robots/Robot1/drive") as page:
+            await _frame(page, 0)
+            made.view.on_state(state(robot("Robot1", mode="out_of_service")))
+        await made.until(lambda: not made.control.driven)
+        assert made.fleet.modes == [("Robot1", "manual")]
+
+
+async def test_a_robot_whose_manual_mode_is_refused_keeps_its_mode() -> None:
+    async with site() as made:
+        made.fleet.refuses.add("manual")
+        async with made.client.ws_connect("/api/v1/robots/Robot1/drive") as page:
+            assert "is refused" in json.loads(await page.receive_str(timeout=LIMIT_S))["error"]
+        await made.until(lambda: not made.control.driven)
+        assert (made.fleet.modes, made.fleet.events) == ([], [])
+
+
+async def test_a_mode_that_cannot_be_restored_is_told_and_tried_again() -> None:
+    async with site() as made:
+        made.view.on_state(state(robot("Robot1", mode="paused")))
+        made.fleet.refuses.add("paused")
+        await _driven_shortly(made, "Robot1")
+        assert ["stays manual; it was paused before" in text for text in made.fleet.events] == [True]
+        made.view.on_state(state(robot("Robot1", mode="manual")))
+        made.fleet.refuses.clear()
+        await _driven_shortly(made, "Robot1")
+        assert made.fleet.modes[-1] == ("Robot1", "paused")
+
+
+async def test_a_robot_is_driven_again_only_after_its_mode_is_restored() -> None:
+    """The late request of the one who drove before would end the mode of the next one."""
+    async with site() as made:
+        made.fleet.may_restore.clear()
+        async with made.client.ws_connect("/api/v1/robots/Robot1/drive") as page:
+            await _frame(page, 0)
+        await made.until(lambda: ("Robot1", "automatic") in made.fleet.modes)
+        async with made.client.ws_connect("/api/v1/robots/Robot1/drive") as second:
+            assert "is driven by" in json.loads(await second.receive_str(timeout=LIMIT_S))["error"]
+        made.fleet.may_restore.set()
+        await made.until(lambda: not made.control.driven)
+        await _driven_shortly(made, "Robot1")
+        assert [mode for _, mode in made.fleet.modes] == ["manual", "automatic"] * 2
