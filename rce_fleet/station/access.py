@@ -55,13 +55,18 @@ class AccessControl:
             set_cookie(response, token, secure=request.secure)
         return response
 
-    async def is_still_allowed(self, request: web.Request) -> bool:
-        """Return whether an accepted request's user may still see the fleet; True while that is unknown."""
+    async def is_still_allowed(self, request: web.Request, *, to_control: bool = False) -> bool:
+        """Return whether an accepted request's user may still see the fleet; True while that is unknown.
+
+        Args:
+            request: The request.
+            to_control: Whether the user must still be allowed to control the fleet, too.
+        """
         try:
             user = await self._authenticator.authenticate(request[TOKEN])
         except AuthenticationError:
             return True
-        return user is not None and user.may_view
+        return user is not None and user.may_view and (user.may_control or not to_control)
 
     def control_refusal(self, request: web.Request, name: str, subject: str) -> web.Response | None:
         """Return None if the request's user may control the fleet; else record the refusal and return it."""

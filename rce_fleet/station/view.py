@@ -165,7 +165,7 @@ class FleetView:
         return robot in self._robots
 
     def mode_of(self, robot: str) -> str:
-        """Return the mode that counts for a robot, of its own and the fleet's; empty: the planner tells none."""
+        """Return the mode that counts for a robot, of its own and the fleet's; empty: not known."""
         return str(self._robots.get(robot, {}).get("mode", ""))
 
     def own_mode_of(self, robot: str) -> str:

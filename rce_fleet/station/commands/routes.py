@@ -8,7 +8,7 @@ import json
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import TYPE_CHECKING, Literal
 
-from aiohttp import WSMsgType, web
+from aiohttp import WSCloseCode, WSMsgType, web
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rce.aio.tasks import cancel_and_wait
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from rce_fleet.station.view import FleetView
 
 MAX_FRAME = 1 << 12
+CHECK_S = 2.0
+"""How often the login of a user who drives a robot is checked."""
 _ERRORS = (400, 401, 403, 404, 408, 409, 413, 421, 503)
 
 Method = Callable[["ControlRoutes", web.Request], Awaitable[web.StreamResponse]]
@@ -187,7 +189,7 @@ class ControlRoutes:
             return socket
         try:
             async with self._modes.manual(robot, user), self._sender(request, control, robot) as sender:
-                await _drive(socket, sender)
+                await _drive(socket, sender, lambda: self._access.is_still_allowed(request, to_control=True))
         except (CommandError, PlannerError) as error:
             await _refuse(socket, str(error))
         finally:
@@ -209,8 +211,10 @@ class ControlRoutes:
             self._access.audit(request, "drive", robot, "end")
 
 
-async def _drive(socket: web.WebSocketResponse, sender: CommandSender) -> None:
-    """Pass frames on until the page leaves."""
+async def _drive(
+    socket: web.WebSocketResponse, sender: CommandSender, may_drive: Callable[[], Awaitable[bool]]
+) -> None:
+    """Pass frames on until the page leaves, or its user may not drive any more."""
     guard, loop = DriveGuard(), asyncio.get_running_loop()
 
     async def watch() -> None:
@@ -219,8 +223,31 @@ async def _drive(socket: web.WebSocketResponse, sender: CommandSender) -> None:
             if guard.check(loop.time()):
                 sender.send(velocity_message(0.0, 0.0))
 
-    watcher = asyncio.create_task(watch())
+    async def check_login() -> None:
+        while True:
+            await asyncio.sleep(CHECK_S)
+            if not await may_drive():
+                break
+
+    reader = asyncio.create_task(_pass_on(socket, sender, guard))
+    watcher, checker = asyncio.create_task(watch()), asyncio.create_task(check_login())
     try:
+        await asyncio.wait([reader, checker], return_when=asyncio.FIRST_COMPLETED)
+        if reader.done():
+            reader.result()
+            return
+        checker.result()
+    finally:
+        await cancel_and_wait(reader, watcher, checker)
+    sender.send(velocity_message(0.0, 0.0))
+    text = b"you may not drive this robot any more; log in again"
+    await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=text)
+
+
+async def _pass_on(socket: web.WebSocketResponse, sender: CommandSender, guard: DriveGuard) -> None:
+    """Send the robot what the frames of a page say, until the page leaves."""
+    loop = asyncio.get_running_loop()
+    with contextlib.suppress(ConnectionError):  # the page leaves while it is answered
         async for message in socket:
             if message.type is not WSMsgType.TEXT:
                 break
@@ -234,10 +261,6 @@ async def _drive(socket: web.WebSocketResponse, sender: CommandSender) -> None:
             sender.send(velocity_message(speed, turn_rate))
             answer = {"number": frame.number, "speed": speed, "turn_rate": turn_rate, "reason": guard.reason}
             await socket.send_str(json.dumps(answer))
-    except ConnectionError:
-        pass  # the page left while it was answered
-    finally:
-        await cancel_and_wait(watcher)
 
 
 async def _refuse(socket: web.WebSocketResponse, text: str) -> None:

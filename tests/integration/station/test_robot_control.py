@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 from collections import deque
 from collections.abc import AsyncIterator, Callable
@@ -11,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
-from aiohttp import ClientWebSocketResponse
+from aiohttp import ClientWebSocketResponse, WSCloseCode, WSMsgType
 from aiohttp.test_utils import TestClient, TestServer
 from unit.station.test_station_view import robot, state
 
@@ -19,6 +20,8 @@ from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import Message, TypeRegistry
+from rce_fleet.station.authentication import StationUser, TokenAuthenticator
+from rce_fleet.station.commands import routes
 from rce_fleet.station.commands.control import RobotControl
 from rce_fleet.station.commands.sources import RosCommandSource
 from rce_fleet.station.feed import Feed
@@ -63,6 +66,7 @@ class Site:
     fleet: RecordingFleet
     control: RobotControl
     view: FleetView
+    login: Login
     stops: deque[bool] = field(default_factory=deque)
     velocities: deque[tuple[float, float]] = field(default_factory=deque)
     poses: deque[Message] = field(default_factory=deque)
@@ -76,6 +80,18 @@ class Site:
         async with self.client.put(f"/api/v1{path}", json=body) as reply:
             answer = await reply.json()
             return reply.status, answer.get("message") or answer["error"]
+
+
+class Login(TokenAuthenticator):
+    """A login whose user can be changed; None: it was revoked."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.user: StationUser | None = StationUser("operator", "operator")
+
+    async def authenticate(self, token: str) -> StationUser | None:
+        del token
+        return self.user
 
 
 @asynccontextmanager
@@ -92,9 +108,10 @@ async def site() -> AsyncIterator[Site]:
         control = RobotControl(
             source, view.robot_ids, lambda: feed.on_control(control.stopped, control.driven)
         )
-        station = Station(view, fleet, feed.pages, control=control)  # type: ignore[arg-type]  # as wide as what is called
+        login = Login()
+        station = Station(view, fleet, feed.pages, authenticator=login, control=control)  # type: ignore[arg-type]  # as wide as what is called
         async with TestClient(TestServer(station.make_app())) as client:
-            made = Site(client, fleet, control, view)
+            made = Site(client, fleet, control, view, login)
             await node.subscribe(
                 "/Robot1/emergency_stop", "std_msgs/Bool", lambda said: made.stops.append(said.data)
             )
@@ -244,3 +261,26 @@ async def test_a_robot_is_driven_again_only_after_its_mode_is_restored() -> None
         await made.until(lambda: not made.control.driven)
         await _driven_shortly(made, "Robot1")
         assert [mode for _, mode in made.fleet.modes] == ["manual", "automatic"] * 2
+
+
+@pytest.mark.parametrize("user", [None, StationUser("operator", "viewer")])
+async def test_driving_ends_with_the_permission(
+    user: StationUser | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When the login is revoked, or the role is taken away; the page still sends frames."""
+    monkeypatch.setattr(routes, "CHECK_S", 0.05)
+    async with site() as made, made.client.ws_connect("/api/v1/robots/Robot1/drive") as page:
+        assert (await _frame(page, 0))["speed"] == 0.2
+        made.login.user = user
+        async with asyncio.timeout(LIMIT_S):
+            for number in range(1, 1_000_000):
+                frame = {"number": number, "sent": asyncio.get_running_loop().time(), "held": True}
+                with contextlib.suppress(ConnectionError):  # the station has closed it: read on
+                    await page.send_str(json.dumps({**frame, "speed": 0.2}))
+                if (await page.receive()).type is not WSMsgType.TEXT:
+                    break
+                await asyncio.sleep(0.01)
+        assert page.close_code == WSCloseCode.POLICY_VIOLATION
+        await made.until(lambda: not made.control.driven)
+        await made.until(lambda: made.velocities and made.velocities[-1] == (0.0, 0.0))
+        assert made.fleet.modes[-1] == ("Robot1", "automatic")
