@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 
 import msgspec
 from msgspec import Struct
+from yarl import URL
 
 from rce_fleet.api.webhooks import WebhookRequest
 from rce_fleet.exceptions import RequestRefusedError
@@ -140,22 +141,41 @@ def check_url(url: str, *, allow_private: bool) -> None:
     """
     try:
         parts = urlsplit(url)
-        host, _ = parts.hostname or "", parts.port
+        host, _ = (
+            URL(url).raw_host or "",
+            parts.port,
+        )  # as it is connected to: other digits and dots are replaced
     except ValueError as error:
         raise RequestRefusedError(f"url {url!r:.80}: {error}") from error
     if parts.scheme not in ("http", "https") or not host:
         raise RequestRefusedError(f"url must be http://... or https://..., not {url!r:.80}")
     if parts.username is not None or parts.password is not None:
         raise RequestRefusedError("url must not hold a name or password; deliveries are signed instead")
-    if not allow_private and (host == "localhost" or is_private(host)):
+    if not allow_private and (host.rstrip(".") == "localhost" or is_private(host)):
         raise RequestRefusedError(
             f"{host} is on this machine or in a private network; if events shall go there, set allow_private"
         )
 
 
+_CARRIERS = tuple(map(ipaddress.IPv6Network, ("64:ff9b::/96", "::/96")))
+"""IPv6 addresses whose last 32 bits are an IPv4 address: NAT64, and the older form of mapped addresses."""
+_LOCAL_NAT64 = ipaddress.IPv6Network("64:ff9b:1::/48")
+
+
 def is_private(address: str) -> bool:
-    """Whether an IP address is not one of the public Internet; False for names."""
+    """Whether an IP address is not one of the public Internet; False for names.
+
+    An IPv6 address that carries an IPv4 address (mapped, NAT64, 6to4) is as private as that one. Digits and
+    dots that are not a whole address, such as ``127.1``, count as private: they are not looked up as names.
+    """
     try:
-        return not ipaddress.ip_address(address).is_global
+        found = ipaddress.ip_address(address)
     except ValueError:
-        return False
+        return address.replace(".", "").isdigit()
+    if isinstance(found, ipaddress.IPv6Address):
+        carried = found.ipv4_mapped or found.sixtofour
+        if any(found in network for network in _CARRIERS):
+            carried = ipaddress.IPv4Address(int(found) & 0xFFFF_FFFF)
+        if found in _LOCAL_NAT64 or (carried is not None and not carried.is_global):
+            return True
+    return not found.is_global

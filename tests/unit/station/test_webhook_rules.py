@@ -47,6 +47,24 @@ def test_a_signature_covers_time_and_body() -> None:
             "http://10.0.0.8:80/x",
         ),
         *("http://[::1]/", "http://169.254.169.254/latest", "http://192.168.1.1/", "http://0.0.0.0/"),
+        # Digits and dots that the HTTP client reads as those of 127.0.0.1
+        *("http://127\u30020\u30020\u30021/", "http://\uff11\uff12\uff17.0.0.1/", "http://127\uff0e0.0.1/"),
+        *(
+            "http://127.0.0.1./",
+            "http://localhost./",
+            "http://LOCALHOST/",
+            "http://127.1/",
+            "http://2130706433/",
+        ),
+        # IPv6 addresses that carry an IPv4 address
+        *("http://[64:ff9b::7f00:1]/", "http://[64:ff9b::10.0.0.8]/", "http://[2002:7f00:1::]/"),
+        *(
+            "http://[2002:c0a8:101::1]/",
+            "http://[::ffff:127.0.0.1]/",
+            "http://[64:ff9b:1::1]/",
+            "http://[::7f00:1]/",
+        ),
+        "http://[fe80::1%25eth0]/",
     ],
 )
 def test_urls_that_are_refused(url: str) -> None:
@@ -57,7 +75,12 @@ def test_urls_that_are_refused(url: str) -> None:
 def test_private_urls_need_to_be_allowed() -> None:
     for url in ("http://127.0.0.1:9/x", "https://localhost/", "http://192.168.1.1/"):
         check_url(url, allow_private=True)
-    check_url("https://erp.example.com/fleet?x=1", allow_private=False)
+    for url in (
+        "https://erp.example.com/fleet?x=1",
+        "http://[64:ff9b::8.8.8.8]/",
+        "http://[2002:808:808::1]/",
+    ):
+        check_url(url, allow_private=False)
 
 
 async def test_a_name_of_a_private_address_is_refused() -> None:
