@@ -58,7 +58,7 @@ class Desired:
         self._goals.pop(robot, None)
 
     def clear(self) -> None:
-        """Forget everything: the cells are numbered in another way now."""
+        """Forget everything: the cells have other numbers now, or the fleet manager keeps goals and cells."""
         self._goals.clear()
         self._cells.clear()
 

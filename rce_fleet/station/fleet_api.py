@@ -134,7 +134,9 @@ class FleetApi:
         """
         said = await self._by_manager(f"/robots/{quote(robot, safe='')}/goal", {"cell": cell}, user)
         if said is None:
-            return await self._fleet.set_goal(robot, cell)
+            said = await self._fleet.set_goal(robot, cell)
+            if not self.manager.here:
+                return said
         self._fleet.forget_goal(robot)
         return said
 
@@ -153,7 +155,9 @@ class FleetApi:
         """
         said = await self._by_manager(f"/cells/{cell}", {"blocked": blocked}, user)
         if said is None:
-            return await self._fleet.block_cell(cell, blocked=blocked)
+            said = await self._fleet.block_cell(cell, blocked=blocked)
+            if not self.manager.here:
+                return said
         self._fleet.forget_cell(cell)
         return said
 

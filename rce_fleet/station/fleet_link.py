@@ -129,6 +129,10 @@ class FleetLink:
         """Do not send a goal to a restarted planner again: the fleet manager does."""
         self._desired.forget_goal(robot)
 
+    def forget_requests(self) -> None:
+        """Send no goals and cells to a restarted planner again: the fleet manager runs, and does."""
+        self._desired.clear()
+
     @property
     def expects_manager(self) -> bool:
         """Whether the fleet was configured with a fleet manager."""

@@ -329,7 +329,12 @@ class Station:
         return _reply(made)
 
     def _tell_manager(self, here: bool) -> None:
-        """Tell all pages whether there is a fleet manager, which they may ask."""
+        """Tell all pages whether there is a fleet manager, which they may ask.
+
+        What went to the planner while the manager was away is the manager's matter from now on.
+        """
+        if here:
+            self._fleet.forget_requests()
         self._pages.send("manager", json.dumps({"type": "manager", "here": here}))
 
     def _tell_restart(self) -> None:
