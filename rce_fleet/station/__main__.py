@@ -36,6 +36,7 @@ from rce.web.server import HttpServer
 from rce_client.exceptions import RefusedError
 from rce_fleet.station.authentication import Authenticator, TokenAuthenticator
 from rce_fleet.station.commands.control import RobotControl
+from rce_fleet.station.commands.desired_stops import DesiredStops, stops_file
 from rce_fleet.station.commands.sources import CommandSource, EngineCommandSource, RosCommandSource
 from rce_fleet.station.engine_authenticator import EngineAuthenticator, StationAccount
 from rce_fleet.station.engine_planner_client import EnginePlannerClient
@@ -55,6 +56,8 @@ from rce_fleet.station.ros_planner_client import RosPlannerClient
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 from rce_fleet.station.world_link import WorldLink, states_text, things_text
+
+_log = logging.getLogger(__name__)
 
 PORT = 9080
 
@@ -97,7 +100,8 @@ def ui(
         str, typer.Option(help="ROS master of the simulated world in which the fleet drives (rce sim).")
     ] = "",
     state_dir: Annotated[
-        Path | None, typer.Option(help="Folder for the station's webhooks [STATE/station].")
+        Path | None,
+        typer.Option(help="Folder for the station's webhooks and emergency stops [STATE/station]."),
     ] = None,
     demo: Annotated[bool, typer.Option("--demo", hidden=True)] = False,
     tls: Tls = False,
@@ -125,7 +129,7 @@ def ui(
         typer.echo(str(error), err=True)
         raise typer.Exit(2) from None
     if identity is None and (text := plain_warning("the logins of the station travel", bind)):
-        logging.getLogger(__name__).warning("%s", text)
+        _log.warning("%s", text)
     authenticator = _authenticator(backend, bind, token, login)
     try:
         names = ServerNames(bind, public_name or ())
@@ -135,6 +139,7 @@ def ui(
             serve(
                 *(backend, bind, port, authenticator, names, server_tls, history, world),
                 webhooks=place / "webhooks.json",
+                stops=stops_file(place, backend.fleet),
                 kill_leader=DemoProcess().kill_leader if demo else None,
             )
         )
@@ -197,6 +202,10 @@ class Backend(Protocol):
         """The client of the planner."""
 
     @property
+    def fleet(self) -> str:
+        """What tells the fleet from others."""
+
+    @property
     def layers(self) -> LayerSource:
         """Where layers come from."""
 
@@ -222,6 +231,7 @@ class EngineBackend:
                 "station", [Fault("token", "a token is for robots; the station needs the user's password")]
             )
         self.account = account = StationAccount(config.url, config.user, password, self._tls)
+        self.fleet = f"{config.url} {config.user} {config.robot}"
         self.client = EnginePlannerClient(config, self._tls)
         self._on_state: Callable[[dict[str, Any]], None] = _ignore
         self._watch = EngineWatch(
@@ -258,7 +268,7 @@ class RosBackend:
         self.client = RosPlannerClient(master_uri, types)
         self.layers = RosLayerSource(master_uri, types)
         self.commands = RosCommandSource(self.layers)
-        self._master_uri = master_uri
+        self.fleet = self._master_uri = master_uri
 
     async def watch(self, on_state: Callable[[dict[str, Any]], None]) -> None:
         """Call ``on_state`` with the graph's nodes until cancelled."""
@@ -281,6 +291,7 @@ async def serve(
     world: str = "",
     *,
     webhooks: Path | None = None,
+    stops: Path | None = None,
     kill_leader: Callable[[], None] | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM."""
@@ -298,8 +309,12 @@ async def serve(
     for number in end_signals():
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     layers = LayerHub(backend.layers, view, TypeRegistry(PackageIndex.from_environ()))
+    desired_stops = DesiredStops(stops)
     control = RobotControl(
-        backend.commands, view.robot_ids, lambda: feed.on_control(control.stopped, control.driven)
+        backend.commands,
+        view.robot_ids,
+        lambda: feed.on_control(control.stopped, control.driven, control.fleet_stopped_by),
+        desired_stops,
     )
     types = TypeRegistry(PackageIndex.from_environ())
     link = (
@@ -332,6 +347,10 @@ async def serve(
     )
     figures = FigureRecorder(view, recorder.records, station.fleet_api.statistics)
     await station.fleet_api.load()
+    try:
+        await asyncio.to_thread(desired_stops.load)
+    except (OSError, ValueError) as error:
+        _log.error("emergency stops of before are not known: %s: %s", stops, error)
     async with AsyncExitStack() as stack:
         stack.push_async_callback(layers.close)
         stack.push_async_callback(control.close)

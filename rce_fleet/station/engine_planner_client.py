@@ -95,11 +95,11 @@ class EnginePlannerClient(PlannerClient):
             on_error=lambda text: listener.take_event(text, "bad"),
             on_state=self._on_state,
         ) as connection:
+            self.connection = connection  # before the planner: emergency stops do not need it
             try:
                 for request in config.setup():
                     await connection.request(request)
                 await self._join_planner(connection)
-                self.connection = connection
                 await ready()
                 async with asyncio.TaskGroup() as group:
                     group.create_task(self._follow_robots(connection))

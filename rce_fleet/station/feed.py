@@ -105,9 +105,10 @@ class Feed:
         """Send the engine's state."""
         self.pages.send("engine", _text("engine", state))
 
-    def on_control(self, stopped: dict[str, str], driven: dict[str, str]) -> None:
-        """Send who stopped and who drives which robots."""
-        self.pages.send("control", _text("control", {"stopped": stopped, "driven": driven}))
+    def on_control(self, stopped: dict[str, str], driven: dict[str, str], fleet: str | None = None) -> None:
+        """Send who stopped and who drives which robots, and who stopped all of them, if somebody did."""
+        message = {"stopped": stopped, "driven": driven, "fleet_stopped_by": fleet}
+        self.pages.send("control", _text("control", message))
 
     def on_event(self, text: str, tone: str) -> None:
         """Send an event."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import ipaddress
-import os
 import secrets
 import threading
 from collections.abc import Iterator
@@ -17,6 +15,7 @@ from yarl import URL
 
 from rce_fleet.api.webhooks import WebhookRequest
 from rce_fleet.exceptions import RequestRefusedError
+from rce_fleet.station.private_files import write_private
 
 MAX_WEBHOOKS = 20
 
@@ -115,22 +114,7 @@ class WebhookStore:
         if self._file is None:
             return
         with self._saving:
-            self._write(self._file)
-
-    def _write(self, file: Path) -> None:
-        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        aside = file.with_name(f".{file.name}.{os.getpid()}")
-        body = msgspec.json.encode(list(self._webhooks.values()))
-        try:
-            descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-            with os.fdopen(descriptor, "wb") as output:
-                output.write(body)
-                output.flush()
-                os.fsync(output.fileno())
-            aside.replace(file)
-        finally:
-            with contextlib.suppress(FileNotFoundError):
-                aside.unlink()
+            write_private(self._file, msgspec.json.encode(list(self._webhooks.values())))
 
 
 def check_url(url: str, *, allow_private: bool) -> None:

@@ -6,20 +6,29 @@ import asyncio
 import json
 import sys
 from collections import deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support.engine import Program, running_engine, until
 
+from rce.aio.tasks import cancel_and_wait
+from rce.config.client import loads
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce_client.connection import Connection
 from rce_fleet.station.commands.control import RobotControl
+from rce_fleet.station.commands.desired_stops import DesiredStops, stops_file
 from rce_fleet.station.commands.sources import EngineCommandSource
+from rce_fleet.station.engine_planner_client import EnginePlannerClient
 from rce_fleet.station.engine_watch import EngineWatch
+from rce_fleet.station.fleet_link import FleetLink
+from rce_fleet.station.view import FleetView
 from rce_fleet.wiring import FleetAccount, robot_config
 
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(300)]
@@ -27,8 +36,19 @@ pytestmark = [pytest.mark.e2e, pytest.mark.timeout(300)]
 TYPES = TypeRegistry(PackageIndex([]))
 
 
-async def test_an_emergency_stop_needs_no_planner() -> None:
-    """The robot stands; it also does after its bridge was restarted, until it is released."""
+@dataclass
+class Site:
+    """An engine, and a robot behind its bridge."""
+
+    url: str
+    folder: Path
+    bridge: Program
+    got: deque[bool]
+    watch: EngineWatch
+
+
+@asynccontextmanager
+async def robot_at_engine() -> AsyncIterator[Site]:
     async with (
         running_engine() as engine,
         Core(port=0) as core,
@@ -48,33 +68,88 @@ async def test_an_emergency_stop_needs_no_planner() -> None:
         watching = asyncio.create_task(watch.run())
         await bridge.start()
         try:
-            async with Connection(engine.url, "testUser", "testUser", "fleetOperator") as connection:
-                source = EngineCommandSource(lambda: connection, watch.read_items)
-                control = RobotControl(source, lambda: ["Robot1"])
-
-                async def stopped() -> bool:
-                    result = await control.emergency_stop(None, "op", stopped=True)
-                    return result.reached == ("Robot1",)
-
-                async def gets(expected: bool) -> bool:
-                    return expected in got
-
-                keeping = asyncio.create_task(control.run())
-                await until(stopped, what="the station reaches the robot")
-                await until(lambda: gets(True), what="the robot is stopped")
-                await bridge.stop()
-                got.clear()
-                await bridge.start()
-                await until(lambda: gets(True), what="the robot is stopped again")
-                await control.emergency_stop(["Robot1"], "op", stopped=False)
-                await until(lambda: gets(False), what="the robot is released")
-                other = await control.emergency_stop(["Robot7"], "op", stopped=True)
-                assert "command_Robot7_emergency_stop" in other.missed["Robot7"]
-                keeping.cancel()
-                await asyncio.gather(keeping, return_exceptions=True)
-                await control.close()
-                await connection.remove_all()
+            yield Site(engine.url, engine.folder, bridge, got, watch)
         finally:
             watching.cancel()
             await asyncio.gather(watching, return_exceptions=True)
             await bridge.stop()
+
+
+async def test_an_emergency_stop_needs_no_planner() -> None:
+    """The robot stands; it also does after its bridge was restarted, until it is released."""
+    async with robot_at_engine() as site:
+        got, bridge = site.got, site.bridge
+        async with Connection(site.url, "testUser", "testUser", "fleetOperator") as connection:
+            source = EngineCommandSource(lambda: connection, site.watch.read_items)
+            control = RobotControl(source, lambda: ["Robot1"])
+
+            async def stopped() -> bool:
+                result = await control.emergency_stop(None, "op", stopped=True)
+                return result.reached == ("Robot1",)
+
+            async def gets(expected: bool) -> bool:
+                return expected in got
+
+            keeping = asyncio.create_task(control.run())
+            await until(stopped, what="the station reaches the robot")
+            await until(lambda: gets(True), what="the robot is stopped")
+            await bridge.stop()
+            got.clear()
+            await bridge.start()
+            await until(lambda: gets(True), what="the robot is stopped again")
+            await control.emergency_stop(["Robot1"], "op", stopped=False)
+            await until(lambda: gets(False), what="the robot is released")
+            other = await control.emergency_stop(["Robot7"], "op", stopped=True)
+            assert "command_Robot7_emergency_stop" in other.missed["Robot7"]
+            keeping.cancel()
+            await asyncio.gather(keeping, return_exceptions=True)
+            await control.close()
+            await connection.remove_all()
+
+
+async def nothing() -> None: ...
+
+
+async def test_a_station_without_its_planner_reaches_robots() -> None:
+    """Its container has no planner. The robot is stopped, and again by a station that restarts."""
+    async with robot_at_engine() as site:
+        account = {"url": site.url, "userID": "testUser", "password": "testUser", "robotID": "fleetOperator"}
+        config = loads(json.dumps({**account, "containers": [{"cTag": "planner"}]}), "station.config")
+        file = stops_file(site.folder, "fleet")
+
+        @asynccontextmanager
+        async def station() -> AsyncIterator[RobotControl]:
+            client, stops = EnginePlannerClient(config), DesiredStops(file)
+            stops.load()
+            source = EngineCommandSource(lambda: client.connection, site.watch.read_items)
+            control = RobotControl(source, list, stops=stops)
+            link = FleetLink(
+                client,
+                FleetView(),
+                on_change=lambda _: None,
+                on_pose=lambda _: None,
+                on_event=lambda *_: None,
+            )
+            work = [
+                asyncio.create_task(link.run(nothing)),
+                asyncio.create_task(control.run()),
+            ]
+            try:
+                yield control
+            finally:
+                await control.close()
+                await cancel_and_wait(*work)
+
+        async with station() as control:
+
+            async def stopped() -> bool:
+                return (await control.emergency_stop(None, "op", stopped=True)).reached == ("Robot1",)
+
+            await until(stopped, what="the station reaches the robot")
+            await until(lambda: True in site.got, what="the robot is stopped")
+        site.got.clear()
+        async with station() as control:
+            assert (control.stopped, control.fleet_stopped_by) == ({"Robot1": "op"}, "op")
+            await until(lambda: True in site.got, what="the robot is stopped again")
+            await control.emergency_stop(None, "op", stopped=False)
+            await until(lambda: False in site.got, what="the robot is released")

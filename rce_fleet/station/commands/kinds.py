@@ -32,6 +32,12 @@ class RobotCommand:
         """Return the tag of the interface that offers this topic of a robot."""
         return f"command_{robot}_{self.key}"
 
+    def robot_of(self, tag: str) -> str:
+        """Return the robot that offers this topic by an interface with a tag; empty: none does."""
+        before, after = self.interface_tag("\0").split("\0")
+        is_one = tag.startswith(before) and tag.endswith(after)
+        return tag[len(before) : -len(after)] if is_one else ""
+
 
 EMERGENCY_STOP = RobotCommand("emergency_stop", "std_msgs/Bool", "emergency_stop", is_latched=True)
 VELOCITY = RobotCommand("velocity", "geometry_msgs/Twist", "raw_cmd_vel")

@@ -117,11 +117,13 @@ class ControlRoutes:
             return problem(409, "this station cannot reach robots")
         robots = None if robot is None else [robot]
         result = await self._control.emergency_stop(robots, request[USER].name, stopped=asked.stopped)
-        done = bool(result.reached) and not result.missed
+        done = (bool(result.reached) or not asked.stopped) and not result.missed
         name = "emergency_stop" if asked.stopped else "release_emergency_stop"
         self._access.audit(request, name, subject, result.text, done=done)
-        if not done and not (robot is None and result.reached):
-            return problem(409, result.text if result.missed else "no robot is known")
+        if asked.stopped and not result.reached and not result.missed:
+            return problem(409, "no robot is known yet; robots are stopped when they appear")
+        if result.missed and not (robot is None and result.reached):
+            return problem(409, result.text)
         return _reply(Answer(message=f"{'stopped' if asked.stopped else 'released'}: {result.text}"))
 
     @ROUTES.route(

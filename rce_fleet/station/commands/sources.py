@@ -8,9 +8,12 @@ from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
+from rce.ros.errors import MasterError, NodeClosedError
 from rce_client.exceptions import ClientError
+from rce_fleet.station.commands.kinds import EMERGENCY_STOP
 
 if TYPE_CHECKING:
+    from rce.ros.node import Node
     from rce.ros.node import Publisher as RosPublisher
     from rce_client.connection import Connection
     from rce_client.topics import Publisher
@@ -78,6 +81,14 @@ class CommandSource(ABC):
             CommandError: The robot does not offer the topic, or engine or graph cannot be reached.
         """
 
+    async def robots(self) -> set[str]:
+        """Return robots that offer the emergency stop, also if the planner does not know them; maybe not all.
+
+        Raises:
+            CommandError: They are not known now.
+        """
+        return set()
+
 
 class EngineCommandSource(CommandSource):
     """Connects interfaces named ``command_ROBOT_KEY`` of robots.
@@ -106,8 +117,18 @@ class EngineCommandSource(CommandSource):
         except ClientError as error:
             raise CommandError(f"the engine cannot be reached: {error}") from error
         sender = _EngineSender(self, connection, publisher, latch="1" if command.is_latched else "")
-        await sender.connect(endpoints)
+        try:
+            await sender.connect(endpoints)
+        except CommandError:
+            await sender.close()  # a tag can be opened once only
+            raise
         return sender
+
+    async def robots(self) -> set[str]:
+        """Return the robots with an interface for emergency stops."""
+        offers, own = await self._read_offers(), self._own_endpoints()
+        found = {EMERGENCY_STOP.robot_of(tag) for tag, endpoints in offers.items() if endpoints - own}
+        return found - {""}
 
     async def find(self, tag: str, otherwise: str) -> set[str]:
         """Return the robots that have an interface. What the master says is kept for a second.
@@ -115,7 +136,17 @@ class EngineCommandSource(CommandSource):
         Raises:
             CommandError: There is none; the text begins with ``otherwise``.
         """
-        connection, now = self._connection(), asyncio.get_running_loop().time()
+        found = (await self._read_offers()).get(tag, set()) - self._own_endpoints()
+        if not found:
+            raise CommandError(f"{otherwise}: no interface {tag} exists")
+        return found
+
+    def _own_endpoints(self) -> set[str]:
+        connection = self._connection()
+        return set() if connection is None else {connection.robot_id}
+
+    async def _read_offers(self) -> dict[str, set[str]]:
+        now = asyncio.get_running_loop().time()
         if now - self._read_at > KEEP_S:
             try:
                 items = await self._read_items("interfaces")
@@ -125,11 +156,7 @@ class EngineCommandSource(CommandSource):
             self._offers = {}
             for item in items:
                 self._offers.setdefault(item["tag"], set()).add(str(item["endpoint"]))
-        own = "" if connection is None else connection.robot_id
-        found = self._offers.get(tag, set()) - {own}
-        if not found:
-            raise CommandError(f"{otherwise}: no interface {tag} exists")
-        return found
+        return self._offers
 
 
 class _EngineSender(CommandSender):
@@ -182,33 +209,66 @@ class RosCommandSource(CommandSource):
 
     async def open(self, robot: str, command: RobotCommand) -> CommandSender:
         """Advertise the topic in the robot's graph."""
-        stack = AsyncExitStack()
+        sender = _RosSender(self._graphs, robot, command)
+        await sender.join()
+        return sender
+
+    async def robots(self) -> set[str]:
+        """Return the robots of the planner's graph that subscribe to emergency stops."""
         try:
-            node, namespace = await stack.enter_async_context(self._graphs.graph_of(robot))
-            publisher = await node.advertise(
-                f"{namespace}{command.topic}", command.type_name, latch=command.is_latched, queue_size=1
-            )
-        except Exception as error:
-            await stack.aclose()
-            raise CommandError(f"the ROS graph of {robot} cannot be reached: {error}") from error
-        stack.push_async_callback(publisher.close)
-        return _RosSender(publisher, stack)
+            return await self._graphs.find_subscribed(EMERGENCY_STOP.topic)
+        except MasterError as error:
+            raise CommandError(f"the ROS master does not say which robots there are: {error}") from error
 
 
 class _RosSender(CommandSender):
-    def __init__(self, publisher: RosPublisher, stack: AsyncExitStack) -> None:
-        self._publisher = publisher
-        self._stack = stack
+    def __init__(self, graphs: RosLayerSource, robot: str, command: RobotCommand) -> None:
+        self._graphs = graphs
+        self._robot = robot
+        self._command = command
+        self._stack = AsyncExitStack()
+        self._node: Node | None = None
+        self._publisher: RosPublisher | None = None
+        self._last: dict[str, Any] | None = None
+
+    async def join(self) -> None:
+        """Advertise the topic in the graph where the robot is now, unless it is done already."""
+        command = self._command
+        async with AsyncExitStack() as stack:
+            try:
+                node, namespace = await stack.enter_async_context(self._graphs.graph_of(self._robot))
+                if node is self._node:
+                    return
+                publisher = await node.advertise(
+                    f"{namespace}{command.topic}", command.type_name, latch=command.is_latched, queue_size=1
+                )
+            except Exception as error:
+                raise CommandError(f"the ROS graph of {self._robot} cannot be reached: {error}") from error
+            stack.push_async_callback(publisher.close)
+            before, self._stack = self._stack, stack.pop_all()
+            self._node, self._publisher = node, publisher
+            if self._last is not None and command.is_latched:
+                self.send(self._last)
+            await before.aclose()
 
     def send(self, message: dict[str, Any]) -> None:
-        self._publisher.publish(message)
+        self._last = message
+        if self._publisher is not None:
+            with suppress(NodeClosedError):  # it was told to stop: the robot is not connected then
+                self._publisher.publish(message)
 
     @property
     def is_connected(self) -> bool:
-        return self._publisher.connections > 0
+        return self._publisher is not None and self._publisher.connections > 0
 
     async def repair(self) -> None:
-        """Leave it to the ROS graph: subscribers find the topic by themselves."""
+        """Move to the robot's own graph, which discovery may not have known before, or know elsewhere now.
+
+        In the same graph subscribers find the topic by themselves.
+        """
+        if not self.is_connected:
+            await self._graphs.look_again()
+            await self.join()
 
     async def close(self) -> None:
         await self._stack.aclose()

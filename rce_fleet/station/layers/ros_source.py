@@ -13,6 +13,8 @@ from rce.ros.closing import release
 from rce.ros.errors import MasterError, RosError
 from rce.ros.multimaster.listing import list_masters
 from rce.ros.node import Node
+from rce.ros.node.master import MasterClient
+from rce.ros.xmlrpc import RpcClient
 from rce_fleet.station.layers.sources import LayerSource
 
 if TYPE_CHECKING:
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 NODE = "operator_station_layers"
+KEEP_S = 1.0
+"""How long the answer of discovery is kept for robots that may have moved."""
 
 
 class RosLayerSource(LayerSource):
@@ -45,6 +49,8 @@ class RosLayerSource(LayerSource):
         """The station's node in each graph, by master."""
         self._users: Counter[str] = Counter()
         """Open topics in each graph."""
+        self._listing = asyncio.Lock()
+        self._listed_at = float("-inf")
         self._joining: dict[str, asyncio.Lock] = {}
 
     @asynccontextmanager
@@ -105,13 +111,35 @@ class RosLayerSource(LayerSource):
             if not self._users[uri]:
                 await self._nodes.pop(uri).__aexit__(None, None, None)
 
+    async def look_again(self) -> None:
+        """Read from discovery, at most once a second, where robots are that may have moved."""
+        async with self._listing:
+            now = asyncio.get_running_loop().time()
+            if now - self._listed_at >= KEEP_S:
+                self._listed_at = now
+                await self._read_masters()
+
+    async def find_subscribed(self, topic: str) -> set[str]:
+        """Return the robots of the planner's graph where something subscribes to a topic.
+
+        Raises:
+            MasterError: The master does not answer.
+        """
+        async with RpcClient() as rpc:
+            state = await MasterClient(self._master_uri, f"/{NODE}", "", rpc).call("getSystemState")
+        names = [name.split("/", 2) for name, _ in state[1]]
+        return {parts[1] for parts in names if parts[0] == "" and parts[2:] == [topic]}
+
     async def _find_master(self, robot: str) -> str | None:
         """Return the URI of the robot's own master; None if it is in the planner's graph."""
         if robot not in self._masters:
-            try:
-                found = await list_masters(self._master_uri)
-            except RosError as error:
-                _log.debug("no robots with masters of their own: %s", error)
-                return None
-            self._masters |= {master.name: master.uri for master in found if master.online}
+            await self._read_masters()
         return self._masters.get(robot)
+
+    async def _read_masters(self) -> None:
+        try:
+            found = await list_masters(self._master_uri)
+        except RosError as error:
+            _log.debug("no robots with masters of their own: %s", error)
+        else:
+            self._masters |= {master.name: master.uri for master in found if master.online}

@@ -129,7 +129,7 @@ for (const type of ["state", "changes"]) fleet.addEventListener(type, () => {
   }
   if (isPaused) at("#mode").textContent = t(`mode.${mode}`);
 });
-fleet.addEventListener("control", () => { at("#release-all").hidden = !Object.keys(fleet.stopped).length; });
+fleet.addEventListener("control", () => { at("#release-all").hidden = fleet.stoppedBy === null && !Object.keys(fleet.stopped).length; });
 at("#undo").addEventListener("click", () => operator.undo());
 operator.addEventListener("acted", () => {
   const { undoable } = operator;

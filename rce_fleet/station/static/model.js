@@ -22,6 +22,7 @@ export class Fleet extends EventTarget {
   isPaused = false;    // whether the time of the simulated world stands still
   mode = "automatic";  // of the whole fleet: automatic, paused or stopped
   stopped = {};        // robot -> who stopped it
+  stoppedBy = null;    // who stopped all robots, also those that appear later
   driven = {};         // robot -> who drives it by hand
   manager = false;     // whether a fleet manager answers
   sequence = 0;        // number of the last change that is known
@@ -128,8 +129,9 @@ export class Fleet extends EventTarget {
   }
 
   // Who stopped robots, and who drives them by hand: {robot: user}.
-  on_control({ stopped, driven }) {
+  on_control({ stopped, driven, fleet_stopped_by: stoppedBy }) {
     this.stopped = stopped;
+    this.stoppedBy = stoppedBy ?? null;
     this.driven = driven;
     for (const robot of this.robots.values()) Object.assign(robot, { emergency: stopped[robot.id] ?? null, driver: driven[robot.id] ?? null });
   }

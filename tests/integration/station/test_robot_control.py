@@ -14,9 +14,12 @@ from typing import Any
 import pytest
 from aiohttp import ClientWebSocketResponse, WSCloseCode, WSMsgType
 from aiohttp.test_utils import TestClient, TestServer
+from support.multimaster import DiscoveryNetwork
 from unit.station.test_station_view import robot, state
 
+from rce.aio.tasks import cancel_and_wait
 from rce.ros.core import Core
+from rce.ros.multimaster.discovery import Discovery
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import Message, TypeRegistry
@@ -138,6 +141,15 @@ async def test_a_stop_reaches_those_who_listen() -> None:
         assert (status, set(made.control.stopped)) == (200, {"Robot2"})
         status, text = await made.put("/robots/Robot2/emergency-stop", {"stopped": True})
         assert (status, "gets this when it is" in text) == (409, True)
+
+
+async def test_a_stop_reaches_robots_that_the_planner_does_not_know() -> None:
+    """As after a restart of the station while the planner is down."""
+    async with site() as made:
+        made.view.on_state(state())
+        status, text = await made.put("/emergency-stop", {"stopped": True})
+        await made.until(lambda: True in made.stops)
+        assert (status, "Robot1 reached" in text, set(made.control.stopped)) == (200, True, {"Robot1"})
 
 
 async def test_an_initial_pose_reaches_localization() -> None:
@@ -284,3 +296,29 @@ async def test_driving_ends_with_the_permission(
         await made.until(lambda: not made.control.driven)
         await made.until(lambda: made.velocities and made.velocities[-1] == (0.0, 0.0))
         assert made.fleet.modes[-1] == ("Robot1", "automatic")
+
+
+async def test_a_stop_follows_a_robot_into_its_own_graph() -> None:
+    """Discovery knows the robot's master only after the stop was sent in the planner's graph."""
+    network = DiscoveryNetwork()
+    stops: deque[bool] = deque()
+    async with (
+        Core(port=0) as planner,
+        Core(port=0) as robot_core,
+        Node("safety", argv=[], master_uri=robot_core.uri, types=TYPES) as node,
+        Discovery(network.settings(planner.uri, name="planner")),
+    ):
+        await node.subscribe("/emergency_stop", "std_msgs/Bool", lambda said: stops.append(said.data))
+        source = RosCommandSource(RosLayerSource(planner.uri, TYPES))
+        control = RobotControl(source, lambda: ["Robot1"])
+        result = await control.emergency_stop(None, "op", stopped=True)
+        assert (result.reached, list(stops)) == ((), [])
+        async with Discovery(network.settings(robot_core.uri, name="Robot1")):
+            keeping = asyncio.create_task(control.run())
+            async with asyncio.timeout(LIMIT_S):
+                while True not in stops:
+                    await asyncio.sleep(0.05)
+            await cancel_and_wait(keeping)
+            result = await control.emergency_stop(None, "op", stopped=False)
+            assert (result.reached, control.stopped) == (("Robot1",), {})
+            await control.close()
