@@ -133,7 +133,7 @@ class Lookups:
                 result = question()
             except (OSError, UnicodeError) as error:
                 result = error
-            except Exception as error:  # noqa: BLE001 - such as a name with a null character
+            except Exception as error:  # noqa: BLE001 - such as a port beyond all limits
                 result = socket.gaierror(socket.EAI_FAIL, str(error) or type(error).__name__)
             with self._lock:
                 waiters = self._open.pop(key)

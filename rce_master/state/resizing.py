@@ -35,7 +35,7 @@ def resize_container(tx: Transaction, command: ResizeContainer) -> None:
 def _check_room(tx: Transaction, container: Container, requested: Resources) -> None:
     """Check the machine where it is, and the one that it is on its way to."""
     had = container.resources
-    move = tx.tables.moves.get(container.id)
+    move = tx.tables.moves.get(container.id) or tx.tables.volume_moves.get(container.id)
     for process in (container.task_set, move.to if move else ""):
         task_set = tx.tables.task_sets.get(process)
         if task_set is None:

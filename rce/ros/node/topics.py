@@ -116,6 +116,7 @@ class Topics:
                 await source.register()
             except BaseException:
                 self.inputs.pop(topic, None)
+                source.close()  # an update may have come before
                 raise
         else:
             source.catch_up(subscriber)

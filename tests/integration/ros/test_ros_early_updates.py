@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 import xmlrpc.client
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +16,8 @@ import pytest
 from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
-from rce.ros.node import Node
+from rce.ros.errors import MasterRefusedError
+from rce.ros.node import Node, Publisher
 
 STRING = "std_msgs/String"
 
@@ -95,3 +97,30 @@ async def test_update_of_before_the_registration_is_asked_about(core: Core, make
                 await listener.subscribe("/t", STRING)
                 for publisher in publishers:
                     await publisher.wait_for_subscribers()
+
+
+class RefusingMaster(EarlyMaster):
+    """Refuses the subscription once the node has connected to the publisher."""
+
+    def __init__(self, core_uri: str, publisher: Publisher) -> None:
+        super().__init__(core_uri, early=1, late=1, times=1)
+        self._publisher = publisher
+
+    def _dispatch(self, method: str, arguments: tuple[Any, ...]) -> Any:
+        answer = super()._dispatch(method, arguments)
+        if method != "registerSubscriber":
+            return answer
+        while not self._publisher.connections:
+            time.sleep(0.01)
+        return -1, "refused", 0
+
+
+async def test_refused_registration_leaves_no_connection(core: Core, make_node: MakeNode) -> None:
+    async with make_node("a") as a, asyncio.timeout(60):
+        publisher = await a.advertise("/t", STRING)
+        with serving(RefusingMaster(core.uri, publisher)) as uri:
+            async with Node("c", argv=[], master_uri=uri, intra_process=False, signals=False) as listener:
+                with pytest.raises(MasterRefusedError):
+                    await listener.subscribe("/t", STRING)
+                while publisher.connections:
+                    await asyncio.sleep(0.01)

@@ -12,6 +12,7 @@ from support.master_world import World
 
 from rce.control import SNAPSHOTS, EndpointState, EndpointStatus, RestoreVolume, SaveVolume
 from rce.model import MEGABYTE, Network, Volume
+from rce.model.specs import ResourceChanges
 from rce_master.exceptions import ConflictError, LimitReachedError, NoRoomError
 from rce_master.state import commands
 from rce_master.state.changes import Changes
@@ -272,6 +273,17 @@ def returned() -> Moving:
     world.restored("c1")
     assert world.runs_at("c1")
     return world
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_it_grows_only_if_the_next_machine_has_room(phase: VolumeMovePhase) -> None:
+    world = Moving()
+    world.up_to(phase)
+    world.do(commands.SetDraining(machine="m1", draining=True))
+    world.container("d", size=3)
+    assert world.state.tables.endpoints["anna/d"].task_set == "c2"
+    with pytest.raises(NoRoomError, match="m2 has 1 of 4 slots free, 2 needed"):
+        world.do(commands.ResizeContainer(user="anna", tag="c", changes=ResourceChanges(size=2)))
 
 
 def test_it_goes_back_if_it_fails_at_the_new_machine() -> None:
