@@ -293,11 +293,11 @@ def _writer_of(
 
 def _says_nothing(record: Record) -> bool:
     """Return whether a manager without this record would do the same."""
-    match record:
-        case Zone(is_removed=True, unsent=False) | GoalEntry(cell=None, unsent=False):
-            return True
-        case _:
-            return False
+    if isinstance(record, Zone):
+        return record.is_removed and not record.unsent
+    if isinstance(record, GoalEntry):
+        return record.cell is None and not record.unsent
+    return False
 
 
 def _read_id(db: sqlite3.Connection) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import assert_never
 
 from rce_fleet.limits import (
     LEAST_CAPACITY,
@@ -20,8 +21,10 @@ from rce_fleet.limits import (
 from rce_fleet.tasks.order import MOST_BETWEEN, Order
 from rce_fleet.tasks.records import (
     BlockedCells,
+    FleetEntry,
     GoalEntry,
     Places,
+    PlannerRun,
     Record,
     RobotEntry,
     RobotProfile,
@@ -61,8 +64,10 @@ def clamped(record: Record) -> Record:
             made = _zone(record)
         case BlockedCells():
             made = BlockedCells(_possible(record.cells), _possible(record.unsent))
+        case RobotEntry() | GoalEntry() | FleetEntry() | PlannerRun():
+            made = record
         case _:
-            return record
+            assert_never(record)
     return record if made == record else made
 
 

@@ -258,7 +258,7 @@ def _check_backup(file: Path) -> None:
     """It has the state and this machine's certificates, and nothing of its etcd."""
     with tarfile.open(file) as tar:
         names = tar.getnames()
-    assert {"master/master.sqlite", "certificates/engine.key", "certificates/authority.pem"} <= set(names)
+    assert {"master/rce.sqlite", "certificates/engine.key", "certificates/authority.pem"} <= set(names)
     assert not [name for name in names if "etcd" in name]
 
 
