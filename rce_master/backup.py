@@ -81,7 +81,7 @@ def back_up(folders: Mapping[str, Path], out: Path, export: Export | None = None
     if export is None and not store.exists():
         raise BackupError(
             f"{folders[MASTER]} is not a master's state folder: it has no {FILE_NAME}; "
-            "name the folder with --state-dir or --config"
+            "name the folder with --state-dir or --config; for a state in etcd, add --store etcd://HOST:PORT"
         )
     if out.exists():
         raise BackupError(f"{out} is there already; name another file, or remove it")

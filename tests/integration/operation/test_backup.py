@@ -223,3 +223,4 @@ async def test_copy_with_paths_outside_is_refused(copy: Path, tmp_path: Path) ->
 async def test_folder_without_state_is_not_copied(tmp_path: Path) -> None:
     told = await rce(tmp_path, "backup", "b.tar", "--state-dir", str(tmp_path / "nothing"), code=1)
     assert "is not a master's state folder" in told
+    assert "--store" in told
