@@ -1,7 +1,7 @@
 """Whether the other side of a connection still takes part: what is a sign of life, and when it is missed.
 
 A program that hangs, or whose machine is gone without a word, closes no connection. So after a while without
-a sign of life it is pinged, and after some more the connection counts as lost. A slow link is no reason:
+a sign of life it is pinged, and after some more the connection counts as lost. A slow link does not count:
 behind a large message in either direction, a ping or its answer may take many seconds. Signs of life are
 therefore
 

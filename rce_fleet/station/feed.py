@@ -106,7 +106,7 @@ class Feed:
         self.pages.send("engine", _text("engine", state))
 
     def on_control(self, stopped: dict[str, str], driven: dict[str, str], fleet: str | None = None) -> None:
-        """Send who stopped and who drives which robots, and who stopped all of them, if somebody did."""
+        """Send who stopped and who drives which robots, and who stopped all of them, if any user did."""
         message = {"stopped": stopped, "driven": driven, "fleet_stopped_by": fleet}
         self.pages.send("control", _text("control", message))
 

@@ -149,7 +149,7 @@ async def test_lazy_relay_forgets_what_nobody_listens_to(core: Core) -> None:
         assert await heard_at_once(core.uri, "/to", 1) == {"new"}
 
 
-async def test_a_lazy_relay_listens_only_while_somebody_listens_to_it(core: Core) -> None:
+async def test_a_lazy_relay_listens_only_while_it_has_a_subscriber(core: Core) -> None:
     async with (
         node("talker", core.uri) as talker,
         node("listener", core.uri) as listener,
@@ -286,7 +286,7 @@ async def test_one_connection_carries_topics_and_services_both_ways() -> None:
             await base.service_client("refuse", "roscpp/Empty").call({}, timeout=20)
 
 
-async def test_a_link_brings_messages_only_while_somebody_listens() -> None:
+async def test_a_link_brings_messages_only_while_there_is_a_subscriber() -> None:
     async with (
         linked() as (cloud, robot, _, _),
         node("planner", cloud.uri) as planner,
@@ -311,7 +311,7 @@ async def test_link_keeps_what_each_publisher_latched() -> None:
 
 
 async def test_link_forgets_what_nobody_listens_to() -> None:
-    """A later subscriber gets what is latched then, and not what was when somebody listened last."""
+    """A later subscriber gets what is latched then, and not what was at the last subscription."""
     async with linked() as (cloud, robot, one, _), node("base", robot.uri) as base:
         publisher = await base.advertise("said", STRING, latch=True)
         publisher.publish(data="old")

@@ -94,7 +94,7 @@ async def test_publisher_with_a_bad_answer_ends_no_subscriber() -> None:
 
 @asynccontextmanager
 async def provider(core: Core, answer: bytes) -> AsyncIterator[None]:
-    """Provide ``/s``: whoever connects gets ``answer``."""
+    """Provide ``/s``: each client gets ``answer``."""
 
     async def greet(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.read(1)

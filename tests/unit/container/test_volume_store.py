@@ -41,7 +41,7 @@ def often_switched() -> Iterator[None]:
 def test_volumes_come_and_go_while_they_are_measured(tmp_path: Path) -> None:
     """A thread measures; the event loop gives volumes to containers meanwhile.
 
-    No file system is in the images, as after a power failure: that is no reason to stop either.
+    No file system is in the images, as after a power failure; measuring continues.
     """
     store = VolumeStore(tmp_path, images=True)
     (tmp_path / "anna").mkdir()

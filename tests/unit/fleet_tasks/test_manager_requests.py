@@ -372,7 +372,7 @@ async def test_old_events_that_cannot_be_removed_stop_nothing(
 
 
 async def test_an_event_that_cannot_be_written_is_rolled_back(client: ManagerClient) -> None:
-    """A record without a form in the journal: whoever waits is told, and the next step recovers."""
+    """A record without a form in the journal: waiting callers are told, and the next step recovers."""
     assert (await client.ask("POST", "/tasks", GO))[0] == 201
     book = client.manager.book
     book.emit(replace(book.find("T1"), revision=2**70), "wrong", 1.0)

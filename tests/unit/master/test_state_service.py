@@ -147,7 +147,7 @@ async def test_a_fault_of_ours_is_no_end(cloud: Cloud, caplog: pytest.LogCapture
 
 
 async def test_commands_fail_once_a_listener_failed() -> None:
-    """Its master ends; what waits for it must not wait for ever."""
+    """Its master ends; its callers get an error."""
     store = FragileStore()
     service = await StateService.open(store)
 
