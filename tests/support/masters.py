@@ -13,6 +13,7 @@ from typing import Any
 
 import aiohttp
 
+from rce_master.leadership.core import STANDBY_HEADER
 from support.engine import Program, until
 from support.master_program import environment
 from support.ports import free_ports
@@ -93,6 +94,18 @@ class Masters:
         return aiohttp.ClientSession(
             headers={"Authorization": f"Bearer {self.token}"}, timeout=aiohttp.ClientTimeout(total=timeout)
         )
+
+    async def ask(self, method: str, url: str, **options: Any) -> tuple[int, str]:
+        """Ask a master; repeat what was not done because no master led at that moment."""
+
+        async def answer() -> tuple[int, str] | None:
+            async with (
+                self.session(120.0) as session,
+                session.request(method, url, **options) as reply,
+            ):
+                return None if STANDBY_HEADER in reply.headers else (reply.status, await reply.text())
+
+        return await until(answer, timeout=120, what=f"a leading master answers {method} {url}")
 
     @asynccontextmanager
     async def under_load(self, writers: int = 3) -> AsyncIterator[None]:

@@ -31,13 +31,9 @@ class Pushed:
         """Push it to a master."""
         url = f"{at.url}api/v1/packages/{self.name}/1.0"
         query = {"key": self.spec.key, "signature": self.spec.signature}
-        async with (
-            made.session(WAIT_S) as session,
-            session.put(url, params=query, data=self.archive) as reply,
-        ):
-            text = await reply.text()
-            assert reply.status == status, text
-            return text
+        got, text = await made.ask("PUT", url, params=query, data=self.archive)
+        assert got == status, text
+        return text
 
     def path(self, master: MasterProcess) -> Path:
         return master.log.parent / master.name / "bundles" / self.sha256

@@ -38,7 +38,8 @@ from rce_master.cli.exceptions import ApiError
 
 pytestmark = [pytest.mark.needs("etcd"), pytest.mark.asyncio(loop_scope="module")]
 
-LEASE_S = 4.0
+LEASE_S = 10.0
+"""Of a loaded machine: a leader that etcd keeps waiting for some seconds still leads."""
 SECRET = "a secret for the tests"
 AUTHORIZATION = {"Authorization": f"Bearer {SECRET}"}
 
