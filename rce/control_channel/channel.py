@@ -47,12 +47,12 @@ from rce.control import (
     decode_to_task_set,
     encode,
 )
+from rce.control_channel.connections import TaskSetConnection
 from rce.control_channel.terms import Terms
 from rce.control_channel.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, MAX_TEXT, ControlTimeouts
 from rce.dialing import open_url_socket
 from rce.masters import Masters
 from rce.tls import CertificateError, Context, explain_to_client
-from rce.tls.websocket import TlsClientConnection
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -269,7 +269,7 @@ class TaskSetChannel:
                 ping_timeout=self._timeouts.ping_timeout,
                 close_timeout=self._timeouts.close,
                 max_size=MAX_FRAME,
-                create_connection=TlsClientConnection,
+                create_connection=TaskSetConnection,
             ) as socket:
                 try:
                     await self._talk(socket)

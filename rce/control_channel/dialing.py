@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from websockets.asyncio.client import connect
 
 from rce.control.execution import MAX_DATA, path_of
+from rce.control_channel.connections import TaskSetConnection
 from rce.control_channel.timeouts import DEFAULT_TIMEOUTS, ControlTimeouts
 from rce.dialing import open_url_socket
-from rce.tls.websocket import TlsClientConnection
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -75,7 +75,7 @@ class Dialer:
             close_timeout=self._timeouts.close,
             max_size=max_size,
             max_queue=4,
-            create_connection=TlsClientConnection,
+            create_connection=TaskSetConnection,
         ) as master:
             yield master
 

@@ -41,6 +41,7 @@ from rce.control import (
 from rce.control.execution import run_of
 from rce.control.node_states import PATH as NODE_STATES_PATH
 from rce.control.snapshots import UPLOADS
+from rce.control_channel.connections import MasterConnection
 from rce.control_channel.contents import ReadContent, answer, is_for_contents
 from rce.control_channel.peer import Peer
 from rce.control_channel.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, ControlTimeouts
@@ -161,7 +162,7 @@ class ControlServer:
 
     async def __aenter__(self) -> Self:
         lobby = Lobby("task sets", per_address=UNAUTHENTICATED_PER_ADDRESS)
-        connection = guarded(GuardedConnection, lobby)
+        connection = guarded(MasterConnection, lobby)
         if self._tls is not None:
             self._gate = TlsGate("control channel", self._tls, lobby)
         self._server = await serve(

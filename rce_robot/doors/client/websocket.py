@@ -2,7 +2,7 @@
 
 The ``websockets`` library does the handshake, the parsing, answers to pings and the end of a connection. It
 waits only for answers to its own pings, which wait behind a large message on a slow link, so
-:class:`rce_robot.doors.client.watch.Watch` replaces its keepalive. Three things differ here, because they
+a :class:`rce.liveness.Watch` replaces its keepalive. Three things differ here, because they
 take a large part of a message's time in the engine:
 
 * A message in one frame is taken from the received data without the library's parser
@@ -30,6 +30,7 @@ from websockets.protocol import State
 
 from rce.buffers import unfilled, write_together
 from rce.guard.websocket import GuardedConnection
+from rce.liveness import Watch
 from rce_robot.doors.client.frames import (
     FIN_BINARY,
     FIN_TEXT,
@@ -39,7 +40,6 @@ from rce_robot.doors.client.frames import (
     find_message,
 )
 from rce_robot.doors.client.steps import LARGE_FRAME, Steps
-from rce_robot.doors.client.watch import Watch
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -204,7 +204,7 @@ class RobotSocket(GuardedConnection):
         self._end_of_input()
         return False
 
-    # Called by the watch: rce_robot.doors.client.watch.Watched
+    # Called by the watch: rce.liveness.Watched
 
     def heard(self) -> bool:
         """Return whether data came since the last call, or came before and waits for its turn."""

@@ -1,4 +1,4 @@
-"""Pings a robot, and notices when it gives no sign of life any more (:mod:`rce.liveness`).
+"""Pings the other side of a connection, and notices when it gives no sign of life any more.
 
 Timers instead of a task: nothing here waits for the connection, which may be full.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 from typing import Protocol
 
-from rce.liveness import Liveness, Outflow, Step
+from rce.liveness.signs import Liveness, Outflow, Step
 
 
 class Watched(Protocol):
@@ -33,8 +33,8 @@ class Watched(Protocol):
 class Watch:
     """Watches a connection until :meth:`stop`.
 
-    While it takes data, it is pinged regularly also if it sends: proxies on the way end connections in which
-    nothing goes to the robot.
+    While the other side takes data, it is pinged regularly also if it sends: proxies on the way end
+    connections in which nothing goes to it.
 
     Args:
         connection: The connection.
