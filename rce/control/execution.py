@@ -4,7 +4,12 @@ A run is a conversation of binary frames in both directions, each one byte that 
 (:class:`Part`) and its contents. The same frames go from the user's program to the master (a WebSocket at
 ``/api/v1/containers/{container}/exec``), from there to the container's machine (a WebSocket that the task set
 dials, ``/exec/RUN`` on the control port) and into the container (a ``SOCK_SEQPACKET`` socket), so nothing on
-the way reads more than the first byte. Each hop waits for the next one, so a slow reader slows the command.
+the way reads more than the first byte.
+
+A slow reader slows the command, and a command that does not read its input slows the user. If both sides can,
+they do so by windows: each sends at most so many bytes of contents more than the other side took (``TAKEN``).
+So nothing waits on the way, where it would delay signals, and pings of the connections. Otherwise each hop
+waits for the next one.
 """
 
 from __future__ import annotations
@@ -21,6 +26,10 @@ FEATURE = "exec"
 """The feature that a task set or an environment names if it can run commands."""
 MAX_DATA = 32 << 10
 """Bytes of the contents of one frame."""
+WINDOW = 256 << 10
+"""Bytes of contents that may be on the way to the engine's programs."""
+MIN_WINDOW = 2 * MAX_DATA
+"""So that a command's output and its errors have room."""
 MAX_ARGUMENTS = 1024
 MAX_COMMAND = 128 << 10
 """Bytes of a command with all its arguments and variables."""
@@ -29,6 +38,7 @@ NOT_RUN = 125
 PATH_PREFIX = "/exec/"
 _RUN = re.compile(rf"{PATH_PREFIX}([0-9a-f]{{32}})")
 _SIZE = struct.Struct("!HH")
+_AMOUNT = struct.Struct("!I")
 
 
 class Part(Enum):
@@ -45,7 +55,10 @@ class Part(Enum):
     ERROR = b"e"
     """Bytes of the command's standard error; with a terminal all is OUTPUT."""
     STARTED = b"b"
-    """The command runs."""
+    """The command runs. If both sides use windows: the window for input, as in ``TAKEN``; otherwise empty."""
+    TAKEN = b"t"
+    """How many bytes of input, or of output and errors together, the sender of this frame took since its last
+    one: 32 bits in network order. In both directions, if both sides use windows."""
     ENDED = b"x"
     """:class:`Ended` as JSON; the last frame."""
 
@@ -74,6 +87,8 @@ class Command(Struct, frozen=True, kw_only=True, omit_defaults=True):
     columns: int = 80
     variables: dict[str, str] = {}
     """Further environment variables, such as TERM."""
+    window: int = 0
+    """How many bytes of output and errors may be on the way; 0: the user's program uses no windows."""
 
 
 class Ended(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -113,6 +128,22 @@ def read_size(data: bytes) -> tuple[int, int]:
     return rows, columns
 
 
+def amount_frame(part: Part, amount: int) -> Frame:
+    """Make a frame that tells a number of bytes."""
+    return Frame(part, _AMOUNT.pack(amount))
+
+
+def read_amount(data: bytes) -> int:
+    """Read a number of bytes.
+
+    Raises:
+        ValueError: It is none.
+    """
+    if len(data) != _AMOUNT.size:
+        raise ValueError(f"a number of bytes has {_AMOUNT.size} bytes, not {len(data)}")
+    return int(_AMOUNT.unpack(data)[0])
+
+
 def ended_frame(code: int, reason: str = "") -> Frame:
     """Make the last frame."""
     return Frame(Part.ENDED, msgspec.json.encode(Ended(code=code, reason=reason[:2000])))
@@ -140,6 +171,8 @@ def read_command(text: str | bytes) -> Command:
         raise ValueError(
             f"the command has {len(command.argv)} arguments; at most {MAX_ARGUMENTS} are allowed"
         )
+    if command.window and command.window < MIN_WINDOW:
+        raise ValueError(f"the window has {command.window} bytes; at least {MIN_WINDOW} are needed, or 0")
     texts = [*command.argv, *command.variables, *command.variables.values()]
     if any("\0" in one for one in texts) or any("=" in name or not name for name in command.variables):
         raise ValueError("arguments and variables hold no NUL, names of variables no '='")

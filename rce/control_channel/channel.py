@@ -47,7 +47,7 @@ from rce.control import (
     decode_to_task_set,
     encode,
 )
-from rce.control_channel.connections import TaskSetConnection
+from rce.control_channel.dialing import TaskSetConnection
 from rce.control_channel.terms import Terms
 from rce.control_channel.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, MAX_QUEUED, MAX_TEXT, ControlTimeouts
 from rce.dialing import open_url_socket

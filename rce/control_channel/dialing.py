@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 from websockets.asyncio.client import connect
 
 from rce.control.execution import MAX_DATA, path_of
-from rce.control_channel.connections import TaskSetConnection
 from rce.control_channel.timeouts import DEFAULT_TIMEOUTS, ControlTimeouts
 from rce.dialing import open_url_socket
+from rce.liveness.websocket import WatchedConnection
+from rce.tls.websocket import TlsClientConnection
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -21,6 +22,10 @@ if TYPE_CHECKING:
     from rce.config import Secret
     from rce.masters import Masters
     from rce.tls import Context
+
+
+class TaskSetConnection(WatchedConnection, TlsClientConnection):
+    """The task set's end of a connection, which watches the master for signs of life."""
 
 
 class Dialer:

@@ -41,12 +41,12 @@ from rce.control import (
 from rce.control.execution import run_of
 from rce.control.node_states import PATH as NODE_STATES_PATH
 from rce.control.snapshots import UPLOADS
-from rce.control_channel.connections import MasterConnection
 from rce.control_channel.contents import ReadContent, answer, is_for_contents
 from rce.control_channel.peer import Peer
 from rce.control_channel.timeouts import DEFAULT_TIMEOUTS, MAX_FRAME, ControlTimeouts
 from rce.guard import PER_ADDRESS, Lobby
 from rce.guard.websocket import GuardedConnection, guarded
+from rce.liveness.websocket import WatchedConnection
 from rce.tls.gate import TlsGate
 from rce.tls.websocket import behind_gate
 
@@ -71,6 +71,10 @@ PROOF_CHECK_S = 1.0
 
 _GARBAGE, _POLICY, _INTERNAL, _GOING_AWAY = 1007, 1008, 1011, 1001
 _MAX_REASON = 123  # bytes of a WebSocket close frame's reason
+
+
+class MasterConnection(WatchedConnection, GuardedConnection):
+    """The master's end of a connection, which watches the task set for signs of life."""
 
 
 class ControlServer:

@@ -13,7 +13,20 @@ from collections.abc import Callable, Mapping
 from typing import Self, assert_never
 
 from rce.aio.tasks import BackgroundTasks, cancel_and_wait
-from rce.control.execution import MAX_DATA, NOT_RUN, Command, Frame, Part, decode, ended_frame, read_size
+from rce.aio.window import Window
+from rce.control.execution import (
+    MAX_DATA,
+    NOT_RUN,
+    WINDOW,
+    Command,
+    Frame,
+    Part,
+    amount_frame,
+    decode,
+    ended_frame,
+    read_amount,
+    read_size,
+)
 from rce_container.environment.descriptors import read_some, write_all
 from rce_container.environment.nodes.launch import NODE_MARK
 from rce_container.environment.nodes.reaper import Child, Reaper
@@ -26,7 +39,7 @@ MAX_EXECUTIONS = 16
 HANGUP_S = 2.0
 """Seconds that a command has to end after SIGHUP, when its user has disconnected."""
 REST_S = 1.0
-"""Seconds to read the last output of a command that has ended."""
+"""Seconds without output after which that of a command that has ended counts as complete."""
 PART_S = 5.0
 """Seconds that the user's side may take to read the last output."""
 SHELLS = ("/bin/bash", "/bin/sh")
@@ -99,8 +112,9 @@ class Executions:
             finally:
                 streams.close_childs()
             try:
-                await asyncio.get_running_loop().sock_sendall(sock, Frame(Part.STARTED).encode())
-                return await _Conversation(child, streams, sock).hold(mark)
+                started = amount_frame(Part.STARTED, WINDOW) if command.window else Frame(Part.STARTED)
+                await asyncio.get_running_loop().sock_sendall(sock, started.encode())
+                return await _Conversation(child, streams, sock, command.window).hold(mark)
             finally:
                 child.signal_group(signal.SIGKILL)
                 await kill_marked(mark, variable=NODE_MARK)
@@ -187,13 +201,56 @@ class _Terminal:
         self._open.difference_update(fds)
 
 
-class _Conversation:
-    """Passes a running command's streams between it and its user."""
+class _Input:
+    """The user's input that the command has not read yet; at most :data:`WINDOW` bytes."""
 
-    def __init__(self, child: Child, streams: _Pipes | _Terminal, sock: socket.socket) -> None:
+    def __init__(self) -> None:
+        self._waiting = bytearray()
+        self._ended = False
+        self._changed = asyncio.Condition()
+
+    async def put(self, data: bytes) -> None:
+        """Add input; wait for room, which there is if the user keeps to the window."""
+        async with self._changed:
+            await self._changed.wait_for(lambda: len(self._waiting) + len(data) <= WINDOW)
+            self._waiting += data
+            self._changed.notify_all()
+
+    async def end(self) -> None:
+        """No more input comes."""
+        async with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+    async def get(self) -> bytes:
+        """Wait for input; empty at its end."""
+        async with self._changed:
+            await self._changed.wait_for(lambda: self._waiting or self._ended)
+            data = bytes(self._waiting[:MAX_DATA])
+            del self._waiting[:MAX_DATA]
+            self._changed.notify_all()
+            return data
+
+
+class _Conversation:
+    """Passes a running command's streams between it and its user.
+
+    Args:
+        child: The command.
+        streams: Its streams.
+        sock: The user's side.
+        window: How many bytes may be on the way to the user; 0: both sides use no windows.
+    """
+
+    def __init__(self, child: Child, streams: _Pipes | _Terminal, sock: socket.socket, window: int) -> None:
         self._child = child
         self._streams = streams
         self._sock = sock
+        self._uses_windows = bool(window)
+        self._window = Window(window or None)
+        self._passed = 0
+        """Bytes of output that were sent."""
+        self._input = _Input()
         self._loop = asyncio.get_running_loop()
         self._turn = asyncio.Lock()
 
@@ -205,17 +262,28 @@ class _Conversation:
         """
         outputs = [asyncio.create_task(self._read(part, fd)) for part, fd in self._streams.outputs.items()]
         listening = asyncio.create_task(self._listen())
+        feeding = asyncio.create_task(self._feed())
         try:
             await asyncio.wait((self._child.ended, listening), return_when=asyncio.FIRST_COMPLETED)
             if not self._child.ended.done():
                 await self._hang_up()
             # Processes that the command left in the background would keep its streams open.
             await kill_marked(mark, variable=NODE_MARK)
-            await asyncio.wait(outputs, timeout=REST_S)
+            await self._pass_the_rest(outputs, listening)
         finally:
-            await cancel_and_wait(*outputs, listening)
+            await cancel_and_wait(*outputs, listening, feeding)
         code = self._child.ended.result()
         return ended_frame(code if code >= 0 else 128 - code)
+
+    async def _pass_the_rest(self, outputs: list[asyncio.Task[None]], listening: asyncio.Task[None]) -> None:
+        """Pass the last output on, as slowly as the user takes it."""
+        waiting = {*outputs}
+        while waiting and not listening.done():
+            before = self._passed, len(waiting)
+            await asyncio.wait({*waiting, listening}, timeout=REST_S, return_when=asyncio.FIRST_COMPLETED)
+            waiting = {task for task in waiting if not task.done()}
+            if (self._passed, len(waiting)) == before and not self._window.is_closed:
+                return  # a stream is still open, and nothing comes from it
 
     async def _hang_up(self) -> None:
         self._child.signal_group(signal.SIGHUP)
@@ -224,28 +292,46 @@ class _Conversation:
         await self._child.ended
 
     async def _read(self, part: Part, fd: int) -> None:
-        while data := await read_some(fd, MAX_DATA):
-            async with self._turn:
-                await self._loop.sock_sendall(self._sock, Frame(part, data).encode())
+        while True:
+            reserved = await self._window.reserve(MAX_DATA)
+            data = await read_some(fd, reserved)
+            self._window.give_back(reserved - len(data))
+            if not data:
+                return
+            await self._send(Frame(part, data))
+            self._passed += len(data)
+
+    async def _send(self, frame: Frame) -> None:
+        async with self._turn:
+            await self._loop.sock_sendall(self._sock, frame.encode())
+
+    async def _feed(self) -> None:
+        """Write the input to the command; drop it if the command does not read, or has closed its input."""
+        while data := await self._input.get():
+            with contextlib.suppress(OSError):
+                await write_all(self._streams.input, data)
+            if self._uses_windows:
+                with contextlib.suppress(OSError):  # the user has disconnected
+                    await self._send(amount_frame(Part.TAKEN, len(data)))
+        self._streams.close_input()
 
     async def _listen(self) -> None:
         """Handle the user's frames; return when the user disconnects or sends an invalid frame."""
         while received := await self._loop.sock_recv(self._sock, MAX_DATA + 2):
             try:
-                frame = decode(received)
-                await self._obey(frame)
+                await self._obey(decode(received))
             except ValueError as error:
                 _log.warning("a command is ended: %s", error)
                 return
-            except OSError:  # the command does not read, or has closed its input
-                self._streams.close_input()
 
     async def _obey(self, frame: Frame) -> None:
         match frame.part:
             case Part.INPUT:
-                await write_all(self._streams.input, frame.data)
+                await self._input.put(frame.data)
             case Part.END_OF_INPUT:
-                self._streams.close_input()
+                await self._input.end()
+            case Part.TAKEN:
+                self._window.give_back(read_amount(frame.data))
             case Part.SIZE:
                 self._streams.resize(*read_size(frame.data))
             case Part.SIGNAL:

@@ -13,22 +13,28 @@ from typing import TYPE_CHECKING, Annotated, assert_never
 import aiohttp
 import msgspec
 import typer
+from msgspec.structs import replace
 
-from rce.aio.tasks import cancel_and_wait
+from rce.aio.tasks import cancel_and_wait, run_until_first
+from rce.aio.window import Window
 from rce.cli.main import Plugged
 from rce.control.execution import (
     MAX_DATA,
     NOT_RUN,
+    WINDOW,
     Command,
     Frame,
     Part,
+    amount_frame,
     decode,
+    read_amount,
     read_ended,
     size_frame,
 )
 from rce_master.cli import credentials
 from rce_master.cli.client import ApiClient
 from rce_master.cli.exceptions import CliError
+from rce_master.cli.output import OutputWriter
 from rce_master.exceptions import MasterError
 
 if TYPE_CHECKING:
@@ -73,7 +79,7 @@ def run_command(container: str, command: Command, *, user: str = "", stdin: bool
     """
     if command.terminal:
         size = shutil.get_terminal_size()
-        command = msgspec.structs.replace(command, rows=size.lines, columns=size.columns)
+        command = replace(command, rows=size.lines, columns=size.columns)
     try:
         return asyncio.run(_run(container, command, user, stdin))
     except (CliError, MasterError) as error:
@@ -97,56 +103,93 @@ async def _run(container: str, command: Command, user: str, stdin: bool) -> int:
         ApiClient.of(credentials.load()) as client,
         client.websocket(f"/containers/{container}/exec", query, MAX_DATA + 2) as socket,
     ):
-        await socket.send_str(msgspec.json.encode(command).decode())
-        with _raw_terminal(command.terminal), _signals(socket, command.terminal):
-            typing = asyncio.create_task(_send_input(socket, stdin, command.terminal))
-            try:
-                return await _show(socket)
-            finally:
-                await cancel_and_wait(typing)
+        await socket.send_str(msgspec.json.encode(replace(command, window=WINDOW)).decode())
+        with _raw_terminal(command.terminal), OutputWriter() as writer:
+            with _signals(socket, command.terminal):
+                code = await _Run(socket, command.terminal, writer).hold(stdin)
+            await writer.drain()  # Ctrl-C ends this program now
+            return code
 
 
-async def _show(socket: ClientWebSocketResponse) -> int:
-    """Write the command's output, until it has ended; return its exit code."""
-    async for message in socket:
-        if message.type is not aiohttp.WSMsgType.BINARY:
-            continue
-        frame = decode(message.data)
+class _Run:
+    """Passes a command's streams between it and this program's own."""
+
+    def __init__(self, socket: ClientWebSocketResponse, terminal: bool, writer: OutputWriter) -> None:
+        self._socket = socket
+        self._terminal = terminal
+        self._writer = writer
+        self._uses_windows = False
+        self._started: asyncio.Future[Window] = asyncio.get_running_loop().create_future()
+        """The window for input, once the command runs."""
+        self._code: int | None = None
+
+    async def hold(self, stdin: bool) -> int:
+        """Pass data until the command has ended; return its exit code."""
+        typing = asyncio.create_task(self._send_input(stdin))
+        try:
+            await run_until_first(self._show(), self._acknowledge())
+        finally:
+            await cancel_and_wait(typing)
+        if self._code is None:
+            raise CliError("the connection to the master was lost; the command has been ended")
+        return self._code
+
+    async def _show(self) -> None:
+        """Have the command's output written, until it has ended or the connection is lost."""
+        async for message in self._socket:
+            if message.type is aiohttp.WSMsgType.BINARY:
+                self._take(decode(message.data))
+                if self._code is not None:
+                    return
+
+    def _take(self, frame: Frame) -> None:
         match frame.part:
             case Part.OUTPUT:
-                _write(1, frame.data)
+                self._writer.write(1, frame.data)
             case Part.ERROR:
-                _write(2, frame.data)
+                self._writer.write(2, frame.data)
+            case Part.STARTED:
+                self._uses_windows = bool(frame.data)
+                self._started.set_result(Window(read_amount(frame.data) if frame.data else None))
+            case Part.TAKEN:
+                self._started.result().give_back(read_amount(frame.data))
             case Part.ENDED:
                 ended = read_ended(frame.data)
                 if ended.reason:
-                    _write(2, f"rce: {ended.reason}\n".encode())
-                return ended.code
-            case Part.STARTED:
-                pass  # no output
+                    self._writer.write(2, f"rce: {ended.reason}\n".encode())
+                self._code = ended.code
             case Part.INPUT | Part.END_OF_INPUT | Part.SIZE | Part.SIGNAL:
                 raise CliError(f"the engine sent {frame.part.name}, which only a user sends")
             case _:
                 assert_never(frame.part)
-    raise CliError("the connection to the master was lost; the command has been ended")
+
+    async def _acknowledge(self) -> None:
+        """Tell what was written; raise what keeps it from being written.
+
+        Raises:
+            OSError: The output is not read any more.
+        """
+        while True:
+            amount = await self._writer.written()
+            if self._uses_windows:
+                with contextlib.suppress(ConnectionError):  # told by the other direction
+                    await self._socket.send_bytes(amount_frame(Part.TAKEN, amount).encode())
+
+    async def _send_input(self, stdin: bool) -> None:
+        """Send the typed or piped input, and its end."""
+        window = await self._started
+        while stdin:
+            reserved = await window.reserve(MAX_DATA)
+            data = await _read_input(reserved)
+            window.give_back(reserved - len(data))
+            if not data:
+                break
+            await self._socket.send_bytes(Frame(Part.INPUT, data).encode())
+        if not self._terminal:
+            await self._socket.send_bytes(Frame(Part.END_OF_INPUT).encode())
 
 
-def _write(fd: int, data: bytes) -> None:
-    rest = memoryview(data)
-    while rest:
-        rest = rest[os.write(fd, rest) :]
-
-
-async def _send_input(socket: ClientWebSocketResponse, stdin: bool, terminal: bool) -> None:
-    """Send the typed or piped input, and its end."""
-    if stdin:
-        while data := await _read_input():
-            await socket.send_bytes(Frame(Part.INPUT, data).encode())
-    if not terminal:
-        await socket.send_bytes(Frame(Part.END_OF_INPUT).encode())
-
-
-async def _read_input() -> bytes:
+async def _read_input(most: int) -> bytes:
     loop = asyncio.get_running_loop()
     ready = loop.create_future()
     try:
@@ -158,7 +201,7 @@ async def _read_input() -> bytes:
             await ready
         finally:
             loop.remove_reader(0)
-    return os.read(0, MAX_DATA)
+    return os.read(0, most)
 
 
 def _wake(ready: asyncio.Future[None]) -> None:

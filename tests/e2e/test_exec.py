@@ -17,8 +17,19 @@ import pytest_asyncio
 from support.engine import Engine, running_engine, until
 from support.owner import Owner
 from support.stranger import stranger
+from websockets.asyncio.client import connect
 
-from rce.control.execution import Command
+from rce.control.execution import (
+    MAX_DATA,
+    MIN_WINDOW,
+    Command,
+    Frame,
+    Part,
+    amount_frame,
+    decode,
+    read_amount,
+    read_ended,
+)
 
 RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]
 NODE = {"containerTag": "box", "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}
@@ -140,6 +151,67 @@ async def test_signals_reach_the_command(shared_engine: Engine, owner: Owner) ->
     killed.kill()
     await killed.communicate()
     await until(lambda: not runs(shared_engine, "sleep 6543"), what="it ended with its user")
+
+
+@IN_PROCESSES
+async def test_signals_pass_input_that_is_not_read(shared_engine: Engine, owner: Owner) -> None:
+    process = await owner.start("exec", "box", "sleep", "6544")
+    assert process.stdin is not None
+    await until(lambda: runs(shared_engine, "sleep 6544"), what="the command runs")
+    process.stdin.write(bytes(8_000_000))
+    with contextlib.suppress(TimeoutError):  # it takes a few hundred thousand bytes
+        async with asyncio.timeout(2.0):
+            await process.stdin.drain()
+    process.send_signal(signal.SIGINT)
+    async with asyncio.timeout(60):
+        await process.communicate()
+    assert process.returncode == 130
+
+
+@IN_PROCESSES
+async def test_a_slow_reader_gets_all_output(owner: Owner) -> None:
+    """Also what the command wrote before it ended, long ago."""
+    process = await owner.start("exec", "box", "sh", "-c", "head -c 1000000 /dev/zero; echo end")
+    assert process.stdout is not None
+    process.stdout._transport.pause_reading()  # type: ignore[attr-defined]
+    await asyncio.sleep(8)  # longer than the engine waits for users that take nothing
+    process.stdout._transport.resume_reading()  # type: ignore[attr-defined]
+    output, _ = await process.communicate()
+    assert (process.returncode, len(output), output[-4:]) == (0, 1_000_004, b"end\n")
+
+
+@IN_PROCESSES
+async def test_connections_of_commands_that_wait_answer_pings(shared_engine: Engine) -> None:
+    """With full windows in both directions, by a client of the protocol that is not ours."""
+    url = f"{shared_engine.url.replace('http', 'ws')}api/v1/containers/box/exec"
+    headers = {"Authorization": f"Bearer {shared_engine.token()}"}
+    async with connect(url, additional_headers=headers, proxy=None, compression=None) as socket:
+        script = "yes & exec sleep 6545"
+        command = Command(argv=("sh", "-c", script), window=MIN_WINDOW)
+        await socket.send(msgspec.json.encode(command).decode())
+        started = decode(await socket.recv(decode=False))
+        assert started.part is Part.STARTED
+        for _ in range(read_amount(started.data) // MAX_DATA):
+            await socket.send(Frame(Part.INPUT, bytes(MAX_DATA)).encode())
+        got, taken = 0, 0
+        with contextlib.suppress(TimeoutError):
+            while True:
+                frame = decode(await asyncio.wait_for(socket.recv(decode=False), 3.0))
+                if frame.part is Part.OUTPUT:
+                    got += len(frame.data)
+                else:
+                    assert frame.part is Part.TAKEN
+                    taken += read_amount(frame.data)
+        assert MAX_DATA <= got <= MIN_WINDOW
+        assert taken < read_amount(started.data)
+        async with asyncio.timeout(30):
+            await (await socket.ping())
+        await socket.send(amount_frame(Part.TAKEN, 1000).encode())
+        assert len(decode(await socket.recv(decode=False)).data) == 1000
+        await socket.send(Frame(Part.SIGNAL, bytes([signal.SIGTERM])).encode())
+        while (frame := decode(await socket.recv(decode=False))).part is not Part.ENDED:
+            await socket.send(amount_frame(Part.TAKEN, len(frame.data)).encode())
+        assert read_ended(frame.data).code == 128 + signal.SIGTERM
 
 
 async def test_the_graph_of_a_container_is_seen_from_outside(owner: Owner) -> None:

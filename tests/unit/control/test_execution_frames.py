@@ -10,12 +10,15 @@ from hypothesis import strategies as st
 from rce.control.execution import (
     MAX_ARGUMENTS,
     MAX_DATA,
+    MIN_WINDOW,
     Command,
     Frame,
     Part,
+    amount_frame,
     decode,
     ended_frame,
     path_of,
+    read_amount,
     read_command,
     read_ended,
     read_size,
@@ -45,6 +48,13 @@ def test_sizes_fit_their_frame(rows: int, columns: int) -> None:
         read_size(b"\0")
 
 
+@given(st.integers(0, 2**32 - 1))
+def test_amounts_are_read_as_written(amount: int) -> None:
+    assert read_amount(amount_frame(Part.TAKEN, amount).data) == amount
+    with pytest.raises(ValueError, match="4 bytes"):
+        read_amount(b"\0" * 5)
+
+
 def test_the_last_frame_holds_code_and_reason() -> None:
     assert read_ended(ended_frame(137, "killed").data) == read_ended(b'{"code":137,"reason":"killed"}')
     with pytest.raises(msgspec.ValidationError):
@@ -55,6 +65,8 @@ def test_the_last_frame_holds_code_and_reason() -> None:
     ("text", "words"),
     [
         ('{"argv": ["a\\u0000b"]}', "NUL"),
+        (f'{{"window": {MIN_WINDOW - 1}}}', "window"),
+        ('{"window": -1}', "window"),
         ('{"variables": {"A=B": "c"}}', "'='"),
         ('{"variables": {"": "c"}}', "'='"),
         ('{"argv": ' + str(["x"] * (MAX_ARGUMENTS + 1)).replace("'", '"') + "}", "1025 arguments"),
