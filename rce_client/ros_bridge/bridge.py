@@ -6,17 +6,18 @@ import asyncio
 import contextlib
 import itertools
 import logging
-from typing import TYPE_CHECKING, assert_never
+from typing import TYPE_CHECKING, TypeVar, assert_never
 
 from rce.aio.backoff import Backoff
 from rce.model import Role
 from rce.ros.closing import release
+from rce.ros.errors import MasterUnreachableError
 from rce.ros.node import MasterError, Node, RosError, TypeRegistry
 from rce.ros.node import Publisher as RosPublisher
 from rce_client.exceptions import CallError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 
     from rce.aio.tasks import TaskScope
     from rce_client.connection import Connection
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+T = TypeVar("T")
+
 MASTER_TIMEOUT = 2.0
 """Seconds between two attempts to reach the robot's ROS master."""
 
@@ -33,7 +36,7 @@ REMINDER = 5.0
 """Seconds between two messages about interfaces that are not connected yet."""
 
 RETRY = Backoff(first=0.5, longest=10.0, jitter=0.5)
-"""Pauses between attempts to subscribe to a topic."""
+"""Pauses between attempts to register a topic or service at the robot's ROS master."""
 
 CALL_TIMEOUT = 30.0
 """Seconds that a service of the robot's graph, or of the cloud, may take."""
@@ -66,7 +69,7 @@ async def build(plan: Plan, conn: Connection, node: Node, tasks: TaskScope) -> N
     """Send all requests to the engine and create all spans; ``tasks`` runs what belongs to them.
 
     Raises:
-        rce.ros.errors.RosError: The robot's graph refuses a registration.
+        rce.ros.errors.RosError: The robot's ROS master refuses a registration.
         rce_client.exceptions.ClientError: The engine refuses the client.
     """
     for request in plan.requests[: plan.first]:
@@ -85,9 +88,9 @@ async def lay(span: Span, conn: Connection, node: Node, tasks: TaskScope) -> Non
             if span.on_demand:
                 tasks.spawn(uplink.listen_on_demand(node, span), name=f"uplink {span.tag}")
             else:
-                await node.listen(span.addr, span.message_type, uplink)
+                await _at_master(lambda: node.listen(span.addr, span.message_type, uplink))
         case Role.PUBLISHER:
-            publisher = await node.advertise(span.addr, span.message_type)
+            publisher = await _at_master(lambda: node.advertise(span.addr, span.message_type))
             downlink = Downlink(publisher)
             await conn.subscriber(span.tag, span.message_type, downlink.received, raw=True, latches=downlink)
         case Role.SERVICE_PROVIDER:
@@ -96,7 +99,9 @@ async def lay(span: Span, conn: Connection, node: Node, tasks: TaskScope) -> Non
             async def ask_cloud(request: bytes) -> bytes:
                 return bytes(await client(request, timeout=CALL_TIMEOUT))
 
-            await node.advertise_service_serialized(span.addr, span.message_type, ask_cloud)
+            await _at_master(
+                lambda: node.advertise_service_serialized(span.addr, span.message_type, ask_cloud)
+            )
         case Role.SERVICE_CLIENT:
             service = node.service_client(span.addr, span.message_type)
 
@@ -109,6 +114,17 @@ async def lay(span: Span, conn: Connection, node: Node, tasks: TaskScope) -> Non
             await conn.service_provider(span.tag, span.message_type, ask_robot, raw=True)
         case _:
             assert_never(span.role)
+
+
+async def _at_master(register: Callable[[], Awaitable[T]]) -> T:
+    """Register at the robot's ROS master; wait while it is away, which may be since this program began."""
+    pauses = RETRY.start()
+    while True:
+        try:
+            return await register()
+        except MasterUnreachableError as error:
+            _log.warning("waiting for the robot's ROS master: %s", error)
+        await asyncio.sleep(pauses.next())
 
 
 class Uplink:

@@ -16,7 +16,7 @@ from rce.aio.tasks import TaskScope
 from rce.model import Role
 from rce.ros.core import Core
 from rce.ros.node import Node
-from rce_client.ros_bridge.bridge import Uplink
+from rce_client.ros_bridge.bridge import Uplink, lay
 from rce_client.ros_bridge.plan import Span
 
 if TYPE_CHECKING:
@@ -92,3 +92,29 @@ async def test_uplink_subscribes_once_its_master_is_back(
             async with asyncio.timeout(60):
                 assert await engine.end("say").received.get() == ros_string("up")
             await stack.aclose()
+
+
+async def test_a_master_that_goes_away_while_the_bridge_starts_is_waited_for(
+    engine: Engine, caplog: pytest.LogCaptureFixture
+) -> None:
+    port = free_port()
+    spans = [
+        Span("say", Role.SUBSCRIBER, STRING, "/say"),
+        Span("hear", Role.PUBLISHER, STRING, "/hear"),
+        Span("ask", Role.SERVICE_PROVIDER, EMPTY, "/ask"),
+    ]
+    async with engine.connection() as conn, contextlib.AsyncExitStack() as stack:
+        async with Core(host="127.0.0.1", port=port) as core:
+            node = Node("bridge", argv=(), master_uri=core.uri, signals=False, master_timeout=0.2)
+            await stack.enter_async_context(node)
+        tasks = await stack.enter_async_context(TaskScope())
+        async with asyncio.timeout(60), asyncio.TaskGroup() as laid:
+            for span in spans:
+                laid.create_task(lay(span, conn, node, tasks))
+            while caplog.text.count("waiting for the robot's ROS master") < len(spans):
+                await asyncio.sleep(0.01)
+            core = await stack.enter_async_context(Core(host="127.0.0.1", port=port))
+        robot = await stack.enter_async_context(Node("robot", argv=(), master_uri=core.uri, signals=False))
+        await (await robot.advertise("/say", STRING)).wait_for_subscribers(1, timeout=60)
+        await (await robot.subscribe("/hear", STRING)).wait_for_publishers(1, timeout=60)
+        await robot.wait_for_service("/ask", timeout=60)
