@@ -21,6 +21,7 @@ from __future__ import annotations
 from array import array
 from bisect import bisect_right
 from collections import deque
+from math import inf
 from typing import TYPE_CHECKING
 
 from rce_fleet.coordination.ledger_view import AFTER_ALL, CELLS, STEPS, Account, LedgerView, QueuedVisit
@@ -184,25 +185,31 @@ class CellLedger(LedgerView):
             InvariantError: A step is not greater than the one before it.
         """
         account = self._account(robot)
+        route, steps, queues = account.route, account.steps, self._queues
+        last = steps[-1] if steps else -inf
+        number = account.passed + len(route)
         for cell, step in visits:
-            if account.steps and step <= account.steps[-1]:
-                raise InvariantError(
-                    f"{robot} enters cell {cell} at step {step}, not after {account.steps[-1]}"
-                )
-            visit = step, robot, account.passed + len(account.route)
-            queue = self._queues.setdefault(cell, deque())
-            queue.insert(self._position(queue, step), visit)
-            account.route.append(cell)
-            account.steps.append(step)
-            self._last_step = max(self._last_step, step)
+            if step <= last:
+                raise InvariantError(f"{robot} enters cell {cell} at step {step}, not after {last}")
+            visit = step, robot, number
+            queue = queues.get(cell)
+            if queue is None:
+                queues[cell] = deque((visit,))
+            elif queue[-1][0] <= step or not self.ordered:
+                queue.append(visit)
+            else:
+                queue.insert(self._position(queue, step), visit)
+            route.append(cell)
+            steps.append(step)
+            number += 1
+            last = step
+        self._last_step = max(self._last_step, last)
         account.version = next(self._versions)
         self._changed.add(robot)
         self._ripe.add(robot)
 
     def _position(self, queue: deque[QueuedVisit], step: float) -> int:
-        """Return the place in a queue of a visit at ``step``: behind granted and earlier ones."""
-        if not self.ordered or not queue:
-            return len(queue)
+        """Return the place in an ordered queue of a visit at ``step``: behind granted and earlier ones."""
         _, robot, number = queue[0]
         account = self._accounts[robot]
         # Only the first visit can be granted, whatever its step is; the steps behind it grow.

@@ -187,8 +187,10 @@ def adopt_rerouting(
         # All of them first: where one has its old path, another may have its new one.
         state.ledger.truncate(robot)
     closed = state.zones.closed(state.grid)
+    shut = state.shut
     for index, record, path in present:
-        possible = list(_possible(state, record.id, request.starts[index], path, closed))
+        barred = state.forbidden(record.id)
+        possible = list(_possible(request.starts[index], path, shut, barred, closed))
         if len(possible) < len(path):
             left.add(record.id)
         state.ledger.insert(record.id, possible)
@@ -202,18 +204,17 @@ def adopt_rerouting(
 
 
 def _possible(
-    state: FleetState,
-    robot: str,
     start: int,
     path: Sequence[tuple[int, float]],
+    shut: frozenset[int],
+    barred: frozenset[int],
     closed: frozenset[tuple[int, int]],
 ) -> Iterator[tuple[int, float]]:
     """Yield the visits of a path up to the first one that is not allowed any more."""
-    forbidden = state.forbidden(robot)
     before = start
-    for cell, step in path:
-        is_barred = cell in forbidden and before not in forbidden
-        if state.is_shut(cell) or is_barred or (before, cell) in closed:
+    for visit in path:
+        cell, _ = visit
+        if cell in shut or (cell in barred and before not in barred) or (before, cell) in closed:
             return
-        yield cell, step
+        yield visit
         before = cell
