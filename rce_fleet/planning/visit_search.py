@@ -196,9 +196,12 @@ def search_path(
             pace = float(costs[edge])
             if state == 0:
                 pace = min(pace, until - step)  # It may have to give way at once.
-            after = -np.inf
-            for place in range(counts[there] + 1):
-                if place > 0:
+            after, first = -np.inf, 0
+            while first < counts[there] and times[there, first, ENTER] <= step + pace:
+                after = max(after, times[there, first, LEAVE])  # the interval before is over by then
+                first += 1
+            for place in range(first, counts[there] + 1):
+                if place > first:
                     after = max(after, times[there, place - 1, LEAVE])
                 if after > until or after == np.inf:
                     break
