@@ -16,10 +16,10 @@ from rce_master.exceptions import StoreError
 from rce_master.store.etcd import EtcdClient
 from rce_master.store.etcd.layout import MAX_OPERATIONS
 from support.engine import until
+from support.go_between import LOOPBACK, GoBetween
 from support.ports import free_ports
 from support.processes import finish
 
-LOOPBACK = "127.0.0.1"
 START_S = 120.0
 
 
@@ -118,7 +118,7 @@ async def _works(client: EtcdClient) -> bool:
     return False
 
 
-class CuttingProxy:
+class CuttingProxy(GoBetween):
     """Passes requests on to a server; after :meth:`cut` it drops connections in place of answers.
 
     Attributes:
@@ -127,49 +127,19 @@ class CuttingProxy:
 
     def __init__(self, target: str) -> None:
         host, _, port = target.rpartition(":")
-        self._target = host, int(port)
+        super().__init__((host, int(port)))
         self._path, self._left = b"", 0
         self.cuts = 0
-        self.endpoint = ""
-        self._tasks: set[asyncio.Task[None]] = set()
 
     def cut(self, path: str, count: int) -> None:
         """Let the server do the next requests for a path, and their clients get no answer."""
         self._path, self._left = path.encode(), count
 
-    @asynccontextmanager
-    async def running(self) -> AsyncIterator[CuttingProxy]:
-        server = await asyncio.start_server(self._serve, LOOPBACK, 0)
-        self.endpoint = f"{LOOPBACK}:{server.sockets[0].getsockname()[1]}"
-        try:
-            yield self
-        finally:
-            server.close()
-            for task in tuple(self._tasks):
-                task.cancel()
-            await asyncio.gather(*self._tasks, return_exceptions=True)
-            await server.wait_closed()
-
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        self._tasks.add(task)
-        try:
-            await self._pass_on(reader, writer)
-        except (OSError, asyncio.IncompleteReadError):
-            pass  # one of the two ended the connection
-        finally:
-            self._tasks.discard(task)
-            writer.transport.abort()
-
-    async def _pass_on(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while request := await _message(reader):
-            server_reader, server_writer = await asyncio.open_connection(*self._target)
-            try:
+            async with self.to_server() as (server_reader, server_writer):
                 server_writer.write(request)
                 answer = await _message(server_reader)
-            finally:
-                server_writer.transport.abort()
             if self._left and self._path in request:
                 self._left -= 1
                 self.cuts += 1

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from aiohttp import web
 from support.engine import until
-from support.etcd import LOOPBACK, cluster
+from support.etcd import cluster
+from support.go_between import LOOPBACK
 from support.masters import MasterProcess
 from support.ports import free_port
 

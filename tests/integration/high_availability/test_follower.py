@@ -11,6 +11,7 @@ import pytest
 import pytest_asyncio
 from support.engine import until
 from support.etcd import Cluster, cluster
+from support.go_between import GoBetween
 
 from rce.model import Resources
 from rce_master.follower import StateFollower
@@ -191,17 +192,17 @@ async def test_after_a_compaction_the_copy_is_loaded_anew(client: EtcdClient, et
     gate = Gate(etcd.endpoints[0])
     async with (
         leader.leading(),
-        gate.open(),
+        gate.running(),
         EtcdClient([gate.endpoint], attempt=20.0) as through,
         following(through, prefix) as follower,
     ):
         await leader.add("anna")
-        await gate.shut()
+        await gate.close()
         await leader.add("bert")
         await leader.remove("anna")
         revision = (await client.range(Keys(prefix).root, limit=1)).revision
         await client._call("v3/kv/compaction", {"revision": str(revision)}, as_it_is)
-        await gate.reopen()
+        await gate.open()
         await until(lambda: follower.loads == 2, what="the copy is loaded anew")
         await take(client, prefix, follower)
 
@@ -212,13 +213,13 @@ async def test_a_broken_watch_goes_on_where_it_broke(client: EtcdClient, etcd: C
     gate = Gate(etcd.endpoints[0])
     async with (
         leader.leading(),
-        gate.open(),
+        gate.running(),
         EtcdClient([gate.endpoint], attempt=20.0) as through,
         following(through, prefix) as follower,
     ):
-        await gate.shut()
+        await gate.close()
         await leader.add("anna")
-        await gate.reopen()
+        await gate.open()
         last = (await EtcdStore(client, prefix).leadership()).last
         await until(lambda: follower.lag.applied >= last, what="the watch goes on")
         await take(client, prefix, follower)
@@ -237,63 +238,21 @@ async def test_a_damaged_row_is_told(client: EtcdClient, caplog: pytest.LogCaptu
             await until(lambda: follower.loads == 2, what="the copy is loaded anew")
 
 
-class Gate:
+class Gate(GoBetween):
     """Passes connections on to a server, or breaks and refuses them."""
 
     def __init__(self, target: str) -> None:
         host, _, port = target.rpartition(":")
-        self._target = host, int(port)
-        self._port = 0
-        self._writers: set[asyncio.StreamWriter] = set()
-        self._server: asyncio.Server | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
+        super().__init__((host, int(port)))
 
-    @property
-    def endpoint(self) -> str:
-        return f"127.0.0.1:{self._port}"
-
-    @contextlib.asynccontextmanager
-    async def open(self) -> AsyncIterator[None]:
-        await self.reopen()
-        try:
-            yield
-        finally:
-            await self.shut()
-
-    async def reopen(self) -> None:
-        self._server = await asyncio.start_server(self._serve, "127.0.0.1", self._port)
-        self._port = self._server.sockets[0].getsockname()[1]
-
-    async def shut(self) -> None:
-        if self._server is None:
-            return
-        self._server.close()
-        for writer in tuple(self._writers):
-            writer.transport.abort()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-        await self._server.wait_closed()
-        self._server = None
-
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        self._tasks.add(task)
-        there, to = await asyncio.open_connection(*self._target)
-        self._writers |= {writer, to}
-        try:
-            async with asyncio.TaskGroup() as group:
-                group.create_task(_pass(reader, to))
-                group.create_task(_pass(there, writer))
-        finally:
-            self._writers -= {writer, to}
-            writer.transport.abort()
-            to.transport.abort()
-            self._tasks.discard(task)
+    async def connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        async with self.to_server() as (there, to), asyncio.TaskGroup() as group:
+            group.create_task(_pass(reader, to))
+            group.create_task(_pass(there, writer))
 
 
 async def _pass(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    with contextlib.suppress(OSError):
-        while piece := await reader.read(65536):
-            writer.write(piece)
-            await writer.drain()
-    writer.transport.abort()
+    while piece := await reader.read(65536):
+        writer.write(piece)
+        await writer.drain()
+    raise ConnectionResetError
