@@ -39,7 +39,7 @@ class Watch:
     Args:
         connection: The connection.
         ping_interval: Seconds from one ping to the next.
-        ping_timeout: Seconds without a sign of life after a ping; None: no limit.
+        ping_timeout: Seconds without a sign of life after a ping; None: they are not limited.
     """
 
     def __init__(self, connection: Watched, ping_interval: float, ping_timeout: float | None) -> None:
@@ -52,7 +52,7 @@ class Watch:
         self._timer = self._loop.call_later(self._liveness.period, self._look)
 
     def stop(self) -> None:
-        """Watch no longer."""
+        """Stop watching."""
         self._timer.cancel()
 
     def _look(self) -> None:

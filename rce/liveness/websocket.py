@@ -1,8 +1,8 @@
 """WebSocket connections that are watched for signs of life in place of the library's keepalive.
 
 The keepalive of ``websockets`` counts only answers to its own pings. Behind a large message on a slow link
-such an answer comes late, and the ping itself waits until the write buffer is almost empty, for ever if the
-other side takes nothing.
+such an answer comes late, and the ping itself waits until the write buffer is almost empty, without a limit
+if the other side takes nothing.
 """
 
 from __future__ import annotations
@@ -27,21 +27,43 @@ class WatchedConnection(Connection):
 
     _watch: Watch | None = None
     _deadline: asyncio.TimerHandle | None = None
-    """When a connection that was given up is dropped."""
-    _data_came = False
+    """When a connection that is to end is dropped."""
+    _has_heard = False
+
+    @property
+    def writable(self) -> bool:
+        """Whether the connection is open and its write buffer below the limit."""
+        return not self.paused and self.protocol.state is State.OPEN
+
+    def watch(self, ping_interval: float, ping_timeout: float | None) -> None:
+        """Ping the other side from now on, and end the connection if it gives no sign of life.
+
+        Args:
+            ping_interval: Seconds from one ping to the next.
+            ping_timeout: Seconds without a sign of life after a ping; None: they are not limited.
+        """
+        if self.protocol.state is State.OPEN:
+            self._watch = Watch(self, ping_interval, ping_timeout)
+
+    def end_soon(self) -> None:
+        """Drop the connection after the close timeout, also if the other side goes on sending."""
+        if self._deadline is None and not self.transport.is_closing():
+            self._deadline = self.loop.call_later(self.close_timeout or 0.0, self.transport.abort)
+
+    # Called by the library
 
     def start_keepalive(self) -> None:
-        """Begin to watch; called by the library after the handshake."""
-        if self.ping_interval is not None and self.protocol.state is State.OPEN:
-            self._watch = Watch(self, self.ping_interval, self.ping_timeout)
+        """Begin to watch, after the handshake."""
+        if self.ping_interval is not None:
+            self.watch(self.ping_interval, self.ping_timeout)
 
     def data_received(self, data: bytes) -> None:
         """Take note of a sign of life."""
-        self._data_came = True
+        self._has_heard = True
         super().data_received(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Watch no longer."""
+        """Stop the watch."""
         if self._watch is not None:
             self._watch.stop()
             self._watch = None
@@ -51,15 +73,10 @@ class WatchedConnection(Connection):
 
     # Called by the watch
 
-    @property
-    def writable(self) -> bool:
-        """Whether it is open and its write buffer below the limit."""
-        return not self.paused and self.protocol.state is State.OPEN
-
     def heard(self) -> bool:
         """Return whether data came since the last call; while it is not read, it may have come."""
-        came, self._data_came = self._data_came, False
-        return came or not self.transport.is_reading()
+        heard, self._has_heard = self._has_heard, False
+        return heard or not self.transport.is_reading()
 
     def send_ping(self) -> None:
         """Write a ping, also if much waits already."""
@@ -69,7 +86,7 @@ class WatchedConnection(Connection):
 
     def give_up(self, silent: float) -> None:
         """End the connection, which has been silent for so many seconds."""
-        self._deadline = self.loop.call_later(self.close_timeout or 0.0, self.transport.abort)
+        self.end_soon()
         if self.protocol.state is State.OPEN:
             self.protocol.fail(CloseCode.INTERNAL_ERROR, f"no sign of life for {silent:.0f} s")
             self.send_data()

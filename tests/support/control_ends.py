@@ -7,11 +7,12 @@ import contextlib
 from collections import Counter
 from typing import TYPE_CHECKING
 
+from websockets.asyncio.client import connect
+
 from rce.aio.backoff import Backoff
 from rce.config.secret import Secret
-from rce.control.exceptions import (
-    PeerRefusedError,
-)
+from rce.control import encode
+from rce.control.exceptions import PeerRefusedError
 from rce.control.messages import (
     CONTROL_VERSION,
     ClientReply,
@@ -120,6 +121,20 @@ def hello() -> Hello:
         process="robots-1",
         machine=MachineInfo(name="m"),
     )
+
+
+@contextlib.asynccontextmanager
+async def deaf_task_set(master: Master) -> AsyncIterator[Peer]:
+    """A task set that says hello and then reads nothing; yields the master's end of it."""
+    url = f"ws://127.0.0.1:{master.server.port}"
+    async with connect(url, additional_headers=headers(), proxy=None, close_timeout=0.1) as socket:
+        await socket.send(encode(hello()))
+        peer, _ = await master.hellos.get()
+        socket.transport.pause_reading()
+        try:
+            yield peer
+        finally:
+            socket.transport.abort()
 
 
 def headers(secret: str = SECRET.reveal()) -> dict[str, str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Self
 
 if TYPE_CHECKING:
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
 LOOPBACK = "127.0.0.1"
 
 
-class GoBetween:
+class GoBetween(ABC):
     """Listens on a port of its own; subclasses pass connections on by :meth:`connected`.
 
     Args:
@@ -63,9 +64,9 @@ class GoBetween:
         await self._server.wait_closed()
         self._server = None
 
+    @abstractmethod
     async def connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Pass on what a client sends and is sent, until either side ends the connection."""
-        raise NotImplementedError
 
     @contextlib.asynccontextmanager
     async def to_server(self) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:

@@ -1,9 +1,8 @@
 """A WebSocket connection without a task between the network and the engine.
 
-The ``websockets`` library does the handshake, the parsing, answers to pings and the end of a connection. It
-waits only for answers to its own pings, which wait behind a large message on a slow link, so
-a :class:`rce.liveness.Watch` replaces its keepalive. Three things differ here, because they
-take a large part of a message's time in the engine:
+The ``websockets`` library does the handshake, the parsing, answers to pings and the end of a connection;
+:class:`~rce.liveness.websocket.WatchedConnection` replaces its keepalive. Three things differ here, because
+they take a large part of a message's time in the engine:
 
 * A message in one frame is taken from the received data without the library's parser
   (:mod:`rce_robot.doors.client.frames`).
@@ -30,7 +29,7 @@ from websockets.protocol import State
 
 from rce.buffers import unfilled, write_together
 from rce.guard.websocket import GuardedConnection
-from rce.liveness import Watch
+from rce.liveness.websocket import WatchedConnection
 from rce_robot.doors.client.frames import (
     FIN_BINARY,
     FIN_TEXT,
@@ -88,14 +87,11 @@ class Receiver(Protocol):
         """The connection ended. Called once, also when the handshake did not complete."""
 
 
-class RobotSocket(GuardedConnection):
+class RobotSocket(WatchedConnection, GuardedConnection):
     """A robot's WebSocket connection."""
 
     _share: LoopShare | None = None
     _user = ""
-    _watch: Watch | None = None
-    _count_heard = 0
-    """How often data had come at the last look of the watch."""
     _begin = 0
     """How much of the oldest received data has been handled."""
     receiver: Receiver | None = None
@@ -107,11 +103,6 @@ class RobotSocket(GuardedConnection):
         parts = self._steps.held + self._fragment_bytes + self._work_bytes
         incomplete = len(self.protocol.reader.buffer) + self._input_bytes + parts
         return incomplete + self.transport.get_write_buffer_size()
-
-    @property
-    def writable(self) -> bool:
-        """Whether the connection is open and its write buffer below the limit."""
-        return not self.paused and self.protocol.state is State.OPEN
 
     def write(self, message: Outgoing) -> None:
         """Write a message. Only to be called while :attr:`writable`."""
@@ -143,29 +134,19 @@ class RobotSocket(GuardedConnection):
         self._fragment_bytes = 0
         self._forget_work()
         self._forget_input()
-        self._end_soon()  # first: over TLS, sending a close frame closes the transport, which may take long
+        self.end_soon()  # first: over TLS, sending a close frame closes the transport, which may take long
         if self.protocol.state is State.OPEN:
             self.protocol.fail(code, reason)
             self.send_data()
 
     async def close(self, code: CloseCode | int = CloseCode.NORMAL_CLOSURE, reason: str = "") -> None:
         """Close the connection; return when it has ended, after the close timeout at the latest."""
-        self._end_soon()  # the library's time limit does not include the wait until the robot takes data
+        self.end_soon()  # the library's time limit does not include the wait until the robot takes data
         await super().close(code, reason)
 
     def abort(self) -> None:
         """Drop the connection at once, without waiting for the robot."""
         self.transport.abort()
-
-    def watch(self, ping_interval: float, ping_timeout: float | None) -> None:
-        """Ping the robot from now on, and end the connection if it gives no sign of life.
-
-        Args:
-            ping_interval: Seconds from one ping to the next.
-            ping_timeout: Seconds without a sign of life after a ping; None: no limit.
-        """
-        if self.protocol.state is State.OPEN:
-            self._watch = Watch(self, ping_interval, ping_timeout)
 
     async def probe(self, timeout_s: float) -> bool:
         """Ping the robot; return whether any data comes from it within ``timeout_s`` seconds.
@@ -198,24 +179,17 @@ class RobotSocket(GuardedConnection):
             self._steps.allow()
             super().data_received(rest)
             if self.protocol.state is not State.OPEN:
-                self._end_soon()
+                self.end_soon()
         if self._input or self._steps.stopped or self._work:
             return True
         self._end_of_input()
         return False
 
-    # Called by the watch: rce.liveness.Watched
+    # Called by the watch
 
     def heard(self) -> bool:
         """Return whether data came since the last call, or came before and waits for its turn."""
-        before, self._count_heard = self._count_heard, self._data_count
-        return self._data_count != before or self._waits
-
-    def send_ping(self) -> None:
-        """Write a ping, also if much waits already."""
-        if self.protocol.state is State.OPEN:
-            self.protocol.send_ping(b"")
-            self.send_data()
+        return super().heard() or self._waits
 
     def give_up(self, silent: float) -> None:
         """End the connection, which has been silent for so many seconds."""
@@ -245,8 +219,6 @@ class RobotSocket(GuardedConnection):
         """Messages that are handled in steps, with their sizes; those behind them wait."""
         self._work_bytes = 0
         self._failed = False
-        self._deadline: asyncio.TimerHandle | None = None
-        """When a connection that has failed, or is being closed, is dropped."""
         sock = transport.get_extra_info("socket")
         if sock is not None and hasattr(socket, "TCP_NOTSENT_LOWAT") and sock.family != socket.AF_UNIX:
             # Without it megabytes of old images fill the kernel's buffer, where other messages cannot
@@ -256,6 +228,7 @@ class RobotSocket(GuardedConnection):
 
     def data_received(self, data: bytes) -> None:
         """Handle received data, now or when it is the user's turn."""
+        self._has_heard = True
         self._data_count += 1
         self._data_came.set()
         if self._share is None:
@@ -311,11 +284,6 @@ class RobotSocket(GuardedConnection):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Tell the receiver."""
-        if self._watch is not None:
-            self._watch.stop()
-            self._watch = None
-        if self._deadline is not None:
-            self._deadline.cancel()
         self._forget_work()
         self._forget_input()
         self._steps.allow(None)
@@ -326,11 +294,6 @@ class RobotSocket(GuardedConnection):
             self.receiver.on_lost(str(exc or self.close_exc))
 
     # Private
-
-    def _end_soon(self) -> None:
-        """Give the robot a moment to receive the reason of the end, also if it goes on sending."""
-        if self._deadline is None and not self.transport.is_closing():
-            self._deadline = self.loop.call_later(self.close_timeout or 0.0, self.transport.abort)
 
     def _take_message(self, data: bytes) -> bool:
         """Handle the next frame without the library, if it is a message; return whether it is."""

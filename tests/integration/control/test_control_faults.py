@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from support.control_ends import Master, TaskSet, headers, hello
-from websockets.asyncio.client import connect
+from support.control_ends import Master, TaskSet, deaf_task_set
 
 from rce.control.exceptions import (
     UnsendableError,
@@ -14,7 +13,6 @@ from rce.control.exceptions import (
 from rce.control.messages import (
     Left,
     Notify,
-    encode,
 )
 from rce.control_channel.timeouts import MAX_TEXT, ControlTimeouts
 
@@ -42,30 +40,17 @@ async def test_failing_handler_makes_the_task_set_dial_anew(caplog: pytest.LogCa
 async def test_silent_peer_is_noticed() -> None:
     quick = ControlTimeouts(ping_interval=0.05, ping_timeout=0.05, close=0.05)
     master = Master(timeouts=quick)
-    async with master.server:
-        url = f"ws://127.0.0.1:{master.server.port}"
-        async with connect(url, additional_headers=headers(), proxy=None, close_timeout=0.1) as silent:
-            await silent.send(encode(hello()))
-            await master.hellos.get()
-            silent.transport.pause_reading()
-            async with asyncio.timeout(60):
-                await master.gone.get()
-            silent.transport.abort()
+    async with master.server, deaf_task_set(master), asyncio.timeout(60):
+        await master.gone.get()
 
 
 async def test_peer_that_takes_no_messages_is_cut_off(caplog: pytest.LogCaptureFixture) -> None:
     master = Master()
-    async with master.server:
-        url = f"ws://127.0.0.1:{master.server.port}"
-        async with connect(url, additional_headers=headers(), proxy=None, close_timeout=0.1) as stuck:
-            await stuck.send(encode(hello()))
-            peer, _ = await master.hellos.get()
-            stuck.transport.pause_reading()
-            for _ in range(9000):
-                peer.send(Notify(id="u/r", text="x"))
-            await master.gone.get()
-            assert caplog.text.count("takes no messages; cut off") == 1
-            stuck.transport.abort()
+    async with master.server, deaf_task_set(master) as peer:
+        for _ in range(9000):
+            peer.send(Notify(id="u/r", text="x"))
+        await master.gone.get()
+        assert caplog.text.count("takes no messages; cut off") == 1
 
 
 async def test_large_messages_pass() -> None:

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import pytest
-from support.control_ends import QUICK, Master, TaskSet, headers, hello
+from support.control_ends import QUICK, Master, TaskSet, deaf_task_set
 from support.slow_link import SlowLink
-from websockets.asyncio.client import connect
 
-from rce.control import Left, Notify, encode
+from rce.control import Left, Notify
 
 if TYPE_CHECKING:
     from rce.control import ToMaster
@@ -63,17 +62,11 @@ async def test_a_long_message_of_the_task_set_passes_a_slow_link() -> None:
 async def test_a_task_set_that_vanishes_amid_data_is_given_up() -> None:
     """It takes nothing more, so a ping waits behind what was sent before."""
     master = Master(timeouts=IMPATIENT)
-    async with master.server:
-        url = f"ws://127.0.0.1:{master.server.port}"
-        async with connect(url, additional_headers=headers(), proxy=None, close_timeout=0.1) as silent:
-            await silent.send(encode(hello()))
-            peer, _ = await master.hellos.get()
-            silent.transport.pause_reading()
-            for _ in range(40):
-                peer.send(Notify(id="u/r", text=LONG))
-            async with asyncio.timeout(60):
-                assert await master.gone.get() is peer
-            silent.transport.abort()
+    async with master.server, deaf_task_set(master) as peer:
+        for _ in range(40):
+            peer.send(Notify(id="u/r", text=LONG))
+        async with asyncio.timeout(60):
+            assert await master.gone.get() is peer
 
 
 async def test_a_master_that_vanishes_is_given_up(caplog: pytest.LogCaptureFixture) -> None:
