@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from aiohttp import ClientWebSocketResponse
 
 _INTERRUPTED = 130
+STUCK_S = 0.5
+"""Seconds without progress of the output after which a repeated signal ends this program."""
 _PASSED_ON = ("TERM", "LANG", "COLORTERM")
 """Variables of this terminal that a command in a terminal gets."""
 
@@ -105,10 +107,12 @@ async def _run(container: str, command: Command, user: str, stdin: bool) -> int:
     ):
         await socket.send_str(msgspec.json.encode(replace(command, window=WINDOW)).decode())
         with _raw_terminal(command.terminal), OutputWriter() as writer:
-            with _signals(socket, command.terminal):
+            with _signals(socket, writer, command.terminal):
                 code = await _Run(socket, command.terminal, writer).hold(stdin)
             await writer.drain()  # Ctrl-C ends this program now
-            return code
+    if code is None:
+        raise CliError("the connection to the master was lost; the command has been ended")
+    return code
 
 
 class _Run:
@@ -123,15 +127,17 @@ class _Run:
         """The window for input, once the command runs."""
         self._code: int | None = None
 
-    async def hold(self, stdin: bool) -> int:
-        """Pass data until the command has ended; return its exit code."""
+    async def hold(self, stdin: bool) -> int | None:
+        """Pass data until the command has ended or the connection is lost.
+
+        Returns:
+            The exit code; None if the connection was lost.
+        """
         typing = asyncio.create_task(self._send_input(stdin))
         try:
             await run_until_first(self._show(), self._acknowledge())
         finally:
             await cancel_and_wait(typing)
-        if self._code is None:
-            raise CliError("the connection to the master was lost; the command has been ended")
         return self._code
 
     async def _show(self) -> None:
@@ -227,29 +233,40 @@ def _raw_terminal(wanted: bool) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _signals(socket: ClientWebSocketResponse, terminal: bool) -> Iterator[None]:
-    """Pass signals and the terminal's size on to the command."""
+def _signals(socket: ClientWebSocketResponse, writer: OutputWriter, terminal: bool) -> Iterator[None]:
+    """Pass signals and the terminal's size on to the command.
+
+    The end of the command comes behind its output. If that is not read, a signal that comes again ends this
+    program instead.
+    """
     loop = asyncio.get_running_loop()
     tasks: set[asyncio.Task[None]] = set()
+    passed: set[int] = set()
 
     def send(frame: Frame) -> None:
         task = loop.create_task(socket.send_bytes(frame.encode()))
         tasks.add(task)
         task.add_done_callback(tasks.discard)
 
+    def pass_on(number: signal.Signals) -> None:
+        if number in passed and writer.stuck_for > STUCK_S:
+            raise SystemExit(128 + number)
+        passed.add(number)
+        send(Frame(Part.SIGNAL, bytes([number])))
+
     def resized() -> None:
         size = shutil.get_terminal_size()
         send(size_frame(size.lines, size.columns))
 
-    handlers = {number: Frame(Part.SIGNAL, bytes([number])) for number in (signal.SIGINT, signal.SIGTERM)}
-    for number, frame in handlers.items():
-        loop.add_signal_handler(number, send, frame)
+    handled = (signal.SIGINT, signal.SIGTERM)
+    for number in handled:
+        loop.add_signal_handler(number, pass_on, number)
     if terminal:
         loop.add_signal_handler(signal.SIGWINCH, resized)
     try:
         yield
     finally:
-        for number in (*handlers, signal.SIGWINCH):
+        for number in (*handled, signal.SIGWINCH):
             loop.remove_signal_handler(number)
         for task in tasks:
             task.cancel()

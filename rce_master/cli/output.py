@@ -14,15 +14,19 @@ if TYPE_CHECKING:
 
 
 class OutputWriter:
-    """Writes in a thread: a pager or a full pipe may take nothing for hours.
+    """Writes in a thread, for a pager or a full pipe may take nothing for hours.
 
-    To be used as a context manager, in an event loop. The thread does not keep the program from ending.
+    Non-blocking writes would not do: that mode belongs to the open file, which other programs share, and the
+    event loop cannot wait for regular files. To be used as a context manager, in an event loop. The thread
+    does not keep the program from ending.
     """
 
     def __init__(self) -> None:
         self._loop = asyncio.get_running_loop()
         self._pieces: SimpleQueue[tuple[int, bytes] | None] = SimpleQueue()
         self._queued = self._written = self._told = 0
+        self._advanced = 0.0
+        """When something was written, or the first piece came after all was written."""
         self._error: OSError | None = None
         self._changed = asyncio.Event()
 
@@ -35,8 +39,15 @@ class OutputWriter:
 
     def write(self, fd: int, data: bytes) -> None:
         """Have bytes written to a descriptor."""
+        if self._written == self._queued:
+            self._advanced = self._loop.time()
         self._queued += len(data)
         self._pieces.put((fd, data))
+
+    @property
+    def stuck_for(self) -> float:
+        """Seconds for which nothing was written though something waits; 0 if nothing waits."""
+        return 0.0 if self._written == self._queued else self._loop.time() - self._advanced
 
     async def written(self) -> int:
         """Wait until something was written; return how many bytes since the last call. For one caller.
@@ -82,5 +93,6 @@ class OutputWriter:
 
     def _note(self, amount: int, error: OSError | None) -> None:
         self._written += amount
+        self._advanced = self._loop.time()
         self._error = error
         self._changed.set()

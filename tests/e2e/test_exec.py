@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import array
 import asyncio
 import contextlib
+import fcntl
 import json
 import os
 import signal
-from collections.abc import AsyncIterator
+import termios
+from collections.abc import AsyncIterator, Iterator
 
 import aiohttp
 import msgspec
@@ -18,10 +21,13 @@ from support.engine import Engine, running_engine, until
 from support.owner import Owner
 from support.stranger import stranger
 from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosedOK
 
 from rce.control.execution import (
     MAX_DATA,
     MIN_WINDOW,
+    NOT_RUN,
+    WINDOW,
     Command,
     Frame,
     Part,
@@ -30,9 +36,13 @@ from rce.control.execution import (
     read_amount,
     read_ended,
 )
+from rce_master.cli.execute import STUCK_S
 
 RUNTIMES = ["process", pytest.param("namespace", marks=pytest.mark.needs("bwrap"))]
 NODE = {"containerTag": "box", "nodeTag": "echo", "pkg": "Test", "exe": "stringEcho.py"}
+
+PIPE = 64 << 10
+"""Bytes that a pipe holds."""
 
 IN_PROCESSES = pytest.mark.parametrize("shared_engine", ["process"], indirect=True, scope="module")
 
@@ -159,25 +169,91 @@ async def test_signals_pass_input_that_is_not_read(shared_engine: Engine, owner:
     assert process.stdin is not None
     await until(lambda: runs(shared_engine, "sleep 6544"), what="the command runs")
     process.stdin.write(bytes(8_000_000))
-    with contextlib.suppress(TimeoutError):  # it takes a few hundred thousand bytes
-        async with asyncio.timeout(2.0):
-            await process.stdin.drain()
+    waiting, before = process.stdin.transport.get_write_buffer_size, 0
+    while not before or waiting() < before:  # it takes a few hundred thousand bytes
+        before = waiting()
+        await asyncio.sleep(1.0)
     process.send_signal(signal.SIGINT)
     async with asyncio.timeout(60):
         await process.communicate()
     assert process.returncode == 130
 
 
+@pytest.fixture
+def pipe() -> Iterator[tuple[int, int]]:
+    """A pipe for a program's output, which the test reads or leaves unread."""
+    ours, theirs = os.pipe()
+    fcntl.fcntl(theirs, fcntl.F_SETPIPE_SZ, PIPE)
+    yield ours, theirs
+    os.close(ours)
+    with contextlib.suppress(OSError):  # closed by the test
+        os.close(theirs)
+
+
+def unread(fd: int) -> int:
+    """How many bytes wait in a pipe."""
+    amount = array.array("i", [0])
+    fcntl.ioctl(fd, termios.FIONREAD, amount)
+    return amount[0]
+
+
 @IN_PROCESSES
-async def test_a_slow_reader_gets_all_output(owner: Owner) -> None:
+async def test_a_slow_reader_gets_all_output(
+    shared_engine: Engine, owner: Owner, pipe: tuple[int, int]
+) -> None:
     """Also what the command wrote before it ended, long ago."""
-    process = await owner.start("exec", "box", "sh", "-c", "head -c 1000000 /dev/zero; echo end")
-    assert process.stdout is not None
-    process.stdout._transport.pause_reading()  # type: ignore[attr-defined]
+    ours, theirs = pipe
+    # The command can end, and a part of its output waits in the container.
+    amount = PIPE + WINDOW - MAX_DATA + PIPE // 2
+    process = await owner.start("exec", "box", "head", "-c", str(amount), "/dev/zero", stdout=theirs)
+    os.close(theirs)
+    await until(lambda: unread(ours) == PIPE, what="the pipe is full")
+    ended = lambda: not runs(shared_engine, f"head -c {amount} /dev/zero")  # noqa: E731 - a short condition
+    await until(ended, what="the command has ended")
     await asyncio.sleep(8)  # longer than the engine waits for users that take nothing
-    process.stdout._transport.resume_reading()  # type: ignore[attr-defined]
-    output, _ = await process.communicate()
-    assert (process.returncode, len(output), output[-4:]) == (0, 1_000_004, b"end\n")
+    with open(ours, "rb", closefd=False) as output:
+        assert await asyncio.to_thread(output.read) == bytes(amount)
+    assert (await process.communicate())[1] == b""
+    assert process.returncode == 0
+
+
+@IN_PROCESSES
+async def test_a_second_signal_ends_a_program_whose_output_is_not_read(
+    shared_engine: Engine, owner: Owner, pipe: tuple[int, int]
+) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        process = await owner.start("exec", "box", "yes", stdout=pipe[1])
+        await until(lambda: unread(pipe[0]) == PIPE, what="the pipe is full")
+        await asyncio.sleep(STUCK_S)
+        process.send_signal(number)
+        await until(lambda: not runs(shared_engine, "yes"), what="the command has ended")
+        ending = asyncio.create_task(process.wait())
+        with pytest.raises(TimeoutError):  # the end waits behind the output
+            await asyncio.wait_for(asyncio.shield(ending), STUCK_S)
+        process.send_signal(number)
+        assert await asyncio.wait_for(ending, 30) == 128 + number
+        os.read(pipe[0], PIPE)
+
+
+@IN_PROCESSES
+async def test_output_before_a_lost_connection_is_written(
+    shared_engine: Engine, owner: Owner, pipe: tuple[int, int]
+) -> None:
+    ours, theirs = pipe
+    amount = PIPE + 100_000
+    script = f"head -c {amount} /dev/zero; exec sleep 6546"
+    process = await owner.start("exec", "box", "--", "sh", "-c", script, stdout=theirs)
+    os.close(theirs)
+    await until(lambda: unread(ours) == PIPE and runs(shared_engine, "sleep 6546"), what="all is written")
+    await asyncio.sleep(2)  # the rest comes to the program, which cannot write it
+    await shared_engine.master.kill()
+    with open(ours, "rb", closefd=False) as output:
+        assert await asyncio.to_thread(output.read) == bytes(amount)
+    _, error = await process.communicate()
+    assert process.returncode == NOT_RUN
+    assert b"the command has been ended" in error
+    await shared_engine.master.start()
+    await until(lambda: _again(owner), timeout=60, what="commands run again")
 
 
 @IN_PROCESSES
@@ -186,17 +262,21 @@ async def test_connections_of_commands_that_wait_answer_pings(shared_engine: Eng
     url = f"{shared_engine.url.replace('http', 'ws')}api/v1/containers/box/exec"
     headers = {"Authorization": f"Bearer {shared_engine.token()}"}
     async with connect(url, additional_headers=headers, proxy=None, compression=None) as socket:
-        script = "yes & exec sleep 6545"
-        command = Command(argv=("sh", "-c", script), window=MIN_WINDOW)
+        command = Command(argv=("sh", "-c", "yes & exec sleep 6545"), window=MIN_WINDOW)
         await socket.send(msgspec.json.encode(command).decode())
-        started = decode(await socket.recv(decode=False))
+
+        async def receive() -> Frame:
+            return decode(await asyncio.wait_for(socket.recv(decode=False), 30))
+
+        started = await receive()
         assert started.part is Part.STARTED
         for _ in range(read_amount(started.data) // MAX_DATA):
             await socket.send(Frame(Part.INPUT, bytes(MAX_DATA)).encode())
         got, taken = 0, 0
         with contextlib.suppress(TimeoutError):
-            while True:
-                frame = decode(await asyncio.wait_for(socket.recv(decode=False), 3.0))
+            while True:  # the first output may take long to come, what follows does not
+                in_time = 30.0 if got < MAX_DATA else 1.0
+                frame = decode(await asyncio.wait_for(socket.recv(decode=False), in_time))
                 if frame.part is Part.OUTPUT:
                     got += len(frame.data)
                 else:
@@ -206,11 +286,15 @@ async def test_connections_of_commands_that_wait_answer_pings(shared_engine: Eng
         assert taken < read_amount(started.data)
         async with asyncio.timeout(30):
             await (await socket.ping())
-        await socket.send(amount_frame(Part.TAKEN, 1000).encode())
-        assert len(decode(await socket.recv(decode=False)).data) == 1000
+        await socket.send(amount_frame(Part.TAKEN, got).encode())
+        more = 0
+        while more < MAX_DATA:
+            more += len((await receive()).data)
         await socket.send(Frame(Part.SIGNAL, bytes([signal.SIGTERM])).encode())
-        while (frame := decode(await socket.recv(decode=False))).part is not Part.ENDED:
-            await socket.send(amount_frame(Part.TAKEN, len(frame.data)).encode())
+        await socket.send(amount_frame(Part.TAKEN, more).encode())
+        while (frame := await receive()).part is not Part.ENDED:
+            with contextlib.suppress(ConnectionClosedOK):  # the end waits to be received
+                await socket.send(amount_frame(Part.TAKEN, len(frame.data)).encode())
         assert read_ended(frame.data).code == 128 + signal.SIGTERM
 
 

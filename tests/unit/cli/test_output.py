@@ -36,8 +36,10 @@ async def test_a_full_pipe_does_not_block(pipe: tuple[int, int]) -> None:
         draining = asyncio.create_task(writer.drain())
         await asyncio.sleep(0.05)
         assert not draining.done()
+        assert writer.stuck_for >= 0.05
         assert os.read(ours, PAGE) == first
         await draining
+        assert writer.stuck_for == 0
         assert await writer.written() == 3000
     assert os.read(ours, PAGE) == second
 
