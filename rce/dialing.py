@@ -91,12 +91,16 @@ async def connect_first(addresses: list[Address]) -> socket.socket:
 def set_keepalive(sock: socket.socket, *, idle: int, interval: int, count: int) -> None:
     """Have the system end a TCP connection whose other end is gone without a word.
 
+    Nothing happens if the socket has been closed.
+
     Args:
         sock: A TCP socket, or what an event loop gives in its place.
         idle: Seconds without data until the system asks the other end.
         interval: Seconds between two questions.
         count: How many of them stay unanswered until the connection is lost.
     """
+    if sock.fileno() < 0:
+        return
     with contextlib.suppress(OSError):  # macOS refuses options of a connection that is lost already
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in (("TCP_KEEPIDLE", idle), ("TCP_KEEPINTVL", interval), ("TCP_KEEPCNT", count)):

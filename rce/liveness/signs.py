@@ -26,6 +26,7 @@ if sys.platform.startswith("linux"):
 
 if TYPE_CHECKING:
     import asyncio
+    from asyncio.trsock import TransportSocket
 
 LOOKS = 4
 """Looks for signs of life in the shorter of the two times."""
@@ -110,10 +111,16 @@ class Outflow:
         self._taken, self._waiting = taken, waiting
         return found
 
+    def _socket(self) -> TransportSocket | None:
+        """Return the socket, where the system can tell of it; none once the transport has closed it."""
+        sock: TransportSocket | None = self._transport.get_extra_info("socket")
+        if not sys.platform.startswith("linux") or sock is None or sock.fileno() < 0:
+            return None
+        return sock
+
     def _in_kernel(self) -> int:
         """Return the bytes that were written to the kernel, and that the other side has not taken."""
-        sock = self._transport.get_extra_info("socket")
-        if not sys.platform.startswith("linux") or sock is None:
+        if (sock := self._socket()) is None:
             return 0
         try:
             return int.from_bytes(fcntl.ioctl(sock.fileno(), termios.TIOCOUTQ, bytes(4)), sys.byteorder)
@@ -123,8 +130,7 @@ class Outflow:
     def _read(self) -> tuple[int, bool]:
         """Return a number that grows with the data that was taken, and whether more waits."""
         buffered = self._transport.get_write_buffer_size()
-        sock = self._transport.get_extra_info("socket")
-        if not sys.platform.startswith("linux") or sock is None:
+        if (sock := self._socket()) is None:
             return -buffered, buffered > 0
         try:
             info = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size)
