@@ -127,9 +127,13 @@ def joined(count: int) -> Fleet:
 
 
 def finish_plans(fleet: Fleet) -> None:
-    """Make all requested plans, one after another."""
-    while fleet.requests or fleet.planner.is_taking_over():
-        fleet.tell(PlanMade(compute_plan(fleet.requests.pop())) if fleet.requests else Tick())
+    """Make all requested plans, and those that are requested because of them, one after another."""
+    while True:
+        if fleet.requests:
+            fleet.tell(PlanMade(compute_plan(fleet.requests.pop())))
+        fleet.tell(Tick())
+        if not fleet.requests and not fleet.planner.is_taking_over():
+            return
 
 
 def pose_cost(count: int, *, batches: int) -> dict[str, Any]:
