@@ -178,7 +178,7 @@ async def plan_cost(count: int) -> dict[str, Any]:
         await worker.compute(PlanRequest(0, 1, 1, (), (), (), (), (), 0, 1))
         # This plan has the first goal only; the next one has all of them.
         fleet.tell(PlanMade(compute_plan(fleet.requests.pop())))
-        while fleet.planner.is_taking_over():
+        while not fleet.requests:
             fleet.tell(Tick())
         request = fleet.requests.pop()
         steps: dict[str, float] = {}

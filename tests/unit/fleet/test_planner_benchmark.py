@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from benchmarks.fleet import byte_rates, pose_cost
+from benchmarks.fleet import byte_rates, plan_cost, pose_cost
 
 
 def test_robots_of_the_benchmark_drive() -> None:
     row = pose_cost(4, batches=1)
     assert row["driving, us per pose"] > 0
+
+
+async def test_a_plan_is_made_beside_the_event_loop() -> None:
+    row = await plan_cost(4)
+    assert row["longest step ms"] > 0
 
 
 async def test_traffic_of_driving_robots_is_counted() -> None:
