@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from abc import abstractmethod
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rce.aio.queues import OverflowPolicy
@@ -26,6 +28,8 @@ URGENT_BELOW = 64 << 10
 
 MAX_WARNINGS = 256
 """Maximum number of different warnings of one interface."""
+_ENTRY_SIZE = 512
+"""Bytes that a remembered warning takes beside its text, about."""
 
 
 class RobotSide(Protocol):
@@ -126,7 +130,7 @@ class RobotInterface(Interface):
         self.message_type = port.spec.message_type
         self.offload = Offload(robot, port.spec)
         self.active = False
-        self._warned: set[str] = set()
+        self._warned: dict[str, Holding | None] = {}
 
     @abstractmethod
     def take(self, message: DataMessage) -> None:
@@ -178,6 +182,10 @@ class RobotInterface(Interface):
     async def close(self) -> None:
         """Tell the robot's side that the interface was removed."""
         self.robot_left()
+        for holding in self._warned.values():
+            if holding is not None:
+                holding.release()
+        self._warned.clear()
         self.robot.closed(self)
 
     def _read(self, message: DataMessage, warn: Callable[[str], None]) -> Buffer:
@@ -194,10 +202,14 @@ class RobotInterface(Interface):
         return read
 
     def _warn(self, text: str) -> None:
-        """Report an ignored field, once."""
-        if text not in self._warned and len(self._warned) < MAX_WARNINGS:
-            self._warned.add(text)
-            self.robot.report(f"{self.tag}: {text}")
+        """Report an ignored field, once; again if the text was forgotten because memory is short."""
+        if text in self._warned or len(self._warned) >= MAX_WARNINGS:
+            return
+        self._warned[text] = None
+        holding = self.robot.hold(sys.getsizeof(text) + _ENTRY_SIZE, partial(self._warned.pop, text, None))
+        if text in self._warned:  # else it was given up at once
+            self._warned[text] = holding
+        self.robot.report(f"{self.tag}: {text}")
 
     def _report(self, problem: str, msg_id: str) -> None:
         """Report a fault of one message to the robot, with or without a service call."""

@@ -282,7 +282,7 @@ PLAIN = Spelling(str)
 
 def short(value: Any) -> str:
     """Quote the beginning of a value."""
-    text = repr(value)
+    text = repr(value[: _MAX_QUOTED + 1] if isinstance(value, str) else value)
     return text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}..."
 
 

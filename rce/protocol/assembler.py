@@ -15,6 +15,7 @@ import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
+from rce.model.spelling import short
 from rce.protocol.exceptions import AssemblyError
 from rce.protocol.limits import DEFAULT_LIMITS, Limits
 
@@ -231,9 +232,8 @@ class Assembler:
         for holder, key in references:
             name = key[:-1]
             if not name or name in holder:
-                raise AssemblyError(
-                    f"{key!r}: there is a value {name!r} already" if name else "'*': the name is missing"
-                )
+                problem = f"there is a value {short(name)} already" if name else "the name is missing"
+                raise AssemblyError(f"{short(key)}: {problem}")
             ids = holder[key] if isinstance(holder[key], list) else [holder[key]]
             count += len(ids)
             if count > self._limits.max_references:
@@ -241,10 +241,10 @@ class Assembler:
             for id_ in ids:
                 if not isinstance(id_, str) or not _ID.fullmatch(id_):
                     raise AssemblyError(
-                        f"{key!r}: an id must be a string of {ID_LENGTH} hexadecimal characters"
+                        f"{short(key)}: an id must be a string of {ID_LENGTH} hexadecimal characters"
                     )
                 if id_ in places or id_ in self._awaited:
-                    raise AssemblyError(f"{key!r}: binary value {id_} is referred to twice")
+                    raise AssemblyError(f"{short(key)}: binary value {id_} is referred to twice")
                 places[id_] = (holder, name)
         for holder, key in references:
             ids = holder.pop(key)

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from rce.ros.types import Field, MessageType
     from rce_robot.converters.custom import CustomConverter
 
+MAX_PATH = 200
+"""Longest path of an unknown field, in characters; its name is as long as the robot likes."""
+
 
 def find_fault(kind: MessageType, value: Any, customs: Mapping[str, CustomConverter], path: str = "") -> None:
     """Walk a JSON object that could not be converted.
@@ -112,7 +115,10 @@ def _check_number(type_name: str, value: Any) -> None:
 
 
 def unknown_fields(kind: MessageType, value: Any, path: str = "") -> Iterator[str]:
-    """Yield the paths of fields that the type does not have; an array's elements have no index in them."""
+    """Yield the paths of fields that the type does not have; an array's elements have no index in them.
+
+    Paths are cut to :data:`MAX_PATH` characters.
+    """
     if not isinstance(value, dict):
         return
     fields = {field.name: field for field in kind.fields}
@@ -120,7 +126,7 @@ def unknown_fields(kind: MessageType, value: Any, path: str = "") -> Iterator[st
         where = f"{path}.{name}" if path else str(name)
         field = fields.get(name)
         if field is None:
-            yield where
+            yield where if len(where) <= MAX_PATH else f"{where[:MAX_PATH]}..."
         elif field.message is not None:
             if field.is_array:
                 for item in inner:

@@ -57,6 +57,9 @@ _log = logging.getLogger(__name__)
 LARGE_TEXT = 1 << 20
 """Size in bytes from which texts are handled in steps, between which other users have their turns."""
 
+MAX_PROBLEM = 4096
+"""Maximum length of a problem in an ``ER`` about data, which may quote what the robot or a peer sent."""
+
 MAX_REASON = 100
 """Maximum length of a reason in a close frame."""
 
@@ -234,7 +237,7 @@ class Session:
 
     def report(self, problem: str, call: CallId | None = None) -> None:
         """Send an ``ER``; if the lane is full, drop and log it."""
-        self._send_report(ErrorReport(problem=problem, call=call))
+        self._send_report(ErrorReport(problem=problem[:MAX_PROBLEM], call=call))
 
     def _send_report(self, report: ErrorReport) -> None:
         if self.send_urgent(_outgoing(report)):

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import pytest
 from support.client_types import ros_string
 
+from rce.control import Notify
 from rce.link import PeerFaultError
+from rce_robot.doors.client.session import MAX_PROBLEM
 
 if TYPE_CHECKING:
     from integration.robot.conftest import Robot
@@ -122,6 +124,12 @@ async def test_unknown_fields_are_told_once(cloud: Cloud, robot: Robot) -> None:
     await robot.say("say", STRING, {"data": 7})
     assert "nonsense" in await robot.get("ER")
     assert "data" in await robot.get("ER")
+
+
+async def test_long_error_text_is_cut(cloud: Cloud, robot: Robot) -> None:
+    assert cloud.master.peer is not None
+    cloud.master.peer.send(Notify(id="testUser/testRobot", text="x" * 100_000))
+    assert await robot.get("ER") == "x" * MAX_PROBLEM
 
 
 async def test_what_is_wrong_is_told_and_nothing_else_is_lost(cloud: Cloud, robot: Robot) -> None:

@@ -144,6 +144,13 @@ def test_wrong_reference_refuses_the_message(msg: object, problem: str) -> None:
     assert stream.pending == 0
 
 
+@pytest.mark.parametrize("rest", [{}, {"k" * 100_000: 1}], ids=["no id", "two values"])
+def test_fault_of_long_name_is_short(rest: dict[str, int]) -> None:
+    (fault,) = ProtocolStream.for_engine().feed(starred({"k" * 100_000 + "*": "x", **rest}), 0.0)
+    assert isinstance(fault, Fault)
+    assert len(fault.text) < 400
+
+
 def test_same_id_in_two_messages_refuses_the_second() -> None:
     stream = ProtocolStream.for_engine()
     stream.feed(starred({"k*": ID}), 0.0)

@@ -73,6 +73,33 @@ def test_an_ignored_field_is_told_once() -> None:
     assert "extra" in setup.robot.reports[0]
 
 
+def test_long_ignored_fields_are_cut() -> None:
+    """The engine remembers and reports the beginning of a long name of a field only."""
+    setup = Setup("SubscriberConverter")
+    for number in range(3):
+        setup.take({"data": "x", "k" * 1_000_000 + str(number): 1})
+    assert len(setup.port.sent) == 3
+    (report,) = setup.robot.reports
+    assert len(report) < 300
+    assert "kkk... was ignored" in report
+
+
+async def test_remembered_warnings_count_as_held() -> None:
+    """Remembered warnings count for the user's memory, and are forgotten when it is short."""
+    setup = Setup("SubscriberConverter")
+    for number in range(300):
+        setup.take({"data": "x", f"k{number}": 1})
+    assert len(setup.robot.reports) == 256
+    held = setup.robot.holdings.bytes
+    assert held > 256 * 500
+    setup.robot.holdings.shed(held)
+    assert setup.robot.holdings.bytes == 0
+    setup.take({"data": "x", "k0": 1})
+    assert len(setup.robot.reports) == 257
+    await setup.interface.close()
+    assert setup.robot.holdings.bytes == 0
+
+
 def test_to_the_robot() -> None:
     setup = Setup("PublisherConverter")
     setup.interface.receive(ros_string("x"), latched=False)
