@@ -34,7 +34,7 @@ class WriteDialect(Protocol):
         """Return the expressions of seconds and nanoseconds."""
 
     def octets(self, code: Code, value: str) -> str:
-        """Return the expression of the bytes of ``uint8[]`` or ``char[]``."""
+        """Return the expression of the octets of ``uint8[]`` or ``char[]``: any buffer of bytes."""
 
     def numbers(self, code: Code, field: Field, value: str) -> str:
         """Return the expression of the bytes of an array of numbers."""
@@ -55,6 +55,8 @@ class WriterBuilder:
         self._code = Code()
         self._pending: list[tuple[str, str]] = []
         self._parts: list[str] = []
+        self._buffers: set[str] = set()
+        """Parts that may be another buffer than bytes."""
 
     def build(self, message_type: MessageType) -> Any:
         """Return the writer of ``message_type``: ``write(message, notes) -> bytes``."""
@@ -64,9 +66,10 @@ class WriterBuilder:
         return self._code.compile("write(m, notes)", f"writer of {message_type.name}")
 
     def _joined(self) -> str:
-        if len(self._parts) > 2:  # noqa: PLR2004  # two parts are added faster than joined
-            return f"b''.join(({', '.join(self._parts)}))"
-        return " + ".join(self._parts) or "b''"
+        parts = self._parts
+        if len(parts) > 2 or (parts and parts[0] in self._buffers):  # noqa: PLR2004  # two are added faster
+            return f"b''.join(({', '.join(parts)},))"
+        return " + ".join(parts) or "b''"
 
     def _message(self, message_type: MessageType, holder: str) -> None:
         self._dialect.open(self._code, message_type, holder)
@@ -92,7 +95,9 @@ class WriterBuilder:
 
     def _array(self, field: Field, value: str) -> None:
         if field.is_bytes:
-            self._block(field, self._local(self._dialect.octets(self._code, value)))
+            data = self._local(self._dialect.octets(self._code, value))
+            self._buffers.add(data)
+            self._block(field, data)
         elif field.type in NUMBERS:
             self._block(field, self._local(self._dialect.numbers(self._code, field, value)))
         else:

@@ -204,8 +204,16 @@ def test_what_does_not_fit_is_refused_by_the_name_of_its_field(name: str, value:
 def test_fixed_octets_are_taken_in_three_forms() -> None:
     """Fixed octets are taken in three forms of the right length."""
     codec = CONVERTERS.of(TYPES.from_definition("mine/Id", "uint8[4] id\nchar[] more\n"))
-    for form in (b"abcd", memoryview(b"abcd"), "YWJjZA==", [97, 98, 99, 100]):
+    id_alone = CONVERTERS.of(TYPES.from_definition("mine/Alone", "uint8[4] id\n"))
+    id_first = CONVERTERS.of(TYPES.from_definition("mine/First", "char[4] id\nuint8 number\n"))
+    id_twice = CONVERTERS.of(TYPES.from_definition("mine/Twice", "uint8[4] id\nuint8[4] more\n"))
+    for form in (b"abcd", bytearray(b"abcd"), memoryview(b"abcd"), "YWJjZA==", [97, 98, 99, 100]):
         assert codec.decode({"id": form, "more": form})[0] == b"abcd\x04\0\0\0abcd"
+        alone = id_alone.decode({"id": form})[0]
+        first = id_first.decode({"id": form, "number": 101})[0]
+        twice = id_twice.decode({"id": form, "more": form})[0]
+        assert (alone, first, twice) == (b"abcd", b"abcde", b"abcdabcd")
+        assert {type(alone), type(first), type(twice)} == {bytes}
     for form in (b"abc", "YWJj", [1, 2, 3]):
         with pytest.raises(ConversionError, match=r"id: has 3 elements, uint8\[4\] has 4"):
             codec.decode({"id": form})
