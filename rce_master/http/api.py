@@ -100,9 +100,13 @@ def _adapt(route: Route, services: Services) -> Answer:
         call = Call(request, services, user, token, None, parts)
         try:
             admit(route, user)
-            text = await read_whole(request) if route.body else b""
+            text = b""
             if route.body:
-                call = replace(call, body=read_body(route.body, text))
+                text = await read_whole(request)
+                if user is not None:
+                    user = call.check_again()
+                    admit(route, user)
+                call = replace(call, user=user, body=read_body(route.body, text))
             keyed = keyed_request(request, user, text) if route.keyed and user is not None else None
             if keyed is None:
                 reply = await route.handler(call)

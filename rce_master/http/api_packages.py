@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from rce.packages import BadKeyError, key_id
 from rce.web.bodies import read_pieces
 from rce.web.openapi import Query
-from rce_master.exceptions import InvalidRequestError, NotFoundError
+from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError
 from rce_master.http import package_models as models
 from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.packages.service import PushRequest
@@ -17,6 +17,8 @@ from rce_master.state.packages import find, uses
 from rce_master.state.records import PackageKey, UserPackage, user_package_key
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
     from rce_master.state.tables import Tables
 
 routes = route_table("packages")
@@ -77,8 +79,16 @@ async def push_package(call: Call) -> models.PackageOut:
         signature=call.query("signature"),
     )
     size = call.request.content_length or 0
-    package, warnings = await call.services.packages.push(request, size, read_pieces(call.request))
+    package, warnings = await call.services.packages.push(request, size, _pieces(call))
     return _shown(call.services.state_service.tables, package, warnings)
+
+
+async def _pieces(call: Call) -> AsyncIterator[bytes]:
+    """Read an archive; refuse it if its sender has lost the permission meanwhile."""
+    async for piece in read_pieces(call.request):
+        yield piece
+    if not call.check_again().role.changes:
+        raise ForbiddenError("the role of your account changes nothing any more")
 
 
 @routes.route(

@@ -123,6 +123,15 @@ class Call:
             return False
         return user == self.user
 
+    def check_again(self) -> User:
+        """Return the caller as they are now, after a body that may have come slowly.
+
+        Raises:
+            WrongCredentialsError: The token is not valid any more.
+        """
+        user, _ = self.services.tokens.find(self.token)
+        return user
+
     async def lasts(self, seconds: float) -> bool:
         """Wait; return False as soon as the caller has lost the permission."""
         loop = asyncio.get_running_loop()
