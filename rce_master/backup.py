@@ -29,6 +29,7 @@ import msgspec
 from rce import __version__
 from rce_master.exceptions import StoreError
 from rce_master.packages.contents import ARCHIVES
+from rce_master.snapshots.service import SNAPSHOTS
 from rce_master.state.records import UserPackage
 from rce_master.state.tables import Tables
 from rce_master.store.base import SCHEMA_VERSION
@@ -44,8 +45,9 @@ Export: TypeAlias = Callable[[], AbstractContextManager[Path]]
 
 _ATTEMPTS = 5
 _STORE = {FILE_NAME, f"{FILE_NAME}-wal", f"{FILE_NAME}-shm", f"{FILE_NAME}-journal"}
-_LEFT_OUT = {*_STORE, "lock", ARCHIVES, "etcd", "etcd.yaml"}
-"""What is copied in another way, and a member of etcd, if it has the same state folder."""
+_LEFT_OUT = {*_STORE, "lock", ARCHIVES, SNAPSHOTS, "etcd", "etcd.yaml"}
+"""What is copied in another way, snapshots, which have the users' files, and a member of etcd, if it has the
+same state folder."""
 _PIECE = 1 << 20
 
 

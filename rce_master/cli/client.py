@@ -173,7 +173,7 @@ class ApiClient:
         except aiohttp.WSServerHandshakeError as error:
             await self.call("GET", path, query=dict(query))  # says why, which a handshake cannot
             raise ApiError(error.status, error.message) from error
-        except aiohttp.ClientError as error:
+        except (aiohttp.ClientError, TimeoutError) as error:
             raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
 
     async def _open_websocket(
@@ -190,7 +190,7 @@ class ApiClient:
                     heartbeat=REQUEST_S,
                     timeout=_CLOSE,
                 )
-            except aiohttp.ClientConnectorError:
+            except (aiohttp.ClientConnectorError, TimeoutError):
                 if number <= 1:
                     raise
                 self._masters.failed(url)

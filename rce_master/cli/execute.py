@@ -84,7 +84,9 @@ def run_command(container: str, command: Command, *, user: str = "", stdin: bool
         command = replace(command, rows=size.lines, columns=size.columns)
     try:
         return asyncio.run(_run(container, command, user, stdin))
-    except (CliError, MasterError) as error:
+    except BrokenPipeError:
+        raise  # the output is not wanted any more, and the program ends quietly
+    except (CliError, MasterError, OSError) as error:
         typer.echo(f"rce: {error}", err=True)
         return NOT_RUN
     except KeyboardInterrupt:

@@ -236,6 +236,17 @@ async def test_a_second_signal_ends_a_program_whose_output_is_not_read(
 
 
 @IN_PROCESSES
+async def test_output_that_cannot_be_written_is_told(owner: Owner) -> None:
+    full = os.open("/dev/full", os.O_WRONLY)
+    process = await owner.start("exec", "box", "echo", "x", stdout=full)
+    os.close(full)
+    _, error = await process.communicate()
+    assert process.returncode == NOT_RUN
+    assert b"No space left" in error
+    assert b"Traceback" not in error
+
+
+@IN_PROCESSES
 async def test_output_before_a_lost_connection_is_written(
     shared_engine: Engine, owner: Owner, pipe: tuple[int, int]
 ) -> None:
