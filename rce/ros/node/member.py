@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -25,6 +26,7 @@ from rce.ros.node.loggers import Loggers
 from rce.ros.node.master import MasterClient
 from rce.ros.node.parameters import Parameters
 from rce.ros.node.registrar import Registrar
+from rce.ros.node.registrations import Registrations
 from rce.ros.node.running import stop_signals
 from rce.ros.node.runtime import Runtime, Types
 from rce.ros.node.service import SerializedHandler, Service
@@ -114,6 +116,11 @@ class GraphMember:
         return self._running.master.slave_uri
 
     @property
+    def service_uri(self) -> str:
+        """The ``rosrpc`` URI under which the node provides its services."""
+        return f"rosrpc://{self._settings.host}:{self._listener.port}"
+
+    @property
     def is_shutdown(self) -> bool:
         """Whether the node was told to stop."""
         return self._stop.is_set()
@@ -195,7 +202,14 @@ class GraphMember:
             slave_uri = f"http://{settings.host}:{server.port}/"
             master = MasterClient(settings.master_uri, self.name, slave_uri, rpc)
             self._runtime = Runtime(
-                self.name, self._types, tasks, rpc, master, scratch, intra_process=self._intra_process
+                self.name,
+                self._types,
+                tasks,
+                rpc,
+                master,
+                Registrations(self.name, tasks),
+                scratch,
+                intra_process=self._intra_process,
             )
             self._parameters = Parameters(master)
             if self._intra_process:
@@ -262,19 +276,29 @@ class GraphMember:
         self, name: str, service_type: str | ServiceType, handler: SerializedHandler
     ) -> Service:
         """Provide a service under a global name."""
-        runtime, uri = self._running, self._service_uri
+        runtime, uri = self._running, self.service_uri
         if name in self._services:
             raise TypeMismatchError(f"this node provides {name} already")
 
+        registration = runtime.registrations.begin(
+            f"service {name}",
+            register=partial(runtime.master.register_service, name, uri),
+            unregister=partial(runtime.master.unregister_service, name, uri),
+            is_needed=lambda: name in self._services,
+        )
+
         async def release(service: Service) -> None:
             del self._services[service.name]
-            await runtime.master.unregister_service(service.name, uri)
+            await registration.end()
 
         service = self._services[name] = Service(runtime, name, service_type, handler, release)
         try:
-            await runtime.master.register_service(name, uri)
+            await registration.wait()
         except BaseException:
-            del self._services[name]
+            if self._services.get(name) is service:  # it may have been closed while it waited
+                del self._services[name]
+                service.disconnect()
+                registration.abandon()
             raise
         return service
 
@@ -309,8 +333,10 @@ class GraphMember:
                     for publisher in list(output.publishers):
                         await publisher.close()
                 await self._parameters.unwatch_all()
+                await self._running.registrations.take_back_abandoned()
         except (MasterError, TimeoutError) as error:
             _log.info("%s left without telling its master: %s", self.name, str(error) or "it took too long")
+        self._running.registrations.close()
         for client in list(self._clients):
             await client.close()
 
@@ -328,10 +354,6 @@ class GraphMember:
         return self._runtime
 
     @property
-    def _service_uri(self) -> str:
-        return f"rosrpc://{self._settings.host}:{self._listener.port}"
-
-    @property
     def _private_parameters(self) -> dict[str, Any]:
         return {f"{self.name}/{name}": value for name, value in self._settings.parameters.items()}
 
@@ -341,7 +363,7 @@ class GraphMember:
             self._topics,
             self._services,
             self._parameters,
-            self._service_uri,
+            self.service_uri,
             self._private_parameters,
             self._stop_for_others,
         )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rce.aio.queues import BoundedQueue
 from rce.ros.errors import HandshakeRefusedError, NodeClosedError, TypeMismatchError
 from rce.ros.node.local import LocalLink, LocalMessage
+from rce.ros.node.registrations import Registration
 from rce.ros.node.runtime import Runtime
 from rce.ros.node.settings import MAX_QUEUED_BYTES
 from rce.ros.tcpros.connection import Connection
@@ -86,6 +87,7 @@ class TopicOutput:
         self.local_links: list[LocalLink] = []
         """Subscribers in this process."""
         self.publishers: list[Publisher] = []
+        self.registration: Registration
         self.lost = 0
         """Messages dropped on links that are gone."""
         self.changed = asyncio.Event()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rce.aio.tasks import TaskScope
 from rce.ros.node.master import MasterClient
+from rce.ros.node.registrations import Registrations
 from rce.ros.xmlrpc import RpcClient
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ class Runtime:
     """Owns the node's background work."""
     rpc: RpcClient
     master: MasterClient
+    registrations: Registrations
     scratch: memoryview
     """Read buffer of all TCPROS connections."""
     intra_process: bool

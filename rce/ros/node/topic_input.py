@@ -12,6 +12,7 @@ from rce.ros.dialing import open_peer_socket
 from rce.ros.errors import HandshakeRefusedError, RosError, TcprosError, TypeMismatchError
 from rce.ros.node.input_link import HeaderReader, InputLink, says_latching
 from rce.ros.node.local import LocalLink, LocalMessage, find_neighbour
+from rce.ros.node.registrations import Registration
 from rce.ros.node.runtime import Runtime
 from rce.ros.node.subscriber import Subscriber
 from rce.ros.tcpros.address import ask_address
@@ -42,6 +43,7 @@ class TopicInput:
         self.message_type_name = message_type_name
         self.md5sum = md5sum
         self.subscribers: list[Subscriber] = []
+        self.registration: Registration
         self.links: list[InputLink | LocalLink] = []
         self.changed = asyncio.Event()
         self._runtime = runtime

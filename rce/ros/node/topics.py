@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 from rce.ros.errors import HandshakeRefusedError, TypeMismatchError
@@ -20,7 +21,8 @@ class Topics:
     """Topics by their global names.
 
     Several handles of a program may publish or subscribe to one topic: the first registers it at the master,
-    the last takes that back.
+    the last takes that back. All wait for the registration; a handle whose wait fails or is cancelled leaves
+    the others alone.
     """
 
     def __init__(self) -> None:
@@ -38,28 +40,31 @@ class Topics:
         """
         name = message_type if isinstance(message_type, str) else message_type.name
         output = self.outputs.get(topic)
-        is_first = output is None
         if output is None:
-            output = self.outputs[topic] = TopicOutput(runtime, topic, message_type, queue_size)
+            output = TopicOutput(runtime, topic, message_type, queue_size)
+            output.registration = runtime.registrations.begin(
+                f"publisher of {topic}",
+                register=partial(runtime.master.register_publisher, topic, name),
+                unregister=partial(runtime.master.unregister_publisher, topic),
+                is_needed=lambda: topic in self.outputs,
+            )
+            self.outputs[topic] = output
         elif output.message_type_name != name:
             raise TypeMismatchError(f"{topic} is published as {output.message_type_name} already, not {name}")
         output.queue_size = max(output.queue_size, queue_size)
 
         async def release(publisher: Publisher) -> None:
-            output.publishers.remove(publisher)
-            if not output.publishers:
-                del self.outputs[topic]
-                output.close()
-                await runtime.master.unregister_publisher(topic)
+            if self._remove_publisher(output, publisher):
+                await output.registration.end()
 
         publisher = Publisher(output, latch=latch, release=release)
         output.publishers.append(publisher)
-        if is_first:
-            try:
-                await runtime.master.register_publisher(topic, name)
-            except BaseException:
-                self.outputs.pop(topic, None)
-                raise
+        try:
+            await output.registration.wait()
+        except BaseException:
+            if self._remove_publisher(output, publisher):
+                output.registration.abandon()
+            raise
         return publisher
 
     async def subscribe(
@@ -88,17 +93,20 @@ class Topics:
         """
         name, md5sum = (message_type.name, message_type.md5sum) if message_type is not None else (ANY, ANY)
         source = self.inputs.get(topic)
-        is_first = source is None
         if source is None:
-            source = self.inputs[topic] = TopicInput(runtime, topic, name, md5sum)
+            source = TopicInput(runtime, topic, name, md5sum)
+            source.registration = runtime.registrations.begin(
+                f"subscriber of {topic}",
+                register=source.register,
+                unregister=partial(runtime.master.unregister_subscriber, topic),
+                is_needed=lambda: topic in self.inputs,
+            )
+            self.inputs[topic] = source
         source.check(name, md5sum)
 
         async def release(subscriber: Subscriber) -> None:
-            source.subscribers.remove(subscriber)
-            if not source.subscribers:
-                del self.inputs[topic]
-                source.close()
-                await runtime.master.unregister_subscriber(topic)
+            if self._remove_subscriber(source, subscriber):
+                await source.registration.end()
 
         subscriber = Subscriber(
             topic,
@@ -111,16 +119,37 @@ class Topics:
             hears_own=hears_own,
         )
         source.subscribers = [*source.subscribers, subscriber]  # a new list: one may be in use by a delivery
-        if is_first:
-            try:
-                await source.register()
-            except BaseException:
-                self.inputs.pop(topic, None)
-                source.close()  # an update may have come before
-                raise
-        else:
-            source.catch_up(subscriber)
+        source.catch_up(subscriber)
+        try:
+            await source.registration.wait()
+        except BaseException:
+            if self._remove_subscriber(source, subscriber):
+                source.registration.abandon()
+            subscriber.sink.end()
+            raise
         return subscriber
+
+    def _remove_publisher(self, output: TopicOutput, publisher: Publisher) -> bool:
+        """Remove a handle; return whether it was the last one, with which the topic is removed."""
+        if publisher not in output.publishers:  # closed while it waited for the master
+            return False
+        output.publishers.remove(publisher)
+        if output.publishers:
+            return False
+        del self.outputs[output.topic]
+        output.close()
+        return True
+
+    def _remove_subscriber(self, source: TopicInput, subscriber: Subscriber) -> bool:
+        """Remove a handle; return whether it was the last one, with which the topic is removed."""
+        if subscriber not in source.subscribers:  # closed while it waited for the master
+            return False
+        source.subscribers = [one for one in source.subscribers if one is not subscriber]
+        if source.subscribers:
+            return False
+        del self.inputs[source.topic]
+        source.close()
+        return True
 
     def accept(self, connection: Connection, fields: dict[str, str]) -> None:
         """Take a subscriber's connection.

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 import time
 import xmlrpc.client
-from collections.abc import Iterator
-from contextlib import contextmanager
-from socketserver import ThreadingMixIn
 from typing import Any
-from xmlrpc.server import SimpleXMLRPCServer
 
 import pytest
+from support.ros_masters import serving
 from support.ros_nodes import MakeNode
 
 from rce.ros.core import Core
@@ -51,23 +47,6 @@ class EarlyMaster:
         with xmlrpc.client.ServerProxy(arguments[3]) as node:
             node.publisherUpdate("/master", "/t", publishers[: self._early])
         return status, text, publishers[: self._late]
-
-
-class Server(ThreadingMixIn, SimpleXMLRPCServer):
-    """Serves each connection in a thread: a node keeps one open to its master."""
-
-
-@contextmanager
-def serving(master: EarlyMaster) -> Iterator[str]:
-    with Server(("127.0.0.1", 0), logRequests=False) as server:
-        server.register_instance(master)
-        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_address[1]}/"
-        finally:
-            server.shutdown()
-            thread.join()
 
 
 @pytest.mark.parametrize(("early", "late", "most"), [(2, 1, 3), (2, 2, 1)])
