@@ -16,7 +16,7 @@ import pytest
 from support.multimaster import STRING, DiscoveryNetwork, node
 
 from rce.ros.core import Core, Graph
-from rce.ros.errors import ServiceFaultError
+from rce.ros.errors import ServiceError, ServiceFaultError
 from rce.ros.multimaster.discovery import Discovery
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.relay.frames import PROTOCOL
@@ -25,6 +25,7 @@ from rce.ros.multimaster.relay.throttle import MessageThrottle
 from rce.ros.multimaster.relay.topic import TopicRelay
 from rce.ros.multimaster.sync import MasterSync, SyncSettings
 from rce.ros.node import Message, Publisher, Subscriber
+from rce.ros.node.master import MasterClient
 
 
 @pytest.fixture
@@ -364,6 +365,23 @@ async def test_a_broken_link_takes_back_and_comes_back() -> None:
                     back = gone and (event.name, event.change.value) == ("/said", "publisher added")
                     if back:
                         break
+
+
+async def test_own_stale_registration_does_not_stop_a_service() -> None:
+    """A registration whose caller gave up may have reached the master all the same."""
+    async with linked() as (cloud, robot, one, _), node("base", robot.uri) as base:
+        relay = one._node
+        master = MasterClient(cloud.uri, relay.name, relay.uri, relay._running.rpc)
+        await master.register_service("/clear", relay.service_uri)
+        await base.advertise_service("clear", "roscpp/Empty", lambda _: None)
+        async with node("planner", cloud.uri) as planner, asyncio.timeout(30):
+            while True:
+                try:
+                    await planner.service_client("clear", "roscpp/Empty").call({}, timeout=20)
+                except ServiceError:
+                    await asyncio.sleep(0.05)
+                else:
+                    break
 
 
 @pytest.mark.parametrize("what", ["the offer shrinks", "the link breaks"])

@@ -169,7 +169,8 @@ class Importer:
         return is_complete
 
     async def _provide(self, number: int, name: str, kind: ServiceKind) -> Service:
-        if await self._master.lookup_service(name) is not None:
+        # A registration of this node that was cancelled or lost its answer may still be there.
+        if await self._master.lookup_service(name) not in (None, self._node.service_uri):
             raise MasterError("it is provided here already")
 
         async def handle(request: bytes) -> bytes:
