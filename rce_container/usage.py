@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
@@ -10,6 +11,8 @@ from rce_container.environment import proc
 from rce_container.environment.messages import Counters
 from rce_container.limits import ControlGroup
 from rce_container.runtimes.base import Handle
+
+_log = logging.getLogger(__name__)
 
 _PSS_EVERY = 5
 """A process's share of memory is slow to read, so only every fifth measurement reads it."""
@@ -36,6 +39,8 @@ class UsageMeter:
         self._fresh: dict[tuple[int, int], int] = {}
         self._table: dict[int, proc.Process] | None = None
         self._round = 0
+        self._failed: set[str] = set()
+        """Containers whose last measurement failed, which was logged."""
 
     def measure(self, containers: Mapping[str, Subject]) -> dict[str, EndpointUsage]:
         """Measure all containers. Blocks.
@@ -44,13 +49,23 @@ class UsageMeter:
             containers: By id.
 
         Returns:
-            The usage by id. A node's memory is its proportional share (PSS), or the resident size if that
-            cannot be read; so is the container's, if its control group does not count.
+            The usage by id, without containers that cannot be measured, which is logged once. A node's memory
+            is its proportional share (PSS), or the resident size if that cannot be read; so is the
+            container's, if its control group does not count.
         """
         self._round += 1
         self._table, self._fresh = None, {}
-        usage = {id_: self._measure(subject) for id_, subject in containers.items()}
+        usage: dict[str, EndpointUsage] = {}
+        failed: set[str] = set()
+        for id_, subject in containers.items():
+            try:
+                usage[id_] = self._measure(subject)
+            except Exception:  # noqa: BLE001 - kernels print what was not expected; the others need their numbers
+                failed.add(id_)
+                if id_ not in self._failed:
+                    _log.exception("the usage of the container %s cannot be measured", id_)
         self._table, self._shares = None, self._fresh
+        self._failed = failed
         return usage
 
     def _measure(self, subject: Subject) -> EndpointUsage:

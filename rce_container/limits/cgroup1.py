@@ -132,6 +132,6 @@ def parse_io(text: str) -> dict[str, int]:
     sums: dict[str, int] = {}
     for line in text.splitlines():
         words = line.split()
-        if len(words) == 3:  # noqa: PLR2004 - the last line is a total
+        if len(words) == 3 and words[2].isdecimal():  # noqa: PLR2004 - the last line is a total
             sums[words[1]] = sums.get(words[1], 0) + int(words[2])
     return sums

@@ -22,6 +22,7 @@ CONTROLLERS = {"memory": "memory", "pids": "processes", "cpu": "cpu", "io": "io"
 """The controllers that are used, the most important first, and the resources that need them."""
 
 _SUBTREE = "cgroup.subtree_control"
+_IO_BYTES = ("rbytes", "wbytes")
 _MAX_WEIGHT = 10_000
 _WEIGHT_PER_CORE = 400
 _HINT = "give it one: a systemd unit with Delegate=yes, or `systemd-run --scope -p Delegate=yes ...`"
@@ -157,10 +158,13 @@ def _request(controllers: Iterable[str]) -> str:
 
 
 def parse_io(text: str) -> dict[str, int]:
-    """Sum ``io.stat`` over all disks."""
+    """Sum the bytes read and written of ``io.stat`` over all disks.
+
+    Some kernels print several disks in one line, and statistics for debugging have words as values.
+    """
     sums: dict[str, int] = {}
-    for line in text.splitlines():
-        for pair in line.split()[1:]:
-            key, _, value = pair.partition("=")
+    for word in text.split():
+        key, _, value = word.partition("=")
+        if key in _IO_BYTES and value.isdecimal():
             sums[key] = sums.get(key, 0) + int(value)
     return sums

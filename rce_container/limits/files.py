@@ -41,9 +41,9 @@ def number(path: Path) -> int:
 
 
 def keyed(text: str) -> dict[str, int]:
-    """Read lines of a key and a number."""
+    """Read lines of a key and a number; leave out other lines."""
     pairs = (line.split() for line in text.splitlines())
-    return {pair[0]: int(pair[1]) for pair in pairs if len(pair) == 2}  # noqa: PLR2004
+    return {pair[0]: int(pair[1]) for pair in pairs if len(pair) == 2 and pair[1].isdecimal()}  # noqa: PLR2004
 
 
 def tree(folder: Path) -> Iterator[Path]:

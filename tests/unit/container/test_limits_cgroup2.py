@@ -85,6 +85,20 @@ def test_usage_and_troubles_are_read(tree: Tree2) -> None:
     assert control_group.troubles() == Troubles(oom_kills=2, refused_forks=7)
 
 
+def test_unusual_lines_of_counters_are_left_out(tree: Tree2) -> None:
+    """Some kernels print several disks in one line; statistics for debugging have words as values."""
+    control_group = limiter(tree).create("m1", LIMITS)
+    folder = tree.own / "rce-t0" / "m1"
+    (folder / "io.stat").write_text(
+        "7:7 7:6 7:5 7:4 rbytes=28672 wbytes=0 rios=7 wios=0 dbytes=0 dios=0\n"
+        "8:0 rbytes=4096 wbytes=8192 use_delay=0 depth=max\n"
+    )
+    (folder / "memory.events").write_text("oom max\noom_kill 3\n")
+    usage = control_group.usage()
+    assert (usage.io_read, usage.io_written) == (32768, 8192)
+    assert control_group.troubles().oom_kills == 3
+
+
 def test_memory_is_not_limited_to_less_than_is_needed(tree: Tree2) -> None:
     control_group = limiter(tree).create("m1", LIMITS)
     with pytest.raises(LimitError, match=r"cannot be limited to 20 MB: it needs 24 MB now; stop some of its"):

@@ -40,7 +40,7 @@ def test_megabytes_are_rounded_up() -> None:
 def test_io_is_summed_over_disks() -> None:
     text = "8:0 Read 100\n8:0 Write 20\n8:0 Total 120\n259:0 Read 1\n259:0 Write 2\nTotal 123\n"
     assert parse_io(text) == {"Read": 101, "Write": 22, "Total": 120}
-    assert parse_io("Total 0\n") == {}
+    assert parse_io("Total 0\n8:0 Read max\n") == {}
 
 
 def test_without_cgroups_each_process_limits_itself() -> None:
