@@ -5,6 +5,7 @@ A package is fetched, verified and unpacked in a scratch folder, and appears com
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
 import hashlib
@@ -54,6 +55,7 @@ class PackageCache:
         """Bytes of each kept package, the least recently used first."""
         self._holders: defaultdict[str, set[str]] = defaultdict(set)
         self._locks = Locks()
+        self._making_room = asyncio.Lock()
         self._turns = Turns(_AT_ONCE, waiting=_MAX_WAITING, each=_OF_ONE_USER)
 
     def open(self) -> None:
@@ -166,12 +168,14 @@ class PackageCache:
 
     async def _make_room(self) -> None:
         """Remove the least recently used packages that no container holds, until the rest fits."""
-        for sha256 in list(self._sizes):
-            if sum(self._sizes.values()) <= self._space:
-                return
-            if sha256 not in self._holders and sha256 not in self._locks:
-                del self._sizes[sha256]
-                await in_thread(remove, self._folder / sha256)
+        async with self._making_room:
+            for sha256 in list(self._sizes):
+                if sum(self._sizes.values()) <= self._space:
+                    return
+                if sha256 not in self._holders and sha256 not in self._locks:
+                    async with self._locks.of(sha256):  # one who asks for it meanwhile waits, and fetches it
+                        self._sizes.pop(sha256, None)
+                        await in_thread(remove, self._folder / sha256)
 
 
 def trouble_of(error: OSError) -> PackageTroubleError:

@@ -23,6 +23,7 @@ _log = logging.getLogger(__name__)
 RETRY = Backoff(first=0.5, longest=30.0)
 """Delays before another attempt."""
 
+_FAULT = "a fault on the container's machine, which its log describes; tell its operator"
 _NOT_INSTALLED = (
     "it has a requirements.txt, which this machine does not install (its operator may allow it:"
     " rce-container --allow-requirements); its nodes start without"
@@ -107,16 +108,23 @@ class Supply:
             try:
                 await self._bring(package)
             except PackageTroubleError as trouble:
-                what = f"package {package.name} {package.version}"
-                text = f"{what} is not there yet: {trouble}; it is tried again"
-                if text != told:
-                    _log.warning("%s: %s", self._holder, text)
-                    self._tell(text)
-                told = text
-                await asyncio.sleep(pauses.next() * trouble.delay_factor)
+                told = self._report(package, str(trouble), told)
+                delay_factor = trouble.delay_factor
+            except Exception as error:  # noqa: BLE001 - the nodes wait for their package, whatever the fault
+                told = self._report(package, _FAULT, told, error)
+                delay_factor = PackageTroubleError.delay_factor
             else:
                 self._on_arrival()
                 return
+            await asyncio.sleep(pauses.next() * delay_factor)
+
+    def _report(self, package: PackageSpec, trouble: str, told: str, fault: Exception | None = None) -> str:
+        """Report a problem, unless it is the one that was told last; return what was told."""
+        text = f"package {package.name} {package.version} is not there yet: {trouble}; it is tried again"
+        if text != told:
+            _log.warning("%s: %s", self._holder, text, exc_info=fault)
+            self._tell(text)
+        return text
 
     async def _bring(self, package: PackageSpec) -> None:
         if self._shelf.has(package.sha256):

@@ -11,6 +11,7 @@ from typing import BinaryIO
 import pytest
 from support.user_packages import pack, sign, write_package
 
+from rce.aio.backoff import Backoff
 from rce.control.exceptions import ContentError
 from rce.control.model import PackageSpec
 from rce.control_channel.contents import Piece
@@ -22,6 +23,7 @@ from rce_container.packages.cache import PackageCache
 from rce_container.packages.disk import replicate
 from rce_container.packages.exceptions import FetchError, NoSpaceError, VerificationError
 from rce_container.packages.shelf import Shelf
+from rce_container.packages.supply import Library, Supply
 
 
 class Depot:
@@ -103,6 +105,49 @@ async def test_what_nobody_holds_goes_when_room_is_needed(depot: Depot, tmp_path
     cache.hold("box", set())
     await cache.ensure("user", four)
     assert kept(tmp_path / "cache") == {one.sha256, four.sha256}
+
+
+async def test_packages_that_arrive_together_make_room(depot: Depot, tmp_path: Path) -> None:
+    """Packages that arrive at the same time in a full cache are all provided."""
+    old = [depot.make(f"old{number}", size=2000) for number in range(4)]
+    new = [depot.make(f"new{number}", size=2000) for number in range(4)]
+    cache = opened(depot, tmp_path / "cache")
+    for spec in old:
+        await cache.ensure("user", spec)
+    cache = opened(depot, tmp_path / "cache", space=1)
+    cache.hold("box", {spec.sha256 for spec in new})
+    users = [cache.ensure("user", spec) for spec in new]
+    assert all(path.is_dir() for path in await asyncio.gather(*users))
+    assert kept(tmp_path / "cache") == {spec.sha256 for spec in new}
+
+
+async def test_a_fault_delays_a_package(
+    depot: Depot, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A fault of the program is logged and told once, and the package is tried again."""
+    faults = [KeyError("a fault"), KeyError("a fault")]
+
+    async def fetch(sha256: str, offset: int) -> Piece:
+        if faults:
+            raise faults.pop()
+        return await depot.fetch(sha256, offset)
+
+    cache = PackageCache(tmp_path / "cache", fetch, space=1 << 20)
+    library = Library(cache=cache, retry=Backoff(first=0.01, longest=0.01))
+    library.open()
+    nav = depot.make("nav")
+    (tmp_path / "box").mkdir()
+    box = Shelf(tmp_path / "box", link=True)
+    told: list[str] = []
+    arrived = asyncio.Event()
+    supply = Supply("box", "user", library, box, tell=told.append, on_arrival=arrived.set)
+    supply.want([nav])
+    await asyncio.wait_for(arrived.wait(), 30)
+    await supply.close()
+    assert box.has(nav.sha256)
+    assert len(told) == 1
+    assert told[0].startswith("package nav 1.0 is not there yet: a fault on the container's machine")
+    assert [record.exc_info is not None for record in caplog.records] == [True]
 
 
 async def test_what_is_not_what_was_signed_is_refused(depot: Depot, tmp_path: Path) -> None:
