@@ -32,9 +32,10 @@ class Connection(Requests, OwnInterfaces):
     other requested items stay in the engine; :meth:`remove_all` removes them.
 
     Requests such as :meth:`create_container` return when they were handed to the network. Without a
-    connection, they are stored and sent after the reconnect. The protocol does not confirm success; a failure
-    arrives as an error text at ``on_error``. Cancelling a request does not withdraw it: it is sent and
-    stored.
+    connection, they are stored and sent after the reconnect. Removals that the engine may not have received
+    before the connection broke are sent again, before everything that exists is restored. The protocol does
+    not confirm success; a failure arrives as an error text at ``on_error``. Cancelling a request does not
+    withdraw it: it is sent and stored.
 
     Args:
         url: The master, ``http://HOST:9000/`` or ``https://``; several, in a list or separated by commas, are

@@ -83,6 +83,30 @@ class Desired:
             requests.append(ConfigureConnections(connect=tuple(self.connections.values())))
         return requests
 
+    def unrestored(self, request: Request) -> Request | None:
+        """Return the part of an applied request that :meth:`restore` does not repeat; None if there is none.
+
+        It consists of removals, and of new sizes of containers that other clients made.
+        """
+        match request:
+            case CreateContainer():
+                return None
+            case ResizeContainer():
+                return None if request.tag in self.containers else request
+            case DestroyContainer():
+                return request
+            case ConfigureComponents():
+                components = ConfigureComponents(
+                    remove_nodes=request.remove_nodes,
+                    remove_interfaces=request.remove_interfaces,
+                    delete_param=request.delete_param,
+                )
+                return components if components != ConfigureComponents() else None
+            case ConfigureConnections():
+                return ConfigureConnections(disconnect=request.disconnect) if request.disconnect else None
+            case _:
+                assert_never(request)
+
     def undo(self) -> list[Request]:
         """Return the requests that remove everything, in an order in which each still finds what it names."""
         requests: list[Request] = []

@@ -7,6 +7,7 @@ import contextlib
 import hashlib
 import logging
 from dataclasses import dataclass, field
+from functools import partial
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Protocol
 from urllib.parse import urlencode, urlsplit, urlunsplit
@@ -152,6 +153,12 @@ async def _ping(socket: EngineSocket, outflow: Outflow) -> None:
         outflow.pinged()
 
 
+def _confirm(on_received: Callable[[], object], pong: asyncio.Future[float]) -> None:
+    """Tell of an answered ping; the connection may have ended instead."""
+    if not pong.cancelled() and pong.exception() is None:
+        on_received()
+
+
 class EngineTransport:
     """A robot's transport to the engine; it reconnects when a connection is lost."""
 
@@ -223,13 +230,27 @@ class EngineTransport:
         self.post_request(frames)
         return True
 
-    def post_request(self, frames: Sequence[Frame]) -> None:
-        """Send a message even if much waits already. For what the program waits for, or asks once."""
-        self._idle.clear()
-        self._queue.put_control(QueuedMessage.of(frames))
+    def post_request(self, frames: Sequence[Frame], on_received: Callable[[], object] | None = None) -> None:
+        """Send a message even if much waits already. For what the program waits for, or asks once.
 
-    def deliver(self, frames: Sequence[Frame]) -> asyncio.Future[None]:
+        Args:
+            frames: The message's frames.
+            on_received: As for :meth:`deliver`.
+        """
+        self._idle.clear()
+        queued = QueuedMessage.of(frames)
+        queued.on_received = on_received
+        self._queue.put_control(queued)
+
+    def deliver(
+        self, frames: Sequence[Frame], on_received: Callable[[], object] | None = None
+    ) -> asyncio.Future[None]:
         """Send a message when its turn comes.
+
+        Args:
+            frames: The message's frames.
+            on_received: Called when the engine has received the message: what the network took can still be
+                lost with the connection.
 
         Returns:
             Done when the message was handed to the network; its exception is a :class:`LostError` if there is
@@ -237,6 +258,7 @@ class EngineTransport:
         """
         queued = QueuedMessage.of(frames)
         queued.sent = asyncio.get_running_loop().create_future()
+        queued.on_received = on_received
         if self.connected:
             self._idle.clear()
             self._queue.put_control(queued)
@@ -356,6 +378,9 @@ class EngineTransport:
                 await socket.send_frames(queued.frames)
                 if queued.sent is not None and not queued.sent.done():
                     queued.sent.set_result(None)
+                if queued.on_received is not None:
+                    pong = asyncio.ensure_future(await socket.ping())
+                    pong.add_done_callback(partial(_confirm, queued.on_received))
             except ConnectionClosed:
                 return
             finally:

@@ -11,7 +11,7 @@ from rce.aio.queues import BoundedQueue
 from rce_client.exceptions import LostError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from rce.protocol import Frame
 
@@ -38,6 +38,8 @@ class QueuedMessage:
     """A message with a key is dropped only for a newer one with this key. Latched messages: the source."""
     sent: asyncio.Future[None] | None = None
     """Completed when the message was handed to the network, or failed."""
+    on_received: Callable[[], object] | None = None
+    """Called when the engine has answered a ping that was sent after the message."""
 
     @classmethod
     def of(cls, frames: Sequence[Frame], key: str | None = None) -> QueuedMessage:

@@ -60,7 +60,7 @@ CONNECTING = "looking for the engine"
 
 
 def _take_note(sent: asyncio.Future[None]) -> None:
-    """Retrieve the error of a message that need not be sent again."""
+    """Retrieve the error of a message: what is still wanted after the reconnect is sent again then."""
     if not sent.cancelled():
         sent.exception()
 
@@ -104,7 +104,9 @@ class Session:
         self._on_state = on_state
         self._tasks: TaskScope | None = None
         self._waiters: set[asyncio.Future[None]] = set()
-        self._backlog: list[Request] = []
+        self._unconfirmed: dict[object, Request] = {}
+        """Removals, and others that :attr:`desired` does not restore, which the engine may not have received;
+        oldest first."""
         self._was_connected = False
         self._refusal: RefusedError | None = None
         self._reminder = Reminder()
@@ -157,10 +159,11 @@ class Session:
         """Send a request, and remember it for reconnects."""
         self.check_open()
         self.desired.apply(request)
-        for part in parts_of(request):
-            sent = self.transport.deliver(encode(part))
-            sent.add_done_callback(partial(self._note_unsent, part))
-            await asyncio.wait((sent,))
+        # All parts at once: if this is cancelled, none is left out.
+        sent = [self.transport.deliver(encode(part), self._keep(part)) for part in parts_of(request)]
+        for one in sent:
+            one.add_done_callback(_take_note)
+        await asyncio.wait(sent)
 
     async def repeat(self) -> None:
         """Send all stored requests again; without a connection none, :meth:`on_connected` sends them."""
@@ -268,11 +271,12 @@ class Session:
         self._happen(ConnectionEvent.FAIL, str(error))
 
     def on_connected(self) -> None:
-        """Ask again for everything that was made."""
-        for request in (*self._backlog, *self.desired.restore()):
+        """Remove again what the engine may not have removed, and ask again for everything that was made."""
+        for key, request in self._unconfirmed.items():
+            self.transport.post_request(encode(request), partial(self._unconfirmed.pop, key, None))
+        for request in self.desired.restore():
             for part in parts_of(request):
                 self.transport.post_request(encode(part))
-        self._backlog.clear()
         event = ConnectionEvent.RESTORE if self._was_connected else ConnectionEvent.CONNECT
         self._was_connected = True
         self._happen(event, "connected")
@@ -318,10 +322,14 @@ class Session:
             self.interfaces.close()
             self._happen(ConnectionEvent.REFUSE, str(error))
 
-    def _note_unsent(self, request: Request, sent: asyncio.Future[None]) -> None:
-        """Send a request after the reconnect that the connection broke before."""
-        if not sent.cancelled() and isinstance(sent.exception(), LostError):
-            self._backlog.append(request)
+    def _keep(self, request: Request) -> Callable[[], object] | None:
+        """Keep what no restoring repeats; return what forgets it again, when the engine has received it."""
+        unrestored = self.desired.unrestored(request)
+        if unrestored is None:
+            return None
+        key = object()
+        self._unconfirmed[key] = unrestored
+        return partial(self._unconfirmed.pop, key, None)
 
     def _take_fault(self, fault: Fault) -> None:
         """Report what came and cannot be read; fail the service call that it was part of."""

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
+from integration.client.conftest import TIMING
 from support.client_types import ECHO, STRING, ros_string
 from support.cloud import PASSWORD
+from support.slow_link import SlowLink
 
+from rce.model import ConfigureConnections
+from rce.model import Connection as ConnectionSpec
+from rce.protocol import MAX_ITEMS
 from rce_client.connection import Connection, State
 from rce_client.exceptions import (
     CallError,
@@ -154,6 +160,78 @@ async def test_what_is_removed_while_away_is_removed_on_return(engine: Engine) -
     assert made[0] == ("DC", "c1")
     assert ("CC", "c2") in made
     assert ("CC", "c1") not in made
+
+
+async def test_removals_in_an_unnoticed_outage_are_repeated(engine: Engine) -> None:
+    """What is removed between the loss of a connection and its detection is removed after the reconnect."""
+    states: list[State] = []
+    async with SlowLink(engine.cloud.ws_url).running() as link:
+        engine.door.body = f'{{"url": "{link.url}"}}'
+        timing = replace(TIMING, ping_interval=0.3, ping_timeout=0.3)
+        conn = Connection(
+            engine.door.url,
+            "testUser",
+            PASSWORD,
+            "testRobot",
+            timing=timing,
+            on_state=lambda state, _: states.append(state),
+        )
+        async with asyncio.timeout(60), conn:
+            publisher = await conn.publisher("say", STRING)
+            await conn.create_container("c1")
+            await conn.create_container("c2")
+            await conn.add_node("c2", "n1", "Test", "a.py")
+            await conn.connect("testRobot/say", "c2/hear")
+            await publisher.wait_active(10)
+            link.hangs = True
+            await conn.disconnect("testRobot/say", "c2/hear")
+            await conn.remove_node("c2", "n1")
+            await conn.destroy_container("c1")
+            await conn.create_container("c1")
+            await conn.resize_container("other", cpu=1)
+            assert State.LOST not in states
+            while State.LOST not in states:
+                await asyncio.sleep(0.02)
+            await link.close()  # what it holds is lost
+            engine.master.requests.clear()
+            link.hangs = False
+            await link.open()
+            await engine.master.changed.until(lambda: len(engine.master.requests) >= 7)
+    assert [kind for _, kind, _ in engine.master.requests] == ["CX", "CN", "DC", "RC", "CC", "CC", "CN"]
+    cut, removed, *_ = (data for _, _, data in engine.master.requests)
+    assert cut == {"disconnect": [{"tagA": "testRobot/say", "tagB": "c2/hear"}]}
+    assert removed == {"removeNodes": [{"containerTag": "c2", "nodeTag": "n1"}]}
+
+
+async def test_received_removals_are_not_repeated(engine: Engine) -> None:
+    back = asyncio.Event()
+
+    def watch(state: State, _: str) -> None:
+        if state is State.RESTORED:
+            back.set()
+
+    async with asyncio.timeout(60), engine.connection(on_state=watch) as conn:
+        await conn.create_container("c1")
+        await conn.destroy_container("c1")
+        publisher = await conn.publisher("say", STRING)
+        await publisher.wait_active(10)
+        engine.master.requests.clear()
+        await engine.kick()
+        await back.wait()
+        await publisher.wait_active(10)
+    assert "DC" not in [type_ for _, type_, _ in engine.master.requests]
+
+
+async def test_cancelled_removal_of_many_is_sent_as_a_whole(engine: Engine) -> None:
+    async with asyncio.timeout(60), engine.connection() as conn:
+        await stall(engine, conn)
+        pairs = tuple(ConnectionSpec(tag_a=f"a/n{number}", tag_b="b/b") for number in range(MAX_ITEMS + 1))
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.1):
+                await conn.request(ConfigureConnections(disconnect=pairs))
+        await engine.kick()
+        requests = engine.master.requests
+        await engine.master.changed.until(lambda: [kind for _, kind, _ in requests].count("CX") == 2)
 
 
 async def test_requests_repeated_while_away_are_sent_once(engine: Engine) -> None:
