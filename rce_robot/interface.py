@@ -77,8 +77,11 @@ class RobotSide(Protocol):
     async def convert(self, job: Job, parts: Sequence[Buffer]) -> tuple[Result, list[memoryview]]:
         """Have a conversion done in another process; raises :class:`ConversionFailedError`."""
 
-    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
-        """Handle a large message again when the binary values that it refers to have arrived."""
+    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> LargeData | None:
+        """Return a large message with the binary values that it refers to, if they have come.
+
+        Otherwise return None, and handle it again when they have.
+        """
 
     def run(self, work: Coroutine[Any, Any, None]) -> bool:
         """Run a coroutine until the robot leaves; return False (without effect) if too many run already."""
@@ -195,11 +198,20 @@ class RobotInterface(Interface):
             raise UnreadableError.at(self.tag, message.msg_id, str(error)) from error
 
     async def read_large(self, large: LargeData) -> Read:
-        """Convert an unparsed message; one that needs binary values is handled again with them."""
+        """Convert an unparsed message.
+
+        If binary values of it have not come yet, it is handled again when they have; the result has their
+        ids. If they have come, it is converted with them now, so that later messages do not overtake it.
+        """
         read = await self.offload.read_text(large)
-        if read.ids:
-            self.robot.await_binaries(large, read.ids)
-        return read
+        complete = self.robot.await_binaries(large, read.ids) if read.ids else None
+        if complete is None:
+            return read
+        holding = self.robot.hold(complete.size - large.size)
+        try:
+            return await self.offload.read_text(complete)
+        finally:
+            holding.release()
 
     def _warn(self, text: str) -> None:
         """Report an ignored field, once; again if the text was forgotten because memory is short."""

@@ -339,10 +339,9 @@ class Namespace:
         """Have a conversion done in another process."""
         return await self._pool.convert(self.id.user, job, parts)
 
-    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
-        """Handle a large message again when its binary values have arrived."""
-        if self._live is not None:
-            self._live.await_binaries(large, ids)
+    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> LargeData | None:
+        """Return a large message with its binary values, if they have come; else handle it when they have."""
+        return self._live.await_binaries(large, ids) if self._live is not None else None
 
     def run(self, work: Coroutine[Any, Any, None]) -> bool:
         """Run a coroutine until the robot leaves."""

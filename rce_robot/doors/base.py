@@ -96,8 +96,8 @@ class DoorSession(Protocol):
     def drop_latched(self, tag: str, source: str) -> None:
         """Withdraw a latched message that was not sent yet."""
 
-    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
-        """Handle a large message again when its binary values have arrived."""
+    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> LargeData | None:
+        """Return a large message with its binary values, if they have come; else handle it when they have."""
 
     def report(self, problem: str, call: CallId | None = None) -> None:
         """Tell the robot of an error."""

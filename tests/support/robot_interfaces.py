@@ -73,6 +73,8 @@ class FakeRobot:
         self.knows_sources = True
         self.sources: list[tuple[str, ...]] = []
         self.awaited: list[tuple[LargeData, list[str]]] = []
+        self.binaries: dict[str, memoryview] = {}
+        """Binary values that came before they were asked for."""
         self.converting: Callable[[], Awaitable[object]] = lambda: asyncio.sleep(0)
         """What a conversion waits for."""
 
@@ -115,8 +117,11 @@ class FakeRobot:
         )
         return result, [memoryview(part) for part in made]
 
-    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
+    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> LargeData | None:
         self.awaited.append((large, list(ids)))
+        if not self.binaries:
+            return None
+        return LargeData(large.address, large.text, {id_: self.binaries[id_] for id_ in ids})
 
     def run(self, work: Coroutine[Any, Any, None]) -> bool:
         if self.room:

@@ -220,11 +220,16 @@ class Session:
         """Drop the unsent latched message of a source."""
         self._outbox.drop_latched(tag, source)
 
-    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> None:
-        """Handle a large message again when its binary values have arrived."""
+    def await_binaries(self, large: LargeData, ids: Sequence[str]) -> LargeData | None:
+        """Return a large message with its binary values, if they have come; else handle it when they have."""
+        complete = None
         for event in self._stream.await_binaries(large, ids, self._now()):
-            self._handle(event)
+            if type(event) is LargeData:
+                complete = event
+            else:
+                self._handle(event)
         self._check_pending()
+        return complete
 
     def send_urgent(self, message: Queued) -> bool:
         """Send in the control lane; False if that is full or the connection ended."""

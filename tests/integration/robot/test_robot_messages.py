@@ -73,6 +73,18 @@ async def test_robot_calls_a_service(cloud: Cloud, robot: Robot) -> None:
     assert answered == {"iTag": "ask", "type": ECHO, "msgID": 'id "1"', "msg": {"data": "slow"}}
 
 
+async def test_large_message_with_a_binary_value_keeps_its_place(cloud: Cloud, robot: Robot) -> None:
+    picture = "sensor_msgs/CompressedImage"
+    end = await cloud.joined("say", "SubscriberConverter", picture)
+    id_ = "ab" * 16
+    await robot.say("say", picture, {"format": "{" * 10_000, "data*": id_})  # too many braces to be light
+    await robot.socket.send(id_.encode() + b"pixels")
+    await robot.say("say", picture, {"format": "later"})
+    first, second = await end.received.get(), await end.received.get()
+    assert first.endswith(b"pixels")
+    assert b"later" in second
+
+
 async def test_a_failed_call_is_an_error_that_names_interface_and_id(cloud: Cloud, robot: Robot) -> None:
     end = await cloud.joined("ask", "ServiceProviderConverter", ECHO)
 

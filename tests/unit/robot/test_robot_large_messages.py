@@ -69,6 +69,26 @@ async def test_large_message_waits_for_its_binary_values() -> None:
     assert setup.port.sent[0].endswith(b"\x06\0\0\0pixels")
 
 
+async def test_large_message_with_binary_values_keeps_its_place() -> None:
+    """Messages that come while it is read do not overtake it; its binary values count as held."""
+    setup = Setup("SubscriberConverter", "sensor_msgs/CompressedImage")
+    id_ = "ab" * 16
+    setup.robot.binaries[id_] = memoryview(b"pixels")
+    message = large(f'{{"data*":"{id_}"}}', cls="sensor_msgs/CompressedImage")
+    held: list[int] = []
+
+    async def note() -> None:
+        held.append(setup.robot.holdings.bytes)
+
+    setup.robot.converting = note
+    setup.interface.take_large(message)
+    setup.take({"data": b"later"})
+    await asyncio.gather(*setup.robot.work)
+    assert [payload[-6:] for payload in setup.port.sent] == [b"pixels", b"\0later"]
+    assert held[1] - held[0] == len(b"pixels")
+    assert setup.robot.holdings.bytes == 0
+
+
 async def test_a_large_answer_of_the_robot_completes_its_call() -> None:
     setup = Setup("ServiceClientConverter", SERVICE)
     call = asyncio.ensure_future(setup.interface.serve(b"\x01"))
