@@ -125,6 +125,7 @@ class Station:
     def make_app(self) -> web.Application:
         """Build the application."""
         app = web.Application(middlewares=[_problems, self._access.check], client_max_size=MAX_BODY)
+        app.on_response_prepare.append(_set_headers)
         for route in ROUTES:
             app.router.add_route(route.method, PREFIX + route.path, partial(route.handler, self))
         for control_route in control_routes.ROUTES:
@@ -171,12 +172,12 @@ class Station:
     async def page(self, request: web.Request) -> web.StreamResponse:
         """Return the page."""
         del request
-        return web.FileResponse(STATIC / "index.html", headers={hdrs.CACHE_CONTROL: "no-cache"})
+        return web.FileResponse(STATIC / "index.html")
 
     async def login_page(self, request: web.Request) -> web.StreamResponse:
         """Return the login page."""
         del request
-        return web.FileResponse(STATIC / "login.html", headers={hdrs.CACHE_CONTROL: "no-cache"})
+        return web.FileResponse(STATIC / "login.html")
 
     @ROUTES.route(
         "POST",
@@ -367,6 +368,18 @@ async def _problems(request: web.Request, handler: Handler) -> web.StreamRespons
     except web.HTTPException as error:
         kept = {"Allow": error.headers["Allow"]} if "Allow" in error.headers else None
         return problem(error.status, error.reason, kept)
+
+
+async def _set_headers(request: web.Request, response: web.StreamResponse) -> None:
+    """Have browsers ask whether pages and scripts have changed, and show them in no other site's frame.
+
+    Scripts of another release would not fit the page, and clicks on a hidden frame would control robots.
+    """
+    if not request.path.startswith(PREFIX):
+        response.headers.setdefault(hdrs.CACHE_CONTROL, "no-cache")
+    response.headers["Content-Security-Policy"] = "frame-ancestors 'none'"
+    response.headers["X-Frame-Options"] = "DENY"
+    response.headers["X-Content-Type-Options"] = "nosniff"
 
 
 def _reply(model: BaseModel) -> web.Response:

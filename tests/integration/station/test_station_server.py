@@ -249,3 +249,17 @@ async def test_the_document_describes_every_route(running: RunningStation) -> No
         "/api/v1/webhooks",
     }
     assert "GoalRequest" in document["components"]["schemas"]
+
+
+async def test_pages_are_asked_for_again_and_never_framed(running: RunningStation) -> None:
+    await running.start()
+    for path in ("/", "/login", "/static/main.js", "/api/v1/fleet", "/nowhere"):
+        async with running.client.get(path) as reply:
+            assert reply.headers["X-Frame-Options"] == "DENY"
+            assert "frame-ancestors 'none'" in reply.headers["Content-Security-Policy"]
+            if reply.status == 200 and not path.startswith("/api"):
+                assert reply.headers["Cache-Control"] == "no-cache"
+    async with running.client.get("/static/main.js") as reply:
+        mark = {"If-None-Match": reply.headers["ETag"]}
+    async with running.client.get("/static/main.js", headers=mark) as reply:
+        assert reply.status == 304
