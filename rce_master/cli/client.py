@@ -39,6 +39,8 @@ IDEMPOTENCY_KEY = "Idempotency-Key"
 PAGE_ITEMS = 1000
 _OK = 400
 _REDIRECTS = 300, 400
+_NOT_NOW = (HTTPStatus.BAD_GATEWAY, HTTPStatus.SERVICE_UNAVAILABLE)
+"""Statuses of a master that has no leader just now."""
 _CLOSE = aiohttp.ClientWSTimeout(ws_close=5.0)
 
 
@@ -250,10 +252,14 @@ class ApiClient:
                     reached, last = True, event.id
                     yield event
                 reached = True
-            except (aiohttp.ClientError, TimeoutError) as error:
+            except (aiohttp.ClientError, TimeoutError, ApiError) as error:
+                if isinstance(error, ApiError) and error.status not in _NOT_NOW:
+                    raise
                 self._masters.failed(url)
                 untried -= 1
                 if not reached and last is None and untried <= 0:
+                    if isinstance(error, ApiError):
+                        raise
                     raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
             await asyncio.sleep(RETRY_S)
 
@@ -274,7 +280,7 @@ def _is_undecided(reply: aiohttp.ClientResponse) -> bool:
     """Return whether an answer leaves open if a request was done that was sent before."""
     status = reply.status
     is_under_way = status == HTTPStatus.CONFLICT and "Retry-After" in reply.headers
-    return is_under_way or status in (HTTPStatus.BAD_GATEWAY, HTTPStatus.SERVICE_UNAVAILABLE)
+    return is_under_way or status in _NOT_NOW
 
 
 def _words(error: Exception) -> str:
