@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from websockets.frames import CloseCode
+
 from rce.tls.websocket import TlsClientConnection
 
 if TYPE_CHECKING:
@@ -28,6 +30,15 @@ class EngineSocket(TlsClientConnection):
         """Take note of the data."""
         self.heard = True
         super().data_received(data)
+
+    async def close(self, code: CloseCode | int = CloseCode.NORMAL_CLOSURE, reason: str = "") -> None:
+        """Close the connection; return when it has ended, after the close timeout at the latest."""
+        # The library's time limit does not include the wait until the engine takes data.
+        deadline = self.loop.call_later(self.close_timeout or 0.0, self.transport.abort)
+        try:
+            await super().close(code, reason)
+        finally:
+            deadline.cancel()
 
     async def send_frames(self, frames: Sequence[Frame]) -> None:
         """Send the frames of a message, and wait until the socket's buffer has room again.
