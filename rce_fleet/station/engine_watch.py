@@ -103,6 +103,8 @@ class EngineWatch:
             except aiohttp.ClientResponseError as error:
                 if error.status == HTTPStatus.UNAUTHORIZED:
                     self._token = ""
+                if error.status >= HTTPStatus.INTERNAL_SERVER_ERROR:  # another one may have the lead
+                    self._masters.failed(master)
                 state = {"error": f"the master answered {error.status}: {error.message}"}
             except (aiohttp.ClientError, TimeoutError) as error:
                 self._masters.failed(master)

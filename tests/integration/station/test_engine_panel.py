@@ -101,6 +101,18 @@ async def test_of_several_masters_one_that_answers_is_watched() -> None:
     assert (await watched(before="http://127.0.0.1:1/"))["containers"]
 
 
+async def test_a_master_that_cannot_answer_is_left_for_another() -> None:
+    """One that is cut off from the others answers 503 for as long as that lasts."""
+
+    async def answer(_: web.Request) -> web.Response:
+        return web.json_response({"error": "no master leads"}, status=503)
+
+    app = web.Application()
+    app.router.add_route("*", "/api/v1/{name}", answer)
+    async with TestServer(app) as cut_off:
+        assert (await watched(before=str(cut_off.make_url("/"))))["containers"]
+
+
 @pytest.mark.needs("chromium")
 async def test_the_page_shows_bars_and_advice() -> None:
     from playwright.async_api import async_playwright
