@@ -40,11 +40,6 @@ def size_of(folder: Path) -> int:
     return sum(found.st_size for found in stats_below(folder) if not stat.S_ISDIR(found.st_mode))
 
 
-def room_of(folder: Path) -> int:
-    """Return how many bytes on disk the files and folders in a folder take; follows no links below it."""
-    return sum(found.st_blocks * 512 for found in stats_below(folder))
-
-
 def remove(folder: Path) -> None:
     """Remove a folder with its contents, as far as possible; may be repeated."""
     try:

@@ -278,6 +278,8 @@ class Incarnation:
         try:
             async with asyncio.timeout(self._context.settings.start_timeout) as self._deadline:
                 await self._launch()
+                if self._context.volumes.claims(self.incarnation_id):
+                    await asyncio.to_thread(self._context.volumes.check_room, self.incarnation_id)
                 self._channel = await connect(str(self.folder.control_socket))
                 self._open_handover(self._channel)
                 if self._stopping:

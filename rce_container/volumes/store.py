@@ -16,8 +16,7 @@ from typing import NamedTuple
 from rce.control import VolumePlacement
 from rce.model import Volume, about
 from rce_container.exceptions import VolumeError
-from rce_container.files import room_of
-from rce_container.volumes import images
+from rce_container.volumes import images, measuring
 from rce_container.volumes.places import SETTLE_S, VolumePlaces
 
 
@@ -68,6 +67,8 @@ class VolumeStore:
         self._doomed: set[str] = set()
         """Volumes to be removed when their container has ended."""
         self.used: dict[str, int] = {}
+        self._faults: dict[str, str] = {}
+        """Why a folder holds more than was measured, by ``user/name``."""
 
     # Claims
 
@@ -87,8 +88,8 @@ class VolumeStore:
             placements: Which files it is to have; none from a master of an earlier release.
 
         Raises:
-            VolumeError: One belongs to a container that has not ended yet, is too full, or cannot be used;
-                or this machine has not the files that count.
+            VolumeError: One belongs to a container that has not ended yet, or cannot be used; or this machine
+                has not the files that count.
         """
         numbers = {placement.name: placement for placement in placements}
         claims, mounts = [], []
@@ -202,11 +203,15 @@ class VolumeStore:
 
     def replace(self, id_: str, new: Path, placement: int) -> None:
         """Put a filled volume in the place of a former one (:meth:`VolumePlaces.replace`). Blocks."""
-        self.used.pop(id_, None)
+        self._forget(id_)
         self.places.replace(id_, new, placement)
 
-    def _discard(self, id_: str) -> bool:
+    def _forget(self, id_: str) -> None:
         self.used.pop(id_, None)
+        self._faults.pop(id_, None)
+
+    def _discard(self, id_: str) -> bool:
+        self._forget(id_)
         return self.places.discard(id_)
 
     # Measuring
@@ -224,19 +229,40 @@ class VolumeStore:
         for incarnation_id, claims in self._claims.items():
             for claim in claims:
                 self._measure(claim.id, pids.get(incarnation_id, 0), claim.path)
-                used = self.used.get(claim.id, 0)
-                if claim.size and used > claim.size and self.places.folder(claim.id).is_dir():
-                    over.append((incarnation_id, _too_full(claim.id, used, claim.size)))
+                if text := self._excess(claim):
+                    over.append((incarnation_id, text))
         for id_ in self.places.existing():
             if id_ not in self.used:
                 self._measure(id_, 0, "")
         return over
 
+    def check_room(self, incarnation_id: str) -> None:
+        """Measure the volumes of a container again that held too much when they were last measured. Blocks.
+
+        Others are measured while it runs: that takes long in a folder with many files.
+
+        Raises:
+            VolumeError: One holds too much.
+        """
+        for claim in self.claims(incarnation_id):
+            if self._excess(claim):
+                self._measure(claim.id, 0, "")
+                if text := self._excess(claim):
+                    raise VolumeError(text)
+
+    def _excess(self, claim: Claim) -> str:
+        """Return what to tell the user of a folder that held too much when it was measured; else nothing."""
+        if not claim.size or not self.places.folder(claim.id).is_dir():
+            return ""
+        used, fault = self.used.get(claim.id, 0), self._faults.get(claim.id, "")
+        return _too_full(claim.id, used, claim.size, fault) if fault or used > claim.size else ""
+
     def _measure(self, id_: str, pid: int, path: str) -> None:
         place, image = self.places.folder(id_), self.places.image(id_)
         with contextlib.suppress(OSError, VolumeError):  # it was removed, or its container ended just now
             if place.is_dir():
-                self.used[id_] = room_of(place)
+                self.used[id_], fault = measuring.measure(place)
+                self._faults[id_] = fault
             elif pid:
                 found = os.statvfs(f"/proc/{pid}/root{path}")
                 if found.f_blocks * found.f_frsize <= image.stat().st_size:  # else it is not mounted yet
@@ -251,10 +277,6 @@ class VolumeStore:
             raise VolumeError(f"the former volume {volume.name!r} is still being removed")
         if self._holder(id_) is not None:
             raise VolumeError(f"volume {volume.name!r} belongs to a container that has not ended yet")
-        if self.places.folder(id_).is_dir():
-            self.used[id_] = room_of(self.places.folder(id_))
-            if self.used[id_] > volume.size:
-                raise VolumeError(_too_full(id_, self.used[id_], volume.size))
 
     def _mount_of(self, id_: str, volume: Volume) -> VolumeMount:
         place, image = self.places.folder(id_), self.places.image(id_)
@@ -285,8 +307,13 @@ def _claim_of(id_: str, volume: Volume, placement: VolumePlacement | None) -> Cl
     return Claim(id_, volume.path, volume.size, volume.snapshots, number)
 
 
-def _too_full(id_: str, used: int, size: int) -> str:
+def _too_full(id_: str, used: int, size: int, fault: str) -> str:
     name = id_.partition("/")[2]
+    if fault:
+        return (
+            f"volume {name!r} may hold {about(size)}, and what it holds cannot be measured: {fault}; remove "
+            f"the volume (rce volume remove {name})"
+        )
     return (
         f"volume {name!r} holds {about(used)} and may hold {about(size)}; create the container with a larger "
         f"size for it, or remove the volume (rce volume remove {name})"

@@ -62,7 +62,7 @@ class _Access(Descent):
         try:
             fd = os.open(name, _READ, dir_fd=folder)
         except PermissionError:
-            fd, mode = _open_forbidden(folder, name, _READ)
+            fd, mode = open_forbidden(folder, name, _READ)
             os.fchmod(fd, mode)
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             os.close(fd)
@@ -76,7 +76,7 @@ class _Access(Descent):
                 return super()._enter(above, name)
             except PermissionError:
                 pass
-        fd, mode = _open_forbidden(above, name, FOLDER)
+        fd, mode = open_forbidden(above, name, FOLDER)
         self._modes[fd] = mode
         return fd
 
@@ -88,7 +88,7 @@ class _Access(Descent):
         super()._leave(folder)
 
 
-def _open_forbidden(folder: int, name: bytes, flags: int) -> tuple[int, int]:
+def open_forbidden(folder: int, name: bytes, flags: int) -> tuple[int, int]:
     """Allow the owner everything with a file or a folder, and open it.
 
     Returns:
