@@ -17,6 +17,7 @@ from rce_container.exceptions import NetworkError
 from rce_container.folder import Record
 from rce_container.network.addresses import choose, hosts_text
 from rce_container.network.namespaces import configure, make_namespace, open_namespace
+from rce_container.packages.disk import in_thread
 
 _log = logging.getLogger(__name__)
 
@@ -84,7 +85,8 @@ class Networks:
             switch, inside = make_namespace(), make_namespace()
             stack.callback(os.close, switch)
             stack.callback(os.close, inside)
-            _plug_in(switch, inside, "probe", IPv4Interface("10.77.0.1/24"), bridge=True)
+            _make_bridge(switch)
+            _plug_in(switch, inside, "probe", IPv4Interface("10.77.0.1/24"))
 
     def enroll(
         self, container: EndpointId, group: str, group_ip: str, incarnation_id: str, hosts: Path
@@ -135,6 +137,8 @@ class Networks:
     async def attach(self, incarnation_id: str, pid: int) -> None:
         """Connect an enrolled container to its switch, and add it to all members' ``/etc/hosts``.
 
+        If it is cancelled, what was begun with the switch is done before it ends.
+
         Args:
             incarnation_id: The incarnation of the container.
             pid: A process in its network namespace.
@@ -148,15 +152,11 @@ class Networks:
         group = self._groups[key]
         member = group.members[incarnation_id]
         async with group.lock:
-            bridge = not group.has_bridge
             inside = open_namespace(pid)
             try:
-                await asyncio.to_thread(
-                    _plug_in, group.switch, inside, _port(incarnation_id), member.address, bridge=bridge
-                )
+                await in_thread(_connect, group, inside, _port(incarnation_id), member)
             finally:
                 os.close(inside)
-            group.has_bridge = member.plugged = True
             await asyncio.to_thread(_write_hosts, list(group.members.values()))
 
     async def detach(self, incarnation_id: str) -> None:
@@ -192,10 +192,21 @@ def _port(incarnation_id: str) -> str:
     return f"v{incarnation_id}"
 
 
-def _plug_in(switch: int, inside: int, port: str, address: IPv4Interface, *, bridge: bool) -> None:
-    """Make the veth pair between a container and its switch; with ``bridge``, make the switch first."""
-    if bridge:
-        configure(switch, [f"link add name {_BRIDGE} type bridge mcast_snooping 0", f"link set {_BRIDGE} up"])
+def _connect(group: _Group, inside: int, port: str, member: _Member) -> None:
+    """Connect a member; make the switch first if there is none. Notes each step that is done."""
+    if not group.has_bridge:
+        _make_bridge(group.switch)
+        group.has_bridge = True
+    _plug_in(group.switch, inside, port, member.address)
+    member.plugged = True
+
+
+def _make_bridge(switch: int) -> None:
+    configure(switch, [f"link add name {_BRIDGE} type bridge mcast_snooping 0"])
+
+
+def _plug_in(switch: int, inside: int, port: str, address: IPv4Interface) -> None:
+    """Make the veth pair between a container and its switch."""
     cable = f"link add name {INTERFACE} type veth peer name {port} netns /proc/self/fd/{switch}"
     configure(
         inside,
@@ -208,7 +219,7 @@ def _plug_in(switch: int, inside: int, port: str, address: IPv4Interface, *, bri
         ],
         others=[switch],
     )
-    configure(switch, [f"link set {port} master {_BRIDGE} up"])
+    configure(switch, [f"link set {_BRIDGE} up", f"link set {port} master {_BRIDGE} up"])
 
 
 def _held_by(pid: int) -> int:
