@@ -75,6 +75,7 @@ async def connect_first(addresses: list[Address]) -> socket.socket:
     """Connect to the first of some addresses that answers, as :func:`open_socket` does.
 
     Raises:
+        ConnectionRefusedError: All addresses refuse; the text has the reason of each.
         OSError: No address answers; the text has the reason of each.
     """
     errors: list[OSError] = []
@@ -85,7 +86,10 @@ async def connect_first(addresses: list[Address]) -> socket.socket:
             errors.append(error)
     if len(errors) == 1:
         raise errors[0]
-    raise OSError("; ".join(map(str, errors)) or "no address")
+    text = "; ".join(map(str, errors)) or "no address"
+    if errors and all(isinstance(error, ConnectionRefusedError) for error in errors):
+        raise ConnectionRefusedError(text)
+    raise OSError(text)
 
 
 def set_keepalive(sock: socket.socket, *, idle: int, interval: int, count: int) -> None:

@@ -8,6 +8,8 @@
     |   +-- MalformedDocumentError  a received document, or a value to send, is not valid XML-RPC
     |   +-- RemoteFaultError        the server answered with a fault
     |   +-- RpcUnreachableError     no answer: refused, lost or timed out
+    |       +-- RpcTimeoutError     no answer in time
+    |       +-- RpcRefusedError     no program listens at the server's address
     +-- MasterError
     |   +-- MasterUnreachableError  the master gave no answer
     |   +-- MasterRefusedError      the master answered with a status other than success
@@ -79,6 +81,10 @@ class RpcUnreachableError(XmlRpcError):
 
 class RpcTimeoutError(RpcUnreachableError):
     """A server did not answer in time: it may be slow, stopped, or gone without a word."""
+
+
+class RpcRefusedError(RpcUnreachableError):
+    """The host of a server refused the connection: no program listens at that address any longer."""
 
 
 class MasterError(RosError):

@@ -10,7 +10,7 @@ from typing import Any
 from rce.aio.backoff import Backoff
 from rce.aio.tasks import TaskScope
 from rce.ros.core.events import Call
-from rce.ros.errors import RpcTimeoutError, RpcUnreachableError, XmlRpcError
+from rce.ros.errors import RpcRefusedError, RpcUnreachableError, XmlRpcError
 from rce.ros.xmlrpc import RpcClient
 from rce.ros.xmlrpc.codec import encode_call
 from rce.ros.xmlrpc.dispatch import ERROR
@@ -21,7 +21,7 @@ CALL_TIMEOUT = 5.0
 """Seconds that a node may take to answer one call."""
 
 RETRY = Backoff(first=0.5, longest=15.0, jitter=0.5)
-"""Seconds until a call is repeated that a node did not answer in time."""
+"""Seconds until a call is repeated that a node did not answer."""
 
 MAX_REPEATS = 60
 """A node that answers none of so many calls in a row, for some 15 minutes, is taken to be gone."""
@@ -42,8 +42,8 @@ class Notifier:
     A newer call takes the place of a waiting one with the same key, so a queue is never longer than the
     number of topics and parameters of its node, however slow the node is.
 
-    A call that is not answered in time is repeated: nothing else tells a node that was busy or stopped of a
-    publisher that came meanwhile.
+    A call that is not answered is repeated: nothing else tells a node that was busy, stopped or out of reach
+    for a moment of a publisher that came meanwhile. Only a refused connection shows that the node is gone.
     """
 
     def __init__(
@@ -110,15 +110,15 @@ class Notifier:
         try:
             document = self._written(call)
             answer = await self._client.send(call.uri, call.method, document, timeout=CALL_TIMEOUT)
-        except RpcTimeoutError as error:
+        except RpcRefusedError as error:
+            _log.info("%s is not delivered: %s", call.method, error)
+            queue.clear()  # the node is gone; a new node at this address registers and learns the state again
+        except RpcUnreachableError as error:
             if call.method == SHUTDOWN:
                 _log.info("%s is not delivered: %s", call.method, error)
                 return True
             _log.info("%s is repeated: %s", call.method, error)
             return False
-        except RpcUnreachableError as error:
-            _log.info("%s is not delivered: %s", call.method, error)
-            queue.clear()  # the node is gone; a new node at this address registers and learns the state again
         except XmlRpcError as error:
             _log.warning("%s to %s: %s", call.method, call.uri, error)
         else:

@@ -8,8 +8,15 @@ import logging
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from rce.aio.backoff import Backoff
 from rce.aio.tasks import TaskScope
-from rce.ros.errors import MasterError, ParameterMissingError, RpcTimeoutError, XmlRpcError
+from rce.ros.errors import (
+    MasterError,
+    ParameterMissingError,
+    RpcRefusedError,
+    RpcUnreachableError,
+    XmlRpcError,
+)
 from rce.ros.multimaster.plan import Clash, Registration, RegistrationKind, split_clashes
 from rce.ros.multimaster.source import multicall, multicall_as
 from rce.ros.node import Node
@@ -21,8 +28,10 @@ RECORD = "~registrations"
 """Parameter that records the registrations, so that a successor can remove them after a kill."""
 
 UPDATE_TIMEOUT = 5.0
-UPDATE_ATTEMPTS = 5
-"""So often a remote subscriber that does not answer in time is told of its publishers."""
+UPDATE_ATTEMPTS = 10
+"""How often a remote subscriber that does not answer is told of its publishers."""
+RETRY = Backoff(first=0.5, longest=15.0, jitter=0.5)
+"""Seconds between these attempts."""
 MASTER_CALLER = "/master"
 
 _REGISTER = {
@@ -189,15 +198,19 @@ class Registrar:
         """Send a remote subscriber its publishers, which the master only gave in its answer to this node."""
         arguments = (MASTER_CALLER, entry.name, uris)
         left = UPDATE_ATTEMPTS
+        pauses = RETRY.start()
         while True:
             left -= 1
             try:
                 await self._master.rpc.call(entry.uri, "publisherUpdate", arguments, timeout=UPDATE_TIMEOUT)
             except XmlRpcError as error:
-                if left and isinstance(error, RpcTimeoutError):
-                    continue  # it may be busy
-                _log.warning("%s does not learn of publishers of %s: %s", entry.node, entry.name, error)
-            return
+                is_gone = isinstance(error, RpcRefusedError) or not isinstance(error, RpcUnreachableError)
+                if is_gone or not left:
+                    _log.warning("%s does not learn of publishers of %s: %s", entry.node, entry.name, error)
+                    return
+                await asyncio.sleep(pauses.next())  # it may be busy, or out of reach for a moment
+            else:
+                return
 
     def _tell_once(self, text: str) -> None:
         if text not in self._told:

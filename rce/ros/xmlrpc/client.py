@@ -15,7 +15,7 @@ import h11
 
 from rce.dialing import set_keepalive
 from rce.ros.dialing import open_peer_socket
-from rce.ros.errors import RpcTimeoutError, RpcUnreachableError
+from rce.ros.errors import RpcRefusedError, RpcTimeoutError, RpcUnreachableError
 from rce.ros.xmlrpc.codec import decode_response, encode_call
 
 _log = logging.getLogger(__name__)
@@ -78,7 +78,8 @@ class RpcClient:
             timeout: Seconds for all of it.
 
         Raises:
-            RpcUnreachableError: No answer came, for whatever reason; an RpcTimeoutError if none came in time.
+            RpcUnreachableError: No answer came, for whatever reason; an RpcTimeoutError if none came in time,
+                an RpcRefusedError if the connection was refused.
             RemoteFaultError: The server answered with a fault.
             MalformedDocumentError: An argument cannot be sent or the answer cannot be read.
         """
@@ -94,7 +95,8 @@ class RpcClient:
             timeout: Seconds for all of it.
 
         Raises:
-            RpcUnreachableError: No answer came, for whatever reason; an RpcTimeoutError if none came in time.
+            RpcUnreachableError: No answer came, for whatever reason; an RpcTimeoutError if none came in time,
+                an RpcRefusedError if the connection was refused.
             RemoteFaultError: The server answered with a fault.
             MalformedDocumentError: The answer cannot be read.
         """
@@ -103,6 +105,8 @@ class RpcClient:
                 answer = await self._exchange(uri, document)
         except TimeoutError as error:
             raise RpcTimeoutError(uri, f"{method} took longer than {timeout:g} s") from error
+        except ConnectionRefusedError as error:
+            raise RpcRefusedError(uri, str(error)) from error
         except (OSError, h11.ProtocolError, EOFError, ValueError) as error:
             raise RpcUnreachableError(uri, str(error) or type(error).__name__) from error
         return decode_response(answer)

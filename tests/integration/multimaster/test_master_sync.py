@@ -6,8 +6,16 @@ import asyncio
 
 import pytest
 from support.multimaster import STRING, DiscoveryNetwork, node
+from support.ros_busy_node import answering_second_call
 
+from rce.aio.tasks import TaskScope
+from rce.ros.core import Core
+from rce.ros.multimaster import registrar
 from rce.ros.multimaster.filters import SyncLists
+from rce.ros.multimaster.plan import Registration, RegistrationKind
+from rce.ros.multimaster.registrar import Registrar
+from rce.ros.node.master import MasterClient
+from rce.ros.xmlrpc import RpcClient
 
 
 async def test_a_topic_reaches_the_other_master(network: DiscoveryNetwork) -> None:
@@ -151,3 +159,29 @@ async def test_next_synchronization_cleans_up_after_killed_one(
         assert "/chatter" in b.graph.topic_types
         async with MasterSync(SyncSettings(b.uri)):
             await b.until(lambda graph: "/chatter" not in graph.topic_types)
+
+
+@pytest.mark.parametrize("first", ["is not answered", "loses its connection"])
+async def test_busy_remote_subscriber_is_told_later(first: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own master does not know the publishers of this graph: nothing else tells it of them."""
+    monkeypatch.setattr(registrar, "UPDATE_TIMEOUT", 0.5)
+    calls: asyncio.Queue[bytes] = asyncio.Queue()
+    loses = first == "loses its connection"
+    async with (
+        asyncio.timeout(30),
+        Core(port=0) as core,
+        node("talker", core.uri) as talker,
+        node("sync", core.uri) as sync,
+        answering_second_call(calls, loses=loses) as uri,
+        RpcClient() as rpc,
+        TaskScope() as tasks,
+    ):
+        await talker.advertise("/t", STRING)
+        registrations = Registrar(sync, MasterClient(core.uri, sync.name, sync.uri, rpc), tasks)
+        remote = Registration(RegistrationKind.SUBSCRIBER, "/t", "/busy", uri, STRING)
+        await registrations.hold("http://remote:11311/", {remote}, {})
+        while calls.qsize() < 2:
+            await asyncio.sleep(0.01)
+        told = calls.get_nowait()
+        assert talker.uri.encode() in told
+        assert calls.get_nowait() == told

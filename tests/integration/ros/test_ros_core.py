@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import os
-import re
 import signal
 import socket
 import sys
 from collections.abc import Callable
 
 import pytest
+from support.ros_busy_node import answering_second_call
 from support.ros_nodes import MakeNode
 
 from rce.ros.core import Change, Core, GraphEvent, notifier
@@ -18,7 +18,7 @@ from rce.ros.core.notifier import CALL_TIMEOUT
 from rce.ros.errors import MasterRefusedError, ParameterMissingError, RemoteFaultError
 from rce.ros.node import Node
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
-from rce.ros.xmlrpc.codec import encode_call, encode_response
+from rce.ros.xmlrpc.codec import encode_call
 
 STRING = "std_msgs/String"
 
@@ -107,29 +107,15 @@ async def test_a_dead_node_stalls_nobody(core: Core, make_node: MakeNode) -> Non
             assert core.graph.subscribers("/t") == {"/b": b.uri}
 
 
+@pytest.mark.parametrize("first", ["is not answered", "loses its connection"])
 async def test_a_busy_node_is_told_of_a_publisher_later(
-    core: Core, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
+    core: Core, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch, first: str
 ) -> None:
-    """A node that did not answer in time is called again: else it never hears of the publisher."""
+    """A node that did not answer is called again: else it never hears of the publisher."""
     monkeypatch.setattr(notifier, "CALL_TIMEOUT", 0.5)
     calls: asyncio.Queue[bytes] = asyncio.Queue()
-    answer = encode_response([1, "", 0])
-
-    async def answer_second(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        head = await reader.readuntil(b"\r\n\r\n")
-        length = int(re.findall(rb"(?i)content-length: *(\d+)", head)[0])
-        calls.put_nowait(await reader.readexactly(length))
-        if calls.qsize() > 1:
-            writer.write(
-                b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: %d\r\n\r\n" % len(answer)
-            )
-            writer.write(answer)
-        await reader.read()  # until the core ends the connection
-        writer.close()
-
-    server = await asyncio.start_server(answer_second, "127.0.0.1")
-    async with server, RpcClient() as rpc, make_node("a") as a:
-        uri = f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/"
+    loses = first == "loses its connection"
+    async with answering_second_call(calls, loses=loses) as uri, RpcClient() as rpc, make_node("a") as a:
         await rpc.call(core.uri, "registerSubscriber", ("/busy", "/t", STRING, uri))
         await a.advertise("t", STRING)
         await _until(lambda: calls.qsize() == 2)

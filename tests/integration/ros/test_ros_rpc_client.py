@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections.abc import Callable
 
 import pytest
+from support.ports import free_port
 
+from rce.dialing import connect_first
+from rce.ros.errors import RpcRefusedError
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer, client
 
 
@@ -50,3 +54,15 @@ async def test_burst_leaves_few_idle_connections() -> None:
     async with RpcClient() as rpc, server() as one:
         await asyncio.gather(*(rpc.call(f"http://127.0.0.1:{one.port}/", "get", ("/a",)) for _ in range(40)))
         assert rpc.connections <= client.MAX_IDLE
+
+
+async def test_refused_call_is_told_from_a_lost_one() -> None:
+    async with RpcClient() as rpc:
+        with pytest.raises(RpcRefusedError):
+            await rpc.call(f"http://127.0.0.1:{free_port()}/", "get", ("/a",))
+
+
+async def test_host_of_two_addresses_that_refuse_refuses() -> None:
+    port = free_port()
+    with pytest.raises(ConnectionRefusedError, match="; "):
+        await connect_first([(socket.AF_INET, (f"127.0.0.{host}", port)) for host in (1, 2)])
