@@ -238,12 +238,14 @@ class ActionServer:
                 goal.accept()
             if not goal.state.is_over:
                 work.conclude(goal, await work.call(self._handler, goal))
-        except asyncio.CancelledError:
-            work.give_up(goal, STOPPED)
-            raise
-        except Exception as error:  # noqa: BLE001 - the client gets every failure of the program
+        except (Exception, asyncio.CancelledError) as error:
+            task = asyncio.current_task()
+            if isinstance(error, asyncio.CancelledError) and task is not None and task.cancelling():
+                work.give_up(goal, STOPPED)
+                raise
+            # The client gets every failure; a task that the handler waited for may have been cancelled too.
             _log.exception("the handler of %s failed on goal %s", self.name, goal.id)
-            work.give_up(goal, f"{type(error).__name__}: {error}")
+            work.give_up(goal, f"{type(error).__name__}: {error}".removesuffix(": "))
         finally:
             self._goals.pop(goal.id, None)
             following = self._policy.ended(goal.id)

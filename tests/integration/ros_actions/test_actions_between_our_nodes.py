@@ -222,6 +222,26 @@ async def test_waiting_goals_are_replaced_and_recalled(make_node: MakeNode) -> N
         assert list((await fourth.result()).sequence) == [4]
 
 
+async def test_waiting_goal_starts_after_a_stray_cancellation(make_node: MakeNode) -> None:
+    """The handler waits for a task of its own that is cancelled; the server is not."""
+
+    async def waits_for_cancelled_task(goal: ServerGoal) -> dict[str, Any]:
+        if goal.request.order == 1:
+            helper = asyncio.ensure_future(asyncio.sleep(60))
+            await goal.wait_for_cancel()
+            helper.cancel()
+            await helper
+        return {"sequence": [goal.request.order]}
+
+    async with pair(make_node, waits_for_cancelled_task, server=SimpleActionServer) as (_, client):
+        first = await client.send(order=1)
+        second = await client.send(order=2)
+        async with asyncio.timeout(20):
+            assert list((await second.result()).sequence) == [2]
+            with pytest.raises(GoalFailedError, match="CancelledError"):
+                await first.result()
+
+
 async def test_a_server_that_stops_aborts_its_goals(make_node: MakeNode) -> None:
     async with make_node("client") as b, ActionClient(b, "job", FIBONACCI) as client:
         async with make_node("server") as a, SimpleActionServer(a, "job", FIBONACCI, until_cancelled):
