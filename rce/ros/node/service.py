@@ -151,26 +151,17 @@ class Session:
         """Do nothing: a session begins when the header came."""
 
     def frame_received(self, connection: Connection, payload: bytes) -> None:
-        """Handle a request, or keep it until those before it have been answered."""
-        if self._busy:
-            self._waiting.append(payload)
+        """Handle a request, or keep it until those before it are answered and the client reads."""
+        self._waiting.append(payload)
+        self._handle_waiting()
+        if self._waiting:
             connection.pause_reading()
-            return
-        answer = self._service.answer(payload)
-        if isinstance(answer, tuple):
-            self._reply(answer)
-        else:
-            self._busy = True
-            self._service.in_background(answer, self)
 
     async def finish(self, work: Awaitable[Chunks]) -> None:
         """Answer a request that takes time, and the requests that came meanwhile."""
         self._reply(await work)
-        while self._waiting:
-            answer = self._service.answer(self._waiting.popleft())
-            self._reply(answer if isinstance(answer, tuple) else await answer)
         self._busy = False
-        self.connection.resume_reading()
+        self._continue()
 
     def connection_lost(self, connection: Connection, error: Exception | None) -> None:
         """Forget the client; the handling of its requests continues to the end."""
@@ -179,7 +170,24 @@ class Session:
         self._service.drop(self)
 
     def writable(self, connection: Connection) -> None:
-        """Do nothing: an answer is written as a whole."""
+        """Handle the requests that came while the client did not read its answers."""
+        del connection  # its own
+        self._continue()
+
+    def _continue(self) -> None:
+        self._handle_waiting()
+        if not self._waiting:
+            self.connection.resume_reading()
+
+    def _handle_waiting(self) -> None:
+        connection = self.connection
+        while self._waiting and not self._busy and not connection.full and connection.is_open:
+            answer = self._service.answer(self._waiting.popleft())
+            if isinstance(answer, tuple):
+                self._reply(answer)
+            else:
+                self._busy = True
+                self._service.in_background(answer, self)
 
     def _reply(self, chunks: Chunks) -> None:
         self.connection.write(chunks)

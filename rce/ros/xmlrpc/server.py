@@ -79,6 +79,7 @@ class _Connection(asyncio.Protocol):
         self._size = 0
         self._transport: asyncio.Transport | None = None
         self._deadline: asyncio.TimerHandle | None = None
+        self._full = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)  # uvloop's only behave like one
@@ -99,12 +100,20 @@ class _Connection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         if self._deadline is None:
             self._deadline = asyncio.get_running_loop().call_later(REQUEST_TIMEOUT, self.close)
-        try:
-            self._http.receive_data(data)
-            while not self._is_closing() and self._next_event():
-                pass
-        except h11.RemoteProtocolError as error:
-            self._refuse(error.error_status_hint, str(error))
+        self._handle_events(data)
+
+    def pause_writing(self) -> None:
+        """Take no more requests: the client does not read its answers."""
+        self._full = True
+        if self._transport is not None and not self._is_closing():
+            self._transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        """Answer the requests that were read already, then take more."""
+        self._full = False
+        self._handle_events(b"")
+        if self._transport is not None and not self._full and not self._is_closing():
+            self._transport.resume_reading()
 
     def eof_received(self) -> None:
         """Close at once: a client that ends its side has got all its answers."""
@@ -118,6 +127,15 @@ class _Connection(asyncio.Protocol):
         """Close now."""
         if self._transport is not None:
             self._transport.abort()
+
+    def _handle_events(self, data: bytes) -> None:
+        try:
+            if data:  # h11 takes b"" for the end of the stream
+                self._http.receive_data(data)
+            while not self._full and not self._is_closing() and self._next_event():
+                pass
+        except h11.RemoteProtocolError as error:
+            self._refuse(error.error_status_hint, str(error))
 
     def _next_event(self) -> bool:
         """Handle one event; return whether there may be more."""
