@@ -367,6 +367,38 @@ async def test_a_broken_link_takes_back_and_comes_back() -> None:
                         break
 
 
+async def test_replaced_publisher_and_provider_bring_their_type() -> None:
+    """A rebuilt node takes the place of the former one between two looks at the graph."""
+    async with (
+        linked() as (cloud, robot, _, _),
+        node("base", robot.uri) as base,
+        node("rebuilt", robot.uri) as rebuilt,
+        node("planner", cloud.uri) as planner,
+        asyncio.timeout(60),
+    ):
+        said = await base.advertise("said", STRING)
+        did = await base.advertise_service("do", "std_srvs/Empty", lambda _: None)
+        await cloud.wait_until(partial(_has_all, {"/said"}, "/do"))
+        number = await rebuilt.advertise("said", "std_msgs/Int32")
+        await rebuilt.advertise_service("do", "std_srvs/SetBool", lambda _: {"success": True})
+        await said.close()
+        await did.close()
+        assert robot.graph.publishers("/said") == {"/rebuilt": rebuilt.uri}
+        assert robot.graph.service("/do") == rebuilt.service_uri
+        heard = await planner.subscribe("said", "std_msgs/Int32")
+        assert (await published_until_heard(number, heard, data=7)).data == 7
+        while True:
+            try:
+                answer = await planner.service_client("do", "std_srvs/SetBool").call(
+                    {"data": True}, timeout=9
+                )
+            except ServiceError:
+                await asyncio.sleep(0.05)
+            else:
+                break
+        assert answer.success
+
+
 async def test_own_stale_registration_does_not_stop_a_service() -> None:
     """A registration whose caller gave up may have reached the master all the same."""
     async with linked() as (cloud, robot, one, _), node("base", robot.uri) as base:
@@ -375,9 +407,10 @@ async def test_own_stale_registration_does_not_stop_a_service() -> None:
         await master.register_service("/clear", relay.service_uri)
         await base.advertise_service("clear", "roscpp/Empty", lambda _: None)
         async with node("planner", cloud.uri) as planner, asyncio.timeout(30):
+            client = planner.service_client("clear", "roscpp/Empty")
             while True:
                 try:
-                    await planner.service_client("clear", "roscpp/Empty").call({}, timeout=20)
+                    await client.call({}, timeout=20)
                 except ServiceError:
                     await asyncio.sleep(0.05)
                 else:

@@ -6,7 +6,8 @@ import asyncio
 import itertools
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from rce.aio.tasks import TaskScope, finish
 from rce.ros.closing import release_all
@@ -30,6 +31,21 @@ MAX_CALLS = 256
 
 Rename = Callable[[str], str | None]
 """Turns a name of this graph into the one to offer; None: not offered."""
+
+
+K = TypeVar("K", TopicKind, ServiceKind)
+
+
+@dataclass(frozen=True, slots=True)
+class _Offered(Generic[K]):
+    """A topic or service that is offered."""
+
+    number: int
+    kind: K
+    origins: frozenset[str]
+    """The URIs of the publishers, or of the provider, when the type was learned."""
+    type_name: str = ""
+    """A topic's type as the master named it then."""
 
 
 class Exporter:
@@ -66,8 +82,8 @@ class Exporter:
         self._rename = rename
         self._foreign = foreign
         self._source = RpcSource(master)
-        self._topics: dict[str, tuple[int, TopicKind]] = {}
-        self._services: dict[str, tuple[int, ServiceKind]] = {}
+        self._topics: dict[str, _Offered[TopicKind]] = {}
+        self._services: dict[str, _Offered[ServiceKind]] = {}
         self._names: dict[int, str] = {}
         self._offered = Offer()
         self._next = 0
@@ -122,8 +138,8 @@ class Exporter:
         await self._update_topics(snapshot, foreign)
         await self._update_services(snapshot, foreign)
         offer = Offer(
-            {key: (self._offered_name(name), kind) for name, (key, kind) in self._topics.items()},
-            {key: (self._offered_name(name), kind) for name, (key, kind) in self._services.items()},
+            {one.number: (self._offered_name(name), one.kind) for name, one in self._topics.items()},
+            {one.number: (self._offered_name(name), one.kind) for name, one in self._services.items()},
         )
         if offer != self._offered:
             self._offered = offer
@@ -144,13 +160,17 @@ class Exporter:
             if uris:
                 found[topic] = uris
         self._forget(self._topics, found)
-        for topic in found.keys() - self._topics.keys():
+        for topic, uris in found.items():
+            known, type_name = self._topics.get(topic), snapshot.topic_types.get(topic, "")
+            if known is not None and known.origins <= set(uris) and known.type_name == type_name:
+                continue
             try:
-                learned = await learn_topic(self._master.rpc, self._node.name, topic, found[topic])
+                learned = await learn_topic(self._master.rpc, self._node.name, topic, uris)
             except NothingToRelayError as error:
                 _log.debug("%s", error)
                 continue
-            self._topics[topic] = (self._number(topic), learned)
+            number = self._number(topic, learned, known)
+            self._topics[topic] = _Offered(number, learned, frozenset(uris), type_name)
 
     async def _update_services(self, snapshot: Snapshot, foreign: set[str]) -> None:
         found: dict[str, str] = {}
@@ -161,21 +181,32 @@ class Exporter:
             if all(self._chosen.takes_service(node, name) for node in nodes):
                 found[service] = address
         self._forget(self._services, found)
-        for service in found.keys() - self._services.keys():
+        for service, address in found.items():
+            known = self._services.get(service)
+            if known is not None and address in known.origins:
+                continue
             try:
-                learned = await learn_service(self._node.name, service, found[service])
+                learned = await learn_service(self._node.name, service, address)
             except NothingToRelayError as error:
                 _log.debug("%s", error)
                 continue
-            self._services[service] = (self._number(service), learned)
+            number = self._number(service, learned, known)
+            self._services[service] = _Offered(number, learned, frozenset((address,)))
 
-    def _forget(self, known: dict[str, Any], found: Mapping[str, object]) -> None:
+    def _forget(self, known: dict[str, _Offered[K]], found: Mapping[str, object]) -> None:
         for name in known.keys() - found.keys():
-            number, _ = known.pop(name)
-            del self._names[number]
-            self._changed.set()
+            self._void(known.pop(name).number)
 
-    def _number(self, name: str) -> int:
+    def _void(self, number: int) -> None:
+        del self._names[number]
+        self._changed.set()
+
+    def _number(self, name: str, kind: K, known: _Offered[K] | None) -> int:
+        """Return the number to offer a name under: the known one, unless the type is another one now."""
+        if known is not None:
+            if known.kind == kind:
+                return known.number
+            self._void(known.number)
         self._next += 1
         self._names[self._next] = name
         return self._next
@@ -192,7 +223,7 @@ class Exporter:
             self._senders.pop(number).end()
         for number in self._clients.keys() - self._names.keys():
             await self._clients.pop(number).close()
-        kinds = {number: (topic, kind) for topic, (number, kind) in self._topics.items()}
+        kinds = {one.number: (topic, one.kind) for topic, one in self._topics.items()}
         for number in (self._wanted & kinds.keys()) - self._subscribers.keys():
             topic, kind = kinds[number]
             sender = _TopicSender(number, self._source_numbers, self._send)
@@ -215,9 +246,9 @@ class Exporter:
     def _client(self, number: int) -> ServiceClient:
         client = self._clients.get(number)
         if client is None:
-            for service, (key, kind) in self._services.items():
-                if key == number:
-                    client = self._clients[number] = self._node.service_client(service, kind.as_type())
+            for service, one in self._services.items():
+                if one.number == number:
+                    client = self._clients[number] = self._node.service_client(service, one.kind.as_type())
                     break
             else:
                 raise NothingToRelayError("the service is not offered any longer")
