@@ -144,6 +144,11 @@ class Incarnation:
         """What the environment reported last; None if it has not."""
         return self._observed.whole
 
+    @property
+    def is_running(self) -> bool:
+        """Whether its environment has reported, so that its volumes are mounted, and is not to end."""
+        return self._channel is not None and self.reported.is_set() and not self._stopping
+
     def apply(self, spec: EndpointSpec) -> None:
         """Give the environment its desired state."""
         self._desired = DesiredState(spec)
@@ -194,7 +199,7 @@ class Incarnation:
         Raises:
             ExecutionError: The environment cannot do it.
         """
-        if self._channel is None or self._stopping or not self.reported.is_set():
+        if self._channel is None or not self.is_running:
             raise ExecutionError("the container is not running")
         if EXEC not in self._features:
             raise ExecutionError(
@@ -208,7 +213,7 @@ class Incarnation:
         Returns:
             Why it is not saved; empty if the snapshot is acknowledged.
         """
-        if self._channel is None or self._stopping or not self.reported.is_set():
+        if self._channel is None or not self.is_running:
             return "its container is not running"
         if NODE_STATES not in self._features:
             return "its container was started by an earlier release, which saves no states"

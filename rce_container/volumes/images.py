@@ -107,6 +107,15 @@ def is_attached(image: Path) -> bool:
     return False
 
 
+def is_on(image: Path, device: int) -> bool:
+    """Whether a device, as in ``st_dev``, is the loop device of an image."""
+    file = Path(f"/sys/dev/block/{os.major(device)}:{os.minor(device)}/loop/backing_file")
+    try:
+        return file.read_text().strip() == str(image.resolve())
+    except OSError:  # it is no loop device
+        return False
+
+
 def used(image: Path) -> int:
     """Return how many bytes the files of an image that is not mounted take.
 

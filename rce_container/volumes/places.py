@@ -119,9 +119,13 @@ class VolumePlaces:
         try:
             if self.folder(id_).is_dir():
                 return os.open(self.folder(id_), _FOLDER)
-            return open_inside(pid, path)
+            root = open_inside(pid, path)
         except OSError as error:
             raise VolumeError(f"its files cannot be read: {error}") from error
+        if not images.is_on(self.image(id_), os.fstat(root).st_dev):  # the empty folder below the mount
+            os.close(root)
+            raise VolumeError("its file system is not mounted in its container")
+        return root
 
     def make_scratch(self) -> Path:
         """Make a folder for a copy of a volume. Blocks.

@@ -51,7 +51,11 @@ _LOOK_S = 0.5
 
 
 class Subject(Protocol):
-    """A running container, as far as its volumes are concerned."""
+    """A container, as far as its volumes are concerned."""
+
+    @property
+    def is_running(self) -> bool:
+        """Whether its environment has reported and is not to end; before, its volumes may not be mounted."""
 
     @property
     def handle(self) -> Handle:
@@ -272,13 +276,14 @@ class SnapshotKeeper:
         """Take the snapshots that volumes ask for, until cancelled.
 
         Args:
-            subjects: The running containers, by incarnation.
+            subjects: The containers, by incarnation; the time of those that start or end does not count.
         """
         while True:
             await asyncio.sleep(_LOOK_S)
             asked = {
                 (incarnation_id, claim.id): claim
-                for incarnation_id in subjects
+                for incarnation_id, subject in subjects.items()
+                if subject.is_running
                 for claim in self._store.claims(incarnation_id)
                 if claim.snapshots
             }
@@ -288,7 +293,9 @@ class SnapshotKeeper:
                 await asyncio.to_thread(_remove, self._copies.pop(key))
             for key, claim in asked.items():
                 subject = subjects.get(key[0])
-                if subject is not None and self._due[key] <= now and self.is_wanted:
+                if subject is None or not subject.is_running:  # it has ended since
+                    continue
+                if self._due[key] <= now and self.is_wanted:
                     self._due[key] = now + claim.snapshots
                     await self._take(key, subject, claim)
 
@@ -305,6 +312,9 @@ class SnapshotKeeper:
             finally:
                 os.close(root)
         except (SnapshotError, VolumeError, OSError) as error:
+            if not subject.is_running:
+                _log.info("volume %s: its container ended before its snapshot was complete", claim.id)
+                return
             _log.warning("there is no snapshot of volume %s: %s", claim.id, error)
             saved = _with(saved, error=str(error))
         self._send(saved)
@@ -323,6 +333,8 @@ class SnapshotKeeper:
             with frozen(subject.pids):
                 began = time.perf_counter()
                 copied = tree.copy(root, target)
+                if not subject.is_running:  # what came after it may have written meanwhile
+                    raise SnapshotError("its container ended while it was copied")
                 pause = time.perf_counter() - began
             tree.finish_copy(copied, target)
             return pause

@@ -18,6 +18,7 @@ from rce.control.model import EndpointState
 from rce.model import MEGABYTE, NodeSpec, Resources, Volume
 from rce_container.exceptions import VolumeError
 from rce_container.volumes import images
+from rce_container.volumes.places import VolumePlaces
 from rce_container.volumes.store import VolumeStore
 
 BOX, OTHER = "user/box", "user/other"
@@ -193,6 +194,19 @@ async def test_a_volume_may_not_hide_the_engine(sandbox: Machine) -> None:
         hidden = str(machine.packages)
         await machine.put(BOX, nodes=(own("keep.py"),), resources=resources(path=hidden))
         await until(lambda: any(f"would hide {hidden}" in text for text in machine.faults), what="a refusal")
+
+
+@IMAGES
+def test_a_volume_that_is_not_mounted_is_not_opened(tmp_path: Path) -> None:
+    """An empty folder is in its place, which is not what the volume holds."""
+    places = VolumePlaces(tmp_path / "volumes", images=True)
+    image = places.image("user/journal")
+    places.make_folder(image.parent)
+    images.make(image, SIZE)
+    place = tmp_path / "place"
+    place.mkdir()
+    with pytest.raises(VolumeError, match="is not mounted in its container"):
+        places.open_running("user/journal", os.getpid(), str(place))
 
 
 @IMAGES

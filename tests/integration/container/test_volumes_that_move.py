@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -24,6 +25,7 @@ from rce.control.messages import (
     Welcome,
 )
 from rce.control.model import VolumePlacement
+from rce.control.snapshots import decode_manifest
 from rce.control_channel.contents import ContentClient
 from rce.control_channel.dialing import Dialer
 from rce.control_channel.peer import Peer
@@ -32,6 +34,7 @@ from rce.control_channel.uploads import Uploader
 from rce.masters import Masters
 from rce.model import MEGABYTE, NodeSpec, Resources, Volume
 from rce_container.volumes import images
+from rce_container.volumes.store import VolumeStore
 from rce_master.packages.contents import ContentStore
 from rce_master.snapshots.service import SNAPSHOT, SnapshotService
 from rce_master.state.records import UserVolume
@@ -231,6 +234,35 @@ async def check_snapshots(a: Machine, b: Machine, folder: Path) -> None:
         await a.drop(BOX)
         scratch = files(a).parents[1] / ".scratch"
         await until(lambda: not list(scratch.iterdir()), what="the copy is removed with its container")
+
+
+@pytest.mark.needs("bwrap")
+@IMAGES
+async def test_a_container_that_starts_gives_no_snapshot(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before its volume is mounted, an empty folder is in its place."""
+    prepare = VolumeStore.prepare
+
+    def prepare_slowly(store: VolumeStore, incarnation_id: str) -> None:
+        time.sleep(3)
+        prepare(store, incarnation_id)
+
+    monkeypatch.setattr(VolumeStore, "prepare", prepare_slowly)
+    machine = Machine(folder, "namespace")
+    machine.volume_limit = VolumeLimit.IMAGE
+    try:
+        async with keeping(folder, machine) as kept, machine.engine():
+            await machine.manager.handle(Welcome(version=CONTROL_VERSION, master="m", features=(SNAPSHOTS,)))
+            await put(machine, 1, 1, snapshots=1, is_new=True)
+            await until(lambda: machine.of(VolumeSaved), what="a snapshot")
+            first = machine.of(VolumeSaved)[0]
+            assert first.error == ""
+            manifest = decode_manifest((kept.folder / first.snapshot).read_bytes())
+            assert [entry.path for entry in manifest.entries] == [b"log"]
+            await machine.drop(BOX)
+    finally:
+        machine.tidy()
 
 
 async def test_damage_is_refused_and_changes_nothing(pair: tuple[Machine, Machine], folder: Path) -> None:
