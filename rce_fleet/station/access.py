@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 
 from aiohttp import hdrs, web
 
+from rce.aio.tasks import cancel_and_wait
 from rce.web.openapi import PREFIX
 from rce.web.origin import ServerNames, is_foreign
 from rce_fleet.station.authentication import AuditedAction, AuthenticationError, Authenticator, StationUser
@@ -14,6 +16,12 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 COOKIE = "rce_station"
 USER, TOKEN = web.RequestKey("user", StationUser), web.RequestKey("token", str)
+IS_CHECKED = web.RequestKey("is_checked", bool)
+"""False: the request may only stop robots, because its token was valid before and cannot be checked now."""
+EMERGENCY_STOP = "/emergency-stop"
+"""The end of paths of emergency stops."""
+STOP_CHECK_S = 0.3
+"""How long an emergency stop waits for the check of its token."""
 _PUBLIC = ("/login", f"{PREFIX}/login", f"{PREFIX}/openapi.json")
 """Paths that need no token, beside the static files of the pages."""
 MAX_TOKEN = 256
@@ -44,7 +52,11 @@ class AccessControl:
         if request.path in _PUBLIC or request.path.startswith("/static/"):
             return await handler(request)
         token = token_of(request)
-        user = await self._authenticator.authenticate(token)
+        request[IS_CHECKED] = True
+        if request.method == hdrs.METH_PUT and request.path.endswith(EMERGENCY_STOP):
+            user = await self._user_of_stop(request, token)
+        else:
+            user = await self._authenticator.authenticate(token)
         if user is None:
             return self._unauthorized(request, token)
         if not user.may_view:
@@ -92,6 +104,23 @@ class AccessControl:
         self._authenticator.audit(request[TOKEN], action)
         if self.on_audit is not None:
             self.on_audit(request[USER].name, action)
+
+    async def _user_of_stop(self, request: web.Request, token: str) -> StationUser | None:
+        """Return the user as last known if the engine does not answer soon: robots can be reached without it.
+
+        Raises:
+            AuthenticationError: The token cannot be checked now, and it was not before.
+        """
+        asking = asyncio.create_task(self._authenticator.authenticate(token))
+        try:
+            await asyncio.wait({asking}, timeout=STOP_CHECK_S)
+            is_answered = asking.done() and not isinstance(asking.exception(), AuthenticationError)
+            if not is_answered and (known := self._authenticator.last_known(token)) is not None:
+                request[IS_CHECKED] = False
+                return known
+            return await asking
+        finally:
+            await cancel_and_wait(asking)
 
     def _unauthorized(self, request: web.Request, token: str) -> web.StreamResponse:
         if request.path == "/" and self._authenticator.has_logins:

@@ -143,6 +143,11 @@ class EngineAuthenticator:
             self._cache.popitem(last=False)
         return user
 
+    def last_known(self, token: str) -> StationUser | None:
+        """Return the user of a token as it was last checked; None if it was not, or was not valid then."""
+        asked_at, known = self._cache.get(token, (0.0, None))
+        return known if time.monotonic() - asked_at < LIFETIME_S else None
+
     async def log_in(self, user: str, password: str, address: str) -> str:
         """Return a token for a user.
 

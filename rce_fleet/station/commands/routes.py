@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rce.aio.tasks import cancel_and_wait
 from rce.web.bodies import read_whole
 from rce.web.routes import Route, RouteTable
-from rce_fleet.station.access import USER, AccessControl, problem
+from rce_fleet.station.access import EMERGENCY_STOP, IS_CHECKED, USER, AccessControl, problem
 from rce_fleet.station.api import Answer
 from rce_fleet.station.commands.driving import DEAD_S, DriveFrame, DriveGuard
 from rce_fleet.station.commands.kinds import VELOCITY, velocity_message
@@ -85,7 +85,7 @@ class ControlRoutes:
 
     @ROUTES.route(
         "PUT",
-        "/emergency-stop",
+        EMERGENCY_STOP,
         "Stop all robots at once, or release them; works without the planner",
         body=StopRequest,
         reply=Answer,
@@ -97,7 +97,7 @@ class ControlRoutes:
 
     @ROUTES.route(
         "PUT",
-        "/robots/{robot}/emergency-stop",
+        f"/robots/{{robot}}{EMERGENCY_STOP}",
         "Stop a robot at once, or release it; works without the planner",
         body=StopRequest,
         reply=Answer,
@@ -113,6 +113,8 @@ class ControlRoutes:
         if refusal is not None:
             return refusal
         asked = StopRequest.model_validate_json(await read_whole(request))
+        if not asked.stopped and not request[IS_CHECKED]:
+            return problem(503, "robots are released when the engine can be reached to check the login")
         if self._control is None:
             return problem(409, "this station cannot reach robots")
         robots = None if robot is None else [robot]

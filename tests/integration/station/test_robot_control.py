@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
-from aiohttp import ClientWebSocketResponse, WSCloseCode, WSMsgType
+from aiohttp import ClientWebSocketResponse, WSCloseCode, WSMsgType, web
 from aiohttp.test_utils import TestClient, TestServer
 from support.multimaster import DiscoveryNetwork
 from unit.station.test_station_view import robot, state
@@ -23,10 +23,11 @@ from rce.ros.multimaster.discovery import Discovery
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import Message, TypeRegistry
-from rce_fleet.station.authentication import StationUser, TokenAuthenticator
+from rce_fleet.station.authentication import Authenticator, StationUser, TokenAuthenticator
 from rce_fleet.station.commands import routes
 from rce_fleet.station.commands.control import RobotControl
 from rce_fleet.station.commands.sources import RosCommandSource
+from rce_fleet.station.engine_authenticator import EngineAuthenticator, StationAccount
 from rce_fleet.station.feed import Feed
 from rce_fleet.station.layers.ros_source import RosLayerSource
 from rce_fleet.station.planner_client import PlannerError
@@ -79,8 +80,9 @@ class Site:
             while not holds():
                 await asyncio.sleep(0.02)
 
-    async def put(self, path: str, body: dict[str, Any]) -> tuple[int, str]:
-        async with self.client.put(f"/api/v1{path}", json=body) as reply:
+    async def put(self, path: str, body: dict[str, Any], token: str = "") -> tuple[int, str]:
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        async with self.client.put(f"/api/v1{path}", json=body, headers=headers) as reply:
             answer = await reply.json()
             return reply.status, answer.get("message") or answer["error"]
 
@@ -98,7 +100,7 @@ class Login(TokenAuthenticator):
 
 
 @asynccontextmanager
-async def site() -> AsyncIterator[Site]:
+async def site(authenticator: Authenticator | None = None) -> AsyncIterator[Site]:
     view = FleetView()
     feed = Feed(view)
     feed.on_change(view.on_state(state(robot("Robot1"), robot("Robot2"))))
@@ -112,7 +114,7 @@ async def site() -> AsyncIterator[Site]:
             source, view.robot_ids, lambda: feed.on_control(control.stopped, control.driven)
         )
         login = Login()
-        station = Station(view, fleet, feed.pages, authenticator=login, control=control)  # type: ignore[arg-type]  # as wide as what is called
+        station = Station(view, fleet, feed.pages, authenticator=authenticator or login, control=control)  # type: ignore[arg-type]  # as wide as what is called
         async with TestClient(TestServer(station.make_app())) as client:
             made = Site(client, fleet, control, view, login)
             await node.subscribe(
@@ -128,6 +130,51 @@ async def site() -> AsyncIterator[Site]:
             )
             yield made
         await control.close()
+
+
+class Engine:
+    """The part of a master that knows whose a token is; it may hang, or end."""
+
+    def __init__(self) -> None:
+        self.roles = {"t": "operator", "v": "viewer"}
+        self.answers = asyncio.Event()
+        self.answers.set()
+        app = web.Application()
+        app.router.add_get("/api/v1/user", self._answer)
+        self.server = TestServer(app)
+
+    async def _answer(self, request: web.Request) -> web.Response:
+        await self.answers.wait()
+        role = self.roles.get(request.headers["Authorization"].removeprefix("Bearer "))
+        return web.json_response({"name": "op", "role": role} if role else {}, status=200 if role else 401)
+
+
+@pytest.mark.parametrize("way", ["hangs", "ended"])
+async def test_robots_are_stopped_while_the_master_is_away(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By who was logged in; a release needs the check, and so does a token that was never valid."""
+    engine = Engine()
+    async with engine.server:
+        account = StationAccount(str(engine.server.make_url("/")), "u", "p")
+        async with EngineAuthenticator(account) as authenticator, site(authenticator) as made:
+            stop, release = {"stopped": True}, {"stopped": False}
+            for token, status in (("t", 200), ("v", 403), ("x", 401)):
+                assert (await made.put("/robots/Robot1/emergency-stop", release, token))[0] == status
+            await made.until(lambda: list(made.stops) == [False])
+            monkeypatch.setattr("rce_fleet.station.engine_authenticator.CACHE_S", 0.0)
+            monkeypatch.setattr("rce_fleet.station.engine_authenticator.OFFLINE_CACHE_S", 0.0)
+            if way == "hangs":
+                engine.answers.clear()
+            else:
+                await engine.server.close()
+            assert (await made.put("/robots/Robot1/emergency-stop", stop, "t"))[0] == 200
+            await made.until(lambda: made.stops[-1])
+            status, text = await made.put("/robots/Robot1/emergency-stop", release, "t")
+            assert (status, "check the login" in text) == (503, True)
+            assert (await made.put("/robots/Robot1/emergency-stop", stop, "v"))[0] == 403
+            engine.answers.set()
+            if way == "hangs":  # it answers again
+                del engine.roles["t"]
+                assert (await made.put("/robots/Robot1/emergency-stop", stop, "t"))[0] == 401
 
 
 async def test_a_stop_reaches_those_who_listen() -> None:
