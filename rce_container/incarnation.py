@@ -49,6 +49,7 @@ from rce_container.logs import last_line
 from rce_container.network import Networks
 from rce_container.node_states import ContainerStates, StateCarrier
 from rce_container.observed import OuterStatus
+from rce_container.packages.disk import in_own_thread
 from rce_container.packages.shelf import Shelf
 from rce_container.packages.supply import Library, Supply
 from rce_container.runtimes.base import Handle
@@ -329,7 +330,10 @@ class Incarnation:
 
     async def _prepare(self, pid: int) -> None:
         await self._context.networks.attach(self.incarnation_id, pid)
-        await asyncio.to_thread(self._context.volumes.prepare, self.incarnation_id)
+        if self._context.volumes.claims(self.incarnation_id):
+            self._limit(None)  # an interrupted change of a file system's size destroys it
+            await in_own_thread(self._context.volumes.prepare, self.incarnation_id)
+            self._limit(self._context.settings.start_timeout)
 
     async def _hang_up(self) -> None:
         self._deadline = None
@@ -409,7 +413,7 @@ class Incarnation:
         return self.enforcer.control_group.pids() or [one.pid for one in self.handle.members(proc.table())]
 
     def _limit(self, seconds: float | None) -> None:
-        if self._deadline is not None:
+        if self._deadline is not None and not self._deadline.expired():
             loop = asyncio.get_running_loop()
             self._deadline.reschedule(None if seconds is None else loop.time() + seconds)
 

@@ -408,7 +408,9 @@ class Manager:
         self._keeper.release(incarnation_id)
 
     async def _await_start(self, incarnation: Incarnation) -> None:
-        await incarnation.reported.wait()
+        with contextlib.suppress(TimeoutError):  # its volumes are being enlarged; others need not wait for it
+            async with asyncio.timeout(self._settings.start_timeout):
+                await incarnation.reported.wait()
         self._starting.discard(incarnation)
         self._start_waiting()
 

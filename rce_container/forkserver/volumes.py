@@ -11,6 +11,7 @@ import errno
 import fcntl
 import os
 import struct
+import time
 from collections.abc import Iterator, Sequence
 
 from rce_container.forkserver.kernel import Mount, mount
@@ -22,6 +23,8 @@ _CONFIGURE = 0x4C0A
 _AUTOCLEAR = 4
 _CONFIG = struct.Struct("=II 5Q 4I 64s 64s 32s 2Q 8Q")
 _ATTEMPTS = 64
+_LOCK_S = 2.0
+_LOCK_PAUSE_S = 0.01
 _FLAGS = Mount.NO_SUID | Mount.NO_DEV
 OPTIONS = "noinit_itable"
 """Options of a mount; without it the kernel would free space of the image that is reserved for inodes."""
@@ -75,10 +78,18 @@ def mount_volumes(volumes: Sequence[tuple[VolumeOrder, int]], procfs: int, owner
 def attach(image: str) -> int:
     """Attach an image to a free loop device; return a descriptor of the device.
 
+    The device keeps the file's lock until it is detached, so that an image is never attached twice, nor while
+    a program enlarges it.
+
     Raises:
-        OSError: It cannot be attached.
+        OSError: It cannot be attached, or is in use.
     """
     file = os.open(image, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+    try:
+        _lock(file)
+    except OSError:
+        os.close(file)
+        raise
     control = os.open("/dev/loop-control", os.O_RDWR | os.O_CLOEXEC)
     try:
         for _ in range(_ATTEMPTS):
@@ -98,6 +109,20 @@ def attach(image: str) -> int:
     finally:
         os.close(control)
         os.close(file)
+
+
+def _lock(image: int) -> None:
+    """Lock an image; the kernel may need a moment to detach it after its former use."""
+    deadline = time.monotonic() + _LOCK_S
+    while True:
+        try:
+            fcntl.flock(image, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            if time.monotonic() > deadline:
+                raise OSError(errno.EBUSY, "its image is mounted, or a program is enlarging it") from error
+            time.sleep(_LOCK_PAUSE_S)
+        else:
+            return
 
 
 def _give(folder: str, owner: int) -> None:

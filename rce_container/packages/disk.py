@@ -9,6 +9,8 @@ import shutil
 import tempfile
 from collections import Counter, defaultdict
 from collections.abc import AsyncIterator, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
@@ -44,7 +46,18 @@ async def in_thread(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs)
 
     So no caller removes a folder into which a thread still writes.
     """
-    work = asyncio.ensure_future(asyncio.to_thread(function, *args, **kwargs))
+    return await _await_end(asyncio.ensure_future(asyncio.to_thread(function, *args, **kwargs)))
+
+
+async def in_own_thread(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+    """Do the same as :func:`in_thread` for what may take minutes: the shared threads are few."""
+    pool = ThreadPoolExecutor(1, thread_name_prefix="long work")
+    work = asyncio.get_running_loop().run_in_executor(pool, partial(function, *args, **kwargs))
+    pool.shutdown(wait=False)
+    return await _await_end(work)
+
+
+async def _await_end(work: asyncio.Future[R]) -> R:
     try:
         return await asyncio.shield(work)
     except asyncio.CancelledError:

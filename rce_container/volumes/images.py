@@ -1,17 +1,21 @@
 """Volumes as file systems of their size, in image files.
 
 The container's own mounts hold the only mount of an image (:mod:`rce_container.forkserver.volumes`), so it
-ends with the container, however that ends. All functions block.
+ends with the container, however that ends. Whatever writes to an image, a loop device or a program, holds a
+lock on its file meanwhile. All functions block.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
 import shutil
 import struct
 import subprocess
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from rce_container.exceptions import VolumeError
@@ -19,7 +23,7 @@ from rce_container.exceptions import VolumeError
 _MAKE = ("mkfs.ext4", "-q", "-F", "-m", "0", "-E", "nodiscard,lazy_itable_init=1")
 _CHECK = ("e2fsck", "-f", "-p")
 _GROW = ("resize2fs",)
-_TIMEOUT_S = 60.0
+_PROBE_TIMEOUT_S = 60.0
 _POLL_S = 0.02
 _SUPERBLOCK = 1024
 """Offset of ext4's superblock; the fields below are relative to it (Linux, ``fs/ext4/ext4.h``)."""
@@ -44,8 +48,9 @@ def unavailable() -> str:
         point.mkdir()
         try:
             make(image, _PROBE_BYTES)
-            _run("unshare", "-m", "mount", "-o", "loop,nosuid,nodev", str(image), str(point))
-            wait_until_unused(image, time.monotonic() + _TIMEOUT_S)
+            mount = ("unshare", "-m", "mount", "-o", "loop,nosuid,nodev")
+            _run(*mount, str(image), str(point), timeout=_PROBE_TIMEOUT_S)
+            wait_until_unused(image, time.monotonic() + _PROBE_TIMEOUT_S)
         except VolumeError as error:
             return str(error)
     return ""
@@ -58,6 +63,7 @@ def make(image: Path, size: int) -> None:
         VolumeError: The disk has not enough room, or the file system cannot be made.
     """
     new = image.with_suffix(".new")
+    new.unlink(missing_ok=True)  # a program of a killed manager may still write to that one
     try:
         _extend(new, size)
         _run(*_MAKE, str(new))
@@ -66,17 +72,50 @@ def make(image: Path, size: int) -> None:
         new.unlink(missing_ok=True)
 
 
-def grow(image: Path, size: int) -> None:
+def grow(image: Path, size: int, deadline: float) -> None:
     """Enlarge an image that is not mounted; one that is large enough stays as it is.
 
+    Takes as long as the programs need: one that is killed while it writes destroys the file system.
+
+    Args:
+        image: The image.
+        size: Bytes.
+        deadline: Until when to wait if another program has it; seconds of the monotonic clock.
+
     Raises:
-        VolumeError: The disk has not enough room, or the file system is damaged.
+        VolumeError: The disk has not enough room, the file system is damaged, or another program has it.
     """
-    if image.stat().st_size >= size and not _is_smaller_inside(image):
-        return
-    _extend(image, size)
-    _run(*_CHECK, str(image), ok=(0, 1))  # 1: faults were found and corrected
-    _run(*_GROW, str(image))
+    with _locked(image, deadline) as lock:
+        if image.stat().st_size >= size and not _is_smaller_inside(image):
+            return
+        _extend(image, size)
+        _run(*_CHECK, str(image), ok=(0, 1), lock=lock)  # 1: faults were found and corrected
+        _run(*_GROW, str(image), lock=lock)
+
+
+@contextlib.contextmanager
+def _locked(image: Path, deadline: float) -> Iterator[int]:
+    """Lock an image; yield the descriptor, which its programs inherit.
+
+    So a program that outlives a killed manager keeps the lock.
+    """
+    fd = os.open(image, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+    try:
+        while True:
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                if time.monotonic() > deadline:
+                    raise VolumeError(
+                        f"the volume {image.stem!r} is in use: a program that an earlier manager started "
+                        "is still enlarging it, or it is mounted"
+                    ) from error
+                time.sleep(_POLL_S)
+            else:
+                break
+        yield fd
+    finally:
+        os.close(fd)
 
 
 def wait_until_unused(image: Path, deadline: float) -> None:
@@ -163,13 +202,28 @@ def _extend(file: Path, size: int) -> None:
         os.close(fd)
 
 
-def _run(*command: str, ok: tuple[int, ...] = (0,)) -> None:
+def _run(
+    *command: str, ok: tuple[int, ...] = (0,), timeout: float | None = None, lock: int | None = None
+) -> None:
+    """Run a program, which survives the end of this one and signals of its terminal.
+
+    Its output goes to a file: a pipe would end it with SIGPIPE after the end of this program.
+    """
     try:
-        done = subprocess.run(  # noqa: S603
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
-        )
+        with tempfile.TemporaryFile("w+", errors="replace") as output:
+            done = subprocess.run(  # noqa: S603
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                timeout=timeout,
+                check=False,
+                pass_fds=() if lock is None else (lock,),
+                start_new_session=True,
+            )
+            output.seek(0)
+            words = output.read().strip().splitlines()[-1:]
     except (OSError, subprocess.TimeoutExpired) as error:
         raise VolumeError(f"{command[0]}: {error}") from error
     if done.returncode not in ok:
-        words = (done.stderr.strip() or done.stdout.strip()).splitlines()[-1:]
         raise VolumeError(f"{command[0]} failed with {done.returncode}: {' '.join(words)}")

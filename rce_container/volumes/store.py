@@ -159,10 +159,13 @@ class VolumeStore:
         return [id_ for id_ in ended if self._discard(id_)]
 
     def prepare(self, incarnation_id: str) -> None:
-        """Make the file systems of a container's volumes, or let them grow. Blocks.
+        """Make the file systems of a container's volumes, or let them grow. Blocks, possibly for minutes.
+
+        The container must have them until this has returned.
 
         Raises:
-            VolumeError: A former container still has one mounted, or the disk is full.
+            VolumeError: A former container still has one mounted, another program is enlarging one, or the
+                disk is full.
         """
         deadline = time.monotonic() + SETTLE_S
         for claim in self._claims.get(incarnation_id, ()):
@@ -173,7 +176,7 @@ class VolumeStore:
                 images.make(image, claim.size)
                 continue
             images.wait_until_unused(image, deadline)
-            images.grow(image, claim.size)
+            images.grow(image, claim.size, deadline)
 
     def _check_placement(self, id_: str, placement: VolumePlacement) -> None:
         if self.places.exists(id_) and self.places.placement(id_) >= placement.number:

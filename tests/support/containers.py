@@ -77,6 +77,7 @@ class ManagerOptions(TypedDict, total=False):
     """Fields of :class:`rce_container.settings.ContainerSettings` that tests give."""
 
     grace: float
+    start_timeout: float
     interrupt_timeout: float
     terminate_timeout: float
     cleanup_timeout: float

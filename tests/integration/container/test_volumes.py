@@ -6,8 +6,13 @@ import asyncio
 import contextlib
 import errno
 import os
+import shutil
 import signal
-from collections.abc import Iterator
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -207,6 +212,112 @@ def test_a_volume_that_is_not_mounted_is_not_opened(tmp_path: Path) -> None:
     place.mkdir()
     with pytest.raises(VolumeError, match="is not mounted in its container"):
         places.open_running("user/journal", os.getpid(), str(place))
+
+
+@pytest.fixture
+def held_prepare(monkeypatch: pytest.MonkeyPatch) -> Iterator[HeldPrepare]:
+    """Volumes are prepared when the test says so."""
+    held = HeldPrepare()
+    monkeypatch.setattr(VolumeStore, "prepare", held.prepare_of(VolumeStore.prepare))
+    yield held
+    held.may_end.set()
+
+
+class HeldPrepare:
+    """Delays what prepares volumes.
+
+    Attributes:
+        began: Set when it was called.
+        may_end: To be set by the test.
+        claimed: For each call whether the container had its volumes until the end.
+    """
+
+    def __init__(self) -> None:
+        self.began, self.may_end = threading.Event(), threading.Event()
+        self.claimed: list[bool] = []
+
+    def prepare_of(self, prepare: Callable[[VolumeStore, str], None]) -> Callable[[VolumeStore, str], None]:
+        def prepare_late(store: VolumeStore, incarnation_id: str) -> None:
+            self.began.set()
+            self.may_end.wait()
+            prepare(store, incarnation_id)
+            self.claimed.append(bool(store.claims(incarnation_id)))
+
+        return prepare_late
+
+
+@pytest.mark.needs("bwrap")
+@IMAGES
+async def test_enlarging_may_take_longer_than_a_start(sandbox: Machine, held_prepare: HeldPrepare) -> None:
+    sandbox.volume_limit = VolumeLimit.IMAGE
+    async with sandbox.engine(start_timeout=5.0):
+        await put(sandbox, "keep.py")
+        asyncio.get_running_loop().call_later(6.0, held_prepare.may_end.set)
+        await sandbox.log_holds(BOX, "node", "1 runs")
+        assert sandbox.faults == []
+        assert held_prepare.claimed == [True]
+        await sandbox.drop(BOX)
+
+
+@pytest.mark.needs("bwrap")
+@IMAGES
+async def test_a_killed_container_has_its_volume_until_it_is_ready(
+    sandbox: Machine, held_prepare: HeldPrepare
+) -> None:
+    """Another one would work on the same image, beside the thread of the first one."""
+    sandbox.volume_limit = VolumeLimit.IMAGE
+    async with sandbox.engine() as manager:
+        await put(sandbox, "keep.py")
+        await until(held_prepare.began.is_set, what="its volume is prepared")
+        manager.kill_all()
+        asyncio.get_running_loop().call_later(2.0, held_prepare.may_end.set)
+        await until(lambda: held_prepare.claimed, what="its volume is ready")
+        assert held_prepare.claimed[0]
+        manager.kill_all()
+        await sandbox.drop(BOX)
+
+
+GROW = """
+import sys, time
+from pathlib import Path
+from rce_container.volumes import images
+images.grow(Path(sys.argv[1]), int(sys.argv[2]), time.monotonic())
+"""
+RESIZE = """#!/bin/sh
+echo started >FIFO
+read -r word <FIFO
+echo "This goes to the killed manager."
+exec RESIZE2FS "$@"
+"""
+
+
+@IMAGES
+def test_a_tool_of_a_killed_manager_keeps_the_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ends as if the manager lived, and no other program writes to the image meanwhile."""
+    places = VolumePlaces(tmp_path / "volumes", images=True)
+    image, fifo, tool = places.image("user/journal"), tmp_path / "fifo", tmp_path / "bin" / "resize2fs"
+    places.make_folder(image.parent)
+    images.make(image, SIZE)
+    os.mkfifo(fifo)
+    tool.parent.mkdir()
+    tool.write_text(RESIZE.replace("FIFO", str(fifo)).replace("RESIZE2FS", str(shutil.which("resize2fs"))))
+    tool.chmod(0o755)
+    path = f"{tool.parent}:{os.environ['PATH']}"
+    command = [sys.executable, "-c", GROW, str(image), str(2 * SIZE)]
+    with subprocess.Popen(command, env={**os.environ, "PATH": path}) as manager:
+        assert fifo.read_text() == "started\n"
+        manager.kill()
+    with pytest.raises(VolumeError, match="is still enlarging it"):
+        images.grow(image, 2 * SIZE, time.monotonic())
+    with pytest.raises(VolumeError, match="a program is enlarging it"):
+        places.open("user/journal")
+    fifo.write_text("go on\n")
+    images.grow(image, 2 * SIZE, time.monotonic() + 60)
+    subprocess.run(["e2fsck", "-f", "-n", image], check=True, capture_output=True)
+    root = places.open("user/journal")
+    assert os.fstatvfs(root).f_blocks * os.fstatvfs(root).f_frsize > SIZE
+    os.close(root)
+    images.wait_until_unused(image, time.monotonic() + 60)
 
 
 @IMAGES
