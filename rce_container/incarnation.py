@@ -106,6 +106,7 @@ class Incarnation:
         self.counters = m.Counters()
         """The traffic of links and interfaces, as last reported by the environment."""
         self._observed = OuterStatus(self._outer_pids if isolated else None)
+        self._filter = intake.PartFilter()
         self.reported = asyncio.Event()
         """Set by the first report, or by an end without a report."""
         self._context = context
@@ -358,9 +359,11 @@ class Incarnation:
         match said:
             case m.Report(status=status, features=features):
                 self._features = frozenset(features) & {EXEC, PATCHES, NODE_STATES}
-                self._report(intake.sanitize_status(self.id, status, self._newest_revision), pace)
+                status = intake.sanitize_status(self.id, status, self._newest_revision)
+                self._report(self._filter.whole(status, self._desired), pace)
             case m.ReportPatch(patch=patch):
-                self._report_patch(intake.sanitize_patch(self.id, patch, self._newest_revision), pace)
+                patch = intake.sanitize_patch(self.id, patch, self._newest_revision)
+                self._report_patch(self._filter.patch(patch, self._desired), pace)
             case m.SpecWanted():
                 self._apply_again(pace)
             case m.Fault(text=text):

@@ -8,7 +8,7 @@ that.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from itertools import islice
 from typing import TypeVar
 
@@ -16,6 +16,7 @@ import msgspec
 from msgspec.structs import asdict, replace
 
 from rce.control import (
+    DesiredState,
     EndpointState,
     EndpointStatus,
     InterfaceUsage,
@@ -37,6 +38,14 @@ MAX_ITEMS = 4096
 MAX_INTERFACES = 16384
 """Of one container; more than the master allows users to make."""
 MAX_CONNECTIONS = 65536
+MAX_DETAILS = 64_000
+"""Bytes of the texts of all nodes of a container."""
+MAX_UNKNOWN_NODES = 64_000
+"""About how many bytes a report may hold of nodes that are not desired: nodes that are removed end first."""
+MAX_UNKNOWN = 500_000
+"""The same of nodes, and of interfaces and connections, while the desired state is not known."""
+_PER_ITEM = 20
+_PER_NODE = 100
 _MAX_NUMBER = 2**53
 """The largest value of a counter; all JSON readers take numbers up to here."""
 _MAX_CODE = 255
@@ -148,6 +157,67 @@ def _named(things: Mapping[str, T]) -> dict[str, T]:
 
 def _whole(number: int, *, least: int = 0) -> int:
     return max(least, min(number, _MAX_NUMBER))
+
+
+class PartFilter:
+    """Leaves out the parts of one container's reports that are not desired.
+
+    Otherwise a few environments could make what the manager tells a master, in one message, too large for it.
+    Before the desired state is known, as after a restart of the manager, little is kept of everything.
+    """
+
+    def __init__(self) -> None:
+        self._room = MAX_UNKNOWN
+        """Bytes left for interfaces and connections while the desired state is not known."""
+
+    def whole(self, status: EndpointStatus, desired: DesiredState | None) -> EndpointStatus:
+        """Return what is kept of a sanitized report."""
+        self._room = MAX_UNKNOWN
+        return self._keep(status, desired)
+
+    def patch(self, patch: StatusPatch, desired: DesiredState | None) -> StatusPatch:
+        """Return what is kept of a sanitized patch."""
+        return replace(patch, status=self._keep(patch.status, desired))
+
+    def _keep(self, status: EndpointStatus, desired: DesiredState | None) -> EndpointStatus:
+        if desired is None:
+            return replace(
+                status,
+                nodes=_keep_nodes(status.nodes, frozenset(), MAX_UNKNOWN),
+                interfaces={tag: up for tag, up in status.interfaces.items() if self._has_room(len(tag))},
+                connections=tuple(one for one in status.connections if self._has_room(0)),
+            )
+        nodes = frozenset(node.tag for node in desired.contents.nodes)
+        return replace(
+            status,
+            nodes=_keep_nodes(status.nodes, nodes, MAX_UNKNOWN_NODES),
+            interfaces={tag: up for tag, up in status.interfaces.items() if tag in desired.interfaces},
+            connections=tuple(one for one in status.connections if one in desired.connections),
+        )
+
+    def _has_room(self, length: int) -> bool:
+        self._room -= _PER_ITEM + length
+        return self._room >= 0
+
+
+def _keep_nodes(nodes: Iterable[NodeStatus], desired: Container[str], room: int) -> tuple[NodeStatus, ...]:
+    kept: list[NodeStatus] = []
+    details = MAX_DETAILS
+    for node in nodes:
+        detail = _cut(node.detail, details)
+        details -= len(detail.encode())
+        if node.tag not in desired:
+            room -= _PER_NODE + len(node.tag) + len(detail.encode())
+            if room < 0:
+                continue
+        kept.append(node if detail == node.detail else replace(node, detail=detail))
+    return tuple(kept)
+
+
+def _cut(text: str, size: int) -> str:
+    """Return the beginning of a text, of so many bytes at most."""
+    data = text.encode()
+    return text if len(data) <= size else data[:size].decode(errors="ignore")
 
 
 class Pace:

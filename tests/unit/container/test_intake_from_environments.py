@@ -5,14 +5,20 @@ from __future__ import annotations
 import msgspec
 import pytest
 
+from rce.control import DesiredState, ObservedStatus
 from rce.control.model import (
+    ConnectionSpec,
+    EndpointKind,
+    EndpointSpec,
     EndpointState,
     EndpointStatus,
     InterfaceUsage,
     LinkAddress,
     NodeState,
     NodeStatus,
+    StatusPatch,
 )
+from rce.model import InterfaceSpec, NodeSpec
 from rce_container import intake
 from rce_container.environment import messages as m
 
@@ -56,6 +62,67 @@ def test_sizes_are_those_of_containers() -> None:
     assert (first.pid, first.exit_code) == (2**53, -255)
     assert len(first.detail) < 2100
     assert len({one.tag for one in status(nodes=(node, node)).nodes}) == len(status(nodes=(node, node)).nodes)
+
+
+DESIRED = DesiredState(
+    EndpointSpec(
+        id="anna/c",
+        kind=EndpointKind.CONTAINER,
+        revision=3,
+        nodes=(NodeSpec(tag="n", pkg="p", exe="e"),),
+        interfaces=(InterfaceSpec(tag="i", type="PublisherInterface", message_type="p/T", addr="/i"),),
+        connections=(ConnectionSpec(id=4, link="l", interface="i", peer_interface="p"),),
+    )
+)
+
+
+def hostile(part: str) -> EndpointStatus:
+    """What an environment reports that nodes took over."""
+    others = [
+        NodeStatus(tag=f"{part}{i}", state=NodeState.FAILED, detail="\u00e9" * 4000) for i in range(5000)
+    ]
+    return status(
+        nodes=(NodeStatus(tag="n", state=NodeState.FAILED, detail="why"), *others),
+        interfaces={"i": True, **{f"{part}{'i' * 90}{i}": True for i in range(16000)}},
+        connections=(4, *range(2**52, 2**52 + 60_000)),
+    )
+
+
+def size(said: EndpointStatus) -> int:
+    return len(msgspec.json.encode(said))
+
+
+def test_reports_keep_what_is_desired() -> None:
+    """A report that names much more than the container has is cut down to that."""
+    said = hostile("x")
+    assert size(said) > 15_000_000
+    found = intake.PartFilter().whole(said, DESIRED)
+    assert found.interfaces == {"i": True}
+    assert found.connections == (4,)
+    assert size(found) < 200_000
+    patch = intake.PartFilter().patch(StatusPatch(status=said), DESIRED)
+    assert patch.status == found
+
+
+def test_nodes_that_are_being_removed_stay() -> None:
+    """A node that is removed is reported until it has ended."""
+    said = status(nodes=(NodeStatus(tag="old", state=NodeState.STOPPING),))
+    assert intake.PartFilter().whole(said, DESIRED) == said
+
+
+def test_little_is_kept_of_unknown_containers() -> None:
+    """While a container's desired state is not known, patches together add no more than one report."""
+    kept = intake.PartFilter()
+    observed = ObservedStatus(kept.whole(hostile("x"), None))
+    for number in range(5):
+        observed.patch(kept.patch(StatusPatch(status=hostile(f"y{number}")), None))
+    assert size(observed.whole) < 1_500_000
+    usual = status(
+        nodes=tuple(NodeStatus(tag=f"n{i}", state=NodeState.RUNNING, pid=i) for i in range(1000)),
+        interfaces={f"interface{i}": True for i in range(10_000)},
+        connections=tuple(range(5000)),
+    )
+    assert intake.PartFilter().whole(usual, None) == usual
 
 
 def test_counters_can_be_told_on() -> None:
