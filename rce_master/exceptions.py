@@ -20,6 +20,7 @@
     +-- TransitionError            an event that a life cycle does not allow in the present state
     +-- StoreError                 the store cannot be read or written
     |   +-- StoreBusyError         another process owns the state folder
+    |   +-- SaveTooLargeError      it takes fewer or smaller rows at a time
     |   +-- EndedError             this master ends, and takes no commands any more
     |   +-- FencedError            this master leads no more, and must not write
     |       +-- StaleTermError     another master has begun a newer term
@@ -164,6 +165,10 @@ class StoreError(MasterError):
 
 class StoreBusyError(StoreError):
     """Another process owns the state folder."""
+
+
+class SaveTooLargeError(StoreError):
+    """The store takes fewer or smaller rows at a time; nothing was written."""
 
 
 class EndedError(StoreError):

@@ -8,9 +8,16 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rce_master.exceptions import EndedError, FencedError, MasterError, RefusedError, StoreError
+from rce_master.exceptions import (
+    EndedError,
+    FencedError,
+    MasterError,
+    RefusedError,
+    SaveTooLargeError,
+    StoreError,
+)
 from rce_master.state.changes import Changes, Touched, make_row
-from rce_master.state.commands import Continue
+from rce_master.state.commands import Continue, Tick
 from rce_master.state.core import State, without_collections
 from rce_master.state.migration import conversion
 from rce_master.store.copying import check_finished
@@ -95,6 +102,8 @@ class StateService:
         self._clock = clock
         self._jobs: asyncio.Queue[_Job] = asyncio.Queue(MAX_WAITING)
         self._store_fault = ""
+        self._max_work = state.settings.max_work
+        """Less than that of the settings after a save that was too large."""
         self._is_unfinished = False
         """Whether a command left work that is continued after the commands that wait."""
         self._end: StoreError | None = None
@@ -265,6 +274,8 @@ class StateService:
                 raise  # the state ends with the leadership; no request is answered from it
             self._revert(done)
             self._settled.set()
+            if isinstance(error, SaveTooLargeError):
+                self._max_work = max(1, self._max_work // 10)
             # The next tick does what was left over: a store that fails is not asked again at once.
             self._is_unfinished = False
             await self._stand_alone(jobs, error, was_alone=not continues)
@@ -275,6 +286,8 @@ class StateService:
         finally:
             self._settled.set()
         self._is_unfinished = any(changes.unfinished for changes in done)
+        if continues or any(isinstance(command, Tick) for job in jobs for command in job.commands):
+            self._max_work = min(self.state.settings.max_work, self._max_work * 2)
         _touch_once(done)
         turn = _Turn()
         for changes in done:
@@ -339,7 +352,7 @@ class StateService:
 
     def _apply(self, command: Command, done: list[Changes]) -> Outcome:
         try:
-            done.append(self.state.apply(command, self._clock()))
+            done.append(self.state.apply(command, self._clock(), self._max_work))
         except RefusedError as error:
             return error
         except Exception as error:  # noqa: BLE001 - logged

@@ -166,17 +166,23 @@ class Transaction:
         now: Seconds of a monotonic clock.
         settings: Limits and grace times.
         make_token: Makes a secret for a link.
+        max_work: In place of that of the settings.
     """
 
     def __init__(
-        self, tables: Tables, now: float, settings: StateSettings, make_token: Callable[[], str]
+        self,
+        tables: Tables,
+        now: float,
+        settings: StateSettings,
+        make_token: Callable[[], str],
+        max_work: int | None = None,
     ) -> None:
         self.tables = tables
         self.now = now
         self.settings = settings
         self.changes = Changes()
         self._make_token = make_token
-        self._work_left = settings.max_work
+        self._work_left = settings.max_work if max_work is None else max_work
 
     def put(
         self,

@@ -231,12 +231,13 @@ class State:
         """
         yield from task_sets.restarting(self._begin(now), revision, piece)
 
-    def apply(self, command: commands.Command, now: float) -> Changes:
+    def apply(self, command: commands.Command, now: float, max_work: int | None = None) -> Changes:
         """Apply a command.
 
         Args:
             command: The command.
             now: Seconds of a clock that never goes back.
+            max_work: In place of that of the settings.
 
         Returns:
             The changes and their effects.
@@ -244,7 +245,7 @@ class State:
         Raises:
             Refused: The state does not allow it; nothing changed.
         """
-        tx = self._begin(now)
+        tx = self._begin(now, max_work)
         try:
             _HANDLERS[type(command)](tx, command)
             return tx.seal()
@@ -296,5 +297,5 @@ class State:
         """
         validate(self.tables)
 
-    def _begin(self, now: float) -> Transaction:
-        return Transaction(self.tables, now, self.settings, self._make_token)
+    def _begin(self, now: float, max_work: int | None = None) -> Transaction:
+        return Transaction(self.tables, now, self.settings, self._make_token, max_work)

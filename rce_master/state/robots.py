@@ -30,6 +30,8 @@ DRAINED = "this robot process is being emptied; connect again"
 """What robots of a drained task set are told."""
 _REMOVAL = 100
 """The work of removing a robot or a connection, as :attr:`StateSettings.max_work` counts it."""
+_INTERFACE = 10
+"""The work of removing an interface."""
 
 
 def login(tx: Transaction, command: RobotLogin) -> None:
@@ -182,6 +184,7 @@ def expire(tx: Transaction) -> None:
             if tx.is_out_of_work():
                 return
             tx.spend(_REMOVAL * (1 + tx.tables.connections.count("endpoint", robot.id)))
+            tx.spend(_INTERFACE * tx.tables.interfaces.count("endpoint", robot.id))
             live.after(RobotEvent.EXPIRE, tx.now)  # it is checked, and nothing is left to record
             endpoints.remove(tx, robot.id, "the robot stayed away")
             tx.happen("robot_gone", robot.id, "its interfaces and connections were removed")

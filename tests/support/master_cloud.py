@@ -27,7 +27,7 @@ from rce.control.messages import (
 from rce.control.model import EndpointStatus
 from rce_master.auth import Authenticator, client_digest
 from rce_master.control_handler import ControlHandler
-from rce_master.exceptions import StoreError
+from rce_master.exceptions import SaveTooLargeError, StoreError
 from rce_master.reconciler import Reconciler
 from rce_master.state import commands
 from rce_master.state.records import User, UserRole
@@ -48,12 +48,13 @@ INTERFACE = {"interfaceType": "PublisherInterface", "className": "std_msgs/Strin
 
 
 class FragileStore(MemoryStore):
-    """Breaks when told to, and notes how often it wrote."""
+    """Breaks when told to, takes so many rows at most as it is told, and notes how often it wrote."""
 
     def __init__(self) -> None:
         super().__init__()
         self.broken = False
         self.saves = 0
+        self.most: int | None = None
         self.free = asyncio.Event()
         self.free.set()
 
@@ -62,6 +63,8 @@ class FragileStore(MemoryStore):
         self.saves += 1
         if self.broken:
             raise StoreError("disk full")
+        if self.most is not None and len(rows) > self.most:
+            raise SaveTooLargeError("too many rows")
         await super().save(rows, term)
 
 

@@ -33,6 +33,9 @@ WATCH_BUFFER = 1 << 20
 """Bytes of a watch that are read ahead."""
 LOAD_S = 20.0
 """The same for a page of records."""
+BYTES_PER_S = 100_000
+"""How fast a member takes a request at least. Its gateway reads JSON slowly, and a request that is given up
+before it was read is not done."""
 MIN_VERSION = (3, 4)
 """The first release whose gateway is below ``/v3``."""
 _OK = 200
@@ -107,7 +110,7 @@ class EtcdClient:
     Args:
         endpoints: Addresses ``HOST:PORT`` of members; the nearest one first.
         tls: Gives the TLS context of each connection, with this master's certificate; None speaks plainly.
-        attempt: Seconds that one member may take for a small request.
+        attempt: Seconds that one member may take for a small request; a large one gets more.
 
     Example:
         ```python
@@ -320,11 +323,12 @@ class EtcdClient:
         reasons: list[str] = []
         maybe_done = False
         body = json.dumps(message).encode()
+        limit = (timeout or self._attempt) + len(body) / BYTES_PER_S
         for _ in self._endpoints:
             used = self._current
             endpoint = self._endpoints[used]
             try:
-                answer = await self._exchange(endpoint, path, body, timeout or self._attempt)
+                answer = await self._exchange(endpoint, path, body, limit)
                 return read(json.loads(answer))
             except (wire.WireError, ValueError) as error:
                 reasons.append(f"{endpoint}: {error}")
@@ -359,7 +363,7 @@ class EtcdClient:
         except aiohttp.ClientConnectorError as error:
             raise _FailedError(_connect_text(error), maybe_done=False) from error
         except TimeoutError:
-            raise _FailedError(f"no answer within {timeout:g} s", maybe_done=True) from None
+            raise _FailedError(f"no answer within {timeout:.3g} s", maybe_done=True) from None
         except (aiohttp.ClientError, OSError) as error:
             text = explain_to_client(error) or str(error) or type(error).__name__
             if self._tls is None and isinstance(error, aiohttp.ServerDisconnectedError):

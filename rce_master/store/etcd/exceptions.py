@@ -20,6 +20,7 @@ OUT_OF_RANGE = 11
 """gRPC's code for a revision that was compacted away."""
 NOT_FOUND = 5
 _INVALID, _EXHAUSTED, _DENIED, _NOT_AUTHENTICATED = 3, 8, 7, 16
+_TOO_LARGE = ("too large", "larger than max", "too many operations")
 _LARGER = "start etcd with --max-request-bytes 16777216"
 _HINTS = {
     "too large": _LARGER,
@@ -46,6 +47,11 @@ class EtcdRefusedError(EtcdError):
         super().__init__(endpoint, fault)
         self.endpoint = endpoint
         self.fault = fault
+
+    @property
+    def is_too_large(self) -> bool:
+        """Whether a smaller request may be done."""
+        return any(part in self.fault.text for part in _TOO_LARGE)
 
     def __str__(self) -> str:
         text = self.fault.text.removeprefix("etcdserver: ").removeprefix("mvcc: ")

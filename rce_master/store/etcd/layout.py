@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rce_master.store.etcd.client import EtcdClient
 
 MAX_OPERATIONS = 4096
-"""Operations of a transaction that etcd must allow; its default is 128."""
+"""Operations of one level of a transaction that etcd must allow; its default is 128."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rce_master.exceptions import FencedError, StaleTermError, StoreBusyError, StoreError
+from rce_master.exceptions import FencedError, SaveTooLargeError, StaleTermError, StoreBusyError, StoreError
 from rce_master.store.etcd.exceptions import OUT_OF_RANGE, EtcdAwayError, EtcdRefusedError
 from rce_master.store.etcd.layout import (
     Keys,
@@ -197,6 +197,7 @@ class EtcdStore:
         unknown, and nothing more can be saved in this term.
 
         Raises:
+            SaveTooLargeError: It exceeds what etcd takes in one request; nothing was written.
             StaleTermError: A newer term was begun.
             FencedError: The lease has ended, and it may have been written or not.
             StoreError: Nothing was written.
@@ -214,8 +215,10 @@ class EtcdStore:
             outcome = await self._repeat([*operations, Put(self._keys.last, now)])
         except FencedError:
             raise
-        except StoreError:
+        except StoreError as error:
             self._is_in_doubt = False
+            if isinstance(error, EtcdRefusedError) and error.is_too_large:
+                raise SaveTooLargeError(str(error)) from error
             raise
         if not outcome.done:
             self._find_out(outcome, now)

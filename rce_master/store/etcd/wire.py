@@ -140,6 +140,11 @@ def end_of(prefix: str) -> bytes:
     return bytes(key)
 
 
+GROUP = 2000
+"""Operations of one level of a transaction. etcd counts each level for itself, from the outermost one on:
+those of a group and the number of groups together stay below what it must allow."""
+
+
 def range_request(
     prefix: str,
     *,
@@ -200,12 +205,12 @@ def txn_request(
 
     Args:
         conditions: It is done if all of them hold.
-        operations: What to write; no key twice.
+        operations: What to write; no key twice. Many are grouped in transactions within this one.
         otherwise: Keys to read if it is not done.
     """
     return {
         "compare": [_condition(one) for one in conditions],
-        "success": [_operation(one) for one in operations],
+        "success": _grouped([_operation(one) for one in operations]),
         "failure": [{"request_range": get_request(key)} for key in otherwise],
     }
 
@@ -341,6 +346,15 @@ def _operation(operation: Put | Delete) -> Message:
     if operation.lease:
         put["lease"] = str(operation.lease)
     return {"request_put": put}
+
+
+def _grouped(operations: list[Message]) -> list[Message]:
+    if len(operations) <= GROUP:
+        return operations
+    return [
+        {"request_txn": {"success": operations[begin : begin + GROUP]}}
+        for begin in range(0, len(operations), GROUP)
+    ]
 
 
 def _records(answer: Message) -> tuple[Record, ...]:

@@ -13,11 +13,14 @@ from support.engine import until
 from support.etcd import Cluster, cluster
 from support.go_between import GoBetween
 
+from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
 from rce.model import Resources
+from rce.model.specs import InterfaceSpec
 from rce_master.follower import StateFollower
 from rce_master.state import commands
 from rce_master.state.core import State
 from rce_master.state.records import User, UserRole
+from rce_master.state.settings import StateSettings
 from rce_master.state_service import StateService
 from rce_master.store import Row
 from rce_master.store.etcd import EtcdClient, EtcdStore
@@ -44,14 +47,15 @@ async def client(etcd: Cluster) -> AsyncIterator[EtcdClient]:
 class Leader:
     """Writes a state to etcd."""
 
-    def __init__(self, client: EtcdClient, prefix: str) -> None:
+    def __init__(self, client: EtcdClient, prefix: str, settings: StateSettings | None = None) -> None:
         self.client = client
         self.prefix = prefix
+        self.settings = settings
 
     @contextlib.asynccontextmanager
     async def leading(self) -> AsyncIterator[None]:
         await prepare(self.client, self.prefix)
-        self.service = await StateService.open(EtcdStore(self.client, self.prefix))
+        self.service = await StateService.open(EtcdStore(self.client, self.prefix), self.settings)
         running = asyncio.create_task(self.service.run())
         try:
             yield
@@ -69,6 +73,28 @@ class Leader:
             )
             if number % 2:
                 await self.service.submit(commands.DestroyContainer(user=name, tag=tag))
+
+    async def add_robot(self, user: str, interfaces: int) -> None:
+        """Add a user with a robot, which leaves again."""
+        await self.add(user, 0)
+        robots = Hello(
+            version=CONTROL_VERSION,
+            kind=TaskSetKind.ROBOT,
+            process="r1",
+            machine=MachineInfo(name="m"),
+            url="ws://r1/",
+        )
+        await self.service.submit(commands.TaskSetArrived(hello=robots))
+        await self.service.submit(commands.RobotLogin(process="r1", id=f"{user}/rob"))
+        specs = [
+            InterfaceSpec(tag=f"in{number}", type="PublisherConverter", message_type="std_msgs/String")
+            for number in range(interfaces)
+        ]
+        adding = [commands.AddInterface(user=user, endpoint="rob", interface=spec) for spec in specs]
+        for begin in range(0, interfaces, 500):
+            outcomes = await self.service.submit_all(adding[begin : begin + 500])
+            assert set(outcomes) == {None}
+        await self.service.submit(commands.RobotLeft(process="r1", id=f"{user}/rob"))
 
     async def remove(self, name: str) -> None:
         await self.service.submit(commands.RemoveUser(name=name))
@@ -120,6 +146,20 @@ async def test_the_copy_is_what_etcd_has(client: EtcdClient) -> None:
             copy = await take(client, prefix, follower)
             assert follower.loads == 1
     assert set(copy["users"]) == {"before", "bert"}
+
+
+async def test_a_robot_with_many_interfaces_does_not_stop_the_tick(client: EtcdClient) -> None:
+    """It has more rows than etcd allows in one level of a transaction."""
+    prefix = next(_prefixes)
+    leader = Leader(client, prefix, StateSettings(robot_grace=0.0))
+    async with leader.leading():
+        await leader.add_robot("anna", 5000)
+        async with following(client, prefix) as follower:
+            await leader.service.submit(commands.Tick())
+            copy = await take(client, prefix, follower)
+            assert follower.loads == 1
+    assert not copy["endpoints"]
+    assert not copy["interfaces"]
 
 
 async def test_what_the_watch_missed_is_read_at_the_takeover(client: EtcdClient) -> None:

@@ -36,6 +36,17 @@ def test_a_transaction_has_numbers_as_texts_and_keys_in_base64() -> None:
     }
 
 
+def test_many_operations_are_grouped_and_keep_their_order() -> None:
+    operations = [Delete(f"key{number}") for number in range(2 * wire.GROUP + 1)]
+    (flat,) = (wire.txn_request([], operations[: wire.GROUP])["success"],)
+    assert len(flat) == wire.GROUP
+    assert all("request_delete_range" in one for one in flat)
+    groups = [one["request_txn"]["success"] for one in wire.txn_request([], operations)["success"]]
+    assert [len(group) for group in groups] == [wire.GROUP, wire.GROUP, 1]
+    keys = [b64decode(one["request_delete_range"]["key"]).decode() for group in groups for one in group]
+    assert keys == [one.key for one in operations]
+
+
 def test_a_page_with_an_empty_value_is_read() -> None:
     page = wire.read_page({"header": HEADER, "kvs": [KV], "count": "1"})
     assert page == wire.Page((wire.Record("a", b"", 2, 7),), 2, more=False, count=1)

@@ -12,6 +12,7 @@ from rce.control.model import (
 )
 from rce_master.exceptions import ConflictError
 from rce_master.state import commands
+from rce_master.state.settings import StateSettings
 
 
 def test_robot_within_grace_time_finds_everything(world: World) -> None:
@@ -31,6 +32,22 @@ def test_robot_within_grace_time_finds_everything(world: World) -> None:
     assert [(w.process, w.id) for w in changes.withdrawals] == [("r1", "anna/rob")]
     assert world.spec("c").connections == ()
     assert world.phase() == "placed"
+
+
+def test_robots_with_many_interfaces_are_removed_one_by_one() -> None:
+    """A save of all of them might be too large for the store."""
+    world = World(StateSettings(max_work=1000))
+    world.robot_set()
+    for robot in ("a", "b", "c"):
+        world.login(robot)
+        for number in range(100):
+            world.interface(f"{robot}/in{number}", "PublisherConverter")
+        world.do(commands.RobotLeft(process="r1", id=f"anna/{robot}"))
+    assert kinds(world.tick(60)) == ["robot_gone"]
+    changes = world.do(commands.Continue())
+    assert (kinds(changes), changes.unfinished) == (["robot_gone"], True)
+    assert kinds(world.do(commands.Continue())) == ["robot_gone"]
+    assert not world.state.tables.interfaces
 
 
 def test_a_robot_connects_once(world: World) -> None:

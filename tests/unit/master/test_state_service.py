@@ -14,7 +14,7 @@ from rce.control.messages import (
     Status,
 )
 from rce.control.model import EndpointState, EndpointStatus, LinkAddress
-from rce_master.exceptions import EndedError, MasterError, NotFoundError, StoreError
+from rce_master.exceptions import EndedError, MasterError, NotFoundError, SaveTooLargeError, StoreError
 from rce_master.state import commands
 from rce_master.state.settings import StateSettings
 from rce_master.state_service import MAX_WAITING, StateService
@@ -124,6 +124,25 @@ async def test_store_that_fails_leaves_work_to_the_next_tick() -> None:
         cloud.store.broken = False
         await cloud.state_service.submit(commands.Tick())
         while any(not c.task_set for c in cloud.state_service.tables.containers()):
+            await asyncio.sleep(0)
+
+
+async def test_a_tick_whose_save_is_too_large_is_followed_by_a_smaller_one() -> None:
+    """Else no grace time would end any more."""
+    async with running(FragileStore(), StateSettings(robot_grace=0.0)) as cloud:
+        robots = cloud.robots()
+        await robots.hello()
+        for number in range(100):
+            await cloud.state_service.submit(commands.RobotLogin(process="r1", id=f"anna/rob{number}"))
+            await cloud.state_service.submit(commands.RobotLeft(process="r1", id=f"anna/rob{number}"))
+        cloud.store.most = 50
+        with pytest.raises(SaveTooLargeError):
+            await cloud.state_service.submit(commands.Tick())
+        assert len(cloud.state_service.tables.endpoints) == 100
+        await cloud.state_service.submit(commands.Tick())
+        assert len(cloud.state_service.tables.endpoints) < 100
+        cloud.store.most = None
+        while cloud.state_service.tables.endpoints:
             await asyncio.sleep(0)
 
 
