@@ -58,7 +58,7 @@ class ForkServer:
             descriptors: Its descriptors; :attr:`Descriptors.answer` is filled in here.
 
         Raises:
-            StartError: It cannot be made.
+            StartError: It cannot be made. Its images may be mounted in the namespaces, which must end then.
         """
         for _ in range(_ATTEMPTS):
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -67,6 +67,9 @@ class ForkServer:
                 self._order(request, descriptors._replace(answer=theirs.fileno()))
                 theirs.close()
                 answer, pid = await _receive_answer(ours)
+            if answer is None and any(volume.image for volume in request.volumes):
+                # They may be mounted there already; a second mount would damage them.
+                raise StartError("its environment died as it was made")
             if answer is None:
                 _log.warning("a container's environment died as it was made; it is tried again")
                 continue

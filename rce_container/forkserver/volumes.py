@@ -10,6 +10,7 @@ import contextlib
 import errno
 import fcntl
 import os
+import stat
 import struct
 import time
 from collections.abc import Iterator, Sequence
@@ -25,6 +26,9 @@ _CONFIG = struct.Struct("=II 5Q 4I 64s 64s 32s 2Q 8Q")
 _ATTEMPTS = 64
 _LOCK_S = 2.0
 _LOCK_PAUSE_S = 0.01
+_MAX_DEPTH = 500
+"""How deep folders may be nested: a descriptor is open for each of those above the present one."""
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
 _FLAGS = Mount.NO_SUID | Mount.NO_DEV
 OPTIONS = "noinit_itable"
 """Options of a mount; without it the kernel would free space of the image that is reserved for inodes."""
@@ -126,11 +130,38 @@ def _lock(image: int) -> None:
 
 
 def _give(folder: str, owner: int) -> None:
-    """Give a folder and what is in it to a user; each container may run as another one. Follows no links."""
-    if os.lstat(folder).st_uid == owner:  # changed last, so that an interrupted change is repeated
+    """Give a folder and what is in it to a user; each container may run as another one. Follows no links.
+
+    Keeps no names: this process counts for the container's limit of memory. No other process changes the
+    folder meanwhile.
+    """
+    if os.lstat(folder).st_uid == owner:
         return
-    for _, folders, files, fd in os.fwalk(folder, follow_symlinks=False):
-        for name in (*folders, *files):
-            os.chown(name, owner, owner, dir_fd=fd, follow_symlinks=False)
+    os.chown(folder, os.geteuid(), -1)  # the owner's at last: an interrupted change is repeated
+    fd = os.open(folder, _FOLDER)
+    levels = [os.scandir(fd)]
+    try:
+        while levels:
+            if (entry := next(levels[-1], None)) is None:
+                levels.pop().close()
+                fd = _replace(fd, "..") if levels else fd
+                continue
+            os.chown(entry.name, owner, owner, dir_fd=fd, follow_symlinks=False)
+            if stat.S_ISDIR(os.stat(entry.name, dir_fd=fd, follow_symlinks=False).st_mode):
+                if len(levels) > _MAX_DEPTH:
+                    raise OSError(errno.ENAMETOOLONG, f"folders are nested more than {_MAX_DEPTH} deep")
+                fd = _replace(fd, entry.name)
+                levels.append(os.scandir(fd))
+    finally:
+        for level in levels:
+            level.close()
+        os.close(fd)
     os.chown(folder, owner, owner)
     os.chmod(folder, 0o700)  # noqa: PTH101 - like its neighbours
+
+
+def _replace(folder: int, name: str) -> int:
+    """Open a folder in, or above, one that is open, and close that one."""
+    fd = os.open(name, _FOLDER, dir_fd=folder)
+    os.close(folder)
+    return fd
