@@ -313,7 +313,9 @@ async def serve(
     control = RobotControl(
         backend.commands,
         view.robot_ids,
-        lambda: feed.on_control(control.stopped, control.driven, control.fleet_stopped_by),
+        lambda: feed.on_control(
+            control.stopped, control.driven, control.fleet_stopped_by, control.undelivered
+        ),
         desired_stops,
     )
     types = TypeRegistry(PackageIndex.from_environ())

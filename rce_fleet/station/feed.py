@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from rce_fleet.station.live import Broadcast, Message
@@ -105,9 +106,27 @@ class Feed:
         """Send the engine's state."""
         self.pages.send("engine", _text("engine", state))
 
-    def on_control(self, stopped: dict[str, str], driven: dict[str, str], fleet: str | None = None) -> None:
-        """Send who stopped and who drives which robots, and who stopped all of them, if any user did."""
-        message = {"stopped": stopped, "driven": driven, "fleet_stopped_by": fleet}
+    def on_control(
+        self,
+        stopped: dict[str, str],
+        driven: dict[str, str],
+        fleet: str | None = None,
+        undelivered: Sequence[str] = (),
+    ) -> None:
+        """Send who stopped and who drives which robots.
+
+        Args:
+            stopped: Who stopped each robot that shall stand.
+            driven: Who drives each robot that is driven by hand.
+            fleet: Who stopped all robots; None: they are not stopped as a whole.
+            undelivered: Robots of ``stopped`` that have not got the stop yet.
+        """
+        message = {
+            "stopped": stopped,
+            "driven": driven,
+            "fleet_stopped_by": fleet,
+            "undelivered": list(undelivered),
+        }
         self.pages.send("control", _text("control", message))
 
     def on_event(self, text: str, tone: str) -> None:

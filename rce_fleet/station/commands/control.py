@@ -59,6 +59,8 @@ class StopResult:
         said = f"{len(self.reached)} robots reached"
         if len(self.reached) == 1:
             said = f"{self.reached[0]} reached"
+        if self.missed:
+            said += f", {len(self.missed)} not reached"
         missed = [f"not {robot}: {why}" for robot, why in sorted(self.missed.items())[:20]]
         unkept = [f"a restart of the station forgets this: {self.unkept}"] if self.unkept else []
         return "; ".join([said, *missed, *unkept])
@@ -70,7 +72,8 @@ class RobotControl:
     Args:
         source: Gives senders for robots' topics.
         robots: Returns the robots that the planner knows, or knew last.
-        on_change: Called after :attr:`stopped`, :attr:`fleet_stopped_by` or :attr:`driven` changed.
+        on_change: Called after :attr:`stopped`, :attr:`undelivered`, :attr:`fleet_stopped_by` or
+            :attr:`driven` changed.
         stops: Which robots shall be stopped; kept in memory only if None.
 
     Attributes:
@@ -93,7 +96,9 @@ class RobotControl:
         self._offering: set[str] = set()
         """Robots that offered the topic when the source was asked last."""
         self._refused_at: dict[str, float] = {}
-        self._told: tuple[dict[str, str], str | None] | None = None
+        self._delivered: dict[str, StopOrder] = {}
+        """The newest order that each robot has got."""
+        self._told: tuple[dict[str, str], list[str], str | None] | None = None
         self.driven: dict[str, str] = {}
 
     @property
@@ -101,6 +106,11 @@ class RobotControl:
         """Who stopped each robot that is stopped."""
         orders = {robot: self._desired.order_for(robot) for robot in sorted(self._known())}
         return {robot: order.user for robot, order in orders.items() if order is not None and order.stopped}
+
+    @property
+    def undelivered(self) -> list[str]:
+        """Robots that shall stand and have not got this yet: they may be driving."""
+        return [robot for robot in self.stopped if not self._has_newest_order(robot)]
 
     @property
     def fleet_stopped_by(self) -> str | None:
@@ -155,11 +165,12 @@ class RobotControl:
         else:
             for robot in wanted:
                 self._desired.order_robot(robot, order)
-        self._tell()
         async with asyncio.TaskGroup() as group:
             for robot in sorted(wanted):
                 group.create_task(reach(robot))
             group.create_task(self._save())
+            await asyncio.sleep(0)  # robots that are connected have their order then
+            self._tell()
             if robots is None:
                 await self._look()
                 for robot in sorted(self._known() - wanted):
@@ -214,7 +225,7 @@ class RobotControl:
 
     def _tell(self) -> None:
         """Call ``on_change`` if something changed since it was called last."""
-        now = self.stopped, self.fleet_stopped_by
+        now = self.stopped, self.undelivered, self.fleet_stopped_by
         if now != self._told:
             self._told = now
             self._on_change()
@@ -247,7 +258,7 @@ class RobotControl:
                     _log.debug("no emergency stop for %s: %s", robot, error)
                 else:
                     if sender.is_connected:
-                        self._desired.was_told(robot, self._send(robot, sender))
+                        self._send_again(robot, sender)
 
         while True:
             now = asyncio.get_running_loop().time()
@@ -257,10 +268,11 @@ class RobotControl:
             await asyncio.sleep(PREPARE_EVERY_S)
 
     def _needs_work(self, now: float, robot: str) -> bool:
-        """Return whether a robot's connection must be made or repaired, or a release is not noted yet."""
+        """Return whether a robot's connection must be made or repaired, or it has not got its order yet."""
         sender = self._stops.get(robot)
         if sender is not None:
-            return not sender.is_connected or self._desired.is_done_when_told(robot)
+            has_order = self._has_newest_order(robot) and not self._desired.is_done_when_told(robot)
+            return not sender.is_connected or not has_order
         is_urgent = self._desired.order_for(robot) is not None
         return is_urgent or now - self._refused_at.get(robot, float("-inf")) >= TRY_AGAIN_S
 
@@ -273,8 +285,23 @@ class RobotControl:
         sent = self._send(robot, sender)
         if not await sender.wait_connected():
             return "it is not connected; it gets this when it is"
-        self._desired.was_told(robot, sent)
+        self._note_delivered(robot, sent)
         return ""
+
+    def _send_again(self, robot: str, sender: CommandSender) -> None:
+        try:
+            self._note_delivered(robot, self._send(robot, sender))
+        except Exception as error:  # noqa: BLE001 - the others must be stopped all the same
+            _log.warning("the emergency stop of %s failed: %s", robot, error)
+
+    def _has_newest_order(self, robot: str) -> bool:
+        order = self._desired.order_for(robot)
+        return order is None or order is self._delivered.get(robot)
+
+    def _note_delivered(self, robot: str, order: StopOrder | None) -> None:
+        if order is not None:
+            self._delivered[robot] = order
+            self._desired.was_told(robot, order)
 
     def _send(self, robot: str, sender: CommandSender) -> StopOrder | None:
         """Send and return the newest order: another one may have come while the connection was made."""

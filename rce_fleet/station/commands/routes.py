@@ -46,6 +46,12 @@ class StopRequest(BaseModel):
     stopped: bool = Field(description="True: stand at once; false: release.")
 
 
+class StopAnswer(Answer):
+    """What an emergency stop, or its release, has reached."""
+
+    missed: list[str] = Field(description="Robots that were not reached; they get it as soon as they are.")
+
+
 class ModeRequest(BaseModel):
     """Whether the fleet drives."""
 
@@ -88,7 +94,7 @@ class ControlRoutes:
         EMERGENCY_STOP,
         "Stop all robots at once, or release them; works without the planner",
         body=StopRequest,
-        reply=Answer,
+        reply=StopAnswer,
         errors=_ERRORS,
     )
     async def stop_all(self, request: web.Request) -> web.StreamResponse:
@@ -100,7 +106,7 @@ class ControlRoutes:
         f"/robots/{{robot}}{EMERGENCY_STOP}",
         "Stop a robot at once, or release it; works without the planner",
         body=StopRequest,
-        reply=Answer,
+        reply=StopAnswer,
         errors=_ERRORS,
     )
     async def stop_one(self, request: web.Request) -> web.StreamResponse:
@@ -126,7 +132,8 @@ class ControlRoutes:
             return problem(409, "no robot is known yet; robots are stopped when they appear")
         if result.missed and not (robot is None and result.reached):
             return problem(409, result.text)
-        return _reply(Answer(message=f"{'stopped' if asked.stopped else 'released'}: {result.text}"))
+        text = f"{'stopped' if asked.stopped else 'released'}: {result.text}"
+        return _reply(StopAnswer(message=text, missed=sorted(result.missed)))
 
     @ROUTES.route(
         "PUT",

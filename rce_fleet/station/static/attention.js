@@ -8,6 +8,7 @@ const DRAW_EVERY_MS = 1000;
 const MOST = 20;
 
 const ANSWERS = {
+  undelivered: ["stop", "release"],
   emergency: ["release"],
   offline: ["takeOut", "reassign"],
   stuck: ["cancel", "reassign", "drive", "takeOut"],
@@ -31,7 +32,7 @@ export class Attention {
   }
 
   draw() {
-    const found = exceptionsOf(this.fleet.robots.values());
+    const found = exceptionsOf([...this.fleet.robots.values(), ...this.fleet.unknownUndelivered()]);
     this.count.textContent = found.length || "";
     const shown = found.slice(0, MOST);
     // Rebuilt only when something else is to be shown, so that a button keeps its focus.

@@ -30,19 +30,21 @@ export function heartbeatAge(robot, now = performance.now()) {
 }
 
 export function markOf(robot) {
-  if (robot.emergency) return MARK.stopped;
+  if (robot.emergency && !robot.undelivered) return MARK.stopped;
   if (robot.state === "silent" || robot.state === "offline") return MARK.offline;
+  if (robot.undelivered) return MARK.trouble;
   if (robot.mode === "manual" || robot.driver) return MARK.manual;
   if (robot.state === "lost") return MARK.lost;
   return TROUBLE.has(robot.state) ? MARK.trouble : MARK.none;
 }
 
-// All that is wrong with a robot, worst first: {kind, severity (3 is worst), text}.
+// All that is wrong with a robot, worst first: {kind, severity (4 is worst), text}.
 export function conditionsOf(robot, now = performance.now()) {
   const found = [];
   const add = (kind, severity, text) => found.push({ kind, severity, text });
   const age = heartbeatAge(robot, now);
-  if (robot.emergency) add("emergency", 3, t("condition.emergency", { user: robot.emergency }));
+  if (robot.undelivered) add("undelivered", 4, t("condition.undelivered", { user: robot.emergency }));
+  else if (robot.emergency) add("emergency", 3, t("condition.emergency", { user: robot.emergency }));
   if (robot.state === "silent") add("offline", 3, [robot.reason || t("condition.silent"), age !== null && t("condition.offline", { seconds: Math.round(age) })].filter(Boolean).join("; "));
   else if (age !== null && age > OFFLINE_S && robot.state !== "joining" && !HEARD.has(robot.state)) add("offline", 2, t("condition.offline", { seconds: Math.round(age) }));
   if (robot.state === "unreachable") add("stuck", 3, robot.reason || t("condition.unreachable", { cell: robot.goal ?? "?" }));

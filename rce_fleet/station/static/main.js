@@ -67,6 +67,7 @@ function answer(name, robot) {
   const task = fleet.robots.get(robot)?.task;
   const answers = {
     show: () => {
+      if (!fleet.robots.has(robot)) return;
       if (fleet.selected !== robot) fleet.select(robot);
       const { pose } = fleet.robots.get(robot);
       if (pose) view.camera.centre(pose.x, pose.y);

@@ -22,6 +22,7 @@ export class Fleet extends EventTarget {
   isPaused = false;    // whether the time of the simulated world stands still
   mode = "automatic";  // of the whole fleet: automatic, paused or stopped
   stopped = {};        // robot -> who stopped it
+  undelivered = new Set(); // robots of these that have not got the stop yet
   stoppedBy = null;    // who stopped all robots, also those that appear later
   driven = {};         // robot -> who drives it by hand
   manager = false;     // whether a fleet manager answers
@@ -129,11 +130,21 @@ export class Fleet extends EventTarget {
   }
 
   // Who stopped robots, and who drives them by hand: {robot: user}.
-  on_control({ stopped, driven, fleet_stopped_by: stoppedBy }) {
+  on_control({ stopped, driven, fleet_stopped_by: stoppedBy, undelivered }) {
     this.stopped = stopped;
+    this.undelivered = new Set(undelivered);
     this.stoppedBy = stoppedBy ?? null;
     this.driven = driven;
-    for (const robot of this.robots.values()) Object.assign(robot, { emergency: stopped[robot.id] ?? null, driver: driven[robot.id] ?? null });
+    for (const robot of this.robots.values()) Object.assign(robot, this.#control(robot.id));
+  }
+
+  #control(id) {
+    return { emergency: this.stopped[id] ?? null, undelivered: this.undelivered.has(id), driver: this.driven[id] ?? null };
+  }
+
+  // Robots that have not got their stop, and that the planner does not know.
+  unknownUndelivered() {
+    return [...this.undelivered].filter((id) => !this.robots.has(id)).map((id) => ({ id, state: "unknown", ...this.#control(id) }));
   }
 
   on_manager({ here }) {
@@ -251,7 +262,7 @@ export class Fleet extends EventTarget {
 
   #robot(id) {
     if (!this.robots.has(id)) {
-      this.robots.set(id, { id, state: "unknown", reason: "", cell: null, goal: null, plan: [], granted: [], replans: 0, pose: null, shown: null, seen: null, heard: null, trail: new Trail(), waitingSince: null, emergency: this.stopped[id] ?? null, driver: this.driven[id] ?? null });
+      this.robots.set(id, { id, state: "unknown", reason: "", cell: null, goal: null, plan: [], granted: [], replans: 0, pose: null, shown: null, seen: null, heard: null, trail: new Trail(), waitingSince: null, ...this.#control(id) });
     }
     return this.robots.get(id);
   }

@@ -53,7 +53,11 @@ export class Operator extends EventTarget {
   async #run(label, run) {
     try {
       const answer = await run();
-      this.say(answer?.message || t("done", { label }));
+      const text = answer?.message || t("done", { label });
+      // An emergency stop that has not reached every robot stays in the list of events.
+      const isPartial = Boolean(answer?.missed?.length);
+      this.say(text, isPartial);
+      if (isPartial) this.note(text);
       this.dispatchEvent(new Event("acted"));
       return answer ?? true;
     } catch (error) {

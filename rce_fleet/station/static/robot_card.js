@@ -23,7 +23,8 @@ export class RobotCard {
     if (this.box.hidden) return;
     const paused = robot.activity === "paused" || robot.mode === "paused";
     const out = robot.activity === "out" || robot.mode === "out_of_service";
-    const names = [robot.emergency ? "release" : "stop", paused ? "resume" : "pause", out ? "putIn" : "takeOut", ...ANSWERS].filter((name) => isPossible(name, this.fleet));
+    const stops = [...(robot.emergency && !robot.undelivered ? [] : ["stop"]), ...(robot.emergency ? ["release"] : [])];
+    const names = [...stops, paused ? "resume" : "pause", out ? "putIn" : "takeOut", ...ANSWERS].filter((name) => isPossible(name, this.fleet));
     const key = [robot.id, ...names].join();
     if (key !== this.key) {
       this.key = key;
@@ -39,7 +40,7 @@ export class RobotCard {
       this.box.replaceChildren(this.title, this.text, row);
     }
     const age = heartbeatAge(robot);
-    const parts = [robot.activity ?? robot.state, robot.reason, robot.task && `${robot.task}`, robot.loads && t("robot.loads", { count: robot.loads }), Number.isFinite(robot.battery) && `${Math.round(100 * robot.battery)} %`];
+    const parts = [robot.undelivered && t("condition.undelivered", { user: robot.emergency }), robot.activity ?? robot.state, robot.reason, robot.task && `${robot.task}`, robot.loads && t("robot.loads", { count: robot.loads }), Number.isFinite(robot.battery) && `${Math.round(100 * robot.battery)} %`];
     parts.push(age === null ? t("age.never") : t("age.seconds", { seconds: age.toFixed(1) }));
     this.text.textContent = parts.filter(Boolean).join(" \u00b7 ");
   }

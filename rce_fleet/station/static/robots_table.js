@@ -61,13 +61,14 @@ export class RobotsTable {
     if (now - this.#orderAt > 900 || wanted !== this.wanted) {
       this.#orderAt = now;
       this.wanted = wanted;
-      const [trouble, others] = [[], []];
+      const [worst, trouble, others] = [[], [], []];
       for (const id of this.#names) {
         const robot = robots.get(id);
         if (wanted && !`${id} ${robot.state}`.toLowerCase().includes(wanted)) continue;
-        (TROUBLE.has(robot.state) || robot.emergency ? trouble : others).push(id);
+        if (robot.undelivered) worst.push(id);
+        else (TROUBLE.has(robot.state) || robot.emergency ? trouble : others).push(id);
       }
-      this.#order = [...trouble, ...others];
+      this.#order = [...worst, ...trouble, ...others];
     }
     let busy = 0;
     for (const robot of robots.values()) if (robot.plan.length > 1) busy++;
@@ -119,12 +120,18 @@ class Row {
     if (row.ariaSelected !== String(selected)) row.setAttribute("aria-selected", selected);
     const age = heartbeatAge(robot);
     const [, state, cell, goal, replans, seen] = cells;
-    setText(state, robot.emergency ? t("state.emergency") : robot.state, robot.emergency || TROUBLE.has(robot.state) ? "bad" : "");
+    setText(state, stateText(robot), robot.emergency || TROUBLE.has(robot.state) ? "bad" : "");
     setText(cell, robot.cell ?? "");
     setText(goal, robot.goal ?? "");
     setText(replans, robot.replans);
     setText(seen, age === null ? t("age.never") : age < FRESH_S ? t("age.now") : t("age.seconds", { seconds: Math.round(age) }), age === null || age >= LATE_S ? "warn" : "quiet");
   }
+}
+
+// A robot that has not got its stop may be driving: its own state stays visible.
+function stateText({ emergency, undelivered, state }) {
+  if (undelivered) return t("state.undelivered", { state });
+  return emergency ? t("state.emergency") : state;
 }
 
 function setText(part, text, name = "") {

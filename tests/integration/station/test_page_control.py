@@ -59,6 +59,25 @@ async def check_stops(made: Site, page: Page) -> None:
     await page.locator("#release-all").wait_for(state="hidden")
 
 
+async def check_missed(page: Page) -> None:
+    """Robot2 does not listen: the page says so as long as its stop is not delivered."""
+    await page.locator("#stop-all").click()
+    await page.locator("#message.bad", has_text="Robot1 reached, 1 not reached; not Robot2").wait_for()
+    await page.locator("#events .bad", has_text="not Robot2").wait_for()
+    await page.locator("#attention-list li.severe", has_text="has not reached it").first.wait_for()
+    first = await page.locator("#attention-list li").first.inner_text()
+    assert first.startswith("!!Robot2"), first
+    assert ("Stop" in first, "Release" in first) == (True, True)
+    await page.locator("tr[data-robot=Robot2]", has_text="idle, stop not delivered").wait_for()
+    await page.locator("tr[data-robot=Robot1]", has_text="e-stop").wait_for()
+    await page.locator("tr[data-robot=Robot2]").click()
+    for name in ("Stop", "Release"):
+        await page.locator("#robot-card button", has_text=name).wait_for()
+    page.once("dialog", lambda dialog: dialog.accept())
+    await page.locator("#release-all").click()
+    await page.locator("tr[data-robot=Robot2]", has_text="stop not delivered").wait_for(state="detached")
+
+
 async def check_pose(made: Site, page: Page) -> None:
     """A drag says where the robot is and in which direction it looks; two cells do without a pointer."""
     await page.locator("#robot-card button", has_text="Localize").click()
@@ -99,6 +118,11 @@ async def check_drive(made: Site, page: Page) -> None:
     await page.keyboard.press("Escape")
     await page.locator("#drive").wait_for(state="hidden")
     await made.until(lambda: made.fleet.modes == [("Robot1", "manual"), ("Robot1", "automatic")])
+
+
+async def test_a_robot_that_a_stop_does_not_reach_is_shown() -> None:
+    async with site() as made, opened(made) as page:
+        await check_missed(page)
 
 
 async def test_an_operator_stops_places_and_drives_a_robot() -> None:

@@ -111,7 +111,11 @@ async def site(authenticator: Authenticator | None = None) -> AsyncIterator[Site
     ):
         source = RosCommandSource(RosLayerSource(core.uri, TYPES))
         control = RobotControl(
-            source, view.robot_ids, lambda: feed.on_control(control.stopped, control.driven)
+            source,
+            view.robot_ids,
+            lambda: feed.on_control(
+                control.stopped, control.driven, control.fleet_stopped_by, control.undelivered
+            ),
         )
         login = Login()
         station = Station(view, fleet, feed.pages, authenticator=authenticator or login, control=control)  # type: ignore[arg-type]  # as wide as what is called
@@ -183,6 +187,7 @@ async def test_a_stop_reaches_those_who_listen() -> None:
         await made.until(lambda: True in made.stops)
         assert (status, "Robot1 reached" in text, "not Robot2" in text) == (200, True, True)
         assert set(made.control.stopped) == {"Robot1", "Robot2"}
+        assert made.control.undelivered == ["Robot2"]
         status, _ = await made.put("/robots/Robot1/emergency-stop", {"stopped": False})
         await made.until(lambda: False in made.stops)
         assert (status, set(made.control.stopped)) == (200, {"Robot2"})

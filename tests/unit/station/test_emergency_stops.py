@@ -24,8 +24,10 @@ class Sender(CommandSender):
         self.sent: list[bool] = []
         self.connected = True
         self.is_broken = False
+        self.tries = 0
 
     def send(self, message: dict[str, Any]) -> None:
+        self.tries += 1
         if self.is_broken:
             raise RuntimeError("broken")
         self.sent.append(message["data"])
@@ -97,6 +99,48 @@ async def test_a_robot_that_is_away_is_stopped_when_it_comes(names: list[str] | 
     robots.here.add("Robot1")
     async with running(control):
         await until(lambda: robots.last("Robot1") is True)
+
+
+async def test_a_stop_that_is_not_delivered_is_told_until_it_is() -> None:
+    robots = Robots("Robot1", "Robot2")
+    told: list[list[str]] = []
+    control = RobotControl(
+        robots, lambda: ["Robot1", "Robot2", "Robot3"], lambda: told.append(control.undelivered)
+    )
+    away = robots.senders["Robot2"] = Sender()
+    away.connected = False
+    result = await control.emergency_stop(None, "op", stopped=True)
+    assert "Robot1 reached, 2 not reached" in result.text
+    assert (told[-1], set(control.stopped)) == (["Robot2", "Robot3"], {"Robot1", "Robot2", "Robot3"})
+    async with running(control):
+        away.connected = True
+        robots.here.add("Robot3")
+        await until(lambda: told[-1] == [])
+        assert (robots.last("Robot2"), robots.last("Robot3")) == (True, True)
+
+
+async def test_robots_that_connect_at_once_are_not_told_as_missed() -> None:
+    robots = Robots("Robot1")
+    told: list[list[str]] = []
+    control = RobotControl(robots, lambda: ["Robot1"], lambda: told.append(control.undelivered))
+    await control.emergency_stop(None, "op", stopped=False)
+    told.clear()
+    await control.emergency_stop(None, "op", stopped=True)
+    assert told == [[]]
+    await control.close()
+
+
+async def test_a_stop_that_cannot_be_sent_again_ends_nothing() -> None:
+    robots = Robots("Robot1", "Robot2")
+    control = RobotControl(robots, lambda: ["Robot1", "Robot2"])
+    broken = robots.senders["Robot1"] = Sender()
+    broken.is_broken = True
+    await control.emergency_stop(None, "op", stopped=True)
+    async with running(control):
+        await until(lambda: broken.tries > 2)
+        assert control.undelivered == ["Robot1"]
+        broken.is_broken = False
+        await until(lambda: control.undelivered == [])
 
 
 async def test_a_release_reaches_a_robot_that_comes_later() -> None:
