@@ -10,17 +10,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import Counter
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from errno import EAGAIN
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from rce.aio.tasks import BackgroundTasks
 from rce_master.exceptions import FencedError, StoreError
 from rce_master.leadership.standby_client import StandbyError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Collection
+    from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Sequence
 
     from rce_master.leadership.registry import MasterRegistry
     from rce_master.packages.contents import ContentStore
@@ -33,6 +34,9 @@ LOOK_S = 10.0
 """Longest time from one comparison with the other masters to the next."""
 WAIT_S = 5.0
 """How long a task set waits for an archive that this master fetches; then it asks again."""
+LOST_S = 900.0
+"""A needed archive counts as lost if for so long no other master had it, and all of them answer. After the
+engine has been down for days, they get to know each other one by one."""
 _PIECE = 1000
 """Archives that are looked at in one turn of the event loop."""
 
@@ -51,6 +55,10 @@ class NeededContents(Protocol):
 
     def is_complete(self) -> bool:
         """Tell whether all that is needed is known; else nothing is removed."""
+
+
+Forget: TypeAlias = "Callable[[Collection[str]], Awaitable[None]]"
+"""Makes the state need archives no more, by their hashes."""
 
 
 class ArchiveCopies:
@@ -79,6 +87,10 @@ class ArchiveCopies:
         self._sending: set[tuple[str, str]] = set()
         """Names of masters, and hashes."""
         self._fetching: dict[str, asyncio.Task[None]] = {}
+        self._absent: dict[str, float] = {}
+        """Since when no master is known that has a needed archive: hashes, and times."""
+        self._lost: set[str] = set()
+        """Those of them that count as lost."""
         self._faults: dict[str, str] = {}
         """What was wrong with each master at the last look."""
 
@@ -86,11 +98,12 @@ class ArchiveCopies:
         """Compare with the other masters soon."""
         self._wanted.set()
 
-    async def run(self, needed: NeededContents) -> None:
+    async def run(self, needed: NeededContents, forget: Forget | None = None) -> None:
         """Compare with the other masters now and then, until cancelled.
 
         Args:
             needed: Tells which archives are needed.
+            forget: Called with the hashes of needed archives that no master has.
 
         Raises:
             FencedError: This master leads no more.
@@ -99,6 +112,9 @@ class ArchiveCopies:
             while True:
                 self._wanted.clear()
                 await self._compare(needed)
+                lost = self._lost
+                if lost and forget is not None:
+                    await forget(lost)
                 try:
                     async with asyncio.timeout(LOOK_S):
                         await self._wanted.wait()
@@ -211,17 +227,12 @@ class ArchiveCopies:
         try:
             others = await self._registry.others()
             own = await asyncio.to_thread(self._store.held)
-            while missing := await self._list(needed) - own:  # what is fetched may name more
-                for sha256 in missing:
-                    await self._fetch(sha256)
-                    own.add(sha256)
+            why = await self._fetch_missing(needed, others, own)
         except FencedError:
             raise
-        except (OSError, StoreError, StandbyError) as error:
-            self._note("this master", f"packages are incomplete: {error}")
-            others = []
-        else:
-            self._note("this master", "")
+        except (OSError, StoreError) as error:
+            why, others = str(error), []
+        self._note("this master", f"packages are incomplete: {why}" if why else "")
         for other in others:
             try:
                 await self._complete(other, needed, own)
@@ -229,6 +240,54 @@ class ArchiveCopies:
                 self._note(other.name, f"its packages are not compared: {error}")
             else:
                 self._note(other.name, "")
+
+    async def _fetch_missing(
+        self, needed: NeededContents, others: Sequence[OtherMaster], own: set[str]
+    ) -> str:
+        """Fetch what this master lacks, and add it to what it has.
+
+        Returns:
+            Why not all was fetched; empty if it was.
+
+        Raises:
+            StoreError: Archives cannot be kept.
+        """
+        held: dict[str, set[str]] | None = None
+        absent: set[str] = set()
+        reasons: dict[str, str] = {}
+        while missing := await self._list(needed) - own - reasons.keys():  # what is fetched may name more
+            if held is None:
+                held = await self._held(others)
+            for sha256 in missing:
+                if not any(sha256 in there for there in held.values()):
+                    absent.add(sha256)
+                    reasons[sha256] = "no other master that answers has it"
+                    continue
+                try:
+                    await self._fetch(sha256)
+                except StandbyError as error:
+                    reasons[sha256] = str(error)
+                else:
+                    own.add(sha256)
+        self._note_absent(absent, all_answered=held is None or len(held) == len(others))
+        if not reasons:
+            return ""
+        example = min(reasons)
+        return f"{len(reasons)} are missing, such as {example}: {reasons[example]}"
+
+    async def _held(self, others: Sequence[OtherMaster]) -> dict[str, set[str]]:
+        """Return what each of the other masters has that answers."""
+        held = {}
+        for other in others:
+            with suppress(StandbyError):
+                held[other.name] = await self._client.held(other)
+        return held
+
+    def _note_absent(self, absent: set[str], *, all_answered: bool) -> None:
+        now = time.monotonic()
+        self._absent = {sha256: self._absent.get(sha256, now) for sha256 in absent}
+        since = now - LOST_S
+        self._lost = {one for one, begun in self._absent.items() if begun <= since} if all_answered else set()
 
     @staticmethod
     async def _list(needed: NeededContents) -> set[str]:

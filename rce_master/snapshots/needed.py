@@ -59,6 +59,10 @@ class NeededSnapshots:
         """Return the hashes of all contents."""
         return self._snapshots() | self._uses.keys()
 
+    def contents_of(self, snapshot: str) -> frozenset[str]:
+        """Return the hashes of a snapshot's manifest, and of what this names if it was read."""
+        return self._named.get(snapshot, frozenset()) | {snapshot}
+
     def is_needed(self, sha256: str) -> bool:
         """Tell whether a content is needed."""
         return sha256 in self._uses or bool(self._volumes.count("snapshot", sha256))

@@ -83,26 +83,32 @@ class SnapshotService:
         Raises:
             FencedError: This master leads no more.
         """
-        await self._forget_lost()
+        if self._copies is None:
+            await self._forget({known.snapshot for known in self._state_service.tables.volumes})
         async with TaskScope() as tasks:
             if self._copies is not None:
-                tasks.spawn(self._copies.run(self._needed), name="copies of snapshots")
+                tasks.spawn(self._copies.run(self._needed, self._forget), name="copies of snapshots")
             await self._sweep()
 
-    async def _forget_lost(self) -> None:
-        """Forget snapshots that no master can have, as after a backup was restored."""
-        if self._copies is not None:
-            return
+    async def _forget(self, contents: Collection[str]) -> None:
+        """Forget snapshots with contents that no master has, as after a backup was restored.
+
+        Args:
+            contents: Those that no other master has.
+        """
+        missing = set(contents)
         for known in [one for one in self._state_service.tables.volumes if one.snapshot]:
-            if await asyncio.to_thread(self._is_lost, known.snapshot):
-                lost = commands.SnapshotLost(volume=known.id, snapshot=known.snapshot)
-                await self._state_service.submit_all([lost])
+            for sha256 in self._needed.contents_of(known.snapshot) & missing:
+                if await asyncio.to_thread(self._is_lost, sha256):
+                    lost = commands.SnapshotLost(volume=known.id, snapshot=known.snapshot)
+                    await self._state_service.submit_all([lost])
+                    break
 
     def _is_lost(self, sha256: str) -> bool:
         try:
             return not self._store.path(sha256).exists()
         except OSError as error:
-            _log.error("it is not known whether the snapshot %s is there: %s", sha256, error)
+            _log.error("it is not known whether the content %s is there: %s", sha256, error)
             return False
 
     async def _sweep(self) -> None:

@@ -72,7 +72,10 @@ def _server() -> str:
     path = f"{folder}/socket"
     subprocess.run(
         [sys.executable, "-P", "-m", "support.forked_commands", path, str(os.getpid())],
-        env={**os.environ, "PYTHONPATH": str(TESTS)},
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(filter(None, (str(TESTS), os.environ.get("PYTHONPATH")))),
+        },
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

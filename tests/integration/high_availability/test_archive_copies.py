@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 from collections import Counter
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Collection, Iterable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import cast
@@ -15,8 +15,10 @@ import pytest
 from aiohttp import web
 from aiohttp.test_utils import TestServer
 from support.engine import until
+from support.ports import free_port
 
-from rce.aio.tasks import cancel_and_wait
+from rce.aio.tasks import TaskScope, cancel_and_wait
+from rce.control.snapshots import FileEntry, Manifest
 from rce_master.http.archives import ArchiveRoutes
 from rce_master.http.leader_check import LeaderCheck
 from rce_master.leadership.core import Fence, LeadershipCore, LeaseSettings
@@ -24,8 +26,14 @@ from rce_master.leadership.registry import MasterRegistry
 from rce_master.leadership.request_key import RequestKey
 from rce_master.leadership.standby_client import StandbyClient
 from rce_master.packages.contents import ARCHIVES_PATH, ContentStore
-from rce_master.packages.copies import ArchiveCopies
+from rce_master.packages.copies import ArchiveCopies, Forget
 from rce_master.packages.transfer import ArchiveClient
+from rce_master.snapshots.service import SnapshotService
+from rce_master.state.changes import make_row
+from rce_master.state.records import UserVolume
+from rce_master.state.tables import Tables
+from rce_master.state_service import StateService
+from rce_master.store import MemoryStore
 from rce_master.store.etcd.layout import OtherMaster
 
 MANY = 20_000
@@ -42,14 +50,18 @@ def fill(folder: Path, names: Iterable[str]) -> None:
         (folder / name).touch()
 
 
-class OneOther:
-    """A registry that knows one other master."""
+class Known:
+    """A registry.
+
+    Attributes:
+        masters: The other masters.
+    """
 
     def __init__(self, url: str) -> None:
-        self._other = OtherMaster("other", url)
+        self.masters = [OtherMaster("other", url)]
 
     async def others(self) -> list[OtherMaster]:
-        return [self._other]
+        return self.masters
 
 
 class Counted:
@@ -78,14 +90,15 @@ class Counted:
 class Pair:
     """A leading master's copies, and the folder of a stand-by."""
 
-    def __init__(self, copies: ArchiveCopies, own: Path, others: Path) -> None:
+    def __init__(self, copies: ArchiveCopies, registry: Known, own: Path, others: Path) -> None:
         self.copies = copies
+        self.registry = registry
         self.own = own
         self.others = others
 
     @asynccontextmanager
-    async def comparing(self, needed: Counted) -> AsyncIterator[None]:
-        running = asyncio.create_task(self.copies.run(needed))
+    async def comparing(self, needed: Counted, forget: Forget | None = None) -> AsyncIterator[None]:
+        running = asyncio.create_task(self.copies.run(needed, forget))
         try:
             yield
         finally:
@@ -101,11 +114,12 @@ async def pair(tmp_path: Path) -> AsyncIterator[Pair]:
     core.granted(0.0, 3.0)
     core.elected(1, 0.0)
     async with TestServer(app) as server, aiohttp.ClientSession() as session:
-        registry = cast("MasterRegistry", OneOther(str(server.make_url("/"))))
+        registry = Known(str(server.make_url("/")))
         client = StandbyClient(session, KEY, Fence(core, lambda: 0.0, "leader"))
-        yield Pair(
-            ArchiveCopies(ContentStore(own), registry, ArchiveClient(client, ARCHIVES_PATH)), own, others
+        copies = ArchiveCopies(
+            ContentStore(own), cast("MasterRegistry", registry), ArchiveClient(client, ARCHIVES_PATH)
         )
+        yield Pair(copies, registry, own, others)
 
 
 async def test_many_held_contents_are_listed_once(pair: Pair) -> None:
@@ -162,3 +176,86 @@ async def test_own_folder_that_cannot_be_read_is_looked_at_again(
         pair.own.mkdir()
         pair.copies.look()
         await until(lambda: not (pair.others / unneeded[0]).exists())
+
+
+def write(folder: Path, *contents: bytes) -> list[str]:
+    """Write contents under their hashes, which are returned."""
+    folder.mkdir(exist_ok=True)
+    names = [hashlib.sha256(content).hexdigest() for content in contents]
+    for name, content in zip(names, contents, strict=True):
+        (folder / name).write_bytes(content)
+    return names
+
+
+async def test_contents_that_no_master_has_do_not_stop_the_others(
+    pair: Pair, caplog: pytest.LogCaptureFixture
+) -> None:
+    here, there = write(pair.own, b"a", b"b"), write(pair.others, b"c", b"d")
+    unneeded = hashes(1, "unneeded")
+    fill(pair.others, unneeded)
+    async with pair.comparing(Counted([*here, *there, *hashes(20, "lost")])):
+        await until(lambda: all((pair.own / name).exists() for name in there))
+        await until(lambda: all((pair.others / name).exists() for name in here))
+        await until(lambda: not (pair.others / unneeded[0]).exists())
+    assert "packages are incomplete: 20 are missing, such as" in caplog.text
+
+
+async def test_contents_are_lost_once_all_other_masters_tell_so(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair.own.mkdir()
+    forgotten: list[set[str]] = []
+    lost = hashes(2, "lost")
+    counted = Counted(lost)
+
+    async def forget(contents: Collection[str]) -> None:
+        forgotten.append(set(contents))
+
+    async def compare_once() -> None:
+        looks = counted.calls["look"]
+        pair.copies.look()
+        await until(lambda: counted.calls["look"] >= looks + 4)  # a whole comparison has ended
+
+    pair.registry.masters.append(OtherMaster("away", f"http://127.0.0.1:{free_port()}/"))
+    async with pair.comparing(counted, forget):
+        await compare_once()
+        monkeypatch.setattr("rce_master.packages.copies.LOST_S", 0.0)
+        await compare_once()
+        assert not forgotten, "one master may have them"
+        pair.registry.masters.pop()
+        monkeypatch.setattr("rce_master.packages.copies.LOST_S", 900.0)
+        await compare_once()
+        assert not forgotten, "a master may not be known yet"
+        monkeypatch.setattr("rce_master.packages.copies.LOST_S", 0.0)
+        pair.copies.look()
+        await until(lambda: forgotten)
+    assert forgotten[0] == set(lost)
+
+
+async def test_volumes_forget_snapshots_that_no_master_has(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rce_master.packages.copies.LOST_S", 0.0)
+    tables = Tables()
+    missing_piece = hashes(1, "piece")[0]
+    file = FileEntry(path=b"f", mode=0o644, modified_ns=0, size=1, pieces=(bytes.fromhex(missing_piece),))
+    (partial,) = write(pair.others, Manifest(entries=(file,)).encode())
+    (whole,) = write(pair.others, Manifest(entries=()).encode())
+    snapshots = {"lost": hashes(1)[0], "partial": partial, "whole": whole}
+    volumes = [UserVolume(user="anna", name=name, size=1, snapshot=of) for name, of in snapshots.items()]
+    for volume in volumes:
+        tables.volumes.assign(volume.id, volume)
+    store = MemoryStore()
+    await store.save([make_row(tables.volumes, volume.id) for volume in volumes], await store.begin_term())
+    state_service = await StateService.open(store)
+    service = SnapshotService(state_service, ContentStore(pair.own), copies=pair.copies)
+    pair.own.mkdir()
+
+    def left() -> list[str]:
+        return [one.name for one in state_service.tables.volumes if one.snapshot]
+
+    async with TaskScope() as tasks:
+        tasks.spawn(state_service.run(), name="state")
+        tasks.spawn(service.run(), name="snapshots")
+        await until(lambda: left() == ["whole"])
+        await until((pair.own / whole).exists)

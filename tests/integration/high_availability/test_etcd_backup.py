@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
+from msgspec.structs import replace
 from support.etcd import Cluster, cluster
 from support.master_program import rce
 from support.masters import Masters, masters
@@ -12,6 +13,10 @@ from support.pushed import Pushed
 from support.user_packages import KEY
 
 from rce_master.etcd_backup import MORE_TERMS
+from rce_master.state.changes import make_row
+from rce_master.state.core import State
+from rce_master.state.records import UserVolume
+from rce_master.state.tables import Tables
 from rce_master.store import SqliteStore
 from rce_master.store.etcd import EtcdClient
 from rce_master.store.etcd.store import EtcdStore
@@ -80,6 +85,28 @@ async def test_a_backup_of_etcd_is_restored_elsewhere(tmp_path: Path) -> None:
         await rce(tmp_path, "restore", "back.tar", "--store", back, "--state-dir", "back/master")
         loaded = await EtcdStore(client, "/back").load()
         assert loaded == {table: rows for table, rows in restored.items() if rows}
+
+
+async def test_volumes_are_restored_without_snapshots(tmp_path: Path) -> None:
+    """A backup holds none of their contents: masters would look for them without end."""
+    old = UserVolume(user="anna", name="a", size=1, snapshot="0" * 64, kept=5, taken=7.0)
+    plain = UserVolume(user="anna", name="b", size=1)
+    tables = Tables()
+    for volume in (old, plain):
+        tables.volumes.assign(volume.id, volume)
+    store = await SqliteStore.open(tmp_path / "one" / "master")
+    try:
+        term = await store.begin_term()
+        await store.save([make_row(tables.volumes, volume.id) for volume in (old, plain)], term)
+    finally:
+        await store.close()
+    await rce(tmp_path, "backup", "copy.tar", "--state-dir", "one")
+    async with cluster(tmp_path / "etcd") as etcd, EtcdClient(etcd.endpoints, attempt=20.0) as client:
+        await rce(tmp_path, "restore", "copy.tar", "--store", f"{etcd.store}/a", "--state-dir", "two/master")
+        restored = State()
+        for _ in restored.reading(await EtcdStore(client, "/a").load()):
+            pass
+    assert list(restored.tables.volumes) == [replace(old, snapshot="", kept=0, taken=0.0), plain]
 
 
 async def test_backups_that_cannot_be_made_or_restored(tmp_path: Path) -> None:
