@@ -30,6 +30,8 @@ MAX_ENTRIES = 100_000
 """Files, folders and links of a volume."""
 MAX_MANIFEST = 32 << 20
 """Bytes of a manifest as it is sent."""
+MAX_PIECES = MAX_MANIFEST // 34
+"""Pieces of all files that a volume is read for, holes included; each takes up to 34 bytes of a manifest."""
 HOLE = b""
 """In place of the hash of a piece that holds only zeros."""
 _MAX_PATH = 4000

@@ -51,6 +51,8 @@ _CAP_AMBIENT_CLEAR_ALL = 4
 _SECBIT_NO_SETUID_FIXUP = 4
 _CAPABILITY_VERSION_3 = 0x2008_0522
 _MNT_DETACH = 2
+_FALLOC_FL_KEEP_SIZE = 1
+_FALLOC_FL_PUNCH_HOLE = 2
 _NS_GET_USERNS = 0xB701
 _SECCOMP_MODE_FILTER = 2
 _BPF_INSTRUCTION_BYTES = 8
@@ -58,6 +60,7 @@ _BPF_INSTRUCTION_BYTES = 8
 _libc = ctypes.CDLL(None, use_errno=True)
 
 _libc.prctl.argtypes = (ctypes.c_int, *[ctypes.c_ulong] * 4)
+_libc.fallocate.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes.c_int64)
 _libc.mount.argtypes = (ctypes.c_char_p, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_ulong, ctypes.c_char_p)
 
 
@@ -98,6 +101,11 @@ def unmount(target: str) -> None:
 def sync_file_system(fd: int) -> None:
     """Write all data of the file system of an open file to its disk. Blocks."""
     _check(_libc.syncfs, fd)
+
+
+def punch_hole(fd: int, offset: int, length: int) -> None:
+    """Give the disk space of a part of a file back; the part reads as zeros, and the size stays."""
+    _check(_libc.fallocate, fd, _FALLOC_FL_KEEP_SIZE | _FALLOC_FL_PUNCH_HOLE, offset, length)
 
 
 def set_dumpable(dumpable: bool) -> None:

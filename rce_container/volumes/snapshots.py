@@ -12,6 +12,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Itera
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
+from rce.aio.tasks import TaskScope
 from rce.control import (
     ContentError,
     RestoreVolume,
@@ -22,12 +23,14 @@ from rce.control import (
     VolumeSaved,
 )
 from rce.control.snapshots import MAX_MANIFEST, Manifest, Offer, decode_manifest
+from rce.guard.turns import CrowdedError, Turns
 from rce_container.exceptions import VolumeError
 from rce_container.files import remove
 from rce_container.folder import make_accessible
+from rce_container.packages.disk import in_own_thread
 from rce_container.volumes import tree
 from rce_container.volumes.freezing import frozen
-from rce_container.volumes.tree import Pieces
+from rce_container.volumes.tree import Allowance, Pieces
 
 if TYPE_CHECKING:
     from rce.control_channel.contents import Piece
@@ -43,6 +46,9 @@ FetchPiece: TypeAlias = "Callable[[str, int], Awaitable[Piece]]"
 _ATTEMPTS = 8
 """Of a transfer, while the master is away or another one takes its place."""
 _PAUSE_S = 1.0
+_AT_ONCE = 4
+"""How many snapshots are taken at the same time, each of another user."""
+_WAITING = 10_000
 _RELEASE_S = 30.0
 """How long the container that has a volume may take to end completely."""
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
@@ -100,6 +106,9 @@ class SnapshotKeeper:
         """Kind and volume of the orders that are being carried out."""
         self._due: dict[tuple[str, str], float] = {}
         """When the next snapshot is taken, by incarnation and volume; seconds of the monotonic clock."""
+        self._taken: set[tuple[str, str]] = set()
+        """The snapshots that are being taken, by incarnation and volume."""
+        self._turns = Turns(_AT_ONCE, waiting=_WAITING, each=1)
         self._copies: dict[tuple[str, str], Path] = {}
         """Copies of the last snapshots, by incarnation and volume: the next ones write only what differs."""
         self.is_wanted = False
@@ -143,7 +152,7 @@ class SnapshotKeeper:
                 raise SnapshotError("its files are not on this machine")
             root = await asyncio.to_thread(self._store.places.open, order.volume)
             try:
-                return await self._send_tree(order.volume, root)
+                return await self._send_tree(order.volume, root, _size_of(root))
             finally:
                 os.close(root)
 
@@ -182,7 +191,7 @@ class SnapshotKeeper:
         try:
             pieces = None
             try:
-                pieces = Pieces(root, await asyncio.to_thread(tree.scan, root))
+                pieces = Pieces(root, await in_own_thread(tree.scan, root, Allowance(_size_of(root))))
             except (SnapshotError, OSError) as error:
                 _log.info("former files of volume %s are of no use: %s", id_, error)
             yield pieces
@@ -243,9 +252,9 @@ class SnapshotKeeper:
 
     # Sending
 
-    async def _send_tree(self, id_: str, root: int) -> str:
-        """Send a snapshot; return its hash, in hex."""
-        manifest = await asyncio.to_thread(tree.scan, root)
+    async def _send_tree(self, id_: str, root: int, size: int) -> str:
+        """Send a snapshot of a volume that may hold so many bytes; return its hash, in hex."""
+        manifest = await in_own_thread(tree.scan, root, Allowance(size))
         listed = manifest.encode()
         name = hashlib.sha256(listed).hexdigest()
         failures = 0
@@ -275,9 +284,15 @@ class SnapshotKeeper:
     async def run(self, subjects: Mapping[str, Subject]) -> None:
         """Take the snapshots that volumes ask for, until cancelled.
 
+        Users take turns, so that a large volume of one delays others' snapshots only a little.
+
         Args:
             subjects: The containers, by incarnation; the time of those that start or end does not count.
         """
+        async with TaskScope() as tasks:
+            await self._run(subjects, tasks)
+
+    async def _run(self, subjects: Mapping[str, Subject], tasks: TaskScope) -> None:
         while True:
             await asyncio.sleep(_LOOK_S)
             asked = {
@@ -289,26 +304,37 @@ class SnapshotKeeper:
             }
             now = time.monotonic()
             self._due = {key: self._due.get(key, now + claim.snapshots) for key, claim in asked.items()}
-            for key in self._copies.keys() - asked.keys():
+            for key in self._copies.keys() - asked.keys() - self._taken:
                 await asyncio.to_thread(_remove, self._copies.pop(key))
             for key, claim in asked.items():
                 subject = subjects.get(key[0])
-                if subject is None or not subject.is_running:  # it has ended since
+                if subject is None or key in self._taken or self._due[key] > now or not self.is_wanted:
                     continue
-                if self._due[key] <= now and self.is_wanted:
-                    self._due[key] = now + claim.snapshots
+                self._due[key] = now + claim.snapshots
+                self._taken.add(key)
+                tasks.spawn(self._take_in_turn(key, subject, claim), name=f"snapshot of {claim.id}")
+
+    async def _take_in_turn(self, key: tuple[str, str], subject: Subject, claim: Claim) -> None:
+        try:
+            async with self._turns.turn(claim.id.partition("/")[0], claim.id):
+                if subject.is_running:
                     await self._take(key, subject, claim)
+        except CrowdedError:
+            _log.warning("there is no snapshot of volume %s: too many others wait", claim.id)
+        finally:
+            self._taken.discard(key)
 
     async def _take(self, key: tuple[str, str], subject: Subject, claim: Claim) -> None:
         saved = VolumeSaved(volume=claim.id, placement=claim.placement)
         try:
             if key not in self._copies:
                 self._copies[key] = await asyncio.to_thread(self._store.places.make_scratch)
-            pause = await asyncio.to_thread(self._copy, subject, claim, self._copies[key])
+            pause = await in_own_thread(self._copy, subject, claim, self._copies[key])
             _log.debug("volume %s: its container was stopped for %.1f ms", claim.id, 1e3 * pause)
             root = os.open(self._copies[key], _FOLDER)
             try:
-                saved = _with(saved, snapshot=await self._send_tree(claim.id, root))
+                size = claim.size or _size_of(root)
+                saved = _with(saved, snapshot=await self._send_tree(claim.id, root, size))
             finally:
                 os.close(root)
         except (SnapshotError, VolumeError, OSError) as error:
@@ -327,13 +353,20 @@ class SnapshotKeeper:
         """
         root = self._store.places.open_running(claim.id, subject.handle.namespaces_pid, claim.path)
         target = os.open(scratch, _FOLDER)
+        size = claim.size or _size_of(root)
+
+        def is_wanted() -> bool:  # its file system stays mounted while it is read
+            return subject.is_running
+
         try:
             with contextlib.suppress(SnapshotError, OSError):  # files vanish meanwhile; the next copy counts
-                tree.copy(root, target)
+                tree.copy(root, target, Allowance(size, is_wanted))
+            if not is_wanted():
+                raise SnapshotError("its container ended while it was read")
             with frozen(subject.pids):
                 began = time.perf_counter()
-                copied = tree.copy(root, target)
-                if not subject.is_running:  # what came after it may have written meanwhile
+                copied = tree.copy(root, target, Allowance(size, is_wanted))
+                if not is_wanted():  # what came after it may have written meanwhile
                     raise SnapshotError("its container ended while it was copied")
                 pause = time.perf_counter() - began
             tree.finish_copy(copied, target)
@@ -351,6 +384,12 @@ def _with(saved: VolumeSaved, *, snapshot: str = "", error: str = "") -> VolumeS
         snapshot=snapshot,
         error=error,
     )
+
+
+def _size_of(root: int) -> int:
+    """Return how many bytes the file system of a folder can hold."""
+    found = os.fstatvfs(root)
+    return found.f_blocks * found.f_frsize
 
 
 def _remove(path: Path) -> None:

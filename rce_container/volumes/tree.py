@@ -9,16 +9,20 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import fcntl
 import os
 import shutil
 import stat
+import sys
 from collections.abc import Awaitable, Callable, Iterator
 from typing import TypeAlias, assert_never
 
 from rce.control import SnapshotError
 from rce.control.snapshots import (
+    HOLE,
     MAX_ENTRIES,
+    MAX_PIECES,
     PIECE,
     Entry,
     FileEntry,
@@ -29,8 +33,9 @@ from rce.control.snapshots import (
     permissions,
     pieces_of,
 )
+from rce.model import about
 from rce_container.descent import FOLDER, Descent, names_in
-from rce_container.forkserver.kernel import sync_file_system
+from rce_container.forkserver.kernel import punch_hole, sync_file_system
 
 Fetch: TypeAlias = Callable[[str], Awaitable[bytes]]
 """Returns a content by its hash, in hex; raises :class:`SnapshotError`."""
@@ -41,6 +46,52 @@ _READ = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
 _CHANGED = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 _OWN = 0o700
+_SLACK = 16 << 20
+"""Bytes beyond its size that a volume that is a folder may hold for a while."""
+
+
+class Allowance:
+    """Ends the reading of a volume that holds too much, or that is not wanted any more. For one pass.
+
+    A node can make files of any size without data, and any number of links to one file.
+
+    Args:
+        size: Bytes that the volume may hold.
+        is_wanted: Whether its files are still wanted.
+    """
+
+    def __init__(self, size: int, is_wanted: Callable[[], bool] = lambda: True) -> None:
+        self._size = size
+        self._is_wanted = is_wanted
+        self._bytes = 0
+        self._pieces = 0
+
+    def begin(self, size: int) -> None:
+        """Count a file of this size.
+
+        Raises:
+            SnapshotError: The files are too large together.
+        """
+        self._pieces += -(-size // PIECE)
+        if self._pieces > MAX_PIECES:
+            raise SnapshotError(
+                f"its files are larger than {about(MAX_PIECES * PIECE)} together, with their holes"
+            )
+
+    def take(self, count: int) -> None:
+        """Count data that is about to be read.
+
+        Raises:
+            SnapshotError: It is too much, or not wanted any more.
+        """
+        self._bytes += count
+        if self._bytes > self._size + _SLACK:
+            raise SnapshotError(
+                f"its files hold more than the {about(self._size)} that it may hold; each hard link counts "
+                "as a file, and 512 kB that hold any data count whole"
+            )
+        if not self._is_wanted():
+            raise SnapshotError("its container ended while it was read")
 
 
 class _Access(Descent):
@@ -132,11 +183,11 @@ def _leads_to(access: Descent, path: bytes) -> bytes:
     return os.readlink(name, dir_fd=folder)
 
 
-def scan(root: int) -> Manifest:
+def scan(root: int, allowance: Allowance) -> Manifest:
     """Read a volume.
 
     Raises:
-        SnapshotError: It has too many files, or changed meanwhile.
+        SnapshotError: It has too many files or too much data, or changed meanwhile.
         OSError: A file cannot be read.
     """
     entries: list[Entry] = []
@@ -148,17 +199,19 @@ def scan(root: int) -> Manifest:
             elif stat.S_ISLNK(found.st_mode):
                 entries.append(LinkEntry(path=path, target=_leads_to(access, path)))
             elif stat.S_ISREG(found.st_mode):
-                entries.append(_read_file(access, path, found))
+                entries.append(_read_file(access, path, found, allowance))
     return Manifest(entries=tuple(entries))
 
 
-def _read_file(access: _Access, path: bytes, found: os.stat_result) -> FileEntry:
+def _read_file(access: _Access, path: bytes, found: os.stat_result, allowance: Allowance) -> FileEntry:
     fd = access.open(path)
     try:
         size = os.fstat(fd).st_size
-        pieces = tuple(
-            digest(_read(fd, offset, min(PIECE, size - offset))) for offset in range(0, size, PIECE)
-        )
+        allowance.begin(size)
+        pieces = [HOLE] * -(-size // PIECE)
+        for offset, length in _parts_with_data(fd, size):
+            allowance.take(length)
+            pieces[offset // PIECE] = digest(_read(fd, offset, length))
     finally:
         os.close(fd)
     return FileEntry(
@@ -166,8 +219,28 @@ def _read_file(access: _Access, path: bytes, found: os.stat_result) -> FileEntry
         mode=permissions(found.st_mode),
         modified_ns=found.st_mtime_ns,
         size=size,
-        pieces=pieces,
+        pieces=tuple(pieces),
     )
+
+
+def _parts_with_data(fd: int, size: int) -> Iterator[tuple[int, int]]:
+    """Iterate over the offsets and lengths of a file's pieces that are not holes as a whole."""
+    offset = 0
+    while (start := _next_data(fd, offset)) < size:
+        offset = start - start % PIECE
+        length = min(PIECE, size - offset)
+        yield offset, length
+        offset += length
+
+
+def _next_data(fd: int, offset: int) -> int:
+    """Return where a file has data, at an offset or after it; beyond any file if nowhere."""
+    try:
+        return os.lseek(fd, offset, os.SEEK_DATA)
+    except OSError as error:
+        if error.errno != errno.ENXIO:
+            raise
+        return sys.maxsize
 
 
 def _read(fd: int, offset: int, length: int) -> bytes:
@@ -218,14 +291,14 @@ class Pieces:
         return data
 
 
-def copy(root: int, target: int) -> Manifest:
+def copy(root: int, target: int, allowance: Allowance) -> Manifest:
     """Make a folder a copy of a volume, and write only what differs from what the folder holds already.
 
     Returns:
         What is in the volume, without the hashes of pieces: for :func:`finish_copy`.
 
     Raises:
-        SnapshotError: It has too many files, or changed meanwhile.
+        SnapshotError: It has too many files or too much data, or changed meanwhile.
         OSError: It cannot be copied.
     """
     entries: dict[bytes, Entry] = {}
@@ -246,7 +319,7 @@ def copy(root: int, target: int) -> Manifest:
                 entries[path] = LinkEntry(path=path, target=leads)
             elif stat.S_ISREG(found.st_mode):
                 _has(made, path, found)
-                size = _copy_file(access, path, made)
+                size = _copy_file(access, path, made, allowance)
                 entries[path] = FileEntry(path=path, mode=mode, modified_ns=modified_ns, size=size, pieces=())
     with _Access(target) as access:
         left = [path for path, _ in _walk(access) if path not in entries]
@@ -305,27 +378,47 @@ def _discard(made: Descent, path: bytes) -> None:
         shutil.rmtree(name, dir_fd=folder)
 
 
-def _copy_file(access: _Access, path: bytes, made: Descent) -> int:
+def _copy_file(access: _Access, path: bytes, made: Descent, allowance: Allowance) -> int:
     """Copy a file; return its size."""
     source = access.open(path)
     try:
         folder, name = made.parent(path)
         fd = os.open(name, _CHANGED, 0o600, dir_fd=folder)
         try:
-            size = os.fstat(source).st_size
+            found = os.fstat(source)
+            size = found.st_size
+            allowance.begin(size)
             try:
                 fcntl.ioctl(fd, _CLONE, source)
             except OSError:  # another file system, or one that cannot share blocks
-                os.ftruncate(fd, size)
-                for offset in range(0, size, PIECE):
-                    data = _read(source, offset, min(PIECE, size - offset))
-                    if os.pread(fd, len(data), offset) != data:
-                        _write_all(fd, data, offset)
+                _copy_data(source, fd, size, allowance)
+            else:
+                allowance.take(min(size, found.st_blocks * 512))
         finally:
             os.close(fd)
     finally:
         os.close(source)
     return size
+
+
+def _copy_data(source: int, fd: int, size: int, allowance: Allowance) -> None:
+    """Make a file equal to another one, with the same holes."""
+    os.ftruncate(fd, size)
+    end = 0
+    for offset, length in _parts_with_data(source, size):
+        _clear(fd, end, offset)
+        allowance.take(length)
+        data = _read(source, offset, length)
+        if os.pread(fd, length, offset) != data:
+            _write_all(fd, data, offset)
+        end = offset + length
+    _clear(fd, end, size)
+
+
+def _clear(fd: int, start: int, end: int) -> None:
+    """Make a part of a file a hole."""
+    if _next_data(fd, start) < end:
+        punch_hole(fd, start, end - start)
 
 
 async def write(manifest: Manifest, root: int, fetch: Fetch) -> None:

@@ -27,7 +27,7 @@ from rce_container.volumes import images, tree
 from rce_container.volumes.freezing import frozen
 from rce_container.volumes.measuring import measure
 from rce_container.volumes.mounted import open_image, open_inside
-from rce_container.volumes.tree import Pieces
+from rce_container.volumes.tree import Allowance, Pieces
 
 IMAGES = pytest.mark.skipif(bool(why := images.unavailable()), reason=f"volumes cannot be images: {why}")
 
@@ -76,7 +76,7 @@ def opened(path: Path) -> int:
 def scan(path: Path) -> Manifest:
     root = opened(path)
     try:
-        return tree.scan(root)
+        return tree.scan(root, Allowance(1 << 30))
     finally:
         os.close(root)
 
@@ -100,7 +100,7 @@ def write(manifest: Manifest, source: Path, target: Path) -> None:
 def copy(source: Path, target: Path) -> None:
     ends = opened(source), opened(target)
     try:
-        tree.finish_copy(tree.copy(*ends), ends[1])
+        tree.finish_copy(tree.copy(*ends, Allowance(1 << 30)), ends[1])
     finally:
         for end in ends:
             os.close(end)
@@ -148,6 +148,60 @@ def test_a_copy_follows_what_changes(made: Path, tmp_path: Path) -> None:
     assert scan(tmp_path / "copy") == scan(made)
     found = (tmp_path / "copy" / "deep" / "deeper" / "file").stat()
     assert (found.st_ino, found.st_blocks) == (kept.st_ino, kept.st_blocks)
+
+
+def test_a_file_without_data_is_copied_at_once(tmp_path: Path) -> None:
+    """Only what holds data is read, and data that became a hole is freed in the copy."""
+    volume, again = tmp_path / "volume", tmp_path / "copy"
+    volume.mkdir()
+    again.mkdir()
+    file = volume / "sparse"
+    file.write_bytes(os.urandom(3 * PIECE))
+    copy(volume, again)
+    with file.open("wb") as opened_:
+        opened_.truncate(256 << 30)
+        os.pwrite(opened_.fileno(), b"data", 200 << 30)
+    ends = opened(volume), opened(again)
+    try:
+        tree.finish_copy(tree.copy(*ends, Allowance(0)), ends[1])  # whole, it would be too much
+        manifest = tree.scan(ends[1], Allowance(0))
+        assert manifest == tree.scan(ends[0], Allowance(0))
+    finally:
+        for end in ends:
+            os.close(end)
+    assert manifest.size == PIECE
+    assert (again / "sparse").stat().st_size == 256 << 30
+    assert (again / "sparse").stat().st_blocks * 512 <= PIECE
+
+
+@pytest.mark.parametrize("read", [scan, lambda volume: copy(volume, volume.parent / "copy")])
+def test_what_is_too_much_is_refused_early(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    """Before it is read: a node can make files of any size, and any number of links to one."""
+    volume = tmp_path / "volume"
+    volume.mkdir()
+    (tmp_path / "copy").mkdir()
+    with (volume / "file").open("wb") as file:
+        file.truncate(4 << 40)
+    with pytest.raises(SnapshotError, match="its files are larger than"):
+        read(volume)
+    (volume / "file").write_bytes(os.urandom(16 * MEGABYTE))
+    for number in range(80):
+        os.link(volume / "file", volume / f"link{number}")
+    with pytest.raises(SnapshotError, match="each hard link counts"):
+        read(volume)
+    assert size_of(tmp_path / "copy") < (1 << 30) + 33 * MEGABYTE
+
+
+def test_a_copy_ends_with_its_container(made: Path, tmp_path: Path) -> None:
+    """Its file system stays mounted while it is read, and the next container waits."""
+    (tmp_path / "copy").mkdir()
+    ends = opened(made), opened(tmp_path / "copy")
+    try:
+        with pytest.raises(SnapshotError, match="its container ended"):
+            tree.copy(*ends, Allowance(1 << 30, lambda: False))
+    finally:
+        for end in ends:
+            os.close(end)
 
 
 def test_a_wrong_piece_is_refused(made: Path, tmp_path: Path) -> None:
@@ -324,7 +378,7 @@ def test_an_image_is_filled_and_read(made: Path, tmp_path: Path) -> None:
     os.close(root)
     images.wait_until_unused(image, time.monotonic() + 30)
     root = open_image(image, point, read_only=True)
-    assert tree.scan(root) == manifest
+    assert tree.scan(root, Allowance(1 << 30)) == manifest
     with pytest.raises(OSError, match="Read-only"):
         os.mkdir("x", dir_fd=root)
     os.close(root)
@@ -386,10 +440,10 @@ def test_a_database_is_copied_whole_while_it_is_written(
         work = tmp_path / "copy"
         work.mkdir(exist_ok=True)
         ends = opened(tmp_path / "volume"), opened(work)
-        tree.copy(*ends)
+        tree.copy(*ends, Allowance(1 << 30))
         with frozen(lambda: [writer.pid]):
             assert state(writer.pid) == "T"
-            tree.copy(*ends)
+            tree.copy(*ends, Allowance(1 << 30))
         for end in ends:
             os.close(end)
         shutil.copytree(work, tmp_path / f"copy{attempt}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import os
 import shutil
 import time
@@ -25,12 +27,12 @@ from rce.control.messages import (
     Welcome,
 )
 from rce.control.model import VolumePlacement
-from rce.control.snapshots import decode_manifest
+from rce.control.snapshots import Offer, decode_manifest
 from rce.control_channel.contents import ContentClient
 from rce.control_channel.dialing import Dialer
 from rce.control_channel.peer import Peer
 from rce.control_channel.server import ControlServer
-from rce.control_channel.uploads import Uploader
+from rce.control_channel.uploads import Upload, Uploader
 from rce.masters import Masters
 from rce.model import MEGABYTE, NodeSpec, Resources, Volume
 from rce_container.volumes import images
@@ -109,11 +111,11 @@ def placement(number: int, *, is_new: bool = False) -> tuple[VolumePlacement, ..
 
 
 async def put(
-    machine: Machine, revision: int, number: int, *, snapshots: int = 0, is_new: bool = False
+    machine: Machine, revision: int, number: int, *, snapshots: int = 0, is_new: bool = False, id_: str = BOX
 ) -> None:
     volume = Volume(name="journal", path="/data/journal", size=SIZE, snapshots=snapshots)
     await machine.put(
-        BOX,
+        id_,
         revision,
         nodes=(NodeSpec(tag="node", pkg="own", exe="keep.py"),),
         resources=Resources(volumes=(volume,)),
@@ -263,6 +265,35 @@ async def test_a_container_that_starts_gives_no_snapshot(
             await machine.drop(BOX)
     finally:
         machine.tidy()
+
+
+class StuckUploader(Uploader):
+    """Sends no snapshot of one volume to its end."""
+
+    @asynccontextmanager
+    async def upload(self, offer: Offer) -> AsyncIterator[Upload]:
+        if offer.volume == JOURNAL:
+            await asyncio.Event().wait()
+        async with super().upload(offer) as upload:
+            yield upload
+
+
+async def test_a_slow_snapshot_does_not_delay_other_users(
+    pair: tuple[Machine, Machine], folder: Path
+) -> None:
+    a, _ = pair
+    async with keeping(folder, a), contextlib.AsyncExitStack() as stack:
+        assert a.uploader is not None
+        a.uploader = StuckUploader(a.uploader._dialer)
+        await stack.enter_async_context(a.engine())
+        await a.manager.handle(Welcome(version=CONTROL_VERSION, master="m", features=(SNAPSHOTS,)))
+        for id_ in (BOX, "other/box"):
+            await put(a, 1, 1, snapshots=1, is_new=True, id_=id_)
+            await a.log_holds(id_, "node", "1 runs")
+        await until(lambda: len(a.of(VolumeSaved)) > 1, what="two snapshots")
+        assert {saved.volume for saved in a.of(VolumeSaved)} == {"other/journal"}
+        await a.drop(BOX)
+        await a.drop("other/box")
 
 
 async def test_damage_is_refused_and_changes_nothing(pair: tuple[Machine, Machine], folder: Path) -> None:
