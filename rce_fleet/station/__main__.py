@@ -304,6 +304,7 @@ async def serve(
         on_pose=feed.on_pose,
         on_event=feed.on_event,
         on_fleet_event=lambda text: station.fleet_api.feed.take(text),  # noqa: PLW0108 - made below
+        on_planner=feed.on_planner,
     )
     stop = asyncio.Event()
     for number in end_signals():

@@ -121,6 +121,11 @@ class RobotModel(_Model):
         default=False, description="Its move client answers nothing: its poses show its progress."
     )
     pose: PoseModel | None
+    age: float | None = Field(
+        default=None,
+        description="Seconds since the planner had its last sign of life, or since the planner was heard "
+        "last, if it does not tell this; null: not known.",
+    )
 
 
 class MapModel(_Model):
@@ -142,3 +147,7 @@ class FleetModel(_Model):
     robots: list[RobotModel]
     blocked: list[int]
     pending: list[int] = Field(description="Cells that will be blocked once a robot has left them.")
+    age: float | None = Field(
+        default=None,
+        description="Seconds since the planner was heard last: it sends something every second; null: never.",
+    )

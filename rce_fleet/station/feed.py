@@ -100,7 +100,7 @@ class Feed:
         self._heard.clear()
         if moved:
             self._all.clear()
-            self.pages.send_forms(lambda: _text("poses", {"poses": moved}), lambda: self._frame(moved))
+            self.pages.send_forms(lambda: _text("poses", {"poses": moved}), lambda: self._frame(moved, now))
 
     def on_engine(self, state: dict[str, Any]) -> None:
         """Send the engine's state."""
@@ -129,12 +129,19 @@ class Feed:
         }
         self.pages.send("control", _text("control", message))
 
+    def on_planner(self, away_since: float | None) -> None:
+        """Send since when the planner is away, seconds since 1970; None: it is there."""
+        self.pages.send("planner", _text("planner", {"away_since": away_since}))
+
     def on_event(self, text: str, tone: str) -> None:
         """Send an event."""
         self.pages.send_event(_text("event", {"text": text, "tone": tone}))
 
     def _tell_all(self, *, compact: bool = False) -> list[Message]:
-        """Return the complete messages; made once for all pages that need them now."""
+        """Return the complete messages; made once for all pages that need them now.
+
+        Ages of robots in frames grow while nothing else changes, so a frame is made for each page.
+        """
         grid = self._view.map()
         if grid is None:
             return []
@@ -147,10 +154,14 @@ class Feed:
                 "blocked": self._view.blocked(),
                 "pending": self._view.pending(),
             }
-            poses = {robot: self._pose(robot) for robot in names if robot in self._view.poses}
-            last = self._frame(poses) if compact else _text("poses", {"poses": poses})
-            self._all[compact] = [_text("map", grid), _text("state", state), last]
-        return self._all[compact]
+            self._all[compact] = [_text("map", grid), _text("state", state)]
+            if not compact:
+                self._all[compact].append(_text("poses", {"poses": self._poses()}))
+        last = [self._frame(self._poses(), time.monotonic())] if compact else []
+        return [*self._all[compact], *last]
+
+    def _poses(self) -> dict[str, _Pose]:
+        return {robot: self._pose(robot) for robot in self._view.robot_ids() if robot in self._view.poses}
 
     def _robots(self, names: tuple[str, ...] | list[str]) -> list[dict[str, Any]]:
         robots = self._view.robots(names)
@@ -164,9 +175,11 @@ class Feed:
         """Return the number of a robot in frames; it keeps it while the station runs."""
         return self._indices.setdefault(robot, len(self._indices))
 
-    def _frame(self, poses: dict[str, _Pose]) -> bytes:
-        ages = self._view.ages
-        rows = [PoseRow(self._index(robot), *pose, ages.get(robot, -1.0)) for robot, pose in poses.items()]
+    def _frame(self, poses: dict[str, _Pose], now: float) -> bytes:
+        rows = []
+        for robot, pose in poses.items():
+            age = self._view.age(robot, now)
+            rows.append(PoseRow(self._index(robot), *pose, -1.0 if age is None else age))
         return encode_poses(time.time(), rows)
 
     def _pose(self, robot: str) -> _Pose:

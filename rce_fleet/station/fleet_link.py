@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Awaitable, Callable
 from math import inf
 from typing import Any, assert_never
@@ -41,8 +42,8 @@ POSES_WAIT_S = 10.0
 topic of poses is followed then."""
 
 
-def _ignore(text: str) -> None:
-    del text
+def _ignore(value: object) -> None:
+    del value
 
 
 class FleetLink:
@@ -55,6 +56,8 @@ class FleetLink:
         on_pose: Called with a robot's id after its pose was updated.
         on_event: Called with a text and a tone (``good``, ``warn``, ``bad`` or empty) for each event.
         on_fleet_event: Called with each event of the fleet manager, a JSON object.
+        on_planner: Called with the time since when the planner is away, seconds since 1970, and with None
+            when it is back: it sent nothing for :data:`SILENT_S`, and does not answer.
     """
 
     def __init__(
@@ -66,6 +69,7 @@ class FleetLink:
         on_pose: Callable[[str], None],
         on_event: Callable[[str, str], None],
         on_fleet_event: Callable[[str], None] = _ignore,
+        on_planner: Callable[[float | None], None] = _ignore,
     ) -> None:
         self._client = client
         self._view = view
@@ -81,6 +85,9 @@ class FleetLink:
         """Whether an event told that the planner publishes no changes."""
         self._on_event = on_event
         self._on_fleet_event = on_fleet_event
+        self._on_planner = on_planner
+        self._began_at = 0.0
+        self._is_away = False
         self._desired = Desired()
         self._planner_started: str | None = None
         self._planner_restarted = asyncio.Event()
@@ -95,6 +102,7 @@ class FleetLink:
     async def run(self, ready: Callable[[], Awaitable[None]]) -> None:
         """Receive messages until cancelled; ``ready`` is called once the planner is connected."""
         self._changes_at = _now()
+        self._began_at = time.monotonic()
         async with asyncio.TaskGroup() as group:
             group.create_task(self._client.run(self, ready))
             group.create_task(self._resend())
@@ -228,6 +236,7 @@ class FleetLink:
                 self._asked_in_vain = True
                 self._follower.fall_back()
                 self._client.receive_states()
+                self._notice_absence()
                 await asyncio.sleep(ASK_AGAIN.first)
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(pauses.next() - ASK_AGAIN.first):
@@ -235,6 +244,7 @@ class FleetLink:
                 continue
             pauses.reset()
             self._asked_in_vain = self._told = False
+            self._note_heard()
             self._state_needed.clear()
             early = self._follower.take_snapshot(answer)
             self._client.stop_states()
@@ -251,6 +261,25 @@ class FleetLink:
                 if self._follower.follows:
                     self.may_have_missed()
                 self._changes_at = _now()
+            self._notice_absence()
+
+    def _notice_absence(self) -> None:
+        """Tell that the planner is away if it sends nothing and does not answer, or was never heard."""
+        now = time.monotonic()
+        is_never_heard = self._view.planner_heard_at is None
+        heard_at = self._view.planner_heard_at or self._began_at
+        if self._is_away or now - heard_at < SILENT_S or not (self._asked_in_vain or is_never_heard):
+            return
+        self._is_away = True
+        self._on_planner(time.time() - (now - heard_at))
+        self._on_event("the planner does not answer; what is shown of the robots is old", "bad")
+
+    def _note_heard(self) -> None:
+        self._view.planner_heard_at = time.monotonic()
+        if self._is_away:
+            self._is_away = False
+            self._on_planner(None)
+            self._on_event("the planner answers again", "good")
 
     def _request_if_behind(self) -> None:
         if self._follower.is_behind:
@@ -271,6 +300,7 @@ class FleetLink:
 
     def take_state(self, message: dict[str, Any]) -> None:
         """Handle a ``fleet/FleetState``; ignore it if the planner publishes changes."""
+        self._note_heard()
         if self._follower.follows:
             return
         self._take(message["started"], self._view.on_state(message))
@@ -280,6 +310,7 @@ class FleetLink:
 
     def take_changes(self, message: dict[str, Any]) -> None:
         """Handle a ``fleet/FleetChanges``."""
+        self._note_heard()
         self._changes_at = _now()
         self._changes_came.set()
         if self._follower.take_changes(message):
@@ -321,12 +352,14 @@ class FleetLink:
 
     def take_poses(self, message: dict[str, Any]) -> None:
         """Handle the poses of many robots."""
+        self._note_heard()
         self._poses_due = inf
-        for robot in self._view.on_poses(message):
+        for robot in self._view.on_poses(message, time.monotonic()):
             self._on_pose(robot)
 
     def take_pose(self, robot: str, message: dict[str, Any]) -> None:
         """Handle a robot's pose message."""
+        self._note_heard()
         self._view.on_pose(robot, message)
         self._on_pose(robot)
 

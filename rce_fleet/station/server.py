@@ -7,6 +7,7 @@ import time
 from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from aiohttp import hdrs, web
 from pydantic import BaseModel, ValidationError
@@ -232,12 +233,14 @@ class Station:
         """Return the state of the fleet."""
         del request
         grid = self._view.map()
+        now = time.monotonic()
         return _reply(
             FleetModel(
                 map=None if grid is None else MapModel(**grid),
-                robots=[RobotModel(**robot) for robot in self._view.robots()],
+                robots=[self._model(robot, now) for robot in self._view.robots()],
                 blocked=self._view.blocked(),
                 pending=self._view.pending(),
+                age=self._view.planner_age(now),
             )
         )
 
@@ -247,9 +250,13 @@ class Station:
         wanted = request.match_info["robot"]
         for robot in self._view.robots():
             if robot["id"] == wanted:
-                return _reply(RobotModel(**robot))
+                return _reply(self._model(robot, time.monotonic()))
         known = ", ".join(self._view.robot_ids()) or "none yet"
         return problem(404, f"robot {wanted!r} is unknown; known robots: {known}")
+
+    def _model(self, robot: dict[str, Any], now: float) -> RobotModel:
+        age = self._view.age(robot["id"], now)
+        return RobotModel(**robot, age=self._view.planner_age(now) if age is None else age)
 
     @ROUTES.route(
         "PUT",

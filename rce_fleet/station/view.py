@@ -63,8 +63,10 @@ class FleetView:
     """The newest state of the fleet and the newest pose of each robot."""
 
     poses: dict[str, Pose] = field(default_factory=dict)
-    ages: dict[str, float] = field(default_factory=dict)
-    """Of robots' last signs of life, as the planner told with the newest poses; seconds."""
+    heard_at: dict[str, float] = field(default_factory=dict)
+    """When robots gave their last signs of life, as the planner told with poses; monotonic seconds."""
+    planner_heard_at: float | None = None
+    """When the planner was heard last, monotonic seconds; None: never."""
     mode: str = "automatic"
     """The mode of the fleet: automatic, paused or stopped."""
     _yaw: float = 0.0
@@ -103,7 +105,7 @@ class FleetView:
         self._map, self._robots, self._blocked, self._pending = grid, robots, blocked, pending
         for robot in self.poses.keys() - robots.keys():
             del self.poses[robot]
-            self.ages.pop(robot, None)
+            self.heard_at.pop(robot, None)
         return change
 
     def on_grid(self, message: dict[str, Any]) -> ViewChange:
@@ -121,7 +123,7 @@ class FleetView:
         for name in message["removed"]:
             self._robots.pop(name, None)
             self.poses.pop(name, None)
-            self.ages.pop(name, None)
+            self.heard_at.pop(name, None)
         blocked, pending, freed = (set(message[part]) for part in ("blocked", "pending", "freed"))
         self._blocked = (self._blocked | blocked) - pending - freed
         self._pending = (self._pending | pending) - blocked - freed
@@ -143,8 +145,8 @@ class FleetView:
         """Set a robot's pose."""
         self.poses[robot] = Pose.of_message(message)
 
-    def on_poses(self, message: dict[str, Any]) -> list[str]:
-        """Set the poses of a ``fleet/FleetPoses``; return the robots that are known."""
+    def on_poses(self, message: dict[str, Any], now: float) -> list[str]:
+        """Set the poses of a ``fleet/FleetPoses`` that came ``now``; return the robots that are known."""
         columns = (message[name] for name in ("robots", "x", "y", "yaw"))
         ages = message.get("age", ())  # planners of earlier releases tell none
         known = []
@@ -152,9 +154,18 @@ class FleetView:
             if robot in self._robots:
                 self.poses[robot] = Pose(x, y, yaw)
                 if place < len(ages):
-                    self.ages[robot] = ages[place]
+                    self.heard_at[robot] = now - ages[place]
                 known.append(robot)
         return known
+
+    def age(self, robot: str, now: float) -> float | None:
+        """Return the seconds since a robot's last sign of life; None: the planner does not tell."""
+        heard_at = self.heard_at.get(robot)
+        return None if heard_at is None else max(0.0, now - heard_at)
+
+    def planner_age(self, now: float) -> float | None:
+        """Return the seconds since the planner was heard last; None: it never was."""
+        return None if self.planner_heard_at is None else max(0.0, now - self.planner_heard_at)
 
     def robot_ids(self) -> list[str]:
         """Return the ids of the robots that the planner knows, ascending."""

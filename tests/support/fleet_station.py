@@ -53,6 +53,7 @@ async def fleet_station(
         on_pose=feed.on_pose,
         on_event=feed.on_event,
         on_fleet_event=lambda text: station.fleet_api.feed.take(text),  # noqa: PLW0108 - made below
+        on_planner=feed.on_planner,
     )
     station = Station(view, fleet, feed.pages, authenticator=authenticator, webhooks=webhooks)
     await station.fleet_api.load()

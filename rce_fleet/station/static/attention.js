@@ -1,6 +1,6 @@
 // What needs the operator, worst first, each with the answers that fit.
 
-import { exceptionsOf, isPossible } from "./conditions.js";
+import { exceptionsOf, fleetConditionsOf, isPossible } from "./conditions.js";
 import { element } from "./engine.js";
 import { t } from "./texts.js";
 
@@ -28,34 +28,40 @@ export class Attention {
     this.list = document.querySelector("#attention-list");
     this.count = document.querySelector("#attention-count");
     setInterval(() => this.draw(), DRAW_EVERY_MS);
-    fleet.addEventListener("control", () => this.draw());
+    for (const type of ["control", "planner"]) fleet.addEventListener(type, () => this.draw());
   }
 
   draw() {
+    const whole = fleetConditionsOf(this.fleet);
     const found = exceptionsOf([...this.fleet.robots.values(), ...this.fleet.unknownUndelivered()]);
-    this.count.textContent = found.length || "";
+    this.count.textContent = whole.length + found.length || "";
     const shown = found.slice(0, MOST);
     // Rebuilt only when something else is to be shown, so that a button keeps its focus.
-    const key = JSON.stringify([this.steers, this.fleet.manager, found.length, shown.map(({ robot, conditions }) => [robot.id, conditions.map(({ kind }) => kind)])]);
+    const key = JSON.stringify([this.steers, this.fleet.manager, whole, found.length, shown.map(({ robot, conditions }) => [robot.id, conditions.map(({ kind }) => kind)])]);
     if (key === this.#drawn) {
-      shown.forEach(({ conditions }, index) => { this.list.children[index].querySelector(".why").textContent = conditions.map(({ text }) => text).join("; "); });
+      shown.forEach(({ conditions }, index) => { this.list.children[whole.length + index].querySelector(".why").textContent = conditions.map(({ text }) => text).join("; "); });
       return;
     }
     this.#drawn = key;
-    this.list.replaceChildren(...shown.map((one) => this.#item(one)));
+    this.list.replaceChildren(...whole.map(({ text }) => this.#line([text])), ...shown.map((one) => this.#item(one)));
     if (found.length > MOST) this.list.append(element("li", t("attention.more", { count: found.length - MOST }), "quiet"));
-    if (!found.length) this.list.append(element("li", t("attention.none"), "quiet"));
+    if (!whole.length && !found.length) this.list.append(element("li", t("attention.none"), "quiet"));
+  }
+
+  #line(content, isSevere = true) {
+    const item = element("li", "", isSevere ? "severe" : "mild");
+    const sign = element("span", isSevere ? "!!" : "!", "sign");
+    sign.setAttribute("aria-hidden", "true");
+    item.append(sign, ...content);
+    return item;
   }
 
   #item({ robot, conditions }) {
-    const item = element("li", "", conditions[0].severity > 2 ? "severe" : "mild");
-    const sign = element("span", conditions[0].severity > 2 ? "!!" : "!", "sign");
-    sign.setAttribute("aria-hidden", "true");
     const name = element("button", robot.id, "link");
     name.type = "button";
     name.addEventListener("click", () => this.answer("show", robot.id));
     const why = element("span", conditions.map(({ text }) => text).join("; "), "why");
-    item.append(sign, name, " ", why);
+    const item = this.#line([name, " ", why], conditions[0].severity > 2);
     if (this.steers) {
       const row = element("div", "", "answers");
       const names = [...new Set(conditions.flatMap(({ kind }) => ANSWERS[kind] ?? []))].filter((name) => isPossible(name, this.fleet));

@@ -60,6 +60,12 @@ export function conditionsOf(robot, now = performance.now()) {
   return found.sort((a, b) => b.severity - a.severity);
 }
 
+// All that is wrong with the whole fleet: as with a robot.
+export function fleetConditionsOf({ plannerAwaySince }) {
+  if (plannerAwaySince === null) return [];
+  return [{ kind: "planner", severity: 4, text: t("condition.planner", { time: new Date(1000 * plannerAwaySince).toLocaleTimeString() }) }];
+}
+
 // The fleet's exceptions: {robot, conditions}, worst first.
 export function exceptionsOf(robots, now = performance.now()) {
   const found = [];

@@ -7,6 +7,7 @@ const LONGEST_MS = 8000;
 
 export class Connection {
   traffic = { messages: 0, bytes: 0, spent_ms: 0 }; // for measurements
+  isLive = false;
   #socket = null;
 
   // onLink: (whether it is live) => shows it
@@ -28,7 +29,7 @@ export class Connection {
     let opened = false;
     socket.addEventListener("open", () => {
       opened = true;
-      this.onLink(true);
+      this.#setLive(true);
       this.layers.request();
     });
     socket.addEventListener("message", ({ data }) => {
@@ -40,9 +41,14 @@ export class Connection {
     });
     socket.addEventListener("close", ({ code }) => {
       if (code === LOGIN_ENDED) return location.replace("/login");
-      this.onLink(false);
+      this.#setLive(false);
       setTimeout(() => this.open(opened ? 500 : Math.min(2 * delay, LONGEST_MS)), delay * (0.5 + Math.random()));
     });
+  }
+
+  #setLive(live) {
+    this.isLive = live;
+    this.onLink(live);
   }
 
   #take(data, socket) {

@@ -38,8 +38,14 @@ const badge = at("#link");
 const connection = new Connection(fleet, layers, (live) => {
   badge.textContent = t(live ? "link.live" : "link.connecting");
   badge.classList.toggle("live", live);
+  markStale();
 });
 const message = at("#message");
+
+// What the map shows is old.
+function markStale() {
+  at("#stages").classList.toggle("stale", !connection.isLive || fleet.plannerAwaySince !== null);
+}
 
 function say(text, bad = false) {
   message.textContent = text;
@@ -131,6 +137,10 @@ for (const type of ["state", "changes"]) fleet.addEventListener(type, () => {
   if (isPaused) at("#mode").textContent = t(`mode.${mode}`);
 });
 fleet.addEventListener("control", () => { at("#release-all").hidden = fleet.stoppedBy === null && !Object.keys(fleet.stopped).length; });
+fleet.addEventListener("planner", () => {
+  at("#planner").hidden = fleet.plannerAwaySince === null;
+  markStale();
+});
 at("#undo").addEventListener("click", () => operator.undo());
 operator.addEventListener("acted", () => {
   const { undoable } = operator;

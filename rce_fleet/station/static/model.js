@@ -25,6 +25,7 @@ export class Fleet extends EventTarget {
   undelivered = new Set(); // robots of these that have not got the stop yet
   stoppedBy = null;    // who stopped all robots, also those that appear later
   driven = {};         // robot -> who drives it by hand
+  plannerAwaySince = null; // seconds since 1970; null: the planner is there
   manager = false;     // whether a fleet manager answers
   sequence = 0;        // number of the last change that is known
   isBehind = false;    // a change is missing: everything is needed again
@@ -149,6 +150,10 @@ export class Fleet extends EventTarget {
 
   on_manager({ here }) {
     this.manager = here;
+  }
+
+  on_planner({ away_since: awaySince }) {
+    this.plannerAwaySince = awaySince;
   }
 
   on_masters(message) {

@@ -161,6 +161,23 @@ async def test_a_silent_robot_comes_first_with_its_answers() -> None:
         )
 
 
+async def test_the_page_tells_that_the_planner_is_away() -> None:
+    """Also a page that is opened later; what it shows is old."""
+    async with site() as made:
+        made.feed.on_planner(time.time() - 60)
+        page = await made.open()
+        await page.locator("#planner", has_text="planner away").wait_for()
+        await page.locator("#stages.stale").wait_for()
+        made.feed.on_change(made.view.on_changes(changes(robot("Robot2", state="silent", reason="gone"))))
+        await page.locator("#attention-list li.severe", has_text="gone").wait_for()
+        texts = await page.locator("#attention-list li").all_inner_texts()
+        assert ("the planner is away since" in texts[0], "Robot2" in texts[1]) == (True, True)
+        made.feed.on_planner(None)
+        await page.locator("#planner").wait_for(state="hidden")
+        await page.locator("#stages.stale").wait_for(state="detached")
+        await page.locator("#attention-list li", has_text="planner").wait_for(state="detached")
+
+
 async def test_the_page_tells_that_the_fleet_is_paused() -> None:
     """Only the button that does something is shown; what it asks for reaches the planner."""
     async with site() as made:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -99,6 +100,14 @@ async def test_reads_the_fleet(running: RunningStation) -> None:
     assert (fleet["blocked"], fleet["pending"]) == ([3], [1])
     robot = await (await running.client.get("/api/v1/robots/Robot1")).json()
     assert (robot["goal"], robot["plan"], robot["pose"]) == (2, [0, 2], None)
+    assert (fleet["age"], robot["age"]) == (None, None)
+    running.view.planner_heard_at = time.monotonic() - 100
+    fleet = await (await running.client.get("/api/v1/fleet")).json()
+    assert (fleet["age"] >= 100, fleet["robots"][0]["age"] >= 100) == (True, True)
+    poses = {"robots": ["Robot1"], "x": [1.0], "y": [0.0], "yaw": [0.0], "age": [5.0]}
+    running.view.on_poses(poses, time.monotonic() - 300)
+    robot = await (await running.client.get("/api/v1/robots/Robot1")).json()
+    assert robot["age"] >= 305, "the robot's own age, which grows"
     missing = await running.client.get("/api/v1/robots/Robot9")
     assert missing.status == 404
     assert "Robot1" in (await missing.json())["error"]

@@ -82,12 +82,14 @@ class Station:
         self.planner = Planner()
         self.view = FleetView()
         self.events: list[str] = []
+        self.away: list[bool] = []
         self.link = FleetLink(
             self.planner,
             self.view,
             on_change=lambda _: None,
             on_pose=lambda _: None,
             on_event=lambda text, _: self.events.append(text),
+            on_planner=lambda since: self.away.append(since is not None),
         )
 
 
@@ -151,6 +153,36 @@ async def test_a_planner_that_falls_silent_is_asked(monkeypatch: pytest.MonkeyPa
         await until(lambda: station.planner.receives_states)
         station.link.take_state(state(1, started="2.0"))
         assert station.view.blocked() == [1]
+
+
+async def test_a_planner_that_does_not_answer_is_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until it sends something again."""
+    monkeypatch.setattr(fleet_link, "SILENT_S", 0.2)
+    async with running(monkeypatch, first=0.05, longest=0.05) as station:
+        station.planner.answer = {"sequence": 7, "state": state(3)}
+        await until(lambda: station.view.blocked() == [3])
+        assert station.away == []
+        station.planner.answer = None
+        await until(lambda: station.away == [True])
+        assert "does not answer" in station.events[-1]
+        station.planner.answer = {"sequence": 7, "state": state(3)}
+        await until(lambda: station.away == [True, False])
+
+
+async def test_a_planner_that_was_never_heard_is_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet_link, "SILENT_S", 0.2)
+    async with running(monkeypatch, first=60.0, longest=60.0) as station:
+        await until(lambda: station.away == [True])
+        station.link.take_state(state(1))
+        assert station.away == [True, False]
+
+
+async def test_a_planner_that_is_quiet_but_answers_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet_link, "SILENT_S", 0.1)
+    async with running(monkeypatch, first=60.0, longest=60.0) as station:
+        station.planner.answer = {"sequence": 7, "state": state(3)}
+        await until(lambda: len(station.planner.asked) == 4)
+        assert station.away == []
 
 
 def poses(*names: str) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 
 import pytest
 from hypothesis import given
@@ -66,9 +67,25 @@ async def test_a_frame_tells_what_the_planner_heard_last() -> None:
     columns = {"robots": ["Robot1", "Robot2"], "x": [1.0, 2.0], "y": [0.0, 0.0], "yaw": [0.0, 0.0]}
     page = feed.pages.open(compact=True)
     for ages, expected in (([], [-1.0, -1.0]), ([0.5, 12.0], [0.5, 12.0])):
-        for name in view.on_poses({**columns, "age": ages}):
+        now = 100.0 + len(ages)
+        for name in view.on_poses({**columns, "age": ages}, now):
             feed.on_pose(name)
-        feed.send_poses(100.0 * len(expected) + len(ages))
+        feed.send_poses(now)
         frame = (await page.take())[-1]
         assert isinstance(frame, bytes)
         assert [row.age for row in decode_poses(frame)[1]] == expected
+
+
+async def test_ages_grow_in_frames_of_pages_that_open_later() -> None:
+    """Also while the planner sends nothing any more."""
+    view = FleetView()
+    feed = Feed(view)
+    feed.on_change(view.on_state(state(robot("Robot1"))))
+    columns = {"robots": ["Robot1"], "x": [1.0], "y": [0.0], "yaw": [0.0], "age": [2.0]}
+    view.on_poses(columns, time.monotonic() - 3600.0)
+    ages = []
+    for _ in range(2):
+        frame = (await feed.pages.open(compact=True).take())[-1]
+        assert isinstance(frame, bytes)
+        ages += [row.age for row in decode_poses(frame)[1]]
+    assert 3602.0 <= ages[0] <= ages[1] < 3800.0
