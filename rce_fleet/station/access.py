@@ -14,7 +14,6 @@ from rce_fleet.station.authentication import AuditedAction, AuthenticationError,
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
-COOKIE = "rce_station"
 USER, TOKEN = web.RequestKey("user", StationUser), web.RequestKey("token", str)
 IS_CHECKED = web.RequestKey("is_checked", bool)
 """False: the request may only stop robots, because its token was valid before and cannot be checked now."""
@@ -52,19 +51,17 @@ class AccessControl:
         if request.path in _PUBLIC or request.path.startswith("/static/"):
             return await handler(request)
         token = token_of(request)
-        request[IS_CHECKED] = True
-        if request.method == hdrs.METH_PUT and request.path.endswith(EMERGENCY_STOP):
-            user = await self._user_of_stop(request, token)
-        else:
-            user = await self._authenticator.authenticate(token)
+        user, is_left_over = await self._find_user(request, token)
         if user is None:
             return self._unauthorized(request, token)
         if not user.may_view:
             return problem(403, f"user {user.name!r} has the role {user.role}, which may not see this fleet")
-        request[USER], request[TOKEN] = user, token
+        request[USER], request[TOKEN] = user, "" if is_left_over else token
         response = await handler(request)
-        if request.query.get("token") and not response.prepared:
-            set_cookie(response, token, secure=request.secure)
+        if is_left_over and not response.prepared:
+            delete_cookie(request, response)
+        elif request.query.get("token") and not response.prepared:
+            set_cookie(request, response, token)
         return response
 
     async def is_still_allowed(self, request: web.Request, *, to_control: bool = False) -> bool:
@@ -105,6 +102,24 @@ class AccessControl:
         if self.on_audit is not None:
             self.on_audit(request[USER].name, action)
 
+    async def _find_user(self, request: web.Request, token: str) -> tuple[StationUser | None, bool]:
+        """Return the user, and whether the token is a cookie that is not valid at a station without logins.
+
+        A station of another engine may have left it. The user is the one of requests without a token then.
+
+        Raises:
+            AuthenticationError: The token cannot be checked now.
+        """
+        request[IS_CHECKED] = True
+        if request.method == hdrs.METH_PUT and request.path.endswith(EMERGENCY_STOP):
+            user = await self._user_of_stop(request, token)
+        else:
+            user = await self._authenticator.authenticate(token)
+        if user is not None or token != request.cookies.get(cookie_name(request)):
+            return user, False
+        user = await self._authenticator.authenticate("")
+        return user, user is not None
+
     async def _user_of_stop(self, request: web.Request, token: str) -> StationUser | None:
         """Return the user as last known if the engine does not answer soon: robots can be reached without it.
 
@@ -138,13 +153,25 @@ def token_of(request: web.Request) -> str:
     """Return the token of a request; empty if it has none, or one that cannot be valid."""
     scheme, _, bearer = request.headers.get(hdrs.AUTHORIZATION, "").partition(" ")
     given = bearer.strip() if scheme.lower() == "bearer" else ""
-    token = given or request.query.get("token", "") or request.cookies.get(COOKIE, "")
+    token = given or request.query.get("token", "") or request.cookies.get(cookie_name(request), "")
     return token if token.isascii() and token.isprintable() and len(token) <= MAX_TOKEN else ""
 
 
-def set_cookie(response: web.StreamResponse, token: str, *, secure: bool) -> None:
+def cookie_name(request: web.Request) -> str:
+    """Return the name of the station's cookie: a browser sends a cookie to all ports of a host."""
+    port = request.host.rpartition(":")[2]
+    return f"rce_station_{port}" if port.isdecimal() else "rce_station"
+
+
+def set_cookie(request: web.Request, response: web.StreamResponse, token: str) -> None:
     """Store a token in a browser's cookie; scripts cannot read it and other sites cannot send it."""
-    response.set_cookie(COOKIE, token, httponly=True, samesite="Strict", secure=secure)
+    name = cookie_name(request)
+    response.set_cookie(name, token, httponly=True, samesite="Strict", secure=request.secure)
+
+
+def delete_cookie(request: web.Request, response: web.StreamResponse) -> None:
+    """Have a browser forget the station's cookie."""
+    response.del_cookie(cookie_name(request))
 
 
 def problem(status: int, text: str, headers: Mapping[str, str] | None = None) -> web.Response:

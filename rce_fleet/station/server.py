@@ -18,7 +18,7 @@ from rce.web.origin import ServerNames
 from rce.web.routes import Route, RouteTable
 from rce_fleet.exceptions import EventsRestartedError, RequestRefusedError
 from rce_fleet.station import masters_watch, replay_routes, world_link
-from rce_fleet.station.access import COOKIE, USER, AccessControl, problem, set_cookie, token_of
+from rce_fleet.station.access import USER, AccessControl, delete_cookie, problem, set_cookie, token_of
 from rce_fleet.station.api import (
     MAX_CELL,
     Answer,
@@ -195,7 +195,7 @@ class Station:
         login = LoginRequest.model_validate_json(await read_whole(request))
         token = await self._authenticator.log_in(login.userID, login.password, request.remote or "")
         response = web.Response(status=204)
-        set_cookie(response, token, secure=request.secure)
+        set_cookie(request, response, token)
         return response
 
     @ROUTES.route(
@@ -205,7 +205,7 @@ class Station:
         """Revoke the request's token and delete the cookie."""
         await self._authenticator.log_out(token_of(request))
         response = web.Response(status=204)
-        response.del_cookie(COOKIE)
+        delete_cookie(request, response)
         return response
 
     @ROUTES.route(

@@ -13,6 +13,7 @@ import pytest
 from aiohttp.test_utils import TestServer
 from support.engine import until
 from support.master_program import master
+from yarl import URL
 
 from rce_fleet.station import page_socket
 from rce_fleet.station.engine_authenticator import CACHE_S, EngineAuthenticator, StationAccount
@@ -177,6 +178,22 @@ async def test_open_station_acts_as_its_user(tmp_path: Path) -> None:
             return any(r["action"] == "set_goal" and r["user"] == "testUser" for r in records)
 
         await until(noted, what="the action is in the audit log")
+
+
+async def test_open_station_drops_the_cookie_of_another_engine(tmp_path: Path) -> None:
+    """A station with logins may have had the same address before; a token that is sent must be valid."""
+    async with running_site(tmp_path, open_=True) as site:
+        name = f"rce_station_{URL(site.station).port}"
+        for path, status in (("", 200), ("api/v1/fleet", 200), ("api/v1/fleet?token=old", 401)):
+            left_over = {"Cookie": f"{name}=left-over"}
+            async with site.session.get(site.station + path, headers=left_over) as reply:
+                assert reply.status == status
+                assert (status == 401) != (name in reply.cookies and reply.cookies[name]["max-age"] == "0")
+        async with site.session.get(
+            f"{site.station}api/v1/me", headers={"Cookie": f"{name}={site.tokens['viewer']}"}
+        ) as reply:
+            assert (await reply.json())["name"] == "viewer"
+            assert name not in reply.cookies
 
 
 @pytest.mark.needs("chromium")

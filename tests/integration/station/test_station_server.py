@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack
 from typing import Any
 
 import pytest
-from aiohttp import web
+from aiohttp import ClientSession, CookieJar, web
 from aiohttp.test_utils import TestClient, TestServer
 
 from rce_fleet.station.authentication import TokenAuthenticator
@@ -200,6 +201,23 @@ async def test_token_is_required_if_one_is_set(running: RunningStation) -> None:
     assert (await running.client.get("/?token=wrong")).status == 401
     assert (await running.client.get("/", params={"token": "open sesame"})).status == 200
     assert (await running.client.get("/static/main.js")).status == 200, "the page's cookie lets its parts in"
+
+
+async def test_stations_on_one_host_keep_their_own_cookies() -> None:
+    """A browser sends a cookie to all ports of a host."""
+    tokens = ("one", "two")
+    async with AsyncExitStack() as stack:
+        browser = await stack.enter_async_context(ClientSession(cookie_jar=CookieJar(unsafe=True)))
+        urls = []
+        for token in tokens:
+            access = TokenAuthenticator(token)
+            app = Station(FleetView(), RecordingFleet(), Broadcast(), authenticator=access).make_app()
+            server = await stack.enter_async_context(TestServer(app))
+            urls.append(server.make_url("/"))
+        for url, token in zip(urls, tokens, strict=True):
+            assert (await browser.get(url, params={"token": token})).status == 200
+        for url in urls:
+            assert (await browser.get(url / "api/v1/fleet")).status == 200
 
 
 async def test_live_socket_sends_changes(running: RunningStation) -> None:
