@@ -64,7 +64,8 @@ new Figures();
 const world = new World3d(at("#world"), view.scene, fleet);
 const worldPanel = new WorldPanel(world, fleet, operator);
 const masters = new MastersPanel(fleet, operator);
-const replay = new Replay(view, fleet);
+const replay = new Replay(view, fleet, say);
+tools.isPast = () => replay.at !== null;
 new ZoneForm(tools, actions, work);
 const tasks = new TasksPanel(work, actions, fleet);
 
@@ -119,6 +120,7 @@ function drawTools() {
 }
 tools.addEventListener("chosen", drawTools);
 fleet.addEventListener("selected", drawTools);
+replay.addEventListener("change", drawTools);
 drawTools();
 
 // What holds for the whole fleet.

@@ -213,10 +213,11 @@ export class Fleet extends EventTarget {
     this.dispatchEvent(new Event("selected"));
   }
 
-  robotAt(x, y, radius) {
+  // The nearest of robots, which may be those of a past moment.
+  robotAt(x, y, radius, robots = this.robots) {
     let best = null;
     let nearest = radius;
-    for (const robot of this.robots.values()) {
+    for (const robot of robots.values()) {
       if (!robot.pose) continue;
       const distance = Math.hypot(robot.pose.x - x, robot.pose.y - y);
       if (distance <= nearest) [best, nearest] = [robot, distance];

@@ -8,7 +8,7 @@ const STEPS = 1000;
 const WINDOW_S = 60;
 const ASK_AGAIN_MS = 15000;
 
-export class Replay {
+export class Replay extends EventTarget {
   #span = null;      // {first, last}, seconds since 1970
   #frames = [];      // of the window that is loaded
   #at = null;        // the moment that is shown; null: live
@@ -16,9 +16,12 @@ export class Replay {
   #robots = new Map();
   #number = 0;
 
-  constructor(view, fleet) {
+  // say: (text, bad) => shows it
+  constructor(view, fleet, say) {
+    super();
     this.view = view;
     this.fleet = fleet;
+    this.say = say;
     this.box = document.querySelector("#replay");
     this.slider = document.querySelector("#replay-time");
     this.output = document.querySelector("#replay-at");
@@ -45,7 +48,19 @@ export class Replay {
     if (!this.#span) await this.#readSpan();
     if (!this.#span) return (this.output.textContent = t("replay.empty"));
     const { first, last } = this.#span;
-    await this.show(first + ((last - first) * this.slider.valueAsNumber) / STEPS);
+    await this.#showOrGoLive(first + ((last - first) * this.slider.valueAsNumber) / STEPS);
+  }
+
+  // The fleet of now must not look like a past one that could not be loaded.
+  async #showOrGoLive(at) {
+    const number = this.#number + 1;
+    try {
+      await this.show(at);
+    } catch (error) {
+      if (number !== this.#number) return;
+      this.goLive();
+      this.say(t("replay.failed", { reason: error.message }), true);
+    }
   }
 
   // Show a moment, seconds since 1970.
@@ -55,11 +70,13 @@ export class Replay {
     this.#tell();
     const known = this.#frames.length && at >= this.#frames[0].time && at <= this.#frames[0].time + WINDOW_S - 1 && at >= this.shown;
     if (!known) {
+      this.output.textContent = t("replay.loading");
       const { frames } = await ask("GET", `/replay/${at}?seconds=${WINDOW_S}`);
       if (number !== this.#number || this.#at === null) return;
       this.#frames = frames;
       this.#robots.clear();
       this.taken = 0;
+      this.#tell();
     }
     this.#takeUntil(at);
   }
@@ -93,7 +110,7 @@ export class Replay {
     const next = this.#at + 1;
     if (this.#span && next > this.#span.last + ASK_AGAIN_MS / 1000) return this.goLive();
     if (this.#span) this.slider.value = (STEPS * (next - this.#span.first)) / Math.max(1, this.#span.last - this.#span.first);
-    this.show(next).catch(() => this.goLive());
+    this.#showOrGoLive(next);
   }
 
   #setPlaying(on) {
@@ -120,5 +137,6 @@ export class Replay {
     this.output.textContent = text;
     this.slider.setAttribute("aria-valuetext", text || t("replay.live"));
     this.view.stage.classList.toggle("past", this.#at !== null);
+    this.dispatchEvent(new Event("change"));
   }
 }

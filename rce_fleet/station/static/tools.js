@@ -6,6 +6,7 @@ import { t } from "./texts.js";
 export class Tools extends EventTarget {
   tool = "act";
   steers = true;
+  isPast = () => false; // whether the map shows a past moment, or loads it: nothing is sent to the fleet of now
   #drag = null;   // {from: [x, y], to: [x, y], robot}
   #pick = null;   // first cell of a task, or where a robot is that is localized without a drag
 
@@ -28,6 +29,7 @@ export class Tools extends EventTarget {
   get hint() {
     const robot = this.fleet.selected;
     if (!this.steers) return t("hint.viewer");
+    if (this.isPast()) return t("hint.past");
     if (this.tool === "act" && robot) return t("hint.goal", { robot });
     if (this.tool === "pose" && !robot) return t("hint.poseRobot");
     if (this.tool === "pose" && this.#pick !== null) return t("hint.look", { robot });
@@ -35,14 +37,21 @@ export class Tools extends EventTarget {
     return t(`hint.${this.tool}`, { robot });
   }
 
+  // Tell that the map shows a past moment, if it does.
+  #refusePast() {
+    if (!this.isPast()) return false;
+    this.actions.operator.say(t("hint.past"), true);
+    return true;
+  }
+
   #robotAt(x, y) {
     const reach = Math.max(0.35 * this.fleet.map.cell_size, (10 * devicePixelRatio) / this.view.scale);
-    return this.fleet.robotAt(x, y, reach);
+    return this.fleet.robotAt(x, y, reach, this.view.scene.shownRobots);
   }
 
   // Gestures ask whether a drag belongs to the tool.
   begin(event) {
-    if (!this.fleet.map || !this.steers) return false;
+    if (!this.fleet.map || !this.steers || this.isPast()) return false;
     const at = this.view.worldAt(event);
     const robot = this.#robotAt(...at);
     const takes = { act: robot !== null, block: true, free: true, zone: true, pose: this.fleet.selected !== null, task: false };
@@ -68,6 +77,7 @@ export class Tools extends EventTarget {
     if (!drag) return;
     this.move(event);
     this.cancel();
+    if (this.#refusePast()) return;
     const { from, to, robot } = drag;
     const cell = this.fleet.cellAt(...to);
     if (this.tool === "act" && robot && cell !== null) return this.actions.sendTo(robot, cell);
@@ -82,13 +92,14 @@ export class Tools extends EventTarget {
     const at = this.view.worldAt(event);
     const robot = this.#robotAt(...at);
     const cell = this.fleet.cellAt(...at);
-    if (robot && (this.tool === "act" || this.tool === "pose" || !this.steers)) return this.fleet.select(robot.id);
+    const selects = this.tool === "act" || this.tool === "pose" || !this.steers;
+    if (robot && selects && this.fleet.robots.has(robot.id)) return this.fleet.select(robot.id);
     if (cell !== null && this.steers) this.use(cell);
   }
 
   // A click on a cell, or Enter.
   use(cell) {
-    if (!this.steers) return;
+    if (!this.steers || this.#refusePast()) return;
     const { fleet, actions } = this;
     const shut = fleet.blocked.has(cell) || fleet.pending.has(cell);
     if (this.tool === "act" && fleet.selected) {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import shutil
 import time
@@ -22,7 +23,7 @@ from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 
 if TYPE_CHECKING:
-    from playwright.async_api import Browser, Page
+    from playwright.async_api import Browser, Page, Route
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 BROWSER = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
@@ -214,6 +215,82 @@ async def test_a_past_moment_is_shown_and_left_again() -> None:
         await page.wait_for_function("rceFleet.view.scene.replay.robots.get('Robot1').pose.x >= 2.6 - 1e-6")
         await page.locator("#replay-live").click()
         assert await page.evaluate("rceFleet.view.scene.replay") is None
+
+
+async def click(page: Page, cell: int) -> None:
+    await drag(page, cell, cell)
+
+
+async def fill_records(made: Site, start: float) -> None:
+    """Robot1 was in the cell 9, where it is not any more."""
+    for second in range(60):
+        entry = made.recorder.take(start + second)
+        if entry is not None:
+            made.recorder.records.add(entry[0], entry[1], whole=entry[2])
+    made.view.on_pose("Robot1", pose(4.5, 4.5, 0.0))
+    made.feed.on_pose("Robot1")
+    made.feed.send_poses(0.0)
+
+
+async def test_clicks_in_the_past_send_nothing() -> None:
+    """Neither clicks, nor drags, nor keys; a robot can be selected where it was."""
+    async with site() as made:
+        start = time.time() - 100
+        await fill_records(made, start)
+        page = await made.open()
+        await page.wait_for_function("rceFleet.fleet.robots.get('Robot1').pose.x === 4.5")
+        await page.evaluate("at => rceFleet.replay.show(at)", start + 20.4)
+        await page.locator("#hint", has_text="The map shows the past").wait_for()
+        await click(page, 9)
+        await page.wait_for_function("rceFleet.fleet.selected === 'Robot1'")
+        await click(page, 44)
+        await page.locator("#message.bad", has_text="The map shows the past").wait_for()
+        await drag(page, 9, 44)  # it moves the map
+        await page.locator("#zoom-fit").click()
+        await page.locator("#map").focus()
+        await page.evaluate("rceFleet.view.cursorCell = 44")
+        await page.keyboard.press("Enter")
+        await page.locator("#tool-block").click()
+        await drag(page, 18, 28)
+        await page.locator("#zoom-fit").click()
+        await click(page, 20)
+        assert await page.evaluate("rceFleet.operator.undoable") is None, "nothing was done"
+        await page.locator("#replay-live").click()
+        await page.locator("#hint", has_text="block them").wait_for()
+        await click(page, 20)
+        await page.wait_for_function("rceFleet.fleet.blocked.has(20)")
+        assert made.view.blocked() == [20]
+        assert made.view.robots()[0]["goal"] is None
+
+
+async def test_a_past_that_cannot_be_loaded_leaves_the_page_live() -> None:
+    async with site() as made:
+        await fill_records(made, time.time() - 100)
+        page = await made.open()
+        waits, asked = asyncio.Event(), asyncio.Event()
+
+        async def fail(route: Route) -> None:
+            asked.set()
+            await waits.wait()
+            await route.fulfill(status=503, json={"error": "no records now"})
+
+        await page.route("**/api/v1/replay/*", fail)
+        await page.evaluate(
+            """() => {
+                const slider = document.querySelector("#replay-time");
+                slider.value = 500;
+                slider.dispatchEvent(new Event("input"));
+            }"""
+        )
+        await asked.wait()
+        await page.locator("#replay-at", has_text="loading").wait_for()
+        await click(page, 20)
+        await page.locator("#message.bad", has_text="The map shows the past").wait_for()
+        waits.set()
+        await page.locator("#message.bad", has_text="no records now").wait_for()
+        await page.locator("#replay-live[aria-pressed=true]").wait_for()
+        assert not await page.locator("#stage.past").count()
+        assert made.view.blocked() == []
 
 
 async def test_the_page_fits_a_phone() -> None:
