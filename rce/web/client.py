@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import aiohttp
@@ -40,6 +41,31 @@ class NameResolver(AbstractResolver):
 
     async def close(self) -> None:
         """Do nothing: lookups belong to the program."""
+
+
+class Sent:
+    """Notes whether a request was sent. It may be so even if no connection could be made at last.
+
+    aiohttp repeats DELETE and PUT once, by itself, if the connection is lost before the answer.
+
+    Attributes:
+        begun: Whether some of the request may have arrived.
+    """
+
+    def __init__(self) -> None:
+        self.begun = False
+
+
+def noting_sent() -> aiohttp.TraceConfig:
+    """Return a trace for a session whose requests have a :class:`Sent` as ``trace_request_ctx``."""
+
+    async def note(_: aiohttp.ClientSession, context: SimpleNamespace, __: object) -> None:
+        if isinstance(context.trace_request_ctx, Sent):
+            context.trace_request_ctx.begun = True
+
+    trace = aiohttp.TraceConfig()
+    trace.on_request_headers_sent.append(note)
+    return trace
 
 
 def session_connector(tls: ssl.SSLContext | None) -> aiohttp.TCPConnector:

@@ -16,7 +16,7 @@ import typer
 
 from rce.masters import Masters
 from rce.tls import CertificateError, client_context, explain_to_client
-from rce.web.client import session_connector
+from rce.web.client import Sent, noting_sent, session_connector
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.events import Event
 from rce_master.exceptions import MasterError
@@ -70,7 +70,9 @@ class ApiClient:
         except CertificateError as error:
             raise CliError(str(error)) from error
         connector = session_connector(tls)
-        self._session = aiohttp.ClientSession(headers=self._headers, timeout=timeout, connector=connector)
+        self._session = aiohttp.ClientSession(
+            headers=self._headers, timeout=timeout, connector=connector, trace_configs=[noting_sent()]
+        )
         return self
 
     async def __aexit__(
@@ -106,9 +108,16 @@ class ApiClient:
         while True:
             url = self._masters.current
             untried -= 1
+            sent = Sent()
             try:
                 async with self._session.request(
-                    method, self._base + path, json=body, params=query, headers=headers, allow_redirects=False
+                    method,
+                    self._base + path,
+                    json=body,
+                    params=query,
+                    headers=headers,
+                    allow_redirects=False,
+                    trace_request_ctx=sent,
                 ) as reply:
                     if headers and reply.status == HTTPStatus.BAD_GATEWAY and end is None:
                         end = clock() + REPEAT_S
@@ -117,11 +126,18 @@ class ApiClient:
                         return await _result(reply)
             except (aiohttp.ClientError, TimeoutError, ValueError) as error:
                 # Only without a connection it is certain that the request had no effect.
-                unsent = isinstance(error, aiohttp.ClientConnectorError)
+                unsent = isinstance(error, aiohttp.ClientConnectorError) and (
+                    method == "GET" or not sent.begun
+                )
                 if headers and not unsent and end is None:
                     end = clock() + REPEAT_S
                 if not (unsent and untried > 0) and (end is None or clock() >= end):
-                    raise CliError(f"cannot use the master at {self._base}: {_words(error)}") from error
+                    warning = (
+                        "; it may have done this or not: look first" if sent.begun and method != "GET" else ""
+                    )
+                    raise CliError(
+                        f"cannot use the master at {self._base}: {_words(error)}{warning}"
+                    ) from error
             self._masters.failed(url)
             if untried <= 0:
                 await asyncio.sleep(RETRY_S)

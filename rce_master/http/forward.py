@@ -11,6 +11,7 @@ from aiohttp import hdrs, web
 from multidict import CIMultiDict
 from yarl import URL
 
+from rce.web.client import Sent, noting_sent
 from rce.web.origin import is_foreign
 from rce_master.http.forwarded import HEADER
 
@@ -98,6 +99,7 @@ class Forwarder:
             auto_decompress=False,
             skip_auto_headers=_ADDED,
             trust_env=False,
+            trace_configs=[noting_sent()],
         )
         return self
 
@@ -121,6 +123,7 @@ class Forwarder:
         if request.headers.get(hdrs.UPGRADE):
             raise NotForwardedError(f"{leader.name} leads; ask it for WebSockets, at {leader.url}")
         response: web.StreamResponse | None = None
+        sent = Sent()
         try:
             async with self._session.request(
                 request.method,
@@ -129,6 +132,7 @@ class Forwarder:
                 data=request.content if request.body_exists else None,
                 allow_redirects=False,
                 ssl=self._tls() if self._tls is not None else True,
+                trace_request_ctx=sent,
             ) as reply:
                 response = web.StreamResponse(
                     status=reply.status, reason=reply.reason, headers=_without(reply.headers)
@@ -138,7 +142,7 @@ class Forwarder:
                     await response.write(piece)
                 await response.write_eof()
         except (aiohttp.ClientError, TimeoutError, ConnectionError) as error:
-            return self._broken(request, leader, response, error)
+            return self._broken(request, leader, response, error, sent)
         return response
 
     def _broken(
@@ -147,6 +151,7 @@ class Forwarder:
         leader: Leader,
         response: web.StreamResponse | None,
         error: Exception,
+        sent: Sent,
     ) -> web.StreamResponse:
         """Return what a client gets whose request may have been done.
 
@@ -158,7 +163,7 @@ class Forwarder:
                 request.transport.abort()  # so that the client does not take the part for the whole
             return response
         self._failures.note(f"{request.method} {request.path} was not answered by {leader.name}: {error}")
-        if isinstance(error, aiohttp.ClientConnectorError) or request.method in _SAFE:
+        if not sent.begun or request.method in _SAFE:
             raise NotForwardedError(f"{leader.name}, which led until now, does not answer") from error
         text = f"{leader.name}, which led until now, did not answer: it may have done this or not; look first"
         return web.json_response({"error": text}, status=502)

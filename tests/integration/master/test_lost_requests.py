@@ -1,0 +1,76 @@
+"""Requests to a master that ends before it answers: nobody is told that they were not done."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import aiohttp
+import pytest
+from aiohttp import web
+from aiohttp.test_utils import TestServer
+
+from rce.guard import TrustedProxies
+from rce_master.cli.client import ApiClient
+from rce_master.cli.exceptions import CliError
+from rce_master.http.forward import Forwarder, NotForwardedError
+from rce_master.http.forwarded import ForwardingKey
+from rce_master.store.etcd.layout import Leader
+
+
+@asynccontextmanager
+async def ending_master() -> AsyncIterator[str]:
+    """Give the address of a master that ends as soon as it has got a request."""
+
+    async def end(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readuntil(b"\r\n\r\n")
+        server.close()
+        writer.transport.abort()
+
+    server = await asyncio.start_server(end, "127.0.0.1", 0)
+    try:
+        yield f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/"
+    finally:
+        server.close()
+
+
+@pytest.mark.parametrize("method", ["DELETE", "PUT", "GET"])
+async def test_another_master_is_not_asked_for_what_may_be_done(method: str) -> None:
+    asked: list[str] = []
+
+    async def answer(request: web.Request) -> web.Response:
+        asked.append(request.method)
+        return web.json_response({})
+
+    app = web.Application()
+    app.router.add_route("*", "/api/v1/containers/a", answer)
+    async with (
+        ending_master() as first,
+        TestServer(app) as second,
+        ApiClient(f"{first},{second.make_url('/')}") as client,
+    ):
+        if method == "GET":
+            await client.call(method, "/containers/a")
+        else:
+            with pytest.raises(CliError, match="it may have done this or not: look first"):
+                await client.call(method, "/containers/a")
+    assert asked == (["GET"] if method == "GET" else [])
+
+
+@pytest.mark.parametrize(("method", "status"), [("DELETE", 502), ("PUT", 502), ("POST", 502), ("GET", 503)])
+async def test_a_stand_by_tells_that_a_request_may_be_done(method: str, status: int) -> None:
+    async with ending_master() as leader, Forwarder(ForwardingKey(b"k" * 32), TrustedProxies()) as forwarder:
+
+        async def forward(request: web.Request) -> web.StreamResponse:
+            try:
+                return await forwarder.forward(request, Leader("first", 1, leader))
+            except NotForwardedError:
+                return web.Response(status=503)
+
+        app = web.Application()
+        app.router.add_route("*", "/a", forward)
+        async with TestServer(app) as standby, aiohttp.ClientSession() as session:
+            for expected in (status, 503):  # the second request finds no leader
+                async with session.request(method, standby.make_url("/a")) as reply:
+                    assert reply.status == expected
