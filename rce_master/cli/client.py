@@ -119,7 +119,7 @@ class ApiClient:
                     allow_redirects=False,
                     trace_request_ctx=sent,
                 ) as reply:
-                    if headers and reply.status == HTTPStatus.BAD_GATEWAY and end is None:
+                    if headers and _may_be_done(reply) and end is None:
                         end = clock() + REPEAT_S
                     others = untried > 0 and STANDBY_HEADER in reply.headers
                     if not others and not (end is not None and _is_undecided(reply) and clock() < end):
@@ -290,6 +290,13 @@ class ApiClient:
             async for line in reply.content:
                 if line.startswith(b"data: "):
                     yield msgspec.json.decode(line[6:], type=Event)
+
+
+def _may_be_done(reply: aiohttp.ClientResponse) -> bool:
+    """Return whether a request may have been done that was not answered with its result."""
+    if reply.status == HTTPStatus.SERVICE_UNAVAILABLE:  # by a leader that ends; a stand-by does nothing
+        return "Retry-After" in reply.headers and STANDBY_HEADER not in reply.headers
+    return reply.status == HTTPStatus.BAD_GATEWAY
 
 
 def _is_undecided(reply: aiohttp.ClientResponse) -> bool:

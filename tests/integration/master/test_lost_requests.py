@@ -12,7 +12,7 @@ from aiohttp import web
 from aiohttp.test_utils import TestServer
 
 from rce.guard import TrustedProxies
-from rce_master.cli.client import ApiClient
+from rce_master.cli.client import IDEMPOTENCY_KEY, ApiClient
 from rce_master.cli.exceptions import CliError
 from rce_master.http.forward import Forwarder, NotForwardedError
 from rce_master.http.forwarded import ForwardingKey
@@ -74,3 +74,21 @@ async def test_a_stand_by_tells_that_a_request_may_be_done(method: str, status: 
             for expected in (status, 503):  # the second request finds no leader
                 async with session.request(method, standby.make_url("/a")) as reply:
                     assert reply.status == expected
+
+
+async def test_rce_repeats_what_a_leader_left_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rce_master.cli.client.RETRY_S", 0.0)
+    keys: list[str] = []
+    statuses = [(503, {"Retry-After": "1"}), (503, {"Retry-After": "1", "RCE-Standby": "yes"}), (201, {})]
+
+    async def answer(request: web.Request) -> web.Response:
+        keys.append(request.headers[IDEMPOTENCY_KEY])
+        status, headers = statuses[len(keys) - 1]
+        return web.json_response({"tag": "a"}, status=status, headers=headers)
+
+    app = web.Application()
+    app.router.add_post("/api/v1/containers", answer)
+    async with TestServer(app) as server, ApiClient(str(server.make_url("/"))) as client:
+        assert await client.call("POST", "/containers", {"tag": "a"}) == {"tag": "a"}
+    assert len(keys) == 3
+    assert len(set(keys)) == 1
