@@ -27,6 +27,7 @@ import { Work } from "./work.js";
 import { ZoneForm } from "./zone_form.js";
 
 const at = (selector) => document.querySelector(selector);
+const IDENTIFY_AGAIN_MS = 5000;
 const WIDE = 1.3; // a map that is this much wider than high is above the view of the world, not beside it
 
 fillTexts();
@@ -38,6 +39,7 @@ const badge = at("#link");
 const connection = new Connection(fleet, layers, (live) => {
   badge.textContent = t(live ? "link.live" : "link.connecting");
   badge.classList.toggle("live", live);
+  identify();
   markStale();
 });
 const message = at("#message");
@@ -171,11 +173,24 @@ fleet.addEventListener("map", () => {
   view.cursorCell = null;
 });
 
+// Asked whenever the connection opens, or does not: browsers do not tell that it was refused for want of a login.
+let identified = 0;
 async function identify() {
-  const response = await fetch("/api/v1/me");
-  if (response.status === 401) return location.replace("/login");
-  if (!response.ok) return say((await response.json()).error, true);
-  const person = await response.json();
+  const number = ++identified;
+  let response, person;
+  try {
+    response = await fetch("/api/v1/me");
+    if (response.status === 401) return location.replace("/login");
+    person = await response.json();
+  } catch {
+    return; // the station is away, or its answer was cut off
+  }
+  if (number !== identified) return;
+  if (!response.ok) {
+    say(person.error, true);
+    if (connection.isLive) setTimeout(() => { if (number === identified) identify(); }, IDENTIFY_AGAIN_MS);
+    return;
+  }
   at("#person").textContent = person.logged_in ? `${person.name} (${person.role})` : "";
   at("#logout").hidden = !person.logged_in;
   editor.form.hidden = !person.steers;
