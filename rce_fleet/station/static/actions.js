@@ -33,8 +33,12 @@ export class Actions {
   holdTask(task) { return this.operator.act(t("action.holdTask.done", { task }), () => ask("POST", `/tasks/${task}/hold`, {}), () => ask("POST", `/tasks/${task}/resume`)); }
   resumeTask(task) { return this.operator.act(t("action.resumeTask.done", { task }), () => ask("POST", `/tasks/${task}/resume`), () => ask("POST", `/tasks/${task}/hold`, {})); }
   raise(task, priority) {
-    const before = this.work.tasks.get(task)?.priority ?? 0;
-    return this.operator.act(t("action.priority.done", { task, priority }), () => ask("PATCH", `/tasks/${task}`, { priority }), () => ask("PATCH", `/tasks/${task}`, { priority: before }));
+    let before = this.work.find(task)?.priority ?? null;
+    const run = async () => {
+      before ??= (await ask("GET", `/tasks/${task}`)).priority;
+      return ask("PATCH", `/tasks/${task}`, { priority });
+    };
+    return this.operator.act(t("action.priority.done", { task, priority }), run, () => ask("PATCH", `/tasks/${task}`, { priority: before }));
   }
 
   // Give a robot's task to another one; the manager refuses it once the robot has the load.

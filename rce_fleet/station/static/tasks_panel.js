@@ -5,6 +5,8 @@ import { t } from "./texts.js";
 
 const TONE = { running: "good", queued: "quiet", assigned: "quiet", held: "warn", suspended: "warn", cancelling: "warn", failed: "bad", cancelled: "quiet", done: "good" };
 
+const MOST_OPEN = 100;
+
 // Whether the action that is under way ends only when a person or a program confirms it.
 function awaitsConfirmation({ visits, stops }) {
   const last = visits.at(-1);
@@ -25,11 +27,24 @@ export class TasksPanel {
 
   draw() {
     const { work } = this;
-    const tasks = [...work.tasks.values(), ...work.recent.slice(0, 5)];
+    const open = [...work.tasks.values()].slice(0, MOST_OPEN);
+    const tasks = [...open, ...work.recent.slice(0, 5)];
+    const more = work.openCount - open.length;
     this.note.textContent = work.trouble === "none" ? t("tasks.noManager") : work.trouble ?? (tasks.length ? "" : t("tasks.none"));
     const focused = document.activeElement?.id;
-    this.body.replaceChildren(...tasks.slice(0, 100).flatMap((task) => [this.#row(task), this.#buttons(task)]));
+    const rows = tasks.flatMap((task) => [this.#row(task), this.#buttons(task)]);
+    if (more > 0) rows.splice(2 * open.length, 0, this.#more(more));
+    this.body.replaceChildren(...rows);
     if (focused?.startsWith("task-")) document.getElementById(focused)?.focus();
+  }
+
+  // Open tasks that are not listed.
+  #more(count) {
+    const row = element("tr");
+    const cell = element("td", t("tasks.more", { count }), "quiet");
+    cell.colSpan = 5;
+    row.append(cell);
+    return row;
   }
 
   #row(task) {

@@ -222,6 +222,7 @@ const TEXTS = {
   "task.running": "running",
   "task.suspended": "suspended",
   tasks: "Tasks",
+  "tasks.more": "and {count} more",
   "tasks.noManager": "no fleet manager runs here",
   "tasks.none": "no tasks",
   theme: "Dark or light",

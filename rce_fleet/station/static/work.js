@@ -4,14 +4,20 @@ import { ask } from "./requests.js";
 
 const EVERY_MS = 2000;
 const MOST_TASKS = 200;
+// Tasks of robots are read beside them if there are more: so many in a page, and so many pages.
+const ROBOTS_TASKS = "running,suspended,cancelling,held,assigned";
+const PAGE = 1000;
+const MOST_PAGES = 5;
 
 export class Work extends EventTarget {
-  tasks = new Map();   // id -> task, those that have not ended
+  tasks = new Map();   // id -> task, those that have not ended; the first ones if there are many
+  openCount = 0;       // how many have not ended
   recent = [];         // tasks that ended, the newest first
   zones = [];
   chargers = null;
   statistics = null;
   trouble = "none";    // why there is nothing: no manager, or its error; null while the manager answers
+  #robotsTasks = new Map(); // id -> task: those of robots that are not among the first ones
   #timer = null;
 
   constructor(fleet) {
@@ -19,6 +25,11 @@ export class Work extends EventTarget {
     this.fleet = fleet;
     // A request that has no answer is an error in the browser's log: the station tells whether there is a manager.
     fleet.addEventListener("manager", () => this.refresh());
+  }
+
+  // A task that a robot does, or that is listed; undefined: another one.
+  find(id) {
+    return this.tasks.get(id) ?? this.#robotsTasks.get(id);
   }
 
   // Ask at once: the operator did something, or the manager came or went.
@@ -32,6 +43,8 @@ export class Work extends EventTarget {
   #forget() {
     this.trouble = "none";
     this.tasks.clear();
+    this.#robotsTasks.clear();
+    this.openCount = 0;
     this.recent = [];
     this.statistics = null;
     for (const robot of this.fleet.robots.values()) Object.assign(robot, { task: null, activity: null, queue: [], loads: 0, deadlineAtRisk: null });
@@ -47,8 +60,12 @@ export class Work extends EventTarget {
         ask("GET", "/zones"),
         ask("GET", "/statistics?seconds=3600"),
       ]);
+      const tasks = new Map(open.tasks.map((task) => [task.id, task]));
+      const missing = new Set(robots.robots.map(({ task }) => task).filter((task) => task && !tasks.has(task)));
+      this.#robotsTasks = await this.#readTasks(missing);
       this.trouble = null;
-      this.tasks = new Map(open.tasks.map((task) => [task.id, task]));
+      this.tasks = tasks;
+      this.openCount = open.next === null ? tasks.size : Math.max(tasks.size + 1, statistics.tasks_open);
       this.recent = ended.tasks;
       this.zones = zones.zones;
       this.statistics = statistics;
@@ -61,13 +78,25 @@ export class Work extends EventTarget {
     if (this.fleet.manager) this.#timer = setTimeout(() => this.#ask(), EVERY_MS);
   }
 
+  // Tasks by their ids; one that ended meanwhile is missing.
+  async #readTasks(ids) {
+    const found = new Map();
+    let cursor = "";
+    for (let page = 0; page < MOST_PAGES && cursor !== null && found.size < ids.size; page++) {
+      const { tasks, next } = await ask("GET", `/tasks?state=${ROBOTS_TASKS}&limit=${PAGE}&cursor=${cursor}`);
+      for (const task of tasks) if (ids.has(task.id)) found.set(task.id, task);
+      cursor = next;
+    }
+    return found;
+  }
+
   // What the manager knows of robots beside the planner: batteries, tasks, activities.
   #takeRobots(robots) {
     const now = Date.now() / 1000;
     for (const { id, battery, task, activity, queue, loads } of robots) {
       const robot = this.fleet.robots.get(id);
       if (!robot) continue;
-      const doing = this.tasks.get(task);
+      const doing = this.find(task);
       const late = doing?.deadline && ((doing.expected_end ?? now) > doing.deadline || doing.late);
       Object.assign(robot, { battery, task, activity, queue, loads: loads?.length ?? 0, deadlineAtRisk: late ? task : null });
     }

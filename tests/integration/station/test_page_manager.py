@@ -138,3 +138,45 @@ async def test_an_operator_works_with_the_manager(tmp_path: Path) -> None:
             await check_buttons(page, fleet)
             await check_robot(page)
             await check_zone(page, fleet)
+
+
+async def check_late_task(page: Page, fleet: ManagedFleet) -> None:
+    """It is told as late by its robot, and preferred and given its own priority again."""
+    stops = [{"cell": 27, "confirm": True}]
+    created = await fleet.ask("POST", "/tasks", {"stops": stops, "priority": 7, "deadline": 1.0})
+    task = created.body["id"]
+    late = page.locator("#attention-list li", has_text=f"task {task} may miss its deadline")
+    await late.locator("button", has_text="Prefer").click()
+    await until_priority(fleet, task, 100)
+    await page.wait_for_selector("#undo:enabled")
+    await page.locator("#undo").click()
+    await until_priority(fleet, task, 7)
+
+
+async def check_unlisted_task(page: Page, fleet: ManagedFleet) -> None:
+    """A task that the page does not know gets its own priority again, too."""
+    order = {"stops": [{"cell": 5}], "earliest_start": 4e9, "priority": 3}
+    task = (await fleet.ask("POST", "/tasks", order)).body["id"]
+    await page.evaluate("id => rceFleet.actions.raise(id, 50)", task)
+    await until_priority(fleet, task, 50)
+    await page.locator("#undo").click()
+    await until_priority(fleet, task, 3)
+
+
+async def until_priority(fleet: ManagedFleet, task: str, wanted: int) -> None:
+    async with asyncio.timeout(WAIT_MS / 1000):
+        while (await fleet.ask("GET", f"/tasks/{task}")).body["priority"] != wanted:
+            await asyncio.sleep(0.1)
+
+
+async def test_deadlines_are_watched_beyond_many_tasks(tmp_path: Path) -> None:
+    """More tasks are open than the page lists."""
+    async with managed_fleet(tmp_path / "journal.sqlite", [0, 7]) as fleet:
+        while (await fleet.ask("GET", "/map")).status != 200:
+            await asyncio.sleep(0.1)
+        for _ in range(205):
+            await fleet.ask("POST", "/tasks", {"stops": [{"cell": 5}], "earliest_start": 4e9})
+        async with fleet_station(fleet.core.uri) as url, opened(url) as page:
+            await check_late_task(page, fleet)
+            await page.locator("#tasks td", has_text="and 106 more").wait_for()
+            await check_unlisted_task(page, fleet)
