@@ -58,12 +58,21 @@ def assign_targets(
         else:
             unreachable.add(robot)
     taken = set(cells.values())
-    for robot, start in starts.items():
-        if robot not in cells:
-            rest = start if robot in unreachable else rests.get(robot, start)
-            own = barred.get(robot, frozenset())
-            cells[robot] = _refuge(grid, reach.of(start, own) - own, start, rest, taken)
-            taken.add(cells[robot])
+    waiting = deque(robot for robot in starts if robot not in cells)
+    while waiting:
+        robot = waiting.popleft()
+        start, own = starts[robot], barred.get(robot, frozenset())
+        rest = start if robot in unreachable else rests.get(robot, start)
+        cell = _refuge(grid, reach.of(start, own) - own, rest, taken)
+        if cell is None:  # it cannot leave, so another robot that was to come here cannot
+            cell = start
+            for other in [one for one, target in cells.items() if target == start]:
+                del cells[other]
+                waiting.append(other)
+                if other in goals:
+                    unreachable.add(other)
+        cells[robot] = cell
+        taken.add(cell)
     return Targets(cells, frozenset(unreachable))
 
 
@@ -98,8 +107,8 @@ class _Reach:
         return seen
 
 
-def _refuge(grid: GridMap, within: set[int], start: int, rest: int, taken: set[int]) -> int:
-    """Return the cell of rest, or the nearest free cell that can be reached and is not a target."""
+def _refuge(grid: GridMap, within: set[int], rest: int, taken: set[int]) -> int | None:
+    """Return the cell of rest, or the nearest free cell that can be reached and is not a target; or None."""
     seen = {rest}
     queue = deque(seen)
     while queue:
@@ -110,4 +119,4 @@ def _refuge(grid: GridMap, within: set[int], start: int, rest: int, taken: set[i
             if other not in seen:
                 seen.add(other)
                 queue.append(other)
-    return start
+    return None
