@@ -37,6 +37,8 @@ from rce_client.exceptions import RefusedError
 from rce_fleet.station.authentication import Authenticator, TokenAuthenticator
 from rce_fleet.station.commands.control import RobotControl
 from rce_fleet.station.commands.desired_stops import DesiredStops, stops_file
+from rce_fleet.station.commands.manual_mode import ManualModes
+from rce_fleet.station.commands.owed_modes import OwedModes, modes_file
 from rce_fleet.station.commands.sources import CommandSource, EngineCommandSource, RosCommandSource
 from rce_fleet.station.engine_authenticator import EngineAuthenticator, StationAccount
 from rce_fleet.station.engine_planner_client import EnginePlannerClient
@@ -101,7 +103,7 @@ def ui(
     ] = "",
     state_dir: Annotated[
         Path | None,
-        typer.Option(help="Folder for the station's webhooks and emergency stops [STATE/station]."),
+        typer.Option(help="Folder for the station's webhooks, emergency stops and modes [STATE/station]."),
     ] = None,
     demo: Annotated[bool, typer.Option("--demo", hidden=True)] = False,
     tls: Tls = False,
@@ -140,6 +142,7 @@ def ui(
                 *(backend, bind, port, authenticator, names, server_tls, history, world),
                 webhooks=place / "webhooks.json",
                 stops=stops_file(place, backend.fleet),
+                modes=modes_file(place, backend.fleet),
                 kill_leader=DemoProcess().kill_leader if demo else None,
             )
         )
@@ -292,6 +295,7 @@ async def serve(
     *,
     webhooks: Path | None = None,
     stops: Path | None = None,
+    modes: Path | None = None,
     kill_leader: Callable[[], None] | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM."""
@@ -331,6 +335,8 @@ async def serve(
         if world
         else None
     )
+    owed_modes = OwedModes(modes)
+    manual_modes = ManualModes(fleet, view, owed_modes)
     recorder = Recorder(view, Records(history))
     station = Station(
         view,
@@ -344,6 +350,7 @@ async def serve(
         world=link,
         webhooks=webhooks,
         kill_leader=kill_leader,
+        modes=manual_modes,
     )
     masters = backend.masters(
         lambda state: feed.pages.send("masters", masters_text(state)), kills=kill_leader is not None
@@ -354,6 +361,10 @@ async def serve(
         await asyncio.to_thread(desired_stops.load)
     except (OSError, ValueError) as error:
         _log.error("emergency stops of before are not known: %s: %s", stops, error)
+    try:
+        await asyncio.to_thread(owed_modes.load)
+    except (OSError, ValueError) as error:
+        _log.error("robots that were driven by hand before are not known: %s: %s", modes, error)
     async with AsyncExitStack() as stack:
         stack.push_async_callback(layers.close)
         stack.push_async_callback(control.close)
@@ -365,12 +376,17 @@ async def serve(
         async def announce() -> None:
             typer.echo(f"rce ui ready: {server.url}")
 
+        async def ended() -> None:
+            await stop.wait()
+            await station.end_drives()  # the planner can be asked only before the rest ends
+
         await _until(
-            stop.wait,
+            ended,
             lambda: fleet.run(announce),
             feed.run,
             lambda: backend.watch(feed.on_engine),
             control.run,
+            manual_modes.run,
             recorder.run,
             figures.run,
             *([link.run] if link else []),

@@ -151,6 +151,11 @@ class FleetLink:
         """Whether requests can reach a fleet manager now, if there is one."""
         return self._client.offers(FLEET_REQUEST)
 
+    @property
+    def knows_modes(self) -> bool:
+        """Whether the planner can be asked for robots' modes; one of an earlier release knows none."""
+        return self._client.offers(SET_MODE)
+
     async def set_grid(self, choice: dict[str, Any], *, preview: bool) -> dict[str, Any]:
         """Lay another grid over the planner's map, or only show it; return the planner's answer.
 
@@ -181,7 +186,7 @@ class FleetLink:
         Raises:
             PlannerError: The planner refused, or cannot be reached.
         """
-        if not self._client.offers(SET_MODE):
+        if not self.knows_modes:
             if not robot:
                 raise PlannerUnavailableError("this planner cannot pause the fleet")
             return await self.set_goal(robot, None) if mode != "automatic" else ""

@@ -3,8 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 from pathlib import Path
+
+
+def fleet_file(folder: Path, kind: str, fleet: str) -> Path:
+    """Return a file of a fleet: several stations of a machine may share the folder.
+
+    Args:
+        folder: The folder.
+        kind: What is in the file, one word.
+        fleet: What tells the fleet from others.
+    """
+    return folder / f"{kind}-{hashlib.sha256(fleet.encode()).hexdigest()[:12]}.json"
 
 
 def write_private(file: Path, body: bytes) -> None:

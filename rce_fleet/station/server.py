@@ -41,6 +41,7 @@ from rce_fleet.station.authentication import (
 )
 from rce_fleet.station.commands import routes as control_routes
 from rce_fleet.station.commands.control import RobotControl
+from rce_fleet.station.commands.manual_mode import ManualModes
 from rce_fleet.station.fleet_api import FleetApi
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.grids import complete_grid, grid_answer
@@ -87,6 +88,7 @@ class Station:
         world: The simulated world in which the fleet drives; if None, there is none.
         webhooks: File in which webhooks are kept; if None, they end with the program.
         kill_leader: Kills the leading master of a demo; if None, this is not one.
+        modes: Gives robots that are driven by hand their own modes again; in memory only if None.
 
     Attributes:
         fleet_api: The part of the API that the fleet manager answers.
@@ -106,6 +108,7 @@ class Station:
         world: WorldLink | None = None,
         webhooks: Path | None = None,
         kill_leader: Callable[[], None] | None = None,
+        modes: ManualModes | None = None,
     ) -> None:
         self._view = view
         self._fleet = fleet
@@ -117,7 +120,9 @@ class Station:
         self._replay = ReplayRoutes(records)
         self._world = world_link.WorldRoutes(world, self._access)
         self._masters = masters_watch.MastersRoutes(kill_leader, self._access)
-        self._control = control_routes.ControlRoutes(control, fleet, view, self._access)
+        self._control = control_routes.ControlRoutes(
+            control, fleet, modes or ManualModes(fleet, view), self._access
+        )
         has_roles = self._authenticator.has_logins
         self.fleet_api = FleetApi(fleet, self._access, webhooks, has_roles=has_roles)
         self.fleet_api.feed.on_restart = self._tell_restart
@@ -167,6 +172,10 @@ class Station:
         app.router.add_get("/", self.page)
         app.router.add_static("/static", STATIC)
         return app
+
+    async def end_drives(self) -> None:
+        """Stop robots that are driven by hand, and give them their own modes again: the station ends."""
+        await self._control.end_drives()
 
     # Handlers
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import threading
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
-from rce_fleet.station.private_files import write_private
+from rce_fleet.station.private_files import fleet_file, write_private
 
 
 class StopOrder(Struct, kw_only=True, frozen=True):
@@ -40,13 +39,13 @@ class _Kept(Struct, kw_only=True):
 
 
 def stops_file(folder: Path, fleet: str) -> Path:
-    """Return the file of a fleet's stops: several stations of a machine may share the folder.
+    """Return the file of a fleet's stops.
 
     Args:
         folder: The folder.
         fleet: What tells the fleet from others.
     """
-    return folder / f"stops-{hashlib.sha256(fleet.encode()).hexdigest()[:12]}.json"
+    return fleet_file(folder, "stops", fleet)
 
 
 class DesiredStops:

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
+from rce_fleet.station.commands.owed_modes import OwedMode, OwedModes
 from rce_fleet.station.planner_client import PlannerError
 
 if TYPE_CHECKING:
     from rce_fleet.station.fleet_link import FleetLink
     from rce_fleet.station.view import FleetView
 
+_log = logging.getLogger(__name__)
+
 AUTOMATIC, MANUAL = "automatic", "manual"
 SHOWN_WAIT_S = 2.0
 """How long the view may take to show a mode that the planner accepted."""
+LOOK_EVERY_S = 2.0
+"""How often robots are looked for that are manual although they are not driven any more."""
 _POLL_S = 0.05
 
 
@@ -25,13 +31,27 @@ class ManualModes:
     Args:
         fleet: Asks the planner.
         view: Knows the robots' modes.
+        owed: The modes that robots shall have again; in memory only if None.
     """
 
-    def __init__(self, fleet: FleetLink, view: FleetView) -> None:
+    def __init__(self, fleet: FleetLink, view: FleetView, owed: OwedModes | None = None) -> None:
         self._fleet = fleet
         self._view = view
-        self._owed: dict[str, str] = {}
-        """Modes that robots should have again, and that the planner did not set."""
+        self._owed = owed or OwedModes()
+        self._driven: set[str] = set()
+        self._settling = asyncio.Lock()
+        """A request for the mode of before must not end the mode of the next one who drives the robot."""
+        self._told: set[str] = set()
+        """Robots of which an event told that their mode was not set again."""
+
+    async def run(self) -> None:
+        """Restore modes until cancelled, after a crash of the station or while the planner was away."""
+        while True:
+            for robot in self._owed.robots:
+                async with self._settling:
+                    if robot not in self._driven:
+                        await self._settle(robot)
+            await asyncio.sleep(LOOK_EVERY_S)
 
     @asynccontextmanager
     async def manual(self, robot: str, user: str) -> AsyncIterator[None]:
@@ -47,31 +67,71 @@ class ManualModes:
         Raises:
             PlannerError: The planner refuses ``manual``, or does not answer.
         """
-        before = self._view.mode_of(robot)
-        own = self._view.own_mode_of(robot)
-        if own == MANUAL:
-            own = self._owed.get(robot, MANUAL)
-        is_accepted = False
+        async with self._settling:
+            self._driven.add(robot)
         try:
-            await self._fleet.set_mode(robot, MANUAL, reason=f"driven by {user}", user=user)
-            is_accepted = True
-            yield
+            before = self._view.mode_of(robot)
+            await self._owe(robot, user)
+            is_accepted = False
+            try:
+                await self._fleet.set_mode(robot, MANUAL, reason=f"driven by {user}", user=user)
+                is_accepted = True
+                yield
+            finally:
+                shown = self._view.mode_of(robot)
+                # The view may not show manual yet. It shows the mode of before then, which may be set again.
+                if shown == MANUAL or (is_accepted and shown == before):
+                    await self._restore(robot)
+                else:
+                    self._owed.forget(robot)
+                await self._save()
         finally:
-            shown = self._view.mode_of(robot)
-            # The view may not show manual yet. It shows the mode of before then, which may be set again.
-            if own != MANUAL and (shown == MANUAL or (is_accepted and shown == before)):
-                await self._restore(robot, own, user)
+            self._driven.discard(robot)
 
-    async def _restore(self, robot: str, mode: str, user: str) -> None:
-        self._owed[robot] = mode
-        reason = "" if mode == AUTOMATIC else f"as before it was driven by {user}"
-        try:
-            await self._fleet.set_mode(robot, mode, reason=reason, user=user)
-        except PlannerError as error:
-            self._fleet.take_event(f"{robot} stays manual; it was {mode} before: {error}", "bad")
+    async def _owe(self, robot: str, user: str) -> None:
+        """Keep the mode that a robot has before it is driven; one that is manual has none of its own."""
+        own, known = self._view.own_mode_of(robot), self._owed.get(robot)
+        if own == MANUAL and known is not None:
+            own = known.mode
+        if own != MANUAL:
+            self._owed.owe(robot, OwedMode(mode=own, user=user))
+            await self._save()
+
+    async def _settle(self, robot: str) -> None:
+        """Restore the mode of a robot that is not driven, if it still is manual."""
+        owed, shown = self._owed.get(robot), self._view.mode_of(robot)
+        if owed is None or not shown or not self._fleet.knows_modes:
             return
+        if shown != MANUAL:
+            self._owed.forget(robot)
+        elif await self._restore(robot):
+            text = f"{robot} is {owed.mode} again, as before it was driven by {owed.user}"
+            self._fleet.take_event(text, "good")
+        await self._save()
+
+    async def _restore(self, robot: str) -> bool:
+        """Give a robot its own mode again, if one is owed; return whether it has it."""
+        owed = self._owed.get(robot)
+        if owed is None:
+            return False
+        reason = "" if owed.mode == AUTOMATIC else f"as before it was driven by {owed.user}"
+        try:
+            await self._fleet.set_mode(robot, owed.mode, reason=reason, user=owed.user)
+        except PlannerError as error:
+            if robot not in self._told:
+                self._told.add(robot)
+                self._fleet.take_event(f"{robot} stays manual; it was {owed.mode} before: {error}", "bad")
+            return False
         for _ in range(round(SHOWN_WAIT_S / _POLL_S)):
             if self._view.mode_of(robot) != MANUAL:
-                del self._owed[robot]
-                break
+                self._owed.forget(robot)
+                self._told.discard(robot)
+                return True
             await asyncio.sleep(_POLL_S)
+        return False
+
+    async def _save(self) -> None:
+        try:
+            await asyncio.to_thread(self._owed.save)
+        except OSError as error:
+            _log.error("the modes of robots are not kept for a restart of the station: %s", error)

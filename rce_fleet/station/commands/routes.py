@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 from aiohttp import WSCloseCode, WSMsgType, web
@@ -18,19 +19,21 @@ from rce_fleet.station.access import EMERGENCY_STOP, IS_CHECKED, USER, AccessCon
 from rce_fleet.station.api import Answer
 from rce_fleet.station.commands.driving import DEAD_S, DriveFrame, DriveGuard
 from rce_fleet.station.commands.kinds import VELOCITY, velocity_message
-from rce_fleet.station.commands.manual_mode import ManualModes
 from rce_fleet.station.commands.sources import CommandError
 from rce_fleet.station.planner_client import PlannerError
 
 if TYPE_CHECKING:
     from rce_fleet.station.commands.control import RobotControl
+    from rce_fleet.station.commands.manual_mode import ManualModes
     from rce_fleet.station.commands.sources import CommandSender
     from rce_fleet.station.fleet_link import FleetLink
-    from rce_fleet.station.view import FleetView
 
 MAX_FRAME = 1 << 12
 CHECK_S = 2.0
 """How often the login of a user who drives a robot is checked."""
+END_S = 3.0
+"""How long the station's end waits until robots that are driven have their own modes again."""
+_ENDS = "the station ends"
 _ERRORS = (400, 401, 403, 404, 408, 409, 413, 421, 503)
 
 Method = Callable[["ControlRoutes", web.Request], Awaitable[web.StreamResponse]]
@@ -76,18 +79,21 @@ class ControlRoutes:
 
     Args:
         control: Reaches the robots; None: this station cannot.
-        fleet: Tells the planner which robot is driven by hand.
-        view: Knows the robots' modes.
+        fleet: Sets the fleet's mode.
+        modes: Tells the planner which robot is driven by hand.
         access: Checks what users may do.
     """
 
     def __init__(
-        self, control: RobotControl | None, fleet: FleetLink, view: FleetView, access: AccessControl
+        self, control: RobotControl | None, fleet: FleetLink, modes: ManualModes, access: AccessControl
     ) -> None:
         self._control = control
         self._fleet = fleet
-        self._modes = ManualModes(fleet, view)
+        self._modes = modes
         self._access = access
+        self._ending = asyncio.Event()
+        self._drives: set[asyncio.Future[None]] = set()
+        """Of each robot that is driven; done when it stands and the planner was told."""
 
     @ROUTES.route(
         "PUT",
@@ -192,20 +198,38 @@ class ControlRoutes:
         control = self._control
         if control is None:
             return problem(409, "this station cannot reach robots")
+        if self._ending.is_set():
+            return problem(503, _ENDS)
         socket = web.WebSocketResponse(heartbeat=5.0, compress=False, max_msg_size=MAX_FRAME)
         await socket.prepare(request)
         user = request[USER].name
         if not control.begin_driving(robot, user):
             await _refuse(socket, f"{robot} is driven by {control.driven[robot]}")
             return socket
+        ended = asyncio.get_running_loop().create_future()
+        self._drives.add(ended)
         try:
             async with self._modes.manual(robot, user), self._sender(request, control, robot) as sender:
-                await _drive(socket, sender, lambda: self._access.is_still_allowed(request, to_control=True))
+                may_drive = partial(self._access.is_still_allowed, request, to_control=True)
+                await _drive(socket, sender, may_drive, self._ending)
         except (CommandError, PlannerError) as error:
             await _refuse(socket, str(error))
         finally:
             control.end_driving(robot)  # last: the next one to drive it shall not lose the mode manual
+            self._drives.discard(ended)
+            ended.set_result(None)
+        if self._ending.is_set():  # the page may be away, so nothing waits for it
+            await socket.close(code=WSCloseCode.GOING_AWAY, message=_ENDS.encode())
         return socket
+
+    async def end_drives(self) -> None:
+        """Stop all robots that are driven by hand, and give them their own modes again; drive no others.
+
+        It takes a few seconds at most; the planner may be away.
+        """
+        self._ending.set()
+        if self._drives:
+            await asyncio.wait(self._drives, timeout=END_S)
 
     @contextlib.asynccontextmanager
     async def _sender(
@@ -223,9 +247,12 @@ class ControlRoutes:
 
 
 async def _drive(
-    socket: web.WebSocketResponse, sender: CommandSender, may_drive: Callable[[], Awaitable[bool]]
+    socket: web.WebSocketResponse,
+    sender: CommandSender,
+    may_drive: Callable[[], Awaitable[bool]],
+    ending: asyncio.Event,
 ) -> None:
-    """Pass frames on until the page leaves, or its user may not drive any more."""
+    """Pass frames on until the page leaves, its user may not drive any more, or the station ends."""
     guard, loop = DriveGuard(), asyncio.get_running_loop()
 
     async def watch() -> None:
@@ -242,14 +269,17 @@ async def _drive(
 
     reader = asyncio.create_task(_pass_on(socket, sender, guard))
     watcher, checker = asyncio.create_task(watch()), asyncio.create_task(check_login())
+    end = asyncio.create_task(ending.wait())
     try:
-        await asyncio.wait([reader, checker], return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait([reader, checker, end], return_when=asyncio.FIRST_COMPLETED)
         if reader.done():
             reader.result()
             return
+        if end.done():
+            return
         checker.result()
     finally:
-        await cancel_and_wait(reader, watcher, checker)
+        await cancel_and_wait(reader, watcher, checker, end)
     sender.send(velocity_message(0.0, 0.0))
     text = b"you may not drive this robot any more; log in again"
     await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=text)

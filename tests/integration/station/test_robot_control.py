@@ -71,6 +71,7 @@ class Site:
     control: RobotControl
     view: FleetView
     login: Login
+    station: Station
     stops: deque[bool] = field(default_factory=deque)
     velocities: deque[tuple[float, float]] = field(default_factory=deque)
     poses: deque[Message] = field(default_factory=deque)
@@ -120,7 +121,7 @@ async def site(authenticator: Authenticator | None = None) -> AsyncIterator[Site
         login = Login()
         station = Station(view, fleet, feed.pages, authenticator=authenticator or login, control=control)  # type: ignore[arg-type]  # as wide as what is called
         async with TestClient(TestServer(station.make_app())) as client:
-            made = Site(client, fleet, control, view, login)
+            made = Site(client, fleet, control, view, login, station)
             await node.subscribe(
                 "/Robot1/emergency_stop", "std_msgs/Bool", lambda said: made.stops.append(said.data)
             )
@@ -254,6 +255,18 @@ async def test_a_robot_is_driven_while_the_switch_is_held() -> None:
                 assert "is driven by" in json.loads(await second.receive_str(timeout=LIMIT_S))["error"]
         await made.until(lambda: made.fleet.modes[-1] == ("Robot1", "automatic"))
         assert made.control.driven == {}
+
+
+async def test_a_station_that_ends_gives_driven_robots_their_modes_back() -> None:
+    """Before it closes the pages, which may be away; it lets no robot be driven any more."""
+    async with site() as made, made.client.ws_connect("/api/v1/robots/Robot1/drive") as page:
+        await _frame(page, 0)
+        await made.station.end_drives()
+        assert made.fleet.modes == [("Robot1", "manual"), ("Robot1", "automatic")]
+        assert (await page.receive(timeout=LIMIT_S)).data == WSCloseCode.GOING_AWAY
+        await made.until(lambda: made.velocities[-1] == (0.0, 0.0))
+        async with made.client.get("/api/v1/robots/Robot1/drive") as reply:
+            assert reply.status == 503
 
 
 async def test_a_robot_that_does_not_listen_is_not_driven() -> None:
