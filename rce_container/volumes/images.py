@@ -151,7 +151,7 @@ def is_on(image: Path, device: int) -> bool:
     file = Path(f"/sys/dev/block/{os.major(device)}:{os.minor(device)}/loop/backing_file")
     try:
         return file.read_text().strip() == str(image.resolve())
-    except OSError:  # it is no loop device
+    except OSError:  # it is not a loop device
         return False
 
 

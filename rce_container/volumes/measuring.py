@@ -78,13 +78,13 @@ def measure(folder: Path) -> Measured:
         folder: What it is in belongs to the engine.
 
     Raises:
-        OSError: There is no folder that it is in, or the machine's resources are exhausted.
+        OSError: Its folder does not exist, or the machine's resources are exhausted.
     """
     above = os.open(folder.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         with _Reader(above) as reader:
             found = _measure(reader, os.fsencode(folder.name))
-            # A node that changes permissions just now is no reason to end its container.
+            # A node may change permissions just now; its container goes on.
             return found if not found.fault else _measure(reader, os.fsencode(folder.name))
     finally:
         os.close(above)

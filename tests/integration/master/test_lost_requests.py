@@ -1,4 +1,4 @@
-"""Requests to a master that ends before it answers: nobody is told that they were not done."""
+"""Requests to a master that ends before it answers: no answer says that they were not done."""
 
 from __future__ import annotations
 
