@@ -178,7 +178,7 @@ class FleetPlanner:
         if self._gone(event.robot):
             return
         record = self._record(event.robot)
-        record.hear(self._now - max(event.age, 0.0))
+        record.hear(self._now - max(event.age, 0.0), self.settings)
         self._look_soon_if_silent(record)
         if record.phase is Phase.HOLDING:
             self._dispatcher.to_settle.add(record.id)

@@ -8,12 +8,16 @@ from math import hypot, inf
 from typing import TYPE_CHECKING
 
 from rce.lifecycle import LifeCycle, remember
+from rce_fleet.coordination.deadlines import ROUNDING
 from rce_fleet.coordination.modes import RobotMode
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.exceptions import TransitionError
 
 if TYPE_CHECKING:
     from rce_fleet.coordination.settings import FleetSettings
+
+_SIGNS = 2
+"""So many signs of life it takes at least until a robot without poses stands still."""
 
 
 class Phase(Enum):
@@ -134,6 +138,8 @@ class RobotRecord:
     recent: tuple[Cause, ...] = ()
     _anchor: tuple[float, float] = (inf, inf)
     _anchored_at: float = inf
+    _rested: float = 0.0
+    """How long the robot has lived, in seconds, since it obeyed and its poses have stayed in one place."""
 
     def change(self, cause: Cause) -> None:
         """Go to the next phase.
@@ -150,12 +156,16 @@ class RobotRecord:
             possible = settings.jump_distance + settings.top_speed * (now - self.posed_at)
             if hypot(x - self.x, y - self.y) > possible:
                 self.jumped_at = now
-        self.x, self.y, self.yaw, self.posed_at, self.alive_at = x, y, yaw, now, now
+        self.hear(now, settings)
+        self.x, self.y, self.yaw, self.posed_at = x, y, yaw, now
         if hypot(x - self._anchor[0], y - self._anchor[1]) > settings.still_distance:
             self._anchor, self._anchored_at = (x, y), now
+            self._rested = 0.0
 
-    def hear(self, alive_at: float) -> None:
-        """Note a sign of life that is not a pose."""
+    def hear(self, alive_at: float, settings: FleetSettings) -> None:
+        """Note a sign of life, a pose or another one."""
+        rested = alive_at - max(self.alive_at, self.obeyed_at, self._anchored_at)
+        self._rested += min(max(rested, 0.0), settings.pose_timeout / _SIGNS)
         self.alive_at = max(self.alive_at, alive_at)
 
     def still_since(self) -> float:
@@ -187,6 +197,7 @@ class RobotRecord:
             self.obeyed_at = inf
         elif self.obeyed_at == inf:
             self.obeyed_at = now
+            self._rested = 0.0
 
     def next_revision(self) -> int:
         """Number of the next list of cells."""
@@ -199,7 +210,8 @@ class RobotRecord:
 
         A robot that sends poses shows that by one that is later than its move client's report by more than
         messages are late. Localization may send none while the robot stands; then the robot must have lived
-        so long without one that no pose of the drive before is still on its way.
+        so long without one that no pose of the drive before is still on its way. A time in which nothing was
+        heard of it hardly counts: its poses of that time are lost or late.
 
         After a pose that cannot be true it takes longer: where the robot is, is known once its poses agree.
         """
@@ -209,4 +221,4 @@ class RobotRecord:
             return self.alive_at - max(self.held_at, self._anchored_at) >= settings.pose_only_settle
         if self.posed_at - max(self.obeyed_at, self._anchored_at) >= settings.settle_time:
             return True
-        return self.alive_at - max(self.obeyed_at, self._anchored_at) >= settings.pose_timeout
+        return self.obeyed_at < inf and self._rested >= settings.pose_timeout - ROUNDING

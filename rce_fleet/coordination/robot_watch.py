@@ -61,7 +61,7 @@ class RobotWatch:
             record.pose_only, record.earlier = True, frozenset()
             self._state.touch(record)
         if record.phase is Phase.HOLDING:
-            record.hear(self._dispatcher.now)
+            record.hear(self._dispatcher.now, self._settings)
             self._dispatcher.to_settle.add(record.id)
         elif record.phase is Phase.ACTIVE:
             self._dispatcher.arrive_by_pose(record, self._dispatcher.now)
