@@ -5,7 +5,13 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import threading
 from pathlib import Path
+from typing import Generic, TypeVar
+
+import msgspec
+
+T = TypeVar("T")
 
 
 def fleet_file(folder: Path, kind: str, fleet: str) -> Path:
@@ -37,3 +43,51 @@ def write_private(file: Path, body: bytes) -> None:
     finally:
         with contextlib.suppress(FileNotFoundError):
             aside.unlink()
+
+
+class KeptInFile(Generic[T]):
+    """What is kept in a private file, as JSON.
+
+    Args:
+        content_type: Type of the content.
+        content: The content if there is no file.
+        file: Where it is kept; None: in memory only.
+    """
+
+    def __init__(self, content_type: type[T], content: T, file: Path | None = None) -> None:
+        self._content_type = content_type
+        self._content = content
+        self._file = file
+        self._saving = threading.Lock()
+        """A save goes on in its thread when the task that waits for it is cancelled."""
+        self._revision = self._written = 0
+        """Of the content; to be increased with each change."""
+
+    @property
+    def is_saved(self) -> bool:
+        """Whether the file has the newest content."""
+        return self._file is None or self._written == self._revision
+
+    def load(self) -> None:
+        """Read the file; a missing one changes nothing. Blocks.
+
+        Raises:
+            OSError: It cannot be read.
+            msgspec.MsgspecError: It is damaged.
+        """
+        if self._file is not None and self._file.exists():
+            self._content = msgspec.json.decode(self._file.read_bytes(), type=self._content_type)
+
+    def save(self) -> None:
+        """Write the file, whole or not at all; nothing if it has the newest content. Blocks.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        if self._file is None:
+            return
+        with self._saving:
+            if self._written != self._revision:
+                revision = self._revision
+                write_private(self._file, msgspec.json.encode(self._content))
+                self._written = revision

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterable
 from pathlib import Path
 
-import msgspec
 from msgspec import Struct
 
-from rce_fleet.station.private_files import fleet_file, write_private
+from rce_fleet.station.private_files import KeptInFile, fleet_file
 
 
 class StopOrder(Struct, kw_only=True, frozen=True):
@@ -48,7 +46,7 @@ def stops_file(folder: Path, fleet: str) -> Path:
     return fleet_file(folder, "stops", fleet)
 
 
-class DesiredStops:
+class DesiredStops(KeptInFile[_Kept]):
     """The newest order for all robots, and for each robot.
 
     Args:
@@ -56,45 +54,26 @@ class DesiredStops:
     """
 
     def __init__(self, file: Path | None = None) -> None:
-        self._file = file
-        self._kept = _Kept()
-        self._saving = threading.Lock()
-        """A save goes on in its thread when the task that waits for it is cancelled."""
-        self._revision = self._written = 0
-
-    def load(self) -> None:
-        """Read the file; a missing one holds none. Blocks.
-
-        Raises:
-            OSError: It cannot be read.
-            msgspec.MsgspecError: It is damaged.
-        """
-        if self._file is not None and self._file.exists():
-            self._kept = msgspec.json.decode(self._file.read_bytes(), type=_Kept)
+        super().__init__(_Kept, _Kept(), file)
 
     @property
     def robots(self) -> set[str]:
         """Robots with an order of their own."""
-        return set(self._kept.robots)
+        return set(self._content.robots)
 
     @property
     def fleet_stopped_by(self) -> str | None:
         """Who stopped all robots; None: they are not stopped as a whole."""
-        return None if self._kept.fleet is None else self._kept.fleet.user
+        return None if self._content.fleet is None else self._content.fleet.user
 
     def order_for(self, robot: str) -> StopOrder | None:
         """Return what a robot shall be told; None: nothing."""
-        return self._kept.robots.get(robot, self._kept.fleet)
+        return self._content.robots.get(robot, self._content.fleet)
 
     def is_done_when_told(self, robot: str) -> bool:
         """Return whether a robot needs an order only until it is told: a release, if not all are stopped."""
         order = self.order_for(robot)
-        return order is not None and not order.stopped and self._kept.fleet is None
-
-    @property
-    def is_saved(self) -> bool:
-        """Whether the file has the newest orders."""
-        return self._file is None or self._written == self._revision
+        return order is not None and not order.stopped and self._content.fleet is None
 
     def order_fleet(self, robots: Iterable[str], order: StopOrder) -> None:
         """Stop or release all robots.
@@ -103,13 +82,13 @@ class DesiredStops:
             robots: Those that are known now.
             order: What to do; a stop also counts for robots that appear later.
         """
-        self._kept.fleet = order if order.stopped else None
-        self._kept.robots = dict.fromkeys([*self._kept.robots, *robots], order)
+        self._content.fleet = order if order.stopped else None
+        self._content.robots = dict.fromkeys([*self._content.robots, *robots], order)
         self._revision += 1
 
     def order_robot(self, robot: str, order: StopOrder) -> None:
         """Stop or release a robot."""
-        self._kept.robots[robot] = order
+        self._content.robots[robot] = order
         self._revision += 1
 
     def release_new(self, robot: str, order: StopOrder) -> None:
@@ -125,23 +104,9 @@ class DesiredStops:
         """
         if order is None or order is not self.order_for(robot):
             return
-        if order.stopped and robot not in self._kept.robots:
-            self._kept.robots[robot] = order
+        if order.stopped and robot not in self._content.robots:
+            self._content.robots[robot] = order
             self._revision += 1
         elif self.is_done_when_told(robot):
-            del self._kept.robots[robot]
+            del self._content.robots[robot]
             self._revision += 1
-
-    def save(self) -> None:
-        """Write the file, whole or not at all; nothing if it has the newest orders. Blocks.
-
-        Raises:
-            OSError: It cannot be written.
-        """
-        if self._file is None:
-            return
-        with self._saving:
-            if self._written != self._revision:
-                revision = self._revision
-                write_private(self._file, msgspec.json.encode(self._kept))
-                self._written = revision

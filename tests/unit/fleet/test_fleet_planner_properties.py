@@ -59,9 +59,7 @@ def test_every_robot_arrives_within_its_own_cells(
 
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 8))
-@example(
-    seed=1523888, count=2
-)  # signs of life come before the poses of a silent time
+@example(seed=1523888, count=2)  # signs of life come before the poses of a silent time
 def test_indexes_equal_a_recomputation_whatever_happens(
     make_fleet: type[SimulatedClients], seed: int, count: int
 ) -> None:
