@@ -32,7 +32,7 @@ class InterfaceTable:
         self._early: dict[tuple[str, str], DataMessage] = {}
         """By interface tag and source."""
         self._withdrawn: set[str] = set()
-        """Own interfaces that were removed; what still comes for them is dropped."""
+        """Tags of own interfaces that were removed; what still comes for them is dropped."""
 
     def add(self, interface: ClientInterface) -> None:
         """Add an interface, and give it what came before.
@@ -76,7 +76,9 @@ class InterfaceTable:
         """Give a message to its interface, or keep it until that is made."""
         interface = self._interfaces.get(message.i_tag)
         if interface is not None:
-            interface.deliver(message)
+            # What was on its way to a removed interface must not reach a later one of another type.
+            if message.i_tag not in self._withdrawn or message.msg_id != NO_ID or interface.fits(message):
+                interface.deliver(message)
         elif message.msg_id == NO_ID and message.i_tag not in self._withdrawn:
             key = message.i_tag, message.latch
             self._early.pop(key, None)

@@ -144,7 +144,7 @@ class ClientInterface(ABC):
         """Take a data message for this interface."""
 
     def fits(self, message: DataMessage) -> bool:
-        """Return whether a message that came before this interface was made is for it."""
+        """Return whether a message is for this interface, if an earlier one may have had its tag."""
         return (
             self.role is Role.PUBLISHER
             and message.message_type == self.message_type

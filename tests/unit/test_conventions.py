@@ -34,7 +34,6 @@ TINY = {
     "rce_fleet/mapping/mapper.py": "what two algorithms, in packages of their own, have in common",
     "rce_fleet/maps/distance.py": "one computation on a map; several rooms use only this one",
     "rce_fleet/offline/inputs.py": "chooses between two readers, one of which needs rosbags",
-    "rce_fleet/station/private_files.py": "common to webhooks and stops, which do not load each other",
     "rce_master/cli/exceptions.py": BASE,
     "rce_master/command.py": TYPER,
     "rce_master/http/leader_check.py": "common to archives and the audit log, which do not load each other",
