@@ -98,7 +98,7 @@ class ReplicatedMaster:
         Raises:
             StoreError: etcd cannot be used as it is; the text says why.
             StoreBusyError: Another master uses the state folder.
-            MasterError: A port cannot be used.
+            MasterError: A port cannot be used, or another master has this one's name.
             CertificateError: A certificate cannot be used.
         """
         settings = self._settings
@@ -111,14 +111,16 @@ class ReplicatedMaster:
         lock = FolderLock(settings.state_dir)
         try:
             tls = None if identity is None else identity.client
-            async with EtcdClient(address.endpoints, tls=tls, attempt=START_S) as client:
-                await _prepare(client, address.prefix)
-                await EngineMark(client, address.prefix, self._secret).check()
             attempt = settings.lease / _ATTEMPTS
             async with EtcdClient(address.endpoints, tls=tls, attempt=attempt) as client:
+                registry = MasterRegistry(client, address.prefix, settings.name)
+                async with EtcdClient(address.endpoints, tls=tls, attempt=START_S) as patient:
+                    await _prepare(patient, address.prefix)
+                    await EngineMark(patient, address.prefix, self._secret).check()
+                    async with self._session() as session:
+                        await registry.check_name(patient, Probe(session, self._masters_tls()).answers)
                 lease = LeaseSettings(ttl=settings.lease)
                 keeper = LeadershipKeeper(client, address.prefix, settings.name, lease)
-                registry = MasterRegistry(client, address.prefix, settings.name)
                 async with TaskScope() as tasks:
                     tasks.spawn(registry.run(), name="registry of masters")
                     if identity is not None:

@@ -16,7 +16,7 @@ ANSWER_S = 1.0
 
 
 class Probe:
-    """Tells whether other masters stand by.
+    """Tells what other masters are doing.
 
     Args:
         session: Makes the connections.
@@ -29,6 +29,20 @@ class Probe:
 
     async def stands_by(self, master: OtherMaster) -> bool:
         """Return whether a master answers that it is a stand-by and reaches etcd."""
+        status, told = await self._ask(master)
+        return (
+            status == HTTPStatus.SERVICE_UNAVAILABLE
+            and told.get("role") == "standby"
+            and bool(told.get("leader"))
+        )
+
+    async def answers(self, master: OtherMaster) -> bool:
+        """Return whether a master runs at an address, in whichever role."""
+        _, told = await self._ask(master)
+        return bool(told.get("role"))
+
+    async def _ask(self, master: OtherMaster) -> tuple[int, dict[str, Any]]:
+        """Return the status and the content of an answer; 0 and nothing if there is none."""
         try:
             async with (
                 asyncio.timeout(ANSWER_S),
@@ -38,11 +52,7 @@ class Probe:
                     ssl=self._tls() if self._tls is not None else True,
                 ) as reply,
             ):
-                told: dict[str, Any] = await reply.json()
-                return (
-                    reply.status == HTTPStatus.SERVICE_UNAVAILABLE
-                    and told["role"] == "standby"
-                    and bool(told["leader"])
-                )
-        except (aiohttp.ClientError, OSError, ValueError, KeyError, TypeError):
-            return False  # also a time-out, which is an OSError
+                told = await reply.json()
+                return (reply.status, told) if isinstance(told, dict) else (0, {})
+        except (aiohttp.ClientError, OSError, ValueError):
+            return 0, {}  # also after a time-out, which is an OSError

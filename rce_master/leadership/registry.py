@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
-from rce_master.exceptions import StoreError
+from rce_master.exceptions import MasterError, StoreError
 from rce_master.store.etcd.layout import Keys, read_master, write_master
-from rce_master.store.etcd.wire import Put
+from rce_master.store.etcd.wire import Condition, Put, Subject
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Awaitable, Callable, Sequence
 
     from rce_master.store.etcd.client import EtcdClient
     from rce_master.store.etcd.layout import OtherMaster
@@ -40,13 +41,38 @@ class MasterRegistry:
         self._keys = Keys(prefix)
         self._name = name
         self._url = ""
+        self._own_urls: set[str] = set()
         self._lease = 0
+        self._revision = 0
+        """Of this master's key, as it was found or written last; 0: there was none."""
         self._changed = asyncio.Event()
+
+    async def check_name(self, client: EtcdClient, answers: Callable[[OtherMaster], Awaitable[bool]]) -> None:
+        """Check that no running master has this one's name; call it before this one listens.
+
+        Two masters of one name would be counted as one, and less than a majority would be taken for one.
+
+        Args:
+            client: Asks etcd, with the patience of a program that starts.
+            answers: Tells whether a master runs at an address.
+
+        Raises:
+            MasterError: One has.
+            StoreError: etcd cannot be asked.
+        """
+        record = await client.get(self._keys.masters + self._name)
+        if record is None:
+            return
+        other = read_master(self._keys, record)
+        if await answers(other):
+            raise MasterError(_taken(other))
+        self._revision = record.modified
 
     def announce(self, url: str) -> None:
         """Say where other masters reach this one; :meth:`run` writes it."""
         if url != self._url:
             self._url, self._lease = url, 0
+            self._own_urls.add(url)
             self._changed.set()
 
     @property
@@ -78,16 +104,37 @@ class MasterRegistry:
             return
         url = self._url
         lease, _ = await self._client.grant(KEPT_S)
-        await self._client.transact([], [Put(self._keys.masters + self._name, write_master(url), lease)])
+        key = self._keys.masters + self._name
+        put = Put(key, write_master(url), lease)
+        while True:
+            unchanged = Condition(key, Subject.MODIFIED, self._revision)
+            outcome = await self._client.transact([unchanged], [put], [key])
+            if outcome.done:
+                break
+            # It ended, an earlier attempt was done after all, or another master was started meanwhile.
+            self._revision = 0
+            for record in outcome.found:
+                if (other := read_master(self._keys, record)).url not in self._own_urls:
+                    raise StoreError(_taken(other))
+                self._revision = record.modified
+        self._revision = outcome.revision
         if url == self._url:
             self._lease = lease
 
     async def others(self) -> Sequence[OtherMaster]:
-        """Return the other masters, also those that are down.
+        """Return the other masters, also those that are down, each by its newest name.
 
         Raises:
             StoreError: etcd cannot be asked.
         """
         records = (await self._client.range(self._keys.masters)).records
-        found = [read_master(self._keys, record) for record in records]
-        return [master for master in found if master.name != self._name]
+        found = [read_master(self._keys, one) for one in sorted(records, key=attrgetter("modified"))]
+        by_url = {master.url: master for master in found if master.name != self._name}
+        return [master for url, master in by_url.items() if url != self._url]
+
+
+def _taken(other: OtherMaster) -> str:
+    return (
+        f"another master, at {other.url}, has the name {other.name} too: give each machine a name of its own,"
+        " by its host name or --machine"
+    )
