@@ -39,7 +39,9 @@ class Conditions:
         self.ready = []
         for task in list(self._book.open_tasks()):
             task = self._check_deadline(task, now)  # noqa: PLW2901 - the same task, changed
-            if task.state in NOT_BEGUN and self._can_begin(task, now):
+            if task.state in NOT_BEGUN and task.next_stop is None:
+                self._finish(task, now)
+            elif task.state in NOT_BEGUN and self._can_begin(task, now):
                 self.ready.append(self._book.tasks[task.number])
         return self.ready
 
@@ -58,6 +60,11 @@ class Conditions:
         ]
         for task in due:
             self._book.recur(task, now)
+
+    def _finish(self, task: Task, now: float) -> None:
+        """End a task of which nothing is left: its last action ended while it was held, or it was changed."""
+        robot = task.visits[-1].robot if task.visits else ""
+        self._book.advance(task, TaskCause.FINISH, now, "all stops were made", robot=robot)
 
     def _check_deadline(self, task: Task, now: float) -> Task:
         deadline = task.order.deadline

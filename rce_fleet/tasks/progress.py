@@ -102,7 +102,7 @@ class TaskProgress:
     def _follow(self, task: Task, robot: RobotFacts, now: float, facts: FleetFacts) -> None:
         entry = self._book.entry(robot.id)
         if entry.is_out:
-            self._give_up(task, now, f"{robot.id} was taken out of service")
+            self._give_up(self._end_action(task, now, robot), now, f"{robot.id} was taken out of service")
             return
         if task.state is TaskState.SUSPENDED:
             task = self._book.advance(task, TaskCause.CONTINUE, now, f"{robot.id} can continue")
@@ -243,7 +243,7 @@ class TaskProgress:
     def _finish(self, task: Task, now: float) -> None:
         if task.state is TaskState.CANCELLING:
             self._book.advance(task, TaskCause.CANCEL, now, f"{task.robot} has brought its load away")
-        elif task.state is TaskState.RUNNING:
+        elif task.state in (TaskState.RUNNING, TaskState.SUSPENDED):
             took = now - (task.started_at if task.started_at is not None else now)
             self._book.advance(task, TaskCause.FINISH, now, f"{task.robot} made all stops in {took:.0f} s")
 
@@ -271,25 +271,25 @@ class TaskProgress:
             self._give_up(task, now, reason)
 
     def _give_up(self, task: Task, now: float, reason: str) -> None:
-        """Give a task to others; with its load on the robot it waits, and then fails."""
+        """Give a task to others, or end it if nothing is left; a bound one waits, and then fails."""
         self.avoid[task.number, task.robot] = now + self._rules.avoid_for
         if (visit := task.action) is not None and _fills_battery(stop := _stop_of_visit(task, visit)):
             task = self._acted(task, stop, visit, now)
         if not task.is_bound:
             if task.state is TaskState.CANCELLING:
                 self._book.advance(task, TaskCause.CANCEL, now, reason)
-            elif task.state is TaskState.RUNNING:
+            elif task.next_stop is None:
+                self._finish(task, now)
+            else:
                 self._book.advance(task, TaskCause.RELEASE, now, reason, robot="", target=None)
-        elif task.state is TaskState.RUNNING:
-            suspended = self._book.advance(
-                task, TaskCause.SUSPEND, now, f"its load is on {task.robot}: {reason}"
-            )
+            return
+        what = f"its load is on {task.robot}" if task.is_loaded else f"{task.robot} acts for it"
+        if task.state is TaskState.RUNNING:
+            suspended = self._book.advance(task, TaskCause.SUSPEND, now, f"{what}: {reason}")
             if suspended.question:
                 self._book.emit(suspended, "question", now, text=suspended.question)
         elif now - task.changed_at > self._rules.load_lost_after:
-            self._book.advance(
-                task, TaskCause.FAIL, now, f"its load is on {task.robot}, which did not come back: {reason}"
-            )
+            self._book.advance(task, TaskCause.FAIL, now, f"{what}; it did not come back: {reason}")
 
 
 def _stop_of_visit(task: Task, visit: StopVisit) -> Stop:

@@ -22,7 +22,7 @@ class TaskState(Enum):
     HELD = "held"
     """A person or program holds it. A robot that carries its load stands still; else it has no robot."""
     SUSPENDED = "suspended"
-    """Its load is on a robot that cannot continue now; it continues when the robot can."""
+    """The robot that has its load or acts for it cannot continue now; it continues when the robot can."""
     CANCELLING = "cancelling"
     """It was cancelled; its robot ends its action and brings the load away."""
     DONE = "done"
@@ -49,13 +49,13 @@ class TaskCause(Enum):
     CONTINUE = "continued"
     """Its robot, which has its load, continues."""
     SUSPEND = "suspended"
-    """Its robot has its load and cannot continue."""
+    """Its robot has its load or acts for it, and cannot continue."""
     CANCEL = "cancelled"
     """It was cancelled, or its robot brought the load away after that."""
     RETURN = "returning"
     """It was cancelled while a robot had its load or acted for it."""
     FINISH = "finished"
-    """The last stop was made."""
+    """All stops were made."""
     FAIL = "failed"
     """A rule ends it without success."""
 
@@ -66,6 +66,7 @@ TASK_LIFE: LifeCycle[TaskState, TaskCause] = LifeCycle(
         TaskState.QUEUED: {
             TaskCause.ASSIGN: TaskState.ASSIGNED,
             TaskCause.START: TaskState.RUNNING,
+            TaskCause.FINISH: TaskState.DONE,
             TaskCause.HOLD: TaskState.HELD,
             TaskCause.CANCEL: TaskState.CANCELLED,
             TaskCause.FAIL: TaskState.FAILED,
@@ -73,6 +74,7 @@ TASK_LIFE: LifeCycle[TaskState, TaskCause] = LifeCycle(
         TaskState.ASSIGNED: {
             TaskCause.ASSIGN: TaskState.ASSIGNED,
             TaskCause.START: TaskState.RUNNING,
+            TaskCause.FINISH: TaskState.DONE,
             TaskCause.RELEASE: TaskState.QUEUED,
             TaskCause.HOLD: TaskState.HELD,
             TaskCause.CANCEL: TaskState.CANCELLED,
@@ -95,9 +97,11 @@ TASK_LIFE: LifeCycle[TaskState, TaskCause] = LifeCycle(
             TaskCause.FAIL: TaskState.FAILED,
         },
         TaskState.SUSPENDED: {
+            TaskCause.FINISH: TaskState.DONE,
             TaskCause.RELEASE: TaskState.QUEUED,
             TaskCause.CONTINUE: TaskState.RUNNING,
             TaskCause.HOLD: TaskState.HELD,
+            TaskCause.CANCEL: TaskState.CANCELLED,
             TaskCause.RETURN: TaskState.CANCELLING,
             TaskCause.FAIL: TaskState.FAILED,
         },

@@ -464,3 +464,77 @@ def test_the_load_of_a_robot_that_drives_stays(floor: Floor) -> None:
     floor.run(2)
     with pytest.raises(TaskRefusedError, match="T1 is running"):
         settle_load(floor.book, task.id, 20, floor.now)
+
+
+def test_a_robot_taken_out_ends_its_action(floor: Floor) -> None:
+    """Its task has nothing left then."""
+    floor.add("Robot1", 0)
+    task = floor.book.create(Order((Stop(Action.GO, (2,), 30.0),)), floor.now)
+    floor.run(5)
+    floor.book.emit(RobotEntry("Robot1", mode="out_of_service"), "taken out", floor.now)
+    floor.run(2)
+    assert floor.task(task).state is TaskState.SUSPENDED
+    floor.run_until_ended(task, most=60)
+    assert floor.task(task).state is TaskState.DONE
+
+
+def _vanish_acting(floor: Floor) -> Task:
+    """Let a robot act at the only stop for half a minute, and be silent from then on."""
+    robot = floor.add("Robot1", 0)
+    task = floor.book.create(Order((Stop(Action.GO, (2,), 30.0),)), floor.now)
+    while floor.task(task).action is None:
+        floor.run(1)
+    robot.state, robot.reason, robot.away_since = "silent", "no messages", floor.now
+    floor.run(20)
+    assert floor.task(task).state is TaskState.SUSPENDED
+    return task
+
+
+def test_a_last_action_ends_while_its_robot_is_away(floor: Floor) -> None:
+    """All stops were made: the task is done, and the robot has none."""
+    task = _vanish_acting(floor)
+    assert floor.task(task).reason == "Robot1 acts for it: Robot1 is silent: no messages"
+    floor.run_until_ended(task, most=20)
+    assert floor.task(task).state is TaskState.DONE
+    assert floor.book.task_of("Robot1") is None
+
+
+def test_an_action_that_ends_while_away_frees_the_task(floor: Floor) -> None:
+    """Another robot makes the stops that are left."""
+    robot = floor.add("Robot1", 0)
+    stops = (Stop(Action.GO, (2,), 30.0), Stop(Action.GO, (5,)))
+    task = floor.book.create(Order(stops), floor.now)
+    while floor.task(task).action is None:
+        floor.run(1)
+    robot.state, robot.away_since = "silent", floor.now
+    floor.add("Robot2", 63)
+    floor.run_until_ended(task, most=120)
+    assert floor.task(task).state is TaskState.DONE
+    assert [visit.robot for visit in floor.task(task).visits] == ["Robot1", "Robot2"]
+
+
+def test_a_suspended_task_can_be_cancelled_in_each_moment(floor: Floor) -> None:
+    """Also between the end of its action and the next step."""
+    task = _vanish_acting(floor)
+    visit = floor.task(task).visits[-1]
+    ended = replace(floor.task(task), visits=(replace(visit, ended_at=floor.now),), position=1)
+    floor.book.put_record(ended)
+    assert floor.book.cancel(task.id, floor.now).state is TaskState.CANCELLED
+    assert floor.book.task_of("Robot1") is None
+
+
+@pytest.mark.parametrize("how", ["held", "changed"])
+def test_a_task_whose_stops_were_all_made_is_done(floor: Floor, how: str) -> None:
+    """No robot has to begin with it to find out that nothing is left."""
+    robot = floor.add("Robot1", 0)
+    stops = (Stop(Action.GO, (2,), 10.0), Stop(Action.GO, (5,)))
+    task = floor.book.create(Order(stops[:1] if how == "held" else stops), floor.now)
+    floor.run(5)
+    floor.book.hold(task.id, floor.now)
+    floor.run(20)
+    robot.state, robot.away_since = "silent", floor.now
+    if how == "changed":
+        floor.book.change(task.id, Order(stops[:1]), floor.now)
+    floor.book.resume(task.id, floor.now)
+    floor.run(2)
+    assert floor.task(task).state is TaskState.DONE
