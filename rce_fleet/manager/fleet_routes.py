@@ -161,7 +161,7 @@ def _show_robot(call: Call, name: str, queues: dict[str, list[str]]) -> FleetRob
         id=name,
         state=facts.state,
         activity="by hand" if facts.by_hand and activity == "idle" else activity,
-        reason=entry.reason or facts.reason,
+        reason=entry.reason or facts.reason or manager.dispatcher.chargers.waiting.get(name, ""),
         cell=facts.cell,
         goal=facts.goal,
         battery=facts.battery,

@@ -7,10 +7,12 @@ from math import inf
 from typing import TYPE_CHECKING
 
 from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot, misfit
-from rce_fleet.tasks.charging import ChargerQueue, place_to_wait
+from rce_fleet.tasks.charging import ChargerQueue
 from rce_fleet.tasks.conditions import Conditions
 from rce_fleet.tasks.energy import BatteryLevels, effort_of
 from rce_fleet.tasks.explaining import why_none
+from rce_fleet.tasks.idle_ways import IdleWays
+from rce_fleet.tasks.parking import Parking, ParkingCells
 from rce_fleet.tasks.progress import ProgressRules, TaskProgress
 from rce_fleet.tasks.queueing import Queues, RobotQueue
 from rce_fleet.tasks.records import AUTOMATIC, RobotProfile
@@ -21,7 +23,6 @@ from rce_fleet.tasks.zone_costs import zone_profiles
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from rce_fleet.planning.grid import GridMap
     from rce_fleet.tasks.book import TaskBook
     from rce_fleet.tasks.facts import FleetFacts, RobotFacts
 
@@ -71,11 +72,11 @@ class Dispatcher:
         self._conditions = Conditions(book)
         self._assigner = Assigner(self._travel, self.rules.assignment, self.rules.battery)
         self._queues = Queues(self._travel, self.rules.queue_length)
-        self.chargers = ChargerQueue(self.rules.battery, self._travel)
+        self._ways = IdleWays(self.rules.progress, self._nearest)
+        self.chargers = ChargerQueue(self.rules.battery, self._ways)
+        self._parking = Parking(self._ways, self.rules.park_after)
         self._profiles: dict[str, RobotProfile] = {}
         """Of robots for which zones count."""
-        self._parking: dict[str, int] = {}
-        self._idle_since: dict[str, float] = {}
         self._queues_due = -inf
         self._explained = 0
         self._facts: FleetFacts | None = None
@@ -147,6 +148,7 @@ class Dispatcher:
             return
         idle = {robot.id: robot for robot in facts.robots.values() if self._is_idle(robot)}
         taken = self._progress.targets()
+        self._ways.begin_step(now, self._progress.standing)
         self.chargers.adopt(idle, book.places.chargers, taken)
         free = [self._free(robot) for robot in idle.values() if self.chargers.can_work(robot)]
         working = {robot.id for robot in free}
@@ -163,11 +165,13 @@ class Dispatcher:
             self._queues_due = now + QUEUES_EVERY
             self._fill_queues(now, facts)
             self._explain(facts, now)
-        self._park(idle, now, facts)
+        used = {*book.places.chargers}.union(*(task.order.cells() for task in book.open_tasks()))
+        cells = ParkingCells(frozenset(book.places.parking), used, taken.keys())
+        self._parking.update(now, idle, self.chargers.charging, facts, cells)
 
     def goals(self) -> dict[str, int | None]:
         """Return where robots shall go; None: the robot shall stand still. Others have no goal."""
-        goals: dict[str, int | None] = dict(self._parking)
+        goals: dict[str, int | None] = dict(self._parking.cells)
         goals.update(self.chargers.charging)
         for task in self._book.active_tasks():
             stands = task.state in (TaskState.HELD, TaskState.SUSPENDED)
@@ -184,7 +188,8 @@ class Dispatcher:
     def leave_floor(self) -> None:
         """Forget cells where robots charge or wait: the planner has another grid."""
         self.chargers.charging.clear()
-        self._parking.clear()
+        self._parking.cells.clear()
+        self._ways.leave_floor()
 
     def activity(self, robot: str) -> str:
         """Return what a robot does for the manager, in one word."""
@@ -198,7 +203,7 @@ class Dispatcher:
             (task is not None, "task"),
             (robot in self.chargers.charging, "charging"),
             (robot in self.chargers.waiting, "waiting for a charger"),
-            (robot in self._parking, "parking"),
+            (robot in self._parking.cells, "parking"),
         )
         return next((word for does, word in doings if does), "idle")
 
@@ -241,7 +246,7 @@ class Dispatcher:
         return FreeRobot(robot.id, robot.cell, self.profile(robot.id), robot.battery)
 
     def _start(self, task: Task, robot: str, now: float) -> None:
-        self._parking.pop(robot, None)
+        self._parking.cells.pop(robot, None)
         self.chargers.charging.pop(robot, None)
         if task.state is TaskState.ASSIGNED and task.robot != robot:
             text = f"{robot} takes it from the queue of {task.robot}"
@@ -345,43 +350,3 @@ class Dispatcher:
             if like not in known:
                 known[like] = why_none(task, robots, self._travel, self._assigner, self._book.places.chargers)
             self._conditions.note(task, known[like], now)
-
-    def _park(self, idle: dict[str, RobotFacts], now: float, facts: FleetFacts) -> None:
-        """Send idle robots out of the way, some time after they have become idle."""
-        charging = self.chargers.charging
-        self._parking = {
-            name: cell for name, cell in self._parking.items() if name in idle and name not in charging
-        }
-        self._idle_since = {name: self._idle_since.get(name, now) for name in idle}
-        moves = [
-            robot
-            for robot in idle.values()
-            if robot.id not in charging
-            and robot.id not in self._parking
-            and now - self._idle_since[robot.id] >= self.rules.park_after
-        ]
-        if not moves or facts.grid is None:
-            return
-        used = set(self._book.places.chargers)
-        for task in self._book.open_tasks():
-            used.update(task.order.cells())
-        for robot in moves:
-            place = self._place(robot, facts.grid, facts, used)
-            if place is not None:
-                self._parking[robot.id] = place
-
-    def _place(self, robot: RobotFacts, grid: GridMap, facts: FleetFacts, used: set[int]) -> int | None:
-        """Return where an idle robot shall wait; None: where it is."""
-        if robot.cell is None:
-            return None
-        others = set(self._parking.values())
-        others.update(
-            each.cell for each in facts.robots.values() if each is not robot and each.cell is not None
-        )
-        parking = self._book.places.parking
-        if parking:
-            free = [cell for cell in parking if cell not in others]
-            return None if robot.cell in parking else self._nearest(robot, free)
-        if robot.cell not in used:
-            return None
-        return place_to_wait(grid, facts.shut, robot.cell, used | others)

@@ -96,3 +96,11 @@ class FleetFacts:
     zones: dict[str, Zone] = field(default_factory=dict)
     pending: frozenset[int] = frozenset()
     requested: frozenset[int] | None = None
+
+    def standing(self) -> dict[int, str]:
+        """Return the cells of robots that the planner does not drive now, and which robot is in each."""
+        return {
+            robot.cell: robot.id
+            for robot in self.robots.values()
+            if robot.cell is not None and robot.is_known and not robot.is_driven
+        }

@@ -49,6 +49,7 @@ class TaskProgress:
 
     Attributes:
         avoid: Until when a robot does not get a task again, by task's number and robot.
+        standing: Cells of robots that stay where they are, and which robot is in each.
     """
 
     def __init__(self, book: TaskBook, rules: ProgressRules, charged: float = 0.95) -> None:
@@ -56,6 +57,7 @@ class TaskProgress:
         self._charged = charged
         self._rules = rules
         self.avoid: dict[tuple[int, str], float] = {}
+        self.standing: dict[int, str] = {}
         self._taken: dict[int, str] = {}
         self._unknown_since: dict[str, float] = {}
         """Of robots with a task that the planner does not know."""
@@ -80,6 +82,7 @@ class TaskProgress:
         self._nearest, self._short_of_energy = nearest, short_of_energy
         self.avoid = {pair: until for pair, until in self.avoid.items() if until > now}
         self._taken = self.targets()
+        self.standing = self._standing(facts)
         self._unknown_since = {
             name: since for name, since in self._unknown_since.items() if name not in facts.robots
         }
@@ -96,6 +99,15 @@ class TaskProgress:
     def targets(self) -> dict[int, str]:
         """Return the cells that robots go to or act in for tasks, and for whom they are taken."""
         return {task.target: task.robot for task in self._book.active_tasks() if task.target is not None}
+
+    def _standing(self, facts: FleetFacts) -> dict[int, str]:
+        """Return the cells of robots that the planner does not drive, or that stand still with a load."""
+        found = facts.standing()
+        for task in self._book.active_tasks():
+            robot = facts.robots.get(task.robot)
+            if task.state in (TaskState.HELD, TaskState.SUSPENDED) and robot is not None:
+                found.update({} if robot.cell is None or not robot.is_known else {robot.cell: robot.id})
+        return found
 
     # Robots that are there
 
@@ -125,7 +137,7 @@ class TaskProgress:
                 self._give_up(task, now, lack)
                 return False
             self._warn_of_energy(task, lack, now)
-        if target is None or (target in facts.shut and len(stop.cells) != 1):
+        if target is None or (len(stop.cells) != 1 and self._is_closed(target, robot, facts)):
             task = self._choose(task, stop, robot, now)
             target = task.target
         if target is None:
@@ -139,6 +151,10 @@ class TaskProgress:
         what = "brings the load of the cancelled task" if number == RETURN else stop.action.value
         self._book.emit(begun, "arrived", now, text=f"{robot.id} is in cell {target}: {what}")
         return True
+
+    def _is_closed(self, target: int, robot: RobotFacts, facts: FleetFacts) -> bool:
+        """Return whether a robot cannot enter its target: another one of the stop's cells may be free."""
+        return target in facts.shut or self.standing.get(target, robot.id) != robot.id
 
     def _warn_of_energy(self, task: Task, lack: str, now: float) -> None:
         """Tell people, once for each stop, that a robot with a load may not get to its end."""
@@ -168,7 +184,13 @@ class TaskProgress:
         elif stop.action is Action.PARK:
             cells = cells or self._book.places.parking or ((robot.cell,) if robot.cell is not None else ())
         taken = {cell: self._taken[cell] for cell in cells if self._taken.get(cell, robot.id) != robot.id}
-        chosen = self._nearest(robot, [cell for cell in cells if cell not in taken])
+        free = [cell for cell in cells if cell not in taken]
+        clear = [cell for cell in free if self.standing.get(cell, robot.id) == robot.id]
+        chosen = self._nearest(robot, clear)
+        if chosen is None:  # a robot that stands there may drive on before this one arrives
+            chosen = self._nearest(robot, free)
+        if chosen is not None and chosen == task.target:
+            return task
         if chosen is not None:
             self._taken[chosen] = robot.id
             sent = replace(task, target=chosen, revision=task.revision + 1, reason="")

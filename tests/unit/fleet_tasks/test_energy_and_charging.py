@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from math import inf
+from typing import Any
 
 import pytest
 
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot
-from rce_fleet.tasks.charging import keeps_clear, place_to_wait
 from rce_fleet.tasks.dispatch import TaskRules
 from rce_fleet.tasks.energy import BatteryLevels, effort_of, share_needed
+from rce_fleet.tasks.facts import RobotFacts
 from rce_fleet.tasks.order import Action, Order, Stop
+from rce_fleet.tasks.parking import keeps_clear, place_to_wait
 from rce_fleet.tasks.queueing import Queues, RobotQueue
-from rce_fleet.tasks.records import Places, RobotProfile, Zone
+from rce_fleet.tasks.records import Places, RobotEntry, RobotProfile, Zone
 from rce_fleet.tasks.task import Task, TaskState
 from rce_fleet.tasks.travel import REFRESHED, TravelCosts
 
@@ -107,7 +109,7 @@ def test_chargers_are_given_to_the_emptiest_first(hungry: Floor) -> None:
     third = hungry.add("Robot3", 63, battery=0.25)
     hungry.run(1)
     assert hungry.dispatcher.chargers.charging == {"Robot2": 56}
-    assert hungry.dispatcher.chargers.waiting == ["Robot3", "Robot1"]
+    assert list(hungry.dispatcher.chargers.waiting) == ["Robot3", "Robot1"]
     hungry.facts.robots["Robot2"].battery = 0.97
     hungry.run(1)
     assert hungry.dispatcher.chargers.charging == {third.id: 56}
@@ -274,3 +276,150 @@ def test_robots_leave_for_no_cell_of_another_floor(hungry: Floor) -> None:
     assert hungry.dispatcher.goals() == {"Robot1": 56, "Robot2": 7}
     hungry.dispatcher.leave_floor()
     assert hungry.dispatcher.goals() == {}
+
+
+def _let_die(floor: Floor, robot: RobotFacts) -> None:
+    """Let a person say that a robot lies dead on the floor."""
+    robot.state, robot.mode, robot.away_since = "dead", "dead", floor.now  # away: the floor does not move it
+    floor.book.emit(RobotEntry(robot.id, mode="dead"), "dead", floor.now)
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_a_charger_under_a_dead_robot_is_left_to_it(hungry: Floor, when: str) -> None:
+    """An idle robot goes to another charger, also if the other one died after it had been chosen."""
+    hungry.book.emit(Places(chargers=(56, 63)), "places", hungry.now)
+    dead, robot = hungry.add("Robot1", 56, battery=0.97), hungry.add("Robot2", 24, battery=0.3)
+    if when == "before":
+        _let_die(hungry, dead)
+    hungry.run(2)
+    assert (hungry.dispatcher.chargers.charging == {"Robot2": 56}) == (when == "after")
+    _let_die(hungry, dead)
+    hungry.run(20)
+    assert (robot.cell, hungry.dispatcher.activity("Robot2")) == (63, "charging")
+
+
+def test_a_robot_without_a_charger_says_why(hungry: Floor) -> None:
+    robot = hungry.add("Robot1", 0, battery=0.3)
+    _let_die(hungry, hungry.add("Robot2", 56))
+    hungry.run(3)
+    assert hungry.dispatcher.chargers.waiting == {"Robot1": "no charger is free; Robot2 stands at 56"}
+    del hungry.facts.robots["Robot2"]
+    hungry.facts.shut, hungry.facts.map_revision = frozenset({1, 8}), 1
+    hungry.run(3)
+    assert hungry.dispatcher.chargers.waiting == {
+        "Robot1": "no path leads Robot1 to a charger that is free (cells 56)"
+    }
+    hungry.facts.shut, hungry.facts.map_revision = frozenset(), 2
+    hungry.run(20)
+    assert robot.cell == 56
+
+
+@pytest.mark.parametrize("why", ["shut", "unreachable", "stuck"])
+def test_a_charger_that_is_not_reached_is_given_up(hungry: Floor, why: str) -> None:
+    """It is blocked, the planner finds no path to it, or the robot does not get on: another one is chosen."""
+    hungry.book.emit(Places(chargers=(56, 63)), "places", hungry.now)
+    robot = hungry.add("Robot1", 0, battery=0.3)
+    hungry.run(2)
+    assert hungry.dispatcher.chargers.charging == {"Robot1": 56}
+    if why == "shut":
+        hungry.facts.shut, hungry.facts.map_revision = frozenset({56}), 1
+        hungry.run(3)
+    else:
+        robot.away_since = hungry.now  # the floor does not move it
+        if why == "unreachable":
+            robot.state = "unreachable"
+        hungry.run(25 if why == "unreachable" else 125)
+    assert hungry.dispatcher.chargers.charging == {"Robot1": 63}
+
+
+def test_a_charger_in_a_zone_is_not_for_each_robot(hungry: Floor) -> None:
+    """The nearest charger is in a zone that this robot may not enter."""
+    hungry.book.emit(Places(chargers=(2, 63)), "places", hungry.now)
+    hungry.book.emit(Zone("dock", "blocked", (2,), robots=("Robot1",)), "zone", hungry.now)
+    hungry.add("Robot1", 0, battery=0.3)
+    hungry.run(2)
+    assert hungry.dispatcher.chargers.charging == {"Robot1": 63}
+
+
+def test_a_sufficient_robot_leaves_the_charger_that_is_left(hungry: Floor) -> None:
+    """A charger under a dead robot does not count as free for an empty one."""
+    hungry.book.emit(Places(chargers=(56, 63)), "places", hungry.now)
+    _let_die(hungry, hungry.add("Robot1", 63))
+    hungry.add("Robot2", 56, battery=0.45)
+    hungry.run(1)
+    hungry.add("Robot3", 40, battery=0.1)
+    hungry.run(2)
+    assert hungry.dispatcher.chargers.charging == {"Robot3": 56}
+
+
+def test_a_charge_stop_avoids_a_charger_under_a_dead_robot(hungry: Floor) -> None:
+    hungry.book.emit(Places(chargers=(56, 63)), "places", hungry.now)
+    dead, robot = hungry.add("Robot1", 56, battery=0.97), hungry.add("Robot2", 24, battery=0.3)
+    task = hungry.book.create(Order((Stop(Action.CHARGE),), robot="Robot2"), hungry.now)
+    hungry.run(2)
+    assert hungry.task(task).target == 56
+    _let_die(hungry, dead)
+    hungry.run(20)
+    assert robot.cell == 63
+
+
+@pytest.mark.parametrize("why", ["dead", "shut", "removed", "taken"])
+def test_a_parking_place_that_is_lost_is_given_up(floor: Floor, why: str) -> None:
+    floor.book.emit(Places(parking=(6, 56)), "places", floor.now)
+    robot = floor.add("Robot1", 3)
+    floor.run(7)
+    assert floor.dispatcher.goals() == {"Robot1": 6}
+    if why == "dead":
+        _let_die(floor, floor.add("Robot2", 6))
+    elif why == "shut":
+        floor.facts.shut, floor.facts.map_revision = frozenset({6}), 1
+    elif why == "removed":
+        floor.book.emit(Places(parking=(56,)), "places", floor.now)
+    else:
+        floor.book.create(Order((Stop(Action.GO, (6,), 60.0),), robot="Robot2"), floor.now)
+        floor.add("Robot2", 7)
+    floor.run(20)
+    assert robot.cell == 56
+
+
+def test_a_parked_robot_leaves_the_cell_of_a_task(floor: Floor) -> None:
+    """It waits there since before the task came."""
+    floor.add("Robot1", 20)
+    floor.book.emit(Places(chargers=(20,)), "places", floor.now)
+    floor.run(10)
+    place = floor.dispatcher.goals()["Robot1"]
+    assert place is not None
+    floor.go(place, robot="Robot2")
+    floor.add("Robot2", 63)
+    floor.run(10)
+    assert floor.dispatcher.goals()["Robot1"] != place
+
+
+def test_a_full_robot_leaves_its_charger_without_a_parking_place(hungry: Floor) -> None:
+    """All parking places are occupied: it waits beside the charger."""
+    hungry.book.emit(Places(chargers=(56,), parking=(7,)), "places", hungry.now)
+    hungry.add("Robot1", 7, battery=0.97)
+    robot = hungry.add("Robot2", 56, battery=0.97)
+    hungry.run(10)
+    assert robot.cell not in (7, 56)
+
+
+class CountedRobots(dict[str, RobotFacts]):
+    """Robots by name; counts how often one looks at all of them."""
+
+    looks = 0
+
+    def values(self) -> Any:
+        self.looks += 1
+        return super().values()
+
+
+def test_a_step_looks_at_all_robots_a_few_times(floor: Floor) -> None:
+    """However many are idle: it does not compare each robot with all others."""
+    robots = floor.facts.robots = CountedRobots()
+    for number in range(40):
+        floor.add(f"Robot{number}", number)
+    floor.run(10)
+    robots.looks = 0
+    floor.dispatcher.update(floor.now, floor.facts)
+    assert robots.looks < 20
