@@ -114,7 +114,8 @@ class TaskProgress:
     def _follow(self, task: Task, robot: RobotFacts, now: float, facts: FleetFacts) -> None:
         entry = self._book.entry(robot.id)
         if entry.is_out:
-            self._give_up(self._end_action(task, now, robot), now, f"{robot.id} was taken out of service")
+            task = self._end_action(task, now, robot)
+            self._give_up(task, now, f"{robot.id} was taken out of service", is_away=True)
             return
         if task.state is TaskState.SUSPENDED:
             task = self._book.advance(task, TaskCause.CONTINUE, now, f"{robot.id} can continue")
@@ -290,9 +291,9 @@ class TaskProgress:
         else:
             reason = f"{task.robot} is {robot.state}: {robot.reason or 'it has no pose'}"
         if now - since > self._rules.lost_after or self._book.entry(task.robot).is_out:
-            self._give_up(task, now, reason)
+            self._give_up(task, now, reason, is_away=True)
 
-    def _give_up(self, task: Task, now: float, reason: str) -> None:
+    def _give_up(self, task: Task, now: float, reason: str, *, is_away: bool = False) -> None:
         """Give a task to others, or end it if nothing is left; a bound one waits, and then fails."""
         self.avoid[task.number, task.robot] = now + self._rules.avoid_for
         if (visit := task.action) is not None and _fills_battery(stop := _stop_of_visit(task, visit)):
@@ -307,11 +308,15 @@ class TaskProgress:
             return
         what = f"its load is on {task.robot}" if task.is_loaded else f"{task.robot} acts for it"
         if task.state is TaskState.RUNNING:
-            suspended = self._book.advance(task, TaskCause.SUSPEND, now, f"{what}: {reason}")
+            target = None if task.action is None else task.target  # others can use its cell meanwhile
+            suspended = self._book.advance(task, TaskCause.SUSPEND, now, f"{what}: {reason}", target=target)
             if suspended.question:
                 self._book.emit(suspended, "question", now, text=suspended.question)
         elif now - task.changed_at > self._rules.load_lost_after:
             self._book.advance(task, TaskCause.FAIL, now, f"{what}; it did not come back: {reason}")
+        elif is_away and task.action is None and task.target is not None:
+            waits = replace(task, target=None, revision=task.revision + 1)
+            self._book.emit(waits, "waits", now, text=f"{what}: {reason}")
 
 
 def _stop_of_visit(task: Task, visit: StopVisit) -> Stop:

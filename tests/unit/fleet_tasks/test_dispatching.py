@@ -538,3 +538,30 @@ def test_a_task_whose_stops_were_all_made_is_done(floor: Floor, how: str) -> Non
     floor.book.resume(task.id, floor.now)
     floor.run(2)
     assert floor.task(task).state is TaskState.DONE
+
+
+@pytest.mark.parametrize("is_cancelled", [False, True])
+def test_a_dead_robot_with_a_load_keeps_no_cell(floor: Floor, *, is_cancelled: bool) -> None:
+    """Others go to the cell to which it was on its way."""
+    robot = floor.add("Robot1", 0)
+    task = floor.deliver(3, 60, return_cells=(20,))
+    while not floor.task(task).is_loaded:
+        floor.run(1)
+    if is_cancelled:
+        floor.book.cancel(task.id, floor.now)
+    floor.run(2)
+    target = 20 if is_cancelled else 60
+    assert floor.task(task).target == target
+    robot.state, robot.away_since = "dead", floor.now
+    floor.book.emit(RobotEntry("Robot1", mode="dead"), "dead", floor.now)
+    floor.add("Robot2", 63)
+    other = floor.go(target)
+    floor.run_until_ended(other, most=60)
+    assert (floor.task(task).target, floor.task(task).loads) == (None, 1)
+    events = len(floor.events)
+    floor.run(5)
+    assert len(floor.events) == events
+    floor.book.emit(RobotEntry("Robot1"), "put in", floor.now)
+    robot.state, robot.away_since = "idle", float("inf")
+    floor.run_until_ended(task)
+    assert floor.task(task).loads == 0
