@@ -72,11 +72,15 @@ class GoBetween(ABC):
     async def to_server(self) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
         """Connect to the server."""
         sock = socket.socket()
-        sock.setblocking(False)
-        if self._piece:
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._piece)
-        await asyncio.get_running_loop().sock_connect(sock, self.target)
-        reader, writer = await asyncio.open_connection(sock=sock, limit=self._piece or 1 << 16)
+        try:
+            sock.setblocking(False)
+            if self._piece:
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._piece)
+            await asyncio.get_running_loop().sock_connect(sock, self.target)
+            reader, writer = await asyncio.open_connection(sock=sock, limit=self._piece or 1 << 16)
+        except BaseException:
+            sock.close()
+            raise
         try:
             yield reader, writer
         finally:
