@@ -12,8 +12,8 @@ pytestmark = [pytest.mark.needs("bwrap"), pytest.mark.xdist_group("starving")]
 
 KILLED, NO_SPACE, NO_MORE = {"killed"}, {"ENOSPC"}, {"EAGAIN"}
 NODE_OR_CONTAINER = KILLED | {"the container died"}
-"""A killed node gives its memory back some time later, last of all what descriptors and page tables hold; on a
-busy machine all of it is late. Before that, the kernel may kill the environment, if it asks for a page."""
+"""A killed node gives its memory back some time later, on a busy machine late: before that, the kernel may
+kill the environment, if it asks for a page. What descriptors and page tables hold comes last."""
 OWN_PROCESSES = 4
 """Holder, environment, node fork server, and the attacker itself."""
 
