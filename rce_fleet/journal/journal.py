@@ -61,6 +61,11 @@ _QUERY = """
 SELECT * FROM events
 WHERE number > ? AND time >= ? AND time < ? AND (? = '' OR id = ?) ORDER BY number LIMIT ?
 """
+_LAST_TASK = """
+SELECT max(CAST(substr(id, 2) AS INTEGER)) FROM (
+    SELECT id FROM events WHERE kind = 'task' UNION ALL SELECT id FROM records WHERE kind = 'task'
+)
+"""
 _COLUMNS = ("number", "time", "kind", "id", "name", "user", "text", "state", "robot", "revision")
 
 T = TypeVar("T")
@@ -96,12 +101,14 @@ class Journal:
 
     Attributes:
         id: Which journal it is. A new file has another one: its events are numbered from 1 again.
+        last_task: The largest number of a task that was written, also if the task was forgotten since.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._db = self._wait_for(self._open)
         self.id: str = self._run(_read_id, "opened")
+        self.last_task: int = self._run(_read_last_task, "opened")
 
     def append(self, events: Sequence[FleetEvent], forgotten: Collection[tuple[str, str]] = ()) -> None:
         """Write events and their records; when this returns they are on the disk.
@@ -116,13 +123,18 @@ class Journal:
         newest = {(event.kind, event.id): event.record for event in events}
         rows = [event_row(event) for event in events]
         write_records = _writer_of(newest.values(), forgotten)
+        numbers = (record.number for record in newest.values() if isinstance(record, Task))
+        last_task = max(numbers, default=0)
 
         def write(db: sqlite3.Connection) -> None:
             with db:
                 db.executemany("INSERT INTO events VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
                 write_records(db)
+                if last_task > self.last_task:
+                    db.execute("INSERT OR REPLACE INTO meta VALUES ('last task', ?)", (last_task,))
 
         self._run(write, "written")
+        self.last_task = max(self.last_task, last_task)
 
     def put(self, records: Iterable[Record]) -> None:
         """Replace records about which there is nothing to tell; there is no event.
@@ -309,6 +321,14 @@ def _read_id(db: sqlite3.Connection) -> str:
             db.execute("INSERT INTO meta VALUES ('journal', ?)", (secrets.randbits(48),))
         found = db.execute(query).fetchone()
     return f"{found[0]:012x}"
+
+
+def _read_last_task(db: sqlite3.Connection) -> int:
+    """Return the largest number of a task; earlier releases wrote it in events and records only."""
+    found = db.execute("SELECT value FROM meta WHERE name = 'last task'").fetchone()
+    if found is None:
+        found = db.execute(_LAST_TASK).fetchone()
+    return int(found[0] or 0)
 
 
 def event_row(event: FleetEvent) -> tuple[Any, ...]:

@@ -121,6 +121,7 @@ class FleetManager:
         """Make the book from the journal."""
         self.book = TaskBook()
         records, self.book.number = self._journal.load()
+        self.book.last_task = self._journal.last_task
         self.written = self.book.number
         for record in sorted(records, key=lambda each: each.number if isinstance(each, Task) else 0):
             self.book.put_record(clamped(record))

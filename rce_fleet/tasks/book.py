@@ -65,8 +65,8 @@ class TaskBook(FleetTables):
         self._check_after(order)
         start = order.earliest_start if order.earliest_start is not None else now
         recurs_at = start + order.every if order.every is not None and order.occurrences != 1 else None
-        self._last_task += 1
-        task = Task(self._last_task, order, user, key, now, now, recurs_at=recurs_at)
+        self.last_task += 1
+        task = Task(self.last_task, order, user, key, now, now, recurs_at=recurs_at)
         if key:
             task = replace(task, asked=digest(order))
         self.emit(task, "created", now, user=user, text=f"{task.id} was accepted")
@@ -254,9 +254,9 @@ class TaskBook(FleetTables):
         number = task.occurrence + 1
         last = order.occurrences is not None and number >= order.occurrences
         self.emit(replace(task, recurs_at=None, revision=task.revision + 1), "recurred", now)
-        self._last_task += 1
+        self.last_task += 1
         following = Task(
-            self._last_task,
+            self.last_task,
             order,
             task.requester,
             "",

@@ -44,6 +44,7 @@ class FleetTables:
         removed_zones: Zones that were removed, and that the planner may still have, by name.
         blocked: Cells that people blocked.
         number: Of the last event.
+        last_task: Number of the last task; no number is given twice, also if the task was forgotten.
     """
 
     def __init__(self) -> None:
@@ -57,11 +58,11 @@ class FleetTables:
         self.removed_zones: dict[str, Zone] = {}
         self.blocked = BlockedCells()
         self.number = 0
+        self.last_task = 0
         self._open: dict[int, None] = {}
         self._by_robot: dict[str, int] = {}
         self._queues: dict[str, dict[int, None]] = {}
         self._by_key: dict[tuple[str, str], int] = {}
-        self._last_task = 0
         self._out: list[FleetEvent] = []
 
     # Records and events
@@ -186,7 +187,7 @@ class FleetTables:
     def _put_task(self, task: Task) -> None:
         before = self.tasks.get(task.number)
         self.tasks[task.number] = task
-        self._last_task = max(self._last_task, task.number)
+        self.last_task = max(self.last_task, task.number)
         if task.key:
             self._by_key.setdefault((task.requester, task.key), task.number)
         if task.has_ended:

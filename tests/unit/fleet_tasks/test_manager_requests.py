@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import sqlite3
 import threading
 from collections.abc import AsyncIterator
 from dataclasses import replace
@@ -572,3 +573,34 @@ async def test_a_robot_shows_what_it_carries(client: ManagerClient) -> None:
         assert names[-1] == list(carried(task))
     assert names == [[], ["A"], ["A", "box"], ["A", "box", "C"], ["A", "box"], ["box"], []]
     assert carried(replace(book.find("T1"), position=0, loads=1)) == ("box",)
+
+
+async def test_a_task_number_is_given_once_over_restarts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The newest tasks are cancelled and forgotten before the oldest one; then the manager is restarted."""
+    client = ManagerClient(tmp_path / "j.sqlite")
+    monkeypatch.setattr(managers, "KEEP_ENDED", 0)
+    for _ in range(3):
+        await client.ask("POST", "/tasks", GO)
+    for task in ("T2", "T3"):
+        await client.ask("DELETE", f"/tasks/{task}")
+    await client.ask("POST", "/tasks/T1/hold", {})
+    assert list(client.manager.book.tasks) == [1]
+    await client.manager.close()
+    again = ManagerClient(tmp_path / "j.sqlite")
+    assert (await again.ask("POST", "/tasks", GO))[1]["id"] == "T4"
+    await again.manager.close()
+    _forget_counter(tmp_path / "j.sqlite")
+    former = ManagerClient(tmp_path / "j.sqlite")
+    assert (await former.ask("POST", "/tasks", GO))[1]["id"] == "T5"
+    await former.manager.close()
+
+
+def _forget_counter(path: Path) -> None:
+    """Make a journal as the release before wrote it: its records have one task, its events name all."""
+    db = sqlite3.connect(path)
+    db.execute("DELETE FROM meta WHERE name = 'last task'")
+    db.execute("DELETE FROM records WHERE id = 'T4'")
+    db.commit()
+    db.close()
