@@ -94,7 +94,10 @@ class TaskRequest(OrderFields):
 
 
 class TaskChange(ApiModel):
-    """A change of a task; what is left out stays as it is. Stops that were made must stay."""
+    """A change of a task; what is left out stays as it is. Stops that were made must stay.
+
+    A change of a recurring task that has ended counts for its next occurrence.
+    """
 
     stops: list[StopModel] | None = Field(default=None, min_length=1, max_length=500)
     name: str | None = Field(default=None, max_length=200)
@@ -145,6 +148,9 @@ class TaskModel(OrderFields):
     expected_end: float | None = Field(description="When it will be done, if that is known.")
     late: bool = Field(description="Its deadline passed before it was done.")
     occurrence: int = Field(description="Number of this occurrence of a recurring task, from 1.")
+    recurs_at: float | None = Field(
+        default=None, description="When its next occurrence is due; null: none follows, or it was created."
+    )
     revision: int = Field(description="Grows with each change; also the ETag.")
 
 

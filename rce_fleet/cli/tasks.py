@@ -20,7 +20,7 @@ Id = Annotated[str, typer.Argument(metavar="TASK", help="Its id, as rce fleet ta
 
 def tasks(
     state: Annotated[
-        str, typer.Option(help="States, separated by commas; also open, ended and all.")
+        str, typer.Option(help="States, separated by commas; also open, ended, recurring and all.")
     ] = "open",
     robot: Annotated[str, typer.Option(help="Only tasks that this robot does.")] = "",
     station: Station = STATION,
@@ -38,9 +38,12 @@ def tasks(
 def _row(task: TaskModel) -> tuple[str, ...]:
     where = "-" if task.target is None else str(task.target)
     what = task.name or _stops(task.stops)
+    notes = [task.reason] if task.reason else []
+    if task.recurs_at is not None:
+        notes.append(f"next {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(task.recurs_at))}")
     return (
         *(task.id, task.state, task.robot_assigned or "-", where, str(task.priority)),
-        *(_clock(task.expected_end), f"{what} ({task.reason})" if task.reason else what),
+        *(_clock(task.expected_end), f"{what} ({'; '.join(notes)})" if notes else what),
     )
 
 
@@ -179,10 +182,10 @@ def reassign(task_id: Id, station: Station = STATION) -> None:
 
 @app.command("cancel")
 def cancel(task_id: Id, station: Station = STATION) -> None:
-    """Cancel a task; a loaded robot brings its load back."""
+    """Cancel a task, or the recurrence of one that has ended."""
 
     async def work(client: FleetClient) -> None:
         task = await client.cancel_task(task_id)
-        typer.echo(f"{task.id} is {task.state}")
+        typer.echo(f"{task.id} is {task.state}" + (", and does not recur" if task.repeat is not None else ""))
 
     do(station, work)

@@ -45,7 +45,7 @@ class TaskRequests(ApiRequests):
         """Yield tasks, page by page.
 
         Args:
-            state: States to include, also ``open`` and ``ended``; empty: all.
+            state: States to include, also ``open``, ``ended`` and ``recurring``; empty: all.
             robot: Only tasks that this robot does.
             requester: Only tasks of this user.
             newest_first: The newest first instead of the oldest.
@@ -79,7 +79,7 @@ class TaskRequests(ApiRequests):
         return await self._change("PATCH", f"/tasks/{path_part(task_id)}", TaskModel, change, revision)
 
     async def cancel_task(self, task_id: str, *, revision: int | None = None) -> TaskModel:
-        """Cancel a task; a loaded robot brings its load back.
+        """Cancel a task; a loaded robot brings its load back, and one that has ended recurs no further.
 
         Example:
             ```python

@@ -120,6 +120,7 @@ def show_task(task: Task, expected_end: float | None) -> TaskModel:
         expected_end=expected_end,
         late=task.late,
         occurrence=task.occurrence,
+        recurs_at=task.recurs_at,
         revision=task.revision,
     )
 

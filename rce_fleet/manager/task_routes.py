@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 MOST_OPEN = 100_000
 """Tasks that have not ended; more are refused until some have."""
+_MORE_STATES = ("open", "ended", "recurring")
+"""Words for several states; recurring: another occurrence follows, also if this one has ended."""
 
 
 async def create(call: Call) -> FleetAnswer:
@@ -40,9 +42,9 @@ async def listed(call: Call) -> FleetAnswer:
     """Return a page of tasks."""
     call.only("state", "robot", "limit", "cursor", "order", "requester")
     states = {state for state in call.query.get("state", "").split(",") if state}
-    unknown = states - {state.value for state in TaskState} - {"open", "ended"}
+    unknown = states - {state.value for state in TaskState} - {*_MORE_STATES}
     if unknown:
-        possible = ", ".join([*(state.value for state in TaskState), "open", "ended"])
+        possible = ", ".join([*(state.value for state in TaskState), *_MORE_STATES])
         raise BadRequestError(f"unknown state {min(unknown)!r}; possible are {possible}")
     limit = call.count("limit", 100, 1000) or 100
     is_descending = call.query.get("order", "asc") == "desc"
@@ -150,6 +152,8 @@ ROUTES = [
 
 def _fits(task: Task, states: set[str], query: dict[str, str]) -> bool:
     kinds = {task.state.value, "ended" if task.has_ended else "open"}
+    if task.recurs_at is not None:
+        kinds.add("recurring")
     if states and not states & kinds:
         return False
     if "robot" in query and task.robot != query["robot"]:

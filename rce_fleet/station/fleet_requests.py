@@ -221,7 +221,7 @@ ROUTES: list[Route[str]] = [
         *("GET", "/tasks", "", "List tasks, by growing number"),
         reply=TaskPage,
         query=(
-            Query(name="state", description="States, separated by commas; also open and ended."),
+            Query(name="state", description="States, separated by commas; also open, ended and recurring."),
             Query(name="robot", description="The robot that does them."),
             Query(name="requester", description="Who created them."),
             Query(name="order", description="asc (default) or desc."),
@@ -232,7 +232,12 @@ ROUTES: list[Route[str]] = [
     _route("GET", "/tasks/{id}", "", "Return a task", reply=TaskModel, name="get_task"),
     _route("PATCH", "/tasks/{id}", "change_task", "Change a task", body=TaskChange, reply=TaskModel),
     _route(
-        *("DELETE", "/tasks/{id}", "cancel_task", "Cancel a task; a loaded robot brings its load back"),
+        *(
+            "DELETE",
+            "/tasks/{id}",
+            "cancel_task",
+            "Cancel a task; one that has ended recurs no further",
+        ),
         reply=TaskModel,
     ),
     _route("POST", "/tasks/{id}/hold", "hold_task", "Hold a task", body=HoldRequest, reply=TaskModel),

@@ -77,6 +77,8 @@ class TaskBook(FleetTables):
     ) -> Task:
         """Replace the order of a task. The stops that were made must stay as they are.
 
+        If the task has ended and recurs, the change counts for its next occurrence.
+
         Raises:
             TaskRefusedError: It has ended, or a robot has already made a stop that would change.
             RevisionError: It is not at the given revision.
@@ -85,6 +87,8 @@ class TaskBook(FleetTables):
         task = self.at(task_id, revision)
         if task.order == order:
             return task
+        if task.has_ended and task.recurs_at is not None:
+            return self._change_next(task, order, task.recurs_at, now, user)
         if task.has_ended or task.state is TaskState.CANCELLING:
             raise TaskRefusedError(f"{task.id} is {task.state.value}: it cannot be changed any more")
         check_order(order)
@@ -106,6 +110,33 @@ class TaskBook(FleetTables):
         if task.robot and order.robot not in ("", task.robot):
             text = f"{order.robot} is to do it, not {task.robot}"
             return self.advance(changed, TaskCause.RELEASE, now, text, robot="", target=None)
+        return changed
+
+    def _change_next(self, task: Task, order: Order, due: float, now: float, user: str) -> Task:
+        """Replace the order of a task that has ended, for its next occurrence.
+
+        Args:
+            task: The task.
+            order: Its times are those of the next occurrence, if they were changed.
+            due: When the next occurrence was due before the change.
+            now: Seconds since 1970.
+            user: Who asks.
+        """
+        before = task.order
+        if order.after != before.after:
+            raise TaskRefusedError(f"{task.id} has ended: only its first occurrence comes after other tasks")
+        recurs_at = _recurs_at(task, order, now)
+        if recurs_at is not None:
+            if order.earliest_start not in (None, before.earliest_start):
+                recurs_at = order.earliest_start
+            elif order.every == before.every:
+                recurs_at = due
+            order = _order_at(task, order, recurs_at)
+        check_order(order)
+        if self.grid is not None:
+            check_cells(order, self.grid)
+        changed = replace(task, order=order, revision=task.revision + 1, recurs_at=recurs_at)
+        self.emit(changed, "changed", now, user=user, text=f"{task.id} was changed for its next occurrence")
         return changed
 
     def hold(
@@ -151,7 +182,8 @@ class TaskBook(FleetTables):
     def cancel(self, task_id: str, now: float, *, user: str = "", revision: int | None = None) -> Task:
         """Cancel a task. A robot that has its load or acts for it brings the load away first.
 
-        Cancelling a task that was cancelled changes nothing.
+        If the task has ended and recurs, it stays as it is, and no occurrence follows. Cancelling a task that
+        was cancelled changes nothing.
 
         Raises:
             TaskRefusedError: It is done or has failed.
@@ -160,6 +192,14 @@ class TaskBook(FleetTables):
         """
         task = self.at(task_id, revision)
         if task.state in (TaskState.CANCELLED, TaskState.CANCELLING):
+            return task
+        if task.has_ended and task.recurs_at is not None:
+            by = user or "a program"
+            last = replace(task, recurs_at=None, cancelled_by=by, revision=task.revision + 1)
+            text = f"{by} ended the recurrence of {task.id}"
+            self.emit(last, "recurrence ended", now, user=user, text=text)
+            return last
+        if task.has_ended and task.cancelled_by:
             return task
         if task.has_ended:
             raise TaskRefusedError(f"{task.id} is {task.state.value}: it cannot be cancelled any more")
@@ -243,14 +283,7 @@ class TaskBook(FleetTables):
         assert every is not None
         assert due is not None
         due += every * max(0.0, (now - due) // every)
-        shift = due - (task.order.earliest_start or task.created_at)
-        late = task.order.deadline
-        order = replace(
-            task.order,
-            earliest_start=due,
-            deadline=None if late is None else min(late + shift, MOST_TIME),
-            after=(),
-        )
+        order = replace(_order_at(task, task.order, due), after=())
         number = task.occurrence + 1
         last = order.occurrences is not None and number >= order.occurrences
         self.emit(replace(task, recurs_at=None, revision=task.revision + 1), "recurred", now)
@@ -281,6 +314,15 @@ def _recurs_at(task: Task, order: Order, now: float) -> float | None:
     if task.recurs_at is None:  # it was the last one
         return (task.created_at if order.earliest_start is None else order.earliest_start) + every
     return task.recurs_at
+
+
+def _order_at(task: Task, order: Order, due: float) -> Order:
+    """Return an order for a task's next occurrence: a deadline that was not changed moves with its start."""
+    deadline = order.deadline
+    if deadline is not None and deadline == task.order.deadline:
+        shift = due - (task.order.earliest_start or task.created_at)
+        deadline = min(deadline + shift, MOST_TIME)
+    return replace(order, earliest_start=due, deadline=deadline)
 
 
 def digest(order: Order) -> str:

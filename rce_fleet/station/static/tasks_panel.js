@@ -2,6 +2,7 @@
 
 import { element } from "./engine.js";
 import { t } from "./texts.js";
+import { ENDED } from "./work.js";
 
 const TONE = { running: "good", queued: "quiet", assigned: "quiet", held: "warn", suspended: "warn", cancelling: "warn", failed: "bad", cancelled: "quiet", done: "good" };
 
@@ -11,6 +12,10 @@ const MOST_OPEN = 100;
 function awaitsConfirmation({ visits, stops }) {
   const last = visits.at(-1);
   return last?.ended_at === null && last.stop >= 0 && stops[last.stop % stops.length].confirm;
+}
+
+function clock(seconds) {
+  return new Date(1000 * seconds).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", hour12: false });
 }
 
 export class TasksPanel {
@@ -28,7 +33,7 @@ export class TasksPanel {
   draw() {
     const { work } = this;
     const open = [...work.tasks.values()].slice(0, MOST_OPEN);
-    const tasks = [...open, ...work.recent.slice(0, 5)];
+    const tasks = [...open, ...work.recurring, ...work.recent.slice(0, 5)];
     const more = work.openCount - open.length;
     this.note.textContent = work.trouble === "none" ? t("tasks.noManager") : work.trouble ?? (tasks.length ? "" : t("tasks.none"));
     const focused = document.activeElement?.id;
@@ -57,12 +62,13 @@ export class TasksPanel {
     return row;
   }
 
-  // When it ends, or ended; a deadline that is at risk has a sign and a colour.
+  // When it ends, ended, or recurs; a deadline that is at risk has a sign and a colour.
   #end(task) {
-    const ended = ["done", "failed", "cancelled"].includes(task.state);
+    const ended = ENDED.includes(task.state);
+    if (ended && task.recurs_at) return element("td", t("tasks.next", { time: clock(task.recurs_at) }), "quiet");
     const at = ended ? task.changed_at : task.expected_end;
     const risk = !ended && task.deadline && (task.late || (at ?? 0) > task.deadline);
-    const text = at ? new Date(1000 * at).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", hour12: false }) : "";
+    const text = at ? clock(at) : "";
     return element("td", risk ? `\u26a0 ${text}` : text, risk ? "bad" : "quiet");
   }
 
@@ -72,7 +78,8 @@ export class TasksPanel {
     const cell = element("td", "", "answers");
     cell.colSpan = 5;
     row.append(cell);
-    if (!this.steers || ["done", "failed", "cancelled", "cancelling"].includes(task.state)) return row;
+    const recurs = ENDED.includes(task.state) && task.recurs_at;
+    if (!this.steers || task.state === "cancelling" || (ENDED.includes(task.state) && !recurs)) return row;
     const add = (name, run) => {
       const button = element("button", t(`action.${name}`));
       button.type = "button";
@@ -83,7 +90,7 @@ export class TasksPanel {
     };
     if (awaitsConfirmation(task)) add("confirm", () => this.actions.confirmTask(task.id));
     if (task.state === "held") add("resume", () => this.actions.resumeTask(task.id));
-    else add("hold", () => this.actions.holdTask(task.id));
+    else if (!recurs) add("hold", () => this.actions.holdTask(task.id));
     add("raise", () => this.actions.raise(task.id, Math.min(100, (task.priority ?? 0) + 10)));
     add("cancel", () => this.actions.cancelTask(task.id));
     return row;

@@ -223,6 +223,7 @@ const TEXTS = {
   "task.suspended": "suspended",
   tasks: "Tasks",
   "tasks.more": "and {count} more",
+  "tasks.next": "next {time}",
   "tasks.noManager": "no fleet manager runs here",
   "tasks.none": "no tasks",
   theme: "Dark or light",

@@ -9,10 +9,13 @@ const ROBOTS_TASKS = "running,suspended,cancelling,held,assigned";
 const PAGE = 1000;
 const MOST_PAGES = 5;
 
+export const ENDED = ["done", "failed", "cancelled"];
+
 export class Work extends EventTarget {
   tasks = new Map();   // id -> task, those that have not ended; the first ones if there are many
   openCount = 0;       // how many have not ended
-  recent = [];         // tasks that ended, the newest first
+  recent = [];         // other tasks that ended, the newest first
+  recurring = [];      // tasks that ended, and of which another occurrence follows
   zones = [];
   chargers = null;
   statistics = null;
@@ -46,6 +49,7 @@ export class Work extends EventTarget {
     this.#robotsTasks.clear();
     this.openCount = 0;
     this.recent = [];
+    this.recurring = [];
     this.statistics = null;
     for (const robot of this.fleet.robots.values()) Object.assign(robot, { task: null, activity: null, queue: [], loads: 0, deadlineAtRisk: null });
     this.dispatchEvent(new Event("change"));
@@ -53,10 +57,11 @@ export class Work extends EventTarget {
 
   async #ask() {
     try {
-      const [robots, open, ended, zones, statistics] = await Promise.all([
+      const [robots, open, ended, recurring, zones, statistics] = await Promise.all([
         ask("GET", "/robots"),
         ask("GET", `/tasks?state=open&limit=${MOST_TASKS}`),
         ask("GET", "/tasks?state=ended&order=desc&limit=20"),
+        ask("GET", `/tasks?state=recurring&limit=${MOST_TASKS}`),
         ask("GET", "/zones"),
         ask("GET", "/statistics?seconds=3600"),
       ]);
@@ -66,7 +71,8 @@ export class Work extends EventTarget {
       this.trouble = null;
       this.tasks = tasks;
       this.openCount = open.next === null ? tasks.size : Math.max(tasks.size + 1, statistics.tasks_open);
-      this.recent = ended.tasks;
+      this.recurring = recurring.tasks.filter(({ state }) => ENDED.includes(state));
+      this.recent = ended.tasks.filter(({ recurs_at: next }) => !next);
       this.zones = zones.zones;
       this.statistics = statistics;
       this.#takeRobots(robots.robots);

@@ -88,6 +88,12 @@ async def check_buttons(page: Page, fleet: ManagedFleet) -> None:
     later = (await fleet.ask("POST", "/tasks", {"stops": [{"cell": 5}], "earliest_start": 4e9})).body["id"]
     await page.locator(f"#task-{later}-cancel").click()
     await fleet.until_state(later, "cancelled")
+    order = {"stops": [{"cell": 5}], "repeat": {"every": 86400}}
+    daily = (await fleet.ask("POST", "/tasks", order)).body["id"]
+    await page.wait_for_function("rceFleet.work.recurring.length === 1")  # done, between two occurrences
+    await page.locator(f"#task-{daily}-cancel").click()
+    await page.wait_for_function("rceFleet.work.recurring.length === 0")
+    assert (await fleet.ask("GET", "/tasks?state=recurring")).body["tasks"] == []
 
 
 async def check_robot(page: Page) -> None:
