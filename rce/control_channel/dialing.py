@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from rce.tls import Context
 
 
+SILENCE_S = 30.0
+"""How long a master may give no sign of life after a ping: it may be writing to a slow disk meanwhile."""
+
+
 class TaskSetConnection(WatchedConnection, TlsClientConnection):
     """The task set's end of a connection, which watches the master for signs of life."""
 
@@ -53,12 +57,16 @@ class Dialer:
         self._timeouts = timeouts
 
     @contextlib.asynccontextmanager
-    async def connect(self, path: str, max_size: int) -> AsyncIterator[ClientConnection]:
+    async def connect(
+        self, path: str, max_size: int, *, silence: float | None = SILENCE_S
+    ) -> AsyncIterator[ClientConnection]:
         """Connect to a path of the control port.
 
         Args:
             path: What the connection is for.
             max_size: Bytes of the longest message that is taken.
+            silence: Seconds without a sign of life after a ping until the connection ends; None: they are
+                not limited, for a master that may leave data unread.
 
         Raises:
             OSError: The master cannot be reached; ``TimeoutError`` if it does not answer.
@@ -76,7 +84,7 @@ class Dialer:
             proxy=None,
             open_timeout=self._timeouts.open,
             ping_interval=self._timeouts.ping_interval,
-            ping_timeout=None,
+            ping_timeout=silence,
             close_timeout=self._timeouts.close,
             max_size=max_size,
             max_queue=4,
@@ -91,5 +99,5 @@ class RunDialer(Dialer):
     @contextlib.asynccontextmanager
     async def dial(self, run: str) -> AsyncIterator[ClientConnection]:
         """Connect for a run; the errors are those of :meth:`connect`."""
-        async with self.connect(path_of(run), MAX_DATA + 2) as master:
+        async with self.connect(path_of(run), MAX_DATA + 2, silence=None) as master:  # until the user reads
             yield master

@@ -13,6 +13,7 @@ from websockets.asyncio.connection import Connection
 from websockets.frames import CloseCode
 from websockets.protocol import State
 
+from rce.liveness.signs import Outflow
 from rce.liveness.watch import Watch
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ class WatchedConnection(Connection):
     _watch: Watch | None = None
     _deadline: asyncio.TimerHandle | None = None
     """When a connection that is to end is dropped."""
+    _closing: asyncio.TimerHandle | None = None
+    """When it is next seen whether the other side takes what waits while it is closed."""
     _has_heard = False
 
     @property
@@ -49,6 +52,29 @@ class WatchedConnection(Connection):
         """Drop the connection after the close timeout, also if the other side goes on sending."""
         if self._deadline is None and not self.transport.is_closing():
             self._deadline = self.loop.call_later(self.close_timeout or 0.0, self.transport.abort)
+
+    async def close(self, code: CloseCode | int = CloseCode.NORMAL_CLOSURE, reason: str = "") -> None:
+        """Close the connection; return when it has ended.
+
+        It is dropped if the other side takes nothing for the close timeout while data waits to be sent; the
+        library's own limit begins after that wait. A side whose silence is not limited may take its time.
+        """
+        if self.ping_timeout is None:
+            await super().close(code, reason)
+            return
+        outflow = Outflow(self.transport)
+        self._look_while_closing(outflow)
+        try:
+            await super().close(code, reason)
+        finally:
+            if self._closing is not None:
+                self._closing.cancel()
+
+    def _look_while_closing(self, outflow: Outflow) -> None:
+        if self._closing is not None and not outflow.moved():
+            self.transport.abort()
+        else:
+            self._closing = self.loop.call_later(self.close_timeout or 0.0, self._look_while_closing, outflow)
 
     # Called by the library
 

@@ -11,6 +11,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 from pydantic import ValidationError
 
 from rce.aio.tasks import cancel_and_wait
+from rce.web.closing import close_socket
 from rce_fleet.station.api import LayersRequest
 
 if TYPE_CHECKING:
@@ -70,7 +71,8 @@ class PageSocket:
             await asyncio.sleep(CHECK_S)
             if not await self._access.is_still_allowed(request):
                 break
-        await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=b"your login has ended; log in again")
+        text = "your login has ended; log in again"
+        await close_socket(request, socket, code=WSCloseCode.POLICY_VIOLATION, reason=text)
 
 
 def _show_layers(layers: LayerHub, page: Page, text: str) -> None:

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rce.aio.tasks import cancel_and_wait
 from rce.web.bodies import read_whole
+from rce.web.closing import close_socket
 from rce.web.routes import Route, RouteTable
 from rce_fleet.station.access import EMERGENCY_STOP, IS_CHECKED, USER, AccessControl, problem
 from rce_fleet.station.api import Answer
@@ -204,22 +205,22 @@ class ControlRoutes:
         await socket.prepare(request)
         user = request[USER].name
         if not control.begin_driving(robot, user):
-            await _refuse(socket, f"{robot} is driven by {control.driven[robot]}")
+            await _refuse(request, socket, f"{robot} is driven by {control.driven[robot]}")
             return socket
         ended = asyncio.get_running_loop().create_future()
         self._drives.add(ended)
         try:
             async with self._modes.manual(robot, user), self._sender(request, control, robot) as sender:
                 may_drive = partial(self._access.is_still_allowed, request, to_control=True)
-                await _drive(socket, sender, may_drive, self._ending)
+                await _drive(request, socket, sender, may_drive, self._ending)
         except (CommandError, PlannerError) as error:
-            await _refuse(socket, str(error))
+            await _refuse(request, socket, str(error))
         finally:
             control.end_driving(robot)  # last: the next one to drive it shall not lose the mode manual
             self._drives.discard(ended)
             ended.set_result(None)
         if self._ending.is_set():  # the page may be away, so nothing waits for it
-            await socket.close(code=WSCloseCode.GOING_AWAY, message=_ENDS.encode())
+            await close_socket(request, socket, code=WSCloseCode.GOING_AWAY, reason=_ENDS)
         return socket
 
     async def end_drives(self) -> None:
@@ -247,6 +248,7 @@ class ControlRoutes:
 
 
 async def _drive(
+    request: web.Request,
     socket: web.WebSocketResponse,
     sender: CommandSender,
     may_drive: Callable[[], Awaitable[bool]],
@@ -267,7 +269,7 @@ async def _drive(
             if not await may_drive():
                 break
 
-    reader = asyncio.create_task(_pass_on(socket, sender, guard))
+    reader = asyncio.create_task(_pass_on(request, socket, sender, guard))
     watcher, checker = asyncio.create_task(watch()), asyncio.create_task(check_login())
     end = asyncio.create_task(ending.wait())
     try:
@@ -281,11 +283,13 @@ async def _drive(
     finally:
         await cancel_and_wait(reader, watcher, checker, end)
     sender.send(velocity_message(0.0, 0.0))
-    text = b"you may not drive this robot any more; log in again"
-    await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=text)
+    text = "you may not drive this robot any more; log in again"
+    await close_socket(request, socket, code=WSCloseCode.POLICY_VIOLATION, reason=text)
 
 
-async def _pass_on(socket: web.WebSocketResponse, sender: CommandSender, guard: DriveGuard) -> None:
+async def _pass_on(
+    request: web.Request, socket: web.WebSocketResponse, sender: CommandSender, guard: DriveGuard
+) -> None:
     """Send the robot what the frames of a page say, until the page leaves."""
     loop = asyncio.get_running_loop()
     with contextlib.suppress(ConnectionError):  # the page leaves while it is answered
@@ -296,7 +300,7 @@ async def _pass_on(socket: web.WebSocketResponse, sender: CommandSender, guard: 
                 frame = DriveFrame.model_validate_json(message.data)
             except ValidationError as error:
                 sender.send(velocity_message(0.0, 0.0))
-                await _refuse(socket, f"not a frame: {error.errors()[0]['msg']}")
+                await _refuse(request, socket, f"not a frame: {error.errors()[0]['msg']}")
                 break
             speed, turn_rate = guard.take(frame, loop.time())
             sender.send(velocity_message(speed, turn_rate))
@@ -304,10 +308,8 @@ async def _pass_on(socket: web.WebSocketResponse, sender: CommandSender, guard: 
             await socket.send_str(json.dumps(answer))
 
 
-async def _refuse(socket: web.WebSocketResponse, text: str) -> None:
-    with contextlib.suppress(ConnectionError):
-        await socket.send_str(json.dumps({"error": text}))
-        await socket.close()
+async def _refuse(request: web.Request, socket: web.WebSocketResponse, text: str) -> None:
+    await close_socket(request, socket, last=json.dumps({"error": text}))
 
 
 def _reply(model: BaseModel) -> web.Response:

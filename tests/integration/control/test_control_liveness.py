@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from dataclasses import replace
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import pytest
-from support.control_ends import QUICK, Master, TaskSet, deaf_task_set
+from support.control_ends import QUICK, SECRET, Master, TaskSet, deaf_task_set
 from support.slow_link import SlowLink
+from websockets.asyncio.server import serve
+from websockets.exceptions import ConnectionClosed
 
 from rce.control import Left, Notify
+from rce.control_channel.dialing import Dialer
+from rce.masters import Masters
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from websockets.asyncio.client import ClientConnection
+    from websockets.asyncio.server import ServerConnection
+
     from rce.control import ToMaster
     from rce.control_channel.peer import Peer
 
 IMPATIENT = replace(QUICK, ping_interval=0.3, ping_timeout=0.5)
 """A message on the slow link takes much longer."""
+PATIENT = replace(QUICK, ping_interval=60.0, ping_timeout=60.0)
 RATE = 400e3
 LONG = "x" * 1_500_000
 
@@ -117,3 +128,75 @@ async def test_a_master_that_reads_slowly_keeps_the_task_set() -> None:
             for _ in range(200):
                 await master.messages.get()
         assert master.story == ["hello"]
+
+
+async def test_master_ends_though_a_task_set_takes_nothing() -> None:
+    """Pings alone would hold it for a minute."""
+    master = Master(timeouts=PATIENT)
+    async with asyncio.timeout(30):
+        async with master.server, deaf_task_set(master) as peer:
+            for _ in range(40):
+                peer.send(Notify(id="u/r", text=LONG))
+            await asyncio.sleep(0.2)  # until the network takes nothing more
+
+
+async def test_task_set_ends_though_the_master_takes_nothing() -> None:
+    """The same for the other end."""
+    master = Slow()
+    async with master.server, SlowLink(f"ws://127.0.0.1:{master.server.port}").running() as link:
+        async with asyncio.timeout(30):
+            async with TaskSet(port_of(link.url), timeouts=PATIENT).running() as robots:
+                await robots.channel.wait_connected()
+                link.hangs = True
+                for _ in range(40):
+                    robots.channel.send(Left(id="u/r", reason=LONG))
+                await asyncio.sleep(0.2)
+        master.may.set()
+
+
+async def test_connection_beside_the_channel_ends_in_its_time() -> None:
+    """What is sent to a master that takes nothing is given up when its time is over, and the close too."""
+    async with deaf_server() as port:
+        dialer = Dialer(Masters([f"ws://127.0.0.1:{port}"]), SECRET, PATIENT)
+        async with asyncio.timeout(30):
+            with pytest.raises(TimeoutError):
+                await _send_for(1, dialer)
+
+
+async def test_connection_beside_the_channel_notices_a_gone_master() -> None:
+    """It ends without a limit of its user, unless that one allows silence."""
+    async with deaf_server() as port:
+        dialer = Dialer(Masters([f"ws://127.0.0.1:{port}"]), SECRET, IMPATIENT)
+        async with asyncio.timeout(60), dialer.connect("/states", 1 << 20, silence=0.5) as socket:
+            with pytest.raises(ConnectionClosed):
+                await _send_on(socket)
+
+
+async def _send_for(seconds: float, dialer: Dialer) -> None:
+    async with asyncio.timeout(seconds), dialer.connect("/states", 1 << 20) as socket:
+        await _send_on(socket)
+
+
+async def _send_on(socket: ClientConnection) -> None:
+    while True:
+        await socket.send(LONG)
+
+
+@contextlib.asynccontextmanager
+async def deaf_server() -> AsyncIterator[int]:
+    """A WebSocket server that reads nothing after the handshake; yields its port."""
+
+    async def stay(socket: ServerConnection) -> None:
+        socket.transport.pause_reading()
+        try:
+            await ended.wait()
+        finally:
+            socket.transport.abort()
+
+    ended = asyncio.Event()
+    async with serve(stay, "127.0.0.1", 0, ping_interval=None) as server:
+        (sock,) = server.sockets
+        try:
+            yield int(sock.getsockname()[1])
+        finally:
+            ended.set()

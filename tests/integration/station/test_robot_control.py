@@ -254,7 +254,7 @@ async def test_a_robot_is_driven_while_the_switch_is_held() -> None:
             async with made.client.ws_connect("/api/v1/robots/Robot1/drive") as second:
                 assert "is driven by" in json.loads(await second.receive_str(timeout=LIMIT_S))["error"]
         await made.until(lambda: made.fleet.modes[-1] == ("Robot1", "automatic"))
-        assert made.control.driven == {}
+        await made.until(lambda: made.control.driven == {})
 
 
 async def test_a_station_that_ends_gives_driven_robots_their_modes_back() -> None:
