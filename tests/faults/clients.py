@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import itertools
 import random
 import time
+from collections import deque
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -25,6 +25,8 @@ INITIAL = 1_000_000
 """Of all registers, which are limits of users."""
 TIMEOUT_S = 3.0
 PAUSE_S = 0.1
+LAST_ANSWERS = 20
+"""Answers that are told if no write is acknowledged in time."""
 TOKENS = 1500
 """A user may have 2000."""
 _FAILURES = (aiohttp.ClientError, TimeoutError, OSError)
@@ -46,6 +48,8 @@ class Clients:
         self._rng = rng
         self._token = ""
         self._numbers = itertools.count(1)
+        self._tasks: list[asyncio.Task[None]] = []
+        self._answers: deque[str] = deque(maxlen=LAST_ANSWERS)
 
     async def prepare(self) -> None:
         """Log in, and make the users whose limits are the registers."""
@@ -73,7 +77,7 @@ class Clients:
     async def under_load(self) -> AsyncIterator[None]:
         """Write and read all the time."""
         users = [(name, number) for number, name in enumerate(REGISTER_USERS)]
-        tasks = [
+        tasks = self._tasks = [
             asyncio.create_task(self._make_tokens(0)),
             *(asyncio.create_task(self._write(name, number)) for name, number in users),
             *(asyncio.create_task(self._read(name, number)) for name, number in users),
@@ -88,14 +92,29 @@ class Clients:
             if isinstance(result, Exception):
                 raise result
 
+    def check(self) -> None:
+        """Check that the clients continue.
+
+        Raises:
+            AssertionError: One of them was answered what no client may be.
+        """
+        for task in self._tasks:
+            if task.done():
+                assert not task.cancelled(), "a client was cancelled"
+                task.result()
+
     async def wait_for_writes(self, count: int = 3, *, since: float = 0.0) -> None:
         """Wait until so many more writes are acknowledged that were asked for after a time."""
         since = since or time.monotonic()
 
         def enough() -> bool:
+            self.check()
             return sum(start >= since for start, _ in self._history.acknowledged) >= count
 
-        await until(enough, timeout=PATIENCE_S, what=f"{count} writes are acknowledged")
+        try:
+            await until(enough, timeout=PATIENCE_S, what=f"{count} writes are acknowledged")
+        except AssertionError as error:
+            raise AssertionError("\n".join([f"{error}; clients were answered:", *self._answers])) from error
 
     async def stored(self) -> list[str]:
         """Return the robots of all tokens."""
@@ -153,11 +172,15 @@ class Clients:
     async def _ask(
         self, session: aiohttp.ClientSession, method: str, url: str, body: object = None
     ) -> tuple[Fate, dict[str, Any]]:
-        with contextlib.suppress(*_FAILURES):
+        try:
             async with session.request(method, url, json=body) as reply:
                 if reply.status < 300:
                     return Fate.DONE, await reply.json()
-                assert reply.status in {500, 502, 503}, (reply.status, await reply.text())
+                text = await reply.text()
+                assert reply.status in {500, 502, 503}, (reply.status, text)
+                self._answers.append(f"{method} {url}: {reply.status} {text}")
                 if STANDBY_HEADER in reply.headers:
                     return Fate.NOT_DONE, {}
+        except _FAILURES as error:
+            self._answers.append(f"{method} {url}: {error!r}")
         return Fate.UNKNOWN, {}

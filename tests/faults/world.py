@@ -39,6 +39,7 @@ class World:
         """Note how long it took until a write was acknowledged that was asked for after a fault."""
 
         def written() -> float | None:
+            self.clients.check()
             return self.history.first_write_after(since)
 
         end = await until(written, timeout=PATIENCE_S, what=f"a write is acknowledged after: {what}")

@@ -87,7 +87,8 @@ async def clocks(world: World) -> None:
     await world.clients.wait_for_writes(10)
     for machine in wrong:
         machine.master_env = {}
-        await machine.master.kill()
+        if machine.master.running:
+            await machine.master.kill()
         await world.whole()
 
 
