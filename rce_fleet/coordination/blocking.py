@@ -206,7 +206,7 @@ class CellBlocking:
         was_blocked = not state.blocked.isdisjoint(opened)
         for cell in opened:
             state.free(cell)
-        self._dispatcher.to_settle.update(state.index.hindered_at(opened))
+        self._dispatcher.to_settle.update(state.index.hindered.at(opened))
         if was_blocked:
             self._dispatcher.out.append(BlockedChanged(tuple(sorted(state.blocked))))
         self._dispatcher.require(record.id for record in state.robots.values() if record.unreachable)

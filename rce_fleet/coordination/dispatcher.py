@@ -119,21 +119,50 @@ class Dispatcher:
         self.require({robot for cell in cells for robot in self.state.ledger.visitors(cell)} - {record.id})
 
     def watch(self, record: RobotRecord) -> None:
-        """Claim the cells that a robot without a cell overlaps, and stop robots that would drive there.
+        """Claim the free cells that a robot overlaps, and stop robots that would drive there.
+
+        It keeps its granted cells: it may still drive there, or be there, if the pose is wrong. Poses of a
+        lost robot that has a cell do not count.
+        """
+        ledger, has_cell = self.state.ledger, self.state.ledger.length(record.id) > 0
+        if record.lost and has_cell:
+            return
+        before = ledger.claims(record.id)
+        hull = set() if isnan(record.x) else self._placement.hull(record)
+        ledger.overlap(record.id, self._beside(record, hull) if has_cell else self._around(record))
+        claims = ledger.claims(record.id)
+        self.state.index.displaced.put(record.id, () if hull <= claims else hull)
+        if claims != before:
+            self.avoid(record)
+            self.require(other.id for other in self.state.robots.values() if other.unreachable)
+            if record.phase is Phase.SILENT and not hull <= before:
+                self._stop_silent(record)  # It would be driven back to its cells, through those of others.
+        if not has_cell or not hull <= before:
+            self.make_room(record)
+
+    def _beside(self, record: RobotRecord, hull: set[int]) -> set[int]:
+        """Return the cells that a robot with a cell overlaps, if its hull is not within its cells."""
+        ledger, touched = self.state.ledger, self._placement.touched(record)
+        if hull <= ledger.claims(record.id):
+            touched &= ledger.overlapped(record.id)
+        return {cell for cell in touched | record.doubted if not self.state.is_blocked(cell)}
+
+    def _around(self, record: RobotRecord) -> set[int]:
+        """Return the cells that a robot without a cell overlaps or may drive to.
 
         A robot that drives was granted cells by an earlier planner: they are claimed until it stands. A robot
         that lies dead on the floor does not reach them.
         """
-        ledger = self.state.ledger
-        before = ledger.claims(record.id)
-        cells = set(before) if isnan(record.x) else self._placement.touched(record)
-        if isnan(record.x) or self.state.mode_of(record) is not RobotMode.DEAD:
-            cells |= self._may_reach(record)
-        ledger.overlap(record.id, cells)
-        if ledger.claims(record.id) != before:
-            self.avoid(record)
-            self.require(other.id for other in self.state.robots.values() if other.unreachable)
-        self.make_room(record)
+        if isnan(record.x):
+            return {*self.state.ledger.claims(record.id), *self._may_reach(record)}
+        touched = self._placement.touched(record)
+        is_dead = self.state.mode_of(record) is RobotMode.DEAD
+        return touched if is_dead else touched | self._may_reach(record)
+
+    def _stop_silent(self, record: RobotRecord) -> None:
+        """Stop a silent robot as well as possible: its move client may hear. It keeps its cells."""
+        self.out.append(SendCancel(record.id))
+        self.send(record, ())
 
     def _may_reach(self, record: RobotRecord) -> frozenset[int]:
         """Return the cells that an earlier planner granted a robot, and that it may still drive to."""
@@ -147,14 +176,16 @@ class Dispatcher:
         return self.state.ledger.claims(record.id) if is_braking else frozenset()
 
     def make_room(self, record: RobotRecord) -> None:
-        """Stop robots that were granted cells which another robot overlaps."""
+        """Stop robots that were granted cells which another robot overlaps; silent ones may hear it."""
         for cell in () if isnan(record.x) else sorted(self._placement.touched(record)):
             owner = self.state.ledger.owner(cell)
             other = self.state.robots.get(owner) if owner is not None else None
-            if other is None or other is record or other.phase is not Phase.ACTIVE:
+            if other is None or other is record or cell not in self.state.ledger.granted(other.id)[1:]:
                 continue
-            if cell in self.state.ledger.granted(other.id)[1:]:
+            if other.phase is Phase.ACTIVE:
                 self.hold(other, f"{record.id} is in its way")
+            elif other.phase is Phase.SILENT and self.now - other.sent_at >= self.settings.repeat_after:
+                self._stop_silent(other)
 
     def _block_left_cells(self) -> None:
         if not self.left:
@@ -204,6 +235,16 @@ class Dispatcher:
             still = extra and extra & self._placement.hull(record)
             self.state.ledger.arrive(record.id, index, still)
         return True
+
+    def has_left(self, record: RobotRecord) -> bool:
+        """Return whether a robot that is not on its path was carried out of its granted cells."""
+        here = self.state.grid.cell_at(record.x, record.y)
+        granted = self.state.ledger.granted(record.id)
+        if here in granted:
+            return False
+        # It may begin in a cell that is shut, and that it only overlaps.
+        in_others = here not in self.state.ledger.claims(record.id)
+        return in_others or self._placement.nearest(record) not in granted
 
     def arrive_by_pose(self, record: RobotRecord, now: float) -> None:
         """Release the last cell behind a robot that is judged by its poses, once it has stood for a while."""

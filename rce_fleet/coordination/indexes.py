@@ -17,6 +17,43 @@ if TYPE_CHECKING:
     from rce_fleet.coordination.ledger import CellLedger
 
 
+class RobotsByCell:
+    """Cells of some robots, and the robots of a cell."""
+
+    def __init__(self) -> None:
+        self.cells: dict[str, frozenset[int]] = {}
+        self._robots: dict[int, set[str]] = {}
+
+    def put(self, robot: str, cells: Iterable[int]) -> None:
+        """Store the cells of a robot; none removes it."""
+        wanted = frozenset(cells)
+        before = self.cells.pop(robot, frozenset())
+        for cell in before - wanted:
+            robots = self._robots[cell]
+            robots.discard(robot)
+            if not robots:
+                del self._robots[cell]
+        for cell in wanted - before:
+            self._robots.setdefault(cell, set()).add(robot)
+        if wanted:
+            self.cells[robot] = wanted
+
+    def at(self, cells: Iterable[int]) -> set[str]:
+        """Return the robots that have one of these cells."""
+        return {robot for cell in cells for robot in self._robots.get(cell, ())}
+
+    def validate(self) -> None:
+        """Compare both directions.
+
+        Raises:
+            InvariantError: They differ.
+        """
+        by_robot = {(cell, robot) for robot, cells in self.cells.items() for cell in cells}
+        by_cell = {(cell, robot) for cell, robots in self._robots.items() for robot in robots}
+        if by_robot != by_cell:
+            raise InvariantError(f"cells by robot are {self.cells}, robots by cell {self._robots}")
+
+
 class FleetIndex:
     """Indexes of robots for the planner's queries.
 
@@ -25,14 +62,15 @@ class FleetIndex:
         stopping: Robots with a cell that were told to stand still, and when; the newest last.
         under_way: Active robots that are not at rest in the last cell of their route.
         hindered: Robots that stand still and cannot be placed, and the cells that they overlap.
+        displaced: Robots that overlap cells of other robots, and the cells that they overlap.
     """
 
     def __init__(self) -> None:
         self.goals: dict[int, str] = {}
         self.stopping: dict[str, float] = {}
         self.under_way: set[str] = set()
-        self.hindered: dict[str, frozenset[int]] = {}
-        self._hindered_at: dict[int, set[str]] = {}
+        self.hindered = RobotsByCell()
+        self.displaced = RobotsByCell()
         self._goal_of: dict[str, int] = {}
 
     def enter(self, record: RobotRecord, ledger: CellLedger) -> None:
@@ -53,36 +91,19 @@ class FleetIndex:
         else:
             self.under_way.discard(robot)
         if record.phase is not Phase.HOLDING:
-            self.set_hindered(robot, ())
+            self.hindered.put(robot, ())
 
     def leave(self, robot: str) -> None:
         """Remove a robot."""
         self._drop_goal(robot)
         self.stopping.pop(robot, None)
         self.under_way.discard(robot)
-        self.set_hindered(robot, ())
+        self.hindered.put(robot, ())
+        self.displaced.put(robot, ())
 
     def last_stop(self) -> float | None:
         """Return when the last robot that is still stopping was told to; None without one."""
         return next(reversed(self.stopping.values()), None)
-
-    def set_hindered(self, robot: str, cells: Iterable[int]) -> None:
-        """Store the cells whose change may allow placing a robot; none if it is not hindered."""
-        wanted = frozenset(cells)
-        before = self.hindered.pop(robot, frozenset())
-        for cell in before - wanted:
-            waiting = self._hindered_at[cell]
-            waiting.discard(robot)
-            if not waiting:
-                del self._hindered_at[cell]
-        for cell in wanted - before:
-            self._hindered_at.setdefault(cell, set()).add(robot)
-        if wanted:
-            self.hindered[robot] = wanted
-
-    def hindered_at(self, cells: Iterable[int]) -> set[str]:
-        """Return the hindered robots that overlap one of these cells."""
-        return {robot for cell in cells for robot in self._hindered_at.get(cell, ())}
 
     def validate(self, records: Iterable[RobotRecord], ledger: CellLedger) -> None:
         """Compare with rebuilt indexes.
@@ -102,10 +123,10 @@ class FleetIndex:
         if list(self.stopping.values()) != sorted(self.stopping.values()):
             raise InvariantError(f"the index of stopping robots is out of order: {self.stopping}")
         holding = {record.id for record in records if record.phase is Phase.HOLDING}
-        by_cell = {(cell, robot) for robot, cells in self.hindered.items() for cell in cells}
-        found = {(cell, robot) for cell, robots in self._hindered_at.items() for robot in robots}
-        if not holding.issuperset(self.hindered) or by_cell != found:
-            raise InvariantError(f"hindered robots are {self.hindered}, by cell {self._hindered_at}")
+        if not holding.issuperset(self.hindered.cells):
+            raise InvariantError(f"hindered robots are {self.hindered.cells}, but {holding} are holding")
+        self.hindered.validate()
+        self.displaced.validate()
 
     def _drop_goal(self, robot: str) -> None:
         goal = self._goal_of.pop(robot, None)

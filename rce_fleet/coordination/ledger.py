@@ -76,10 +76,8 @@ class CellLedger(LedgerView):
         self._settle_owners(robot, account)
 
     def overlap(self, robot: str, cells: Iterable[int]) -> None:
-        """Claim cells for a robot without a cell; skip those that other robots claim."""
+        """Claim cells beside a robot's granted ones, instead of such cells before; skip those of others."""
         account = self._account(robot)
-        if account.route:
-            raise InvariantError(f"{robot} has a cell already")
         account.extra = frozenset(cell for cell in cells if self._owners.get(cell, robot) == robot)
         self._settle_owners(robot, account)
 

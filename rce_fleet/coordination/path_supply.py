@@ -192,7 +192,7 @@ class PathSupply:
         state = self._state
         for robot in robots:
             start = state.ledger.end_of_grant(robot)
-            if state.robots[robot].goal is None and start is not None and state.index.hindered_at({start}):
+            if state.robots[robot].goal is None and start is not None and state.index.hindered.at({start}):
                 self.outdated = True
                 return None
         self._asked = request_plan(state, self._settings, self._plans, now, robots)

@@ -162,8 +162,7 @@ class FleetPlanner:
                 self._distrust(record)
             else:
                 self._follow(record)
-            return
-        if not self.state.ledger.length(record.id):
+        if record.phase is not Phase.ACTIVE or record.id in self.state.index.displaced.cells:
             self._dispatcher.watch(record)
         if record.phase is Phase.HOLDING:
             self._dispatcher.to_settle.add(record.id)
@@ -224,18 +223,15 @@ class FleetPlanner:
 
     def _follow(self, record: RobotRecord) -> None:
         """Update the progress of an active robot."""
-        if not self._dispatcher.arrive(record):
-            here = self.state.grid.cell_at(record.x, record.y)
-            if here not in self.state.ledger.claims(record.id):
-                record.rest = None  # It was carried away: it stays where it was put.
-                self._dispatcher.hold(record, "it left its path")
-                self._dispatcher.make_room(record)
+        if not self._dispatcher.arrive(record) and self._dispatcher.has_left(record):
+            record.rest = None  # It was carried away: it stays where it was put.
+            self._dispatcher.hold(record, "it left its path")
 
     def _distrust(self, record: RobotRecord) -> None:
         """Stop a robot whose pose jumped; it keeps its cells until its poses have agreed for a while."""
         record.rest = None
+        record.doubted = self.state.ledger.overlapped(record.id)
         self._dispatcher.hold(record, "its pose jumped farther than it can drive: localize it")
-        self._dispatcher.make_room(record)
 
     # Requests
 

@@ -45,9 +45,17 @@ def refuse_block(state: FleetState, cell: int) -> str:
 
 
 def hindrance(
-    state: FleetState, record: RobotRecord, hull: AbstractSet[int], own: AbstractSet[int], cell: int | None
+    state: FleetState,
+    record: RobotRecord,
+    hull: AbstractSet[int],
+    own: AbstractSet[int],
+    cell: int | None,
+    reachable: AbstractSet[int],
 ) -> str:
     """Return why a robot that stands still cannot be placed in a cell; empty if it can.
+
+    A robot that had a cell may be partly in another robot's, if that one is there too: one of them has to
+    leave first.
 
     Args:
         state: The fleet.
@@ -55,11 +63,13 @@ def hindrance(
         hull: Cells that its hull overlaps.
         own: Cells that it overlaps, with a margin, and that no other robot claims.
         cell: The cell to place it in; None if there is none.
+        reachable: Cells of its hull that other robots claim, are not in, and may drive to.
     """
     if not hull:
         return "it is outside the map"
-    if cell is None or (not hull <= own and not state.ledger.length(record.id)):
-        other = min(hull - own)
+    held = hull - own
+    if cell is None or reachable or (held and not state.ledger.length(record.id)):
+        other = min(reachable or held)
         return f"cell {other} is held by {state.ledger.owner(other)}"
     if state.is_blocked(cell):
         return "it stands in a blocked cell"

@@ -67,7 +67,7 @@ class PathRepair:
         """Let a robot that has nowhere to go stay where its granted cells end, or make room there."""
         state, robot = self._state, record.id
         state.ledger.truncate(robot)
-        is_in_the_way = bool(state.ledger.occupied(start, robot) or state.index.hindered_at({start}))
+        is_in_the_way = bool(state.ledger.occupied(start, robot) or state.index.hindered.at({start}))
         if not is_in_the_way and start not in forbidden and not state.is_shut(start):
             record.rest = start
             return True

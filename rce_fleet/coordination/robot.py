@@ -102,6 +102,7 @@ class RobotRecord:
         sent_at: When it was last sent a message.
         pose_only: Whether its move client answers nothing, so that its progress is judged by its poses.
         jumped_at: When a pose came that cannot be true.
+        doubted: Cells that it overlapped before that pose; it may be there still, until it is placed.
         mode: Its own mode; the fleet's may count instead.
         mode_reason: Why it has this mode, and who set it.
         lost: Why it is lost, for people; empty: it is not.
@@ -131,6 +132,7 @@ class RobotRecord:
     sent_at: float = -inf
     pose_only: bool = False
     jumped_at: float = -inf
+    doubted: frozenset[int] = frozenset()
     mode: RobotMode = RobotMode.AUTOMATIC
     mode_reason: str = ""
     lost: str = ""

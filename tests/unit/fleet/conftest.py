@@ -37,6 +37,7 @@ from rce_fleet.coordination.move_client import (
     SendStop,
 )
 from rce_fleet.coordination.replanning import compute_plan
+from rce_fleet.coordination.robot import Phase
 from rce_fleet.coordination.robot_signs import RobotSign, RobotSigns
 from rce_fleet.coordination.snapshot import FleetSnapshot, RobotSnapshot, RobotState
 
@@ -100,6 +101,12 @@ class MakeBelieveRobot:
             self.x, self.y = x, y
         return self._end(GoalState.SUCCEEDED) if reach == away else []
 
+    def carry(self, x: float, y: float) -> None:
+        """Put it elsewhere; its navigation gives up, because its emergency stop is pressed meanwhile."""
+        self.x, self.y = x, y
+        if self.current is not None:
+            self.stopping = GoalState.ABORTED
+
     def _end(self, state: GoalState) -> list[tuple[str, GoalState]]:
         assert self.current is not None
         ended = [(self.current.id, state)]
@@ -112,7 +119,8 @@ class SimulatedClients:
     """Runs planner, clients and robots in steps of 0.1 s. Messages are late, out of order and get lost.
 
     After every step it checks that each robot is within its claims, that no two touch, that none touches a
-    box, and that the changes which the planner told of add up to its state.
+    box, and that the changes which the planner told of add up to its state. A robot that was carried is
+    outside of its claims until it takes part in plans again.
 
     Args:
         planner: What is tested.
@@ -151,6 +159,7 @@ class SimulatedClients:
         self.silent: set[str] = set()
         self.mute: set[str] = set()
         """Robots whose move clients answer nothing."""
+        self.carried: set[str] = set()
         self.robots: dict[str, MakeBelieveRobot] = {}
         self.clients: dict[str, MoveClient] = {}
         self.replies: list[Reply] = []
@@ -167,6 +176,11 @@ class SimulatedClients:
     def restart_client(self, robot: str) -> None:
         self.clients[robot] = MoveClient(self.grid, robot, self.now)
 
+    def carry(self, robot: str, x: float, y: float) -> None:
+        """Let a person put a robot elsewhere. There must be room, and others must be able to stop."""
+        self.carried.add(robot)
+        self.robots[robot].carry(x, y)
+
     def restart_planner(self, planner: FleetPlanner) -> None:
         """Let another planner take over; it knows nothing."""
         self.planner = planner
@@ -178,6 +192,7 @@ class SimulatedClients:
     def remove(self, robot: str) -> None:
         """Take a robot off the floor."""
         del self.robots[robot], self.clients[robot]
+        self.carried.discard(robot)
         for key, queue in self._mail.items():
             if key[1] == robot:
                 queue.clear()
@@ -205,11 +220,11 @@ class SimulatedClients:
         self.tell(Tick())  # Paths are found at the next tick.
 
     def newcomers_cells(self) -> set[int]:
-        """The cells of robots that the planner has given no place yet; boxes must not be put there."""
+        """The cells of robots whose place the planner may not know yet; boxes must not be put there."""
         return {
             cell
             for robot in self.robots.values()
-            if not self.planner.state.ledger.length(robot.id)
+            if not self.planner.state.ledger.length(robot.id) or robot.id in self.carried
             for cell in self.grid.cells_touched(robot.x, robot.y, RADIUS)
         }
 
@@ -273,7 +288,10 @@ class SimulatedClients:
         ledger = self.planner.state.ledger
         for robot in self.robots.values():
             touched = self.grid.cells_touched(robot.x, robot.y, RADIUS)
-            if ledger.route(robot.id):
+            record = self.planner.state.robots.get(robot.id)
+            if record is not None and record.phase is Phase.ACTIVE and touched <= ledger.claims(robot.id):
+                self.carried.discard(robot.id)
+            if ledger.route(robot.id) and robot.id not in self.carried:
                 assert touched <= ledger.claims(robot.id), f"{robot.id} is outside of its cells"
             assert not touched & (self.hidden | self.blocked | self.grid.blocked)
         for a, b in combinations(self.robots.values(), 2):
