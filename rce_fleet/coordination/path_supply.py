@@ -55,6 +55,8 @@ class PathSupply:
         self._deadlocked: set[str] = set()
         self._users: dict[str, set[str]] = {}
         self._asked: PlanRequest | None = None
+        self._zones = 0
+        """Revision of the zones when the newest plan for all was requested."""
         self._versions: dict[str, int] = {}
         self._plans = 0
         self._adoption: PlanAdoption | None = None
@@ -94,7 +96,7 @@ class PathSupply:
             self._asked = None
             return
         self._waits_since = None
-        self._adoption = PlanAdoption(self._state, request, result)
+        self._adoption = PlanAdoption(self._state, request, result, self._zones)
         # After a plan that makes progress, request another; otherwise wait for a change.
         self._partial = not result.complete and bool(result.cells)
 
@@ -140,6 +142,7 @@ class PathSupply:
         self.concerned.clear()
         self._guard.note_request()
         self._asked = request_plan(self._state, self._settings, self._plans, now)
+        self._zones = self._state.zones.revision
         self._plans += 1
         self.outdated = self._partial = False
         return MakePlan(self._asked)

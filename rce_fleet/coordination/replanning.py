@@ -17,6 +17,7 @@ from rce_fleet.coordination.rerouting import NO_CELL, LedgerCopy, Rerouting, com
 from rce_fleet.coordination.robot import Phase
 from rce_fleet.coordination.starvation import urgency_of
 from rce_fleet.coordination.targets import assign_targets
+from rce_fleet.coordination.zone_rules import ZoneRules
 from rce_fleet.coordination.zones import ZoneKind
 from rce_fleet.planning.graph import PlanningGraph
 from rce_fleet.planning.grid import GridMap
@@ -263,22 +264,25 @@ class PlanAdoption:
 
     The state may have changed since the request, and may change between two parts. A robot that is not active
     any more, was granted other cells or has another goal gets no route, or no more of it, and a route ends
-    before a cell that no robot may enter any more. That is safe, because robots drive only on granted cells,
-    and the ledger checks each grant; but robots may not reach their goals, so another plan has to follow.
+    before a cell that the robot may not enter any more. That is safe, because robots drive only on granted
+    cells, and the ledger checks each grant; but robots may not reach their goals, so another plan has to
+    follow.
 
     Attributes:
-        was_cut: Whether a route ended before a blocked cell.
+        was_cut: Whether a route ended before a cell that is blocked, or that a zone does not allow any more.
 
     Args:
         state: The fleet; its ledger and the robots' ``unreachable`` are changed.
         request: The plan's request.
         result: The plan.
+        zones: Revision of the zones that the plan keeps to.
     """
 
-    def __init__(self, state: FleetState, request: PlanRequest, result: PlanResult) -> None:
+    def __init__(self, state: FleetState, request: PlanRequest, result: PlanResult, zones: int) -> None:
         self._state = state
         self._request = request
         self._result = result
+        self._zones = zones
         self._next = 0
         self._present: list[str | None] = []
         self.was_cut = False
@@ -320,13 +324,17 @@ class PlanAdoption:
 
     def _visits(self, begin: int, end: int) -> Iterator[tuple[str, int, int]]:
         """Yield visits in order, as far as they are still possible."""
-        shut, present, result = self._state.shut, self._present, self._result
+        state, present, result = self._state, self._present, self._result
+        shut, ledger = state.shut, state.ledger
+        rules = ZoneRules(state) if state.zones.revision != self._zones else None
         steps = result.steps or range(1, len(result.cells) + 1)
         parts = (result.visitors[begin:end], result.cells[begin:end], steps[begin:end])
         for index, cell, step in zip(*parts, strict=True):
             robot = present[index]
-            if robot is not None and cell in shut:
-                present[index] = robot = None  # Its route ends here.
+            if robot is None:
+                continue
+            if cell in shut or (rules and not rules.admit(robot, ledger.account(robot).route[-1], cell)):
+                present[index] = None  # Its route ends here.
                 self.was_cut = True
-            if robot is not None:
+            else:
                 yield robot, cell, step

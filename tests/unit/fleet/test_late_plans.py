@@ -19,11 +19,13 @@ from rce_fleet.coordination.events import (
     SendCancel,
     SendCells,
     Tick,
+    ZonesSet,
 )
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.replanning import PlanRequest, PlanResult, compute_plan
 from rce_fleet.coordination.settings import FleetSettings
+from rce_fleet.coordination.zones import Direction, Zone, ZoneKind
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.guidance import RIGHT, UP
 
@@ -137,6 +139,43 @@ def test_a_route_ends_before_a_cell_that_was_blocked_meanwhile(pair: PlannerHarn
     assert pair.sent["R2"] == (7, 15)
     pair.finish()
     assert 23 not in pair.sent["R2"]
+
+
+@pytest.mark.parametrize(
+    ("zone", "sent"),
+    [
+        (Zone("z", ZoneKind.BLOCKED, (23,), robots=("R2",)), (7, 15)),
+        (Zone("z", ZoneKind.BLOCKED, (23,), robots=("R1",)), (7, 15, 23, 31, 39)),
+        (Zone("z", ZoneKind.BLOCKED, edges=((15, 23),)), (7, 15)),
+        (Zone("z", ZoneKind.ONE_WAY, (23,), direction=Direction.MINUS_Y), (7, 15)),
+        (Zone("z", ZoneKind.LIMITED, (0, 23, 31), capacity=1), (7, 15)),
+        (Zone("z", ZoneKind.LIMITED, (0, 23, 31), capacity=2), (7, 15, 23, 31, 39)),
+        (Zone("z", ZoneKind.LIMITED, (0, 23, 31), robots=("R2",), capacity=1), (7, 15, 23, 31, 39)),
+        (Zone("z", ZoneKind.SLOW, (23,), speed=0.2), (7, 15, 23, 31, 39)),
+    ],
+)
+def test_a_route_keeps_to_zones_that_were_set_meanwhile(
+    pair: PlannerHarness, zone: Zone, sent: tuple[int, ...]
+) -> None:
+    """It ends before the first move that a zone does not allow any more; the next plan leads around it."""
+    pair.tell(ZonesSet((zone,)))
+    pair.finish()
+    assert pair.sent["R2"] == sent
+    pair.finish_all()
+    route = pair.planner.state.ledger.route("R2")
+    assert route[-1] == 63
+    assert (23 in route) is (len(sent) > 2)
+
+
+def test_a_zone_that_was_set_while_a_plan_is_taken_over_counts() -> None:
+    """Of the first part of the plan nothing is granted, and of the second nothing is entered."""
+    harness = PlannerHarness(0, settings=FleetSettings(repairs=0, visits_per_step=3))
+    harness.finish_all()
+    harness.tell(GoalSet("R1", 7))
+    harness.tell(PlanMade(compute_plan(harness.requests[-1])))
+    harness.tell(ZonesSet((Zone("z", ZoneKind.BLOCKED, (6,), robots=("R1",)),)))
+    harness.events(3)
+    assert harness.planner.state.ledger.route("R1") == [0, 1, 2, 3, 4, 5]
 
 
 def test_a_robot_with_another_goal_waits_for_the_next_plan(pair: PlannerHarness) -> None:
