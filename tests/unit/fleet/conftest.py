@@ -288,14 +288,22 @@ class SimulatedClients:
         ledger = self.planner.state.ledger
         for robot in self.robots.values():
             touched = self.grid.cells_touched(robot.x, robot.y, RADIUS)
-            record = self.planner.state.robots.get(robot.id)
-            if record is not None and record.phase is Phase.ACTIVE and touched <= ledger.claims(robot.id):
+            if touched <= ledger.claims(robot.id) and self._takes_part(robot):
                 self.carried.discard(robot.id)
             if ledger.route(robot.id) and robot.id not in self.carried:
                 assert touched <= ledger.claims(robot.id), f"{robot.id} is outside of its cells"
             assert not touched & (self.hidden | self.blocked | self.grid.blocked)
         for a, b in combinations(self.robots.values(), 2):
             assert hypot(a.x - b.x, a.y - b.y) > 2 * RADIUS, f"{a.id} touches {b.id}"
+
+    def _takes_part(self, robot: MakeBelieveRobot) -> bool:
+        """Return whether a robot drives on cells that it was granted where it is."""
+        record = self.planner.state.robots.get(robot.id)
+        if record is None or record.phase is not Phase.ACTIVE:
+            return False
+        has_list = self.clients[robot.id].report.revision == record.revision
+        claims = self.planner.state.ledger.claims(robot.id)
+        return has_list and (robot.current is None or robot.current.cell in claims)
 
     def _check_changes(self) -> None:
         """Add up what the planner says has changed, and compare."""
