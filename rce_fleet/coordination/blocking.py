@@ -152,11 +152,13 @@ class CellBlocking:
         """Take from robots the parts of their paths that zones do not allow any more."""
         state = self._state
         closed = state.zones.closed(state.grid)
+        limited = state.zones.of_kind(ZoneKind.LIMITED)
+        users = {zone.id: state.zone_users(zone) for zone in limited}
         for record in sorted(state.robots.values(), key=lambda record: record.id):
             route = state.ledger.route(record.id)
             if record.phase is not Phase.ACTIVE or len(route) < 2:  # noqa: PLR2004 - a path has two cells
                 continue
-            forbidden = state.forbidden(record.id)
+            forbidden = state.forbidden(record.id, lambda zone: users[zone.id])
             wrong = [
                 index
                 for index, (before, cell) in enumerate(pairwise(route), start=1)
@@ -166,6 +168,10 @@ class CellBlocking:
                 continue
             record.replans += 1
             self._take_path(record, wrong[0], "a zone on its path changed")
+            kept = state.ledger.claims(record.id).union(state.ledger.route(record.id))
+            for zone in limited:
+                if kept.isdisjoint(state.zones.cells(zone)):
+                    users[zone.id].discard(record.id)
 
     # Both
 

@@ -11,10 +11,12 @@ from rce_fleet.coordination.ledger import CellLedger
 from rce_fleet.coordination.modes import RobotMode, effective_mode
 from rce_fleet.coordination.robot import Cause, Phase, RobotRecord
 from rce_fleet.coordination.snapshot import FleetSnapshot, RobotSnapshot, RobotState
-from rce_fleet.coordination.zones import Zone, ZoneBook
+from rce_fleet.coordination.zones import Zone, ZoneBook, union_of
 from rce_fleet.exceptions import InvariantError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rce_fleet.planning.grid import GridMap
 
 
@@ -69,10 +71,15 @@ class FleetState:
         """Return whether a cell is a wall or blocked already."""
         return cell in self.grid.blocked or cell in self.blocked
 
-    def forbidden(self, robot: str) -> frozenset[int]:
-        """Return the cells that one robot may not enter, of those that are open to others."""
+    def forbidden(self, robot: str, users: Callable[[Zone], set[str]] | None = None) -> frozenset[int]:
+        """Return the cells that one robot may not enter, of those that are open to others.
+
+        Args:
+            robot: The robot.
+            users: Returns the robots in a zone or with a path into it, if that is known already.
+        """
         zones = self.zones
-        return zones.forbidden(robot) | zones.full(robot, self.zone_users) if zones.zones else frozenset()
+        return union_of([zones.forbidden(robot), zones.full(robot, users or self.zone_users)])
 
     def zone_users(self, zone: Zone) -> set[str]:
         """Return the robots that claim a cell of a zone or have a path into it."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from rce_fleet.coordination.ledger_view import CELLS, STEPS
 from rce_fleet.coordination.robot import Phase
+from rce_fleet.coordination.zone_rules import ZoneRules
 from rce_fleet.planning.graph import PlanningGraph
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.rerouting import RoutedRobots, reroute
@@ -186,11 +187,9 @@ def adopt_rerouting(
             left.add(robot)
         # All of them first: where one has its old path, another may have its new one.
         state.ledger.truncate(robot)
-    closed = state.zones.closed(state.grid)
-    shut = state.shut
+    rules, shut = ZoneRules(state), state.shut
     for index, record, path in present:
-        barred = state.forbidden(record.id)
-        possible = list(_possible(request.starts[index], path, shut, barred, closed))
+        possible = list(_possible(record.id, request.starts[index], path, shut, rules))
         if len(possible) < len(path):
             left.add(record.id)
         state.ledger.insert(record.id, possible)
@@ -204,17 +203,13 @@ def adopt_rerouting(
 
 
 def _possible(
-    start: int,
-    path: Sequence[tuple[int, float]],
-    shut: frozenset[int],
-    barred: frozenset[int],
-    closed: frozenset[tuple[int, int]],
+    robot: str, start: int, path: Sequence[tuple[int, float]], shut: frozenset[int], rules: ZoneRules
 ) -> Iterator[tuple[int, float]]:
     """Yield the visits of a path up to the first one that is not allowed any more."""
     before = start
     for visit in path:
         cell, _ = visit
-        if cell in shut or (cell in barred and before not in barred) or (before, cell) in closed:
+        if cell in shut or not rules.admit(robot, before, cell):
             return
         yield visit
         before = cell

@@ -27,7 +27,7 @@ class ZoneRules:
         self._closed = zones.closed(state.grid)
         self._forbidden: dict[str, frozenset[int]] = {}
         self._limited = [
-            (zone, frozenset(zone.cells), set(filter(zone.applies_to, state.zone_users(zone))))
+            (zone, zones.cells(zone), set(filter(zone.applies_to, state.zone_users(zone))))
             for zone in zones.of_kind(ZoneKind.LIMITED)
         ]
 

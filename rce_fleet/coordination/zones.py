@@ -140,8 +140,15 @@ class ZoneBook:
     def __init__(self) -> None:
         self.zones: dict[str, Zone] = {}
         self.revision = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forget what was computed from the zones."""
         self._closed: frozenset[tuple[int, int]] | None = None
         self._costs: dict[int, int] | None = None
+        self._cells: dict[str, frozenset[int]] = {}
+        self._blocking: dict[int, Zone] | None = None
+        self._forbidden: dict[tuple[str, ...], frozenset[int]] = {}
 
     # Changes
 
@@ -159,7 +166,7 @@ class ZoneBook:
             made.append(zone)
         if gone or made:
             self.revision += 1
-            self._closed = self._costs = None
+            self._forget()
         return gone, made
 
     def expired(self, now: float) -> list[str]:
@@ -174,18 +181,28 @@ class ZoneBook:
 
     def blocks(self, cell: int) -> Zone | None:
         """Return a zone that blocks a cell for all robots."""
-        for zone in self.of_kind(ZoneKind.BLOCKED):
-            if not zone.robots and cell in zone.cells:
-                return zone
-        return None
+        if self._blocking is None:
+            self._blocking = {}
+            for zone in self.of_kind(ZoneKind.BLOCKED):
+                for other in () if zone.robots else zone.cells:
+                    self._blocking.setdefault(other, zone)
+        return self._blocking.get(cell)
+
+    def cells(self, zone: Zone) -> frozenset[int]:
+        """Return the cells of one of the zones as a set."""
+        found = self._cells.get(zone.id)
+        if found is None:
+            found = self._cells[zone.id] = frozenset(zone.cells)
+        return found
 
     def forbidden(self, robot: str) -> frozenset[int]:
         """Return the cells that are blocked for one robot, but not for all."""
-        found: set[int] = set()
-        for zone in self.of_kind(ZoneKind.BLOCKED):
-            if zone.robots and zone.applies_to(robot):
-                found.update(zone.cells)
-        return frozenset(found)
+        zones = [zone for zone in self.of_kind(ZoneKind.BLOCKED) if zone.robots and zone.applies_to(robot)]
+        key = tuple(zone.id for zone in zones)
+        found = self._forbidden.get(key)
+        if found is None:
+            found = self._forbidden[key] = union_of([self.cells(zone) for zone in zones])
+        return found
 
     def closed(self, grid: GridMap) -> frozenset[tuple[int, int]]:
         """Return the moves ``(from, to)`` that no robot may make.
@@ -237,13 +254,19 @@ class ZoneBook:
             robot: The robot.
             users: Returns the robots that are in a zone, or have a path into it.
         """
-        found: set[int] = set()
+        found = []
         for zone in self.of_kind(ZoneKind.LIMITED):
             if zone.applies_to(robot):
                 others = {other for other in users(zone) if zone.applies_to(other)} - {robot}
                 if len(others) >= zone.capacity:
-                    found.update(zone.cells)
-        return frozenset(found)
+                    found.append(self.cells(zone))
+        return union_of(found)
+
+
+def union_of(sets: Sequence[frozenset[int]]) -> frozenset[int]:
+    """Return a union, without a copy if only one set has members."""
+    parts = [part for part in sets if part]
+    return parts[0] if len(parts) == 1 else frozenset().union(*parts)
 
 
 def carried_zones(zones: Iterable[Zone], carry: Callable[[Iterable[int]], set[int]]) -> list[Zone]:

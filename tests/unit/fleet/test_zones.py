@@ -50,6 +50,27 @@ def blocked(name: str, *cells: int, **more: object) -> Zone:
     return Zone(name, ZoneKind.BLOCKED, cells, **more)  # type: ignore[arg-type]  # the fields of a zone
 
 
+def test_a_replaced_zone_blocks_its_new_cells(make: Make) -> None:
+    """Also for single robots; a cell of two zones stays blocked until both are gone."""
+    fleet = make(GridMap(), [], [])
+    state = fleet.planner.state
+    put(fleet, blocked("a", 1, 2), blocked("b", 2, 3), blocked("c", 8, 9, robots=("Robot1",)))
+    put(fleet, blocked("a", 1, 4), blocked("c", 9, 10, robots=("Robot2",)))
+    assert state.blocked == {1, 2, 3, 4}
+    assert [zone and zone.id for zone in map(state.zones.blocks, range(6))] == [
+        None,
+        "a",
+        "b",
+        "b",
+        "a",
+        None,
+    ]
+    assert state.forbidden("Robot1") == frozenset()
+    assert state.forbidden("Robot2") == {9, 10}
+    assert fleet.ask(ZonesSet((), remove=("b",))).ok
+    assert state.blocked == {1, 4}
+
+
 def test_a_blocked_zone_blocks_until_it_is_removed(make: Make) -> None:
     fleet = make(LOOP, [0], [8])
     put(fleet, blocked("spill", 6, reason="oil", by="anna"))
