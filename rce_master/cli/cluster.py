@@ -37,6 +37,8 @@ from rce_master.cluster.joining import (
     wait_for_vote,
 )
 from rce_master.cluster.members import ClusterError
+from rce_master.cluster.recovery import read_machine
+from rce_master.cluster.recovery import recover as recover_alone
 from rce_master.cluster.report import make_report
 from rce_master.settings import HTTP_PORT
 
@@ -147,6 +149,25 @@ def remove(
         typer.echo(
             "on that machine, if it is there: rce uninstall-service master; rce uninstall-service etcd; then"
             " remove its folder etcd and the file etcd.yaml"
+        )
+
+    run(do())
+
+
+@app.command("recover")
+def recover(state_dir: StateDir = None) -> None:
+    """Make this machine a cluster of its own when most members are lost."""
+
+    async def do() -> None:
+        machine, known = read_machine((state_dir or _default_folder()).absolute())
+        before = await recover_alone(machine, known, _contexts(machine.certificates) if machine.tls else None)
+        again = "the command that started etcd here" if state_dir else "systemctl start rce-etcd rce-master"
+        typer.echo(
+            f"{machine.name} is a cluster of its own; its data as it was is in {before}\n"
+            "writes that had not reached this machine are lost\n"
+            f"start it: {again}\n"
+            "on each other machine, before its etcd or master starts again: remove the folder etcd and the"
+            " file etcd.yaml; then: rce cluster join"
         )
 
     run(do())

@@ -96,6 +96,11 @@ async def ask_all(
     return {member.id: answer for member, answer in zip(members, answers, strict=True)}
 
 
+def answering(answers: Mapping[int, MemberStatus | StoreError | None]) -> set[int]:
+    """Return the members that answer, also those that know no leader."""
+    return {number for number, answer in answers.items() if isinstance(answer, MemberStatus)}
+
+
 def healthy(answers: Mapping[int, MemberStatus | StoreError | None]) -> set[int]:
     """Return the members that answer and know a leader."""
     return {

@@ -10,8 +10,17 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from rce.dialing import open_socket
-from rce_master.cluster.client import ClusterClient, ask_all, healthy
-from rce_master.cluster.members import ClusterError, Member, advice, check_new, check_removal, find
+from rce_master.cluster.client import ClusterClient, answering, ask_all, healthy
+from rce_master.cluster.members import (
+    ClusterError,
+    Member,
+    advice,
+    check_new,
+    check_removal,
+    find,
+    no_quorum,
+    quorum,
+)
 from rce_master.store.etcd.exceptions import EtcdAwayError, EtcdError, EtcdRefusedError
 from rce_master.store.etcd.layout import Keys, read_master
 from rce_master.store.etcd.wire import Delete
@@ -45,6 +54,15 @@ def check_place(machine: Machine) -> None:
             " another one"
             f" or to join again after `rce cluster remove`, stop etcd and remove {machine.data}"
         )
+    check_ports(machine)
+
+
+def check_ports(machine: Machine) -> None:
+    """Check that etcd can listen on this machine.
+
+    Raises:
+        ClusterError: The address is not of this machine, or a port is taken.
+    """
     for port, option in ((machine.client_port, "--client-port"), (machine.peer_port, "--peer-port")):
         family = socket.AF_INET6 if ":" in machine.host else socket.AF_INET
         with socket.socket(family) as sock:
@@ -108,7 +126,10 @@ async def wait_for_vote(
                         members = await client.members()
                         own = next((each for each in members if each.peer == machine.peer), None)
                         if own is None:
-                            raise ClusterError(f"the member {machine.name} was removed meanwhile")
+                            raise ClusterError(
+                                f"{machine.name} is not a member any more: it was removed. To join again,"
+                                f" stop etcd, remove {machine.data} and {machine.config}, and run this again"
+                            )
                         if own.name and not own.is_learner:
                             await client.get("/")
                             return members
@@ -157,7 +178,10 @@ async def remove_member(
     """
     members = await client.members()
     leaving = find(members, name)
-    working = healthy(await ask_all(members, tls))
+    answers = await ask_all(members, tls)
+    working = healthy(answers)
+    if not working:
+        raise ClusterError(no_quorum(members, answering(answers)))
     try:
         check_removal(members, working, leaving)
     except ClusterError:
@@ -165,19 +189,16 @@ async def remove_member(
             raise
     try:
         await client.remove(leaving.id)
-    except EtcdAwayError as error:
-        raise ClusterError(
-            f"etcd has no quorum, so that it cannot remove {leaving.shown}: start members until more"
-            " than half"
-            f" work, or restore a backup. ({error})"
-        ) from error
-    except EtcdRefusedError as error:
-        if "unhealthy" not in error.fault.text:
+    except (EtcdAwayError, EtcdRefusedError) as error:
+        if _UNHEALTHY in str(error):  # of a member that leads, and of others that passed it on
+            raise ClusterError(
+                "etcd refused: it removes no working member while others do not work, or just after they"
+                f" joined; remove those first. ({error})"
+            ) from error
+        if isinstance(error, EtcdRefusedError):
             raise
-        raise ClusterError(
-            f"etcd refused: it removes no working member while others do not work, or just after they joined."
-            f" ({error})"
-        ) from error
+        there = answering(await ask_all(members, tls))
+        raise ClusterError(f"{no_quorum(members, there)} ({error})") from error
     return leaving, tuple(each for each in members if each.id != leaving.id)
 
 
@@ -227,7 +248,9 @@ async def cluster_client(endpoints: Sequence[str], tls: Context | None) -> Clust
 def hint(members: Sequence[Member]) -> str:
     """Return the line on how many machines the cluster has."""
     voters = sum(not each.is_learner for each in members)
-    return f"{voters} member{'s' * (voters != 1)}; {advice(members) or 'it survives the loss of a machine'}"
+    losses = voters - quorum(voters)
+    survives = f"it survives the loss of {'a machine' if losses == 1 else f'{losses} machines'}"
+    return f"{voters} member{'s' * (voters != 1)}; {advice(members) or survives}"
 
 
 async def until_ends(work: Awaitable[int], steps: Callable[[], Awaitable[None]]) -> int:

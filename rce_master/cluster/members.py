@@ -182,6 +182,22 @@ def check_removal(members: Sequence[Member], healthy: Collection[int], leaving: 
         )
 
 
+def no_quorum(members: Sequence[Member], answering: Collection[int]) -> str:
+    """Return that etcd can change nothing, which members answer, and what to do.
+
+    Args:
+        members: All members.
+        answering: The numbers of those that answer.
+    """
+    there = ", ".join(each.shown for each in members if each.id in answering) or "no member"
+    away = ", ".join(each.shown for each in members if each.id not in answering) or "none"
+    return (
+        f"etcd has no quorum, so that nothing can be written or removed. Answering: {there}; away: {away}."
+        " Start members until more than half work; if they are lost for good, on a machine that is left:"
+        " rce cluster recover"
+    )
+
+
 def quorum(voters: int) -> int:
     """Return how many members must work."""
     return voters // 2 + 1

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import aiohttp
 
 from rce.link.address import in_url
-from rce_master.cluster.client import ANSWER_S, ClusterClient, ask_all
-from rce_master.cluster.members import Member, MemberStatus, advice
+from rce_master.cluster.client import ANSWER_S, ClusterClient, answering, ask_all, healthy
+from rce_master.cluster.members import Member, MemberStatus, advice, no_quorum
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -104,12 +104,14 @@ async def make_report(client: ClusterClient, tls: Context | None, http_port: int
     Raises:
         EtcdError: No member of etcd answers.
     """
-    members = await client.members()
+    members = sorted(await client.members(), key=lambda member: member.name)
     answers = await ask_all(members, tls)
-    alarms = await client.alarms()
+    is_led = bool(healthy(answers))
+    alarms = await client.alarms() if is_led else {}
     lines = tuple(_member_line(member, answers[member.id], alarms.get(member.id, ())) for member in members)
     masters = await _ask_masters(members, tls, http_port)
-    return ClusterReport(members=lines, masters=masters, advice=tuple(_advice(members, lines, masters)))
+    advised = list(_advice(members, lines, masters)) if is_led else [no_quorum(members, answering(answers))]
+    return ClusterReport(members=lines, masters=masters, advice=tuple(advised))
 
 
 def _member_line(member: Member, answer: object, alarms: tuple[str, ...]) -> MemberLine:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import os
@@ -294,3 +295,63 @@ async def test_refused_joins_change_nothing(folder: Path) -> None:
         assert (code, "this machine is in no cluster" in output) == (1, True), output
         found = await one.status()
         assert [each["name"] for each in found["members"]] == ["m1"]
+
+
+async def test_machine_that_is_left_recovers_the_state(folder: Path) -> None:
+    """Of two machines one is lost for good; the other has all that was acknowledged, and a new one joins."""
+    async with hosts(folder, 3) as (one, two, three):
+        await one.start_etcd("init")
+        store = f"etcds://{one.machine.address}:2379"
+        here = ("--state-dir", str(one.state))
+        code, output = await one.rce(
+            *("user", "add", USER, "--admin", "--password-stdin", *here, "--store", store), given=PASSWORD
+        )
+        assert code == 0, output
+        await one.start_master()
+        await give_certificate(one, two)
+        await two.start_etcd("join", one.machine.address)
+        await two.start_master()
+        authority = str(one.state / "certificates" / "authority.pem")
+        writer = one.program("writer", sys.executable, "-c", WRITER, authority, PASSWORD, one.url, two.url)
+        await writer.start(ready="acknowledged ", timeout=START_S)
+        await wait_for_writes(writer, 10)
+        await end_etcd(one)  # m2 is in the data only: it joined later
+        code, output = await one.rce("cluster", "recover", *here)
+        assert (code, "m2 (10.77.0.2:2379) works" in output) == (1, True), output
+        await one.start_etcd("init")
+        await wait_for_writes(writer)
+        await two.lose()
+        await until(lambda: _has_no_quorum(one), timeout=START_S, what="etcd has no quorum")
+        code, output = await one.rce("cluster", "remove", "m2", "--force", *here)
+        assert (code, "rce cluster recover" in output) == (1, True), output
+        code, output = await one.rce("cluster", "recover", *here)
+        assert (code, "stop rce-master rce-etcd" in output) == (1, True), output
+        await writer.kill()
+        assert one.master is not None
+        await one.master.kill()
+        await end_etcd(one)
+
+        code, output = await one.rce("cluster", "recover", *here)
+        assert (code, "m1 is a cluster of its own" in output) == (0, True), output
+        await one.start_etcd("init")
+        await one.start_master()
+        await until(lambda: _leads_one_of(one, {"m1"}), timeout=START_S, what="the master leads alone")
+        code, output = await one.run(sys.executable, "-c", LISTING, authority, PASSWORD, one.url)
+        assert code == 0, output
+        assert set(acknowledged(writer)) <= set(json.loads(output))
+        await give_certificate(one, three)
+        await three.start_etcd("join", one.machine.address)
+        assert {each["name"] for each in (await one.status())["members"]} == {"m1", "m3"}
+
+
+async def end_etcd(host: Host) -> None:
+    """End etcd in order, which takes long without a quorum: killing the command would leave etcd."""
+    assert host.etcd is not None
+    assert host.etcd.process is not None
+    host.etcd.process.terminate()
+    async with asyncio.timeout(START_S):
+        await host.etcd.process.wait()
+
+
+async def _has_no_quorum(host: Host) -> bool:
+    return any("etcd has no quorum" in text for text in (await host.status()).get("advice", ()))

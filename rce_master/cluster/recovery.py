@@ -1,0 +1,203 @@
+"""How one machine becomes a cluster of its own when more than half of the members are lost for good."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+import socket
+import time
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+import yaml
+
+from rce.config.store_address import DEFAULT_PREFIX
+from rce_master.cluster.client import ClusterClient, ask_all
+from rce_master.cluster.files import Machine, find_etcd, read_config
+from rce_master.cluster.joining import START_S, check_ports
+from rce_master.cluster.members import ClusterError, Member, MemberStatus
+from rce_master.exceptions import StoreError
+from rce_master.store.etcd.layout import Keys, read_master
+from rce_master.store.etcd.wire import Delete
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from rce.tls import Context
+
+END_S = 30.0
+"""How long etcd may take to end."""
+_PAUSE_S = 0.3
+_LOOPBACK = "127.0.0.1"
+_STOP = (
+    "if etcd runs here, stop it and the master first (systemctl stop rce-master rce-etcd; with --foreground:"
+    " Ctrl-C)"
+)
+
+
+def read_machine(folder: Path) -> tuple[Machine, tuple[Member, ...]]:
+    """Return this machine, and the members that it knew when it joined, as its configuration names them.
+
+    Raises:
+        ClusterError: It is in no cluster.
+    """
+    found = read_config(folder / "etcd.yaml")
+    client = urlsplit(str(found["advertise-client-urls"]))
+    peer = urlsplit(str(found["initial-advertise-peer-urls"]))
+    if client.hostname is None or client.port is None or peer.port is None:
+        raise ClusterError(f"{folder / 'etcd.yaml'} does not name this machine's addresses")
+    tls = client.scheme == "https"
+    machine = Machine(str(found["name"]), client.hostname, client.port, peer.port, folder, tls)
+    members = []
+    for number, text in enumerate(str(found["initial-cluster"]).split(","), 1):
+        name, _, url = text.partition("=")
+        parts = urlsplit(url)
+        members.append(Member(number, name, parts.netloc, _client_of(machine, parts.hostname or "")))
+    return machine, tuple(members)
+
+
+async def recover(machine: Machine, known: Iterable[Member], tls: Context | None) -> Path:
+    """Make a machine's data that of a cluster with one member; return the folder of the data as it was.
+
+    This works on a copy, which takes the place of the data at the end.
+
+    Args:
+        machine: The machine; its etcd does not run.
+        known: The members that it knows.
+        tls: TLS of requests.
+
+    Raises:
+        ClusterError: Another member works, etcd runs here, or the data cannot be used; nothing was changed.
+    """
+    await _check_away([each for each in known if each.peer != machine.peer], tls)
+    if not machine.data.exists():
+        raise ClusterError(f"{machine.data} is missing: restore a backup (rce cluster init, rce restore)")
+    try:
+        check_ports(machine)
+    except ClusterError as error:
+        raise ClusterError(f"{error}; {_STOP}") from error
+    copy = machine.folder / "etcd.alone"
+    before = machine.folder / f"etcd.before-{time.strftime('%Y%m%d-%H%M%S')}"
+    try:
+        await asyncio.to_thread(_copy, machine.data, copy)
+        await _run_alone(machine, copy, tls)
+        machine.data.rename(before)
+        copy.rename(machine.data)
+    except OSError as error:
+        raise ClusterError(f"cannot copy {machine.data}: {error}") from error
+    finally:
+        shutil.rmtree(copy, ignore_errors=True)
+    machine.write({machine.name: machine.peer_url}, new=True)
+    return before
+
+
+async def _check_away(others: Sequence[Member], tls: Context | None) -> None:
+    answers = await ask_all(others, tls)
+    for member in others:
+        if isinstance(answers[member.id], MemberStatus):
+            raise ClusterError(
+                f"etcd on {member.shown} ({member.client}) works: start members until more than half work,"
+                " and remove the lost ones; or stop it for good first, and what only it has is lost"
+            )
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a folder with its owners, which a copy by root would not keep."""
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(source, target)
+    for path in (source, *source.rglob("*")):
+        found = path.stat()
+        os.chown(target / path.relative_to(source), found.st_uid, found.st_gid)
+
+
+async def _run_alone(machine: Machine, data: Path, tls: Context | None) -> None:
+    """Run etcd on a copy of the data, on ports that no other program knows, until it is the only member."""
+    client, peer = _free_port(machine.host), _free_port(_LOOPBACK)
+    client_url = f"{machine.scheme}://{_client_of(machine, machine.host, client)}"
+    own = {
+        "data-dir": str(data),
+        "listen-client-urls": client_url,
+        "advertise-client-urls": client_url,
+        "listen-peer-urls": f"{machine.scheme}://{_LOOPBACK}:{peer}",
+        "force-new-cluster": True,
+    }
+    config = machine.folder / "etcd.alone.yaml"
+    config.write_text(yaml.safe_dump(read_config(machine.config) | own), encoding="utf-8")
+    user, group = _owner(data)
+    process = await asyncio.create_subprocess_exec(
+        *(find_etcd(), "--config-file", str(config)),
+        stdin=asyncio.subprocess.DEVNULL,
+        user=user,
+        group=group,
+    )
+    try:
+        endpoint = _client_of(machine, machine.host, client)
+        async with ClusterClient([endpoint], tls=tls) as alone:
+            await _until_alone(alone, machine, process)
+            await _forget_other_masters(alone, machine, tls)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.terminate()
+        try:
+            async with asyncio.timeout(END_S):
+                await process.wait()
+        except TimeoutError:
+            process.kill()
+            await process.wait()
+        config.unlink(missing_ok=True)
+
+
+async def _until_alone(client: ClusterClient, machine: Machine, process: asyncio.subprocess.Process) -> None:
+    why: object = "etcd was not started"
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(START_S):
+            while process.returncode is None:
+                try:
+                    members = await client.members()
+                    if [each.peer for each in members] == [machine.peer]:
+                        return
+                    why = f"it has {len(members)} members"
+                except StoreError as error:
+                    why = error
+                await asyncio.sleep(_PAUSE_S)
+    raise ClusterError(f"etcd did not become a cluster of its own: {why}; its output says more")
+
+
+async def _forget_other_masters(client: ClusterClient, machine: Machine, tls: Context | None) -> None:
+    """Remove what etcd knows of masters on other machines, so that packages do not wait for them.
+
+    Raises:
+        ClusterError: etcd works on one of these machines, which joined later than this one.
+    """
+    keys = Keys(DEFAULT_PREFIX)
+    masters = [read_master(keys, record) for record in (await client.range(keys.masters)).records]
+    others = {one.name: urlsplit(one.url).hostname or "" for one in masters}
+    others = {name: host for name, host in others.items() if host != machine.host}
+    places = [
+        Member(number, name.rpartition(":")[0], "", _client_of(machine, host))
+        for number, (name, host) in enumerate(others.items(), 1)
+    ]
+    await _check_away(places, tls)
+    operations = [Delete(key + name) for name in others for key in (keys.masters, keys.drained)]
+    if operations:
+        await client.transact([], operations)
+
+
+def _owner(folder: Path) -> tuple[int | None, int | None]:
+    """Return the user and group that etcd is to run as; None: those of this process."""
+    found = folder.stat()
+    return (found.st_uid, found.st_gid) if os.geteuid() == 0 else (None, None)
+
+
+def _client_of(machine: Machine, host: str, port: int = 0) -> str:
+    shown = f"[{host}]" if ":" in host else host
+    return f"{shown}:{port or machine.client_port}"
+
+
+def _free_port(host: str) -> int:
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as sock:
+        sock.bind((host, 0))
+        return int(sock.getsockname()[1])
