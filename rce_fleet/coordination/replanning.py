@@ -95,6 +95,7 @@ class PlanResult:
         steps: Step of each visit, from 1 on.
         ordered: Whether robots that keep the plan's order never wait for each other in a circle.
         rerouting: The new paths, where only some robots need one; then there are no visits.
+        failure: The error with which the planner ended, as type and text; then there are no visits.
     """
 
     number: int
@@ -105,6 +106,7 @@ class PlanResult:
     steps: tuple[int, ...] = ()
     ordered: bool = True
     rerouting: Rerouting | None = None
+    failure: str = ""
 
 
 def request_plan(

@@ -21,6 +21,7 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from asyncio.subprocess import PIPE, Process
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,7 @@ import msgspec
 
 from rce_fleet.compiled import COMPILED, compile_kernels, is_available
 from rce_fleet.coordination.replanning import PlanRequest, PlanResult, compute_plan
+from rce_fleet.coordination.rerouting import Rerouting
 from rce_fleet.coordination.settings import COMPILED_EFFORT
 from rce_fleet.exceptions import PlanWorkerError
 from rce_fleet.nodes.known_robots import VOLUME_VARIABLE
@@ -127,6 +129,9 @@ class PlanWorker:
     async def compute(self, request: PlanRequest) -> PlanResult:
         """Return a plan. If the process ends, it is restarted once.
 
+        If the planner fails, this is logged, and the plan has no visits: robots stand until single robots
+        find paths, or something changes and the next plan is asked for.
+
         Cancelling leaves the process in the middle of its work: end it afterwards.
 
         Raises:
@@ -134,6 +139,15 @@ class PlanWorker:
         """
         self._compile_for(request)
         await self._take_compiled()
+        result = await self._ask_twice(request)
+        if result.failure:
+            self._log.error(
+                "the planner %r failed in plan %d for %d robots: %s; see its traceback on stderr",
+                *(request.planner, request.number, len(request.robots), result.failure),
+            )
+        return result
+
+    async def _ask_twice(self, request: PlanRequest) -> PlanResult:
         try:
             return await self._ask(request)
         except (asyncio.IncompleteReadError, ConnectionError):
@@ -190,7 +204,10 @@ class PlanWorker:
 
 
 def serve(requests: BinaryIO, results: BinaryIO) -> None:
-    """Make plans until the input ends; an empty frame first says that the loops are compiled, if they are."""
+    """Make plans until the input ends; an empty frame first says that the loops are compiled, if they are.
+
+    A planner that raises an exception does not end the process, and is loaded anew for the next plan.
+    """
     planners: dict[str, Planner] = {}
     compiled = is_available()
     if compiled:
@@ -201,13 +218,24 @@ def serve(requests: BinaryIO, results: BinaryIO) -> None:
     gc.freeze()  # Compiled loops are many objects: a full collection would take longer than most plans.
     while len(head := requests.read(_LENGTH)) == _LENGTH:
         request = msgspec.msgpack.decode(requests.read(int.from_bytes(head)), type=PlanRequest)
-        if request.planner not in planners:
-            planners[request.planner] = load_planner(request.planner)
         if compiled:  # compiled loops do so much more in the same time
             request = replace(request, effort=max(request.effort, COMPILED_EFFORT))
-        result = compute_plan(request, planners[request.planner])
+        try:
+            if request.planner not in planners:
+                planners[request.planner] = load_planner(request.planner)
+            result = compute_plan(request, planners[request.planner])
+        except Exception as error:  # noqa: BLE001 - a planner is code of others
+            traceback.print_exc()
+            planners.pop(request.planner, None)
+            result = failed_plan(request, f"{type(error).__name__}: {error}")
         results.write(_frame(msgspec.msgpack.encode(result)))
         results.flush()
+
+
+def failed_plan(request: PlanRequest, failure: str) -> PlanResult:
+    """Return the answer to a request that no plan was made for; after new paths one plan for all follows."""
+    rerouting = Rerouting(found=False) if request.copy is not None else None
+    return PlanResult(request.number, (), (), (), complete=False, rerouting=rerouting, failure=failure)
 
 
 def load_compiled() -> Planner:

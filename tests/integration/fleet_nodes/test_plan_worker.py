@@ -8,6 +8,7 @@ import logging
 import os
 import signal
 import sys
+from dataclasses import replace
 
 import psutil
 import pytest
@@ -90,6 +91,49 @@ async def test_a_request_that_ends_the_process_twice_is_an_error() -> None:
     async with PlanWorker(LOG, command=command, compiled=False) as worker:
         with pytest.raises(PlanWorkerError, match=r"plan 7 for 3 robots .*status 3"):
             await worker.compute(request_of(7))
+
+
+RAISES = """
+import sys
+from rce_fleet.nodes import plan_worker
+from rce_fleet.planning import planner
+
+class RaisesAtOddSeeds:
+    def plan(self, problem):
+        if problem.seed % 2:
+            raise RuntimeError("seed is odd")
+        return planner.load_planner("lacam").plan(problem)
+
+def load(name):
+    if name == "missing":
+        raise ImportError("not here")
+    return RaisesAtOddSeeds()
+
+plan_worker.load_planner = load
+plan_worker.serve(sys.stdin.buffer, sys.stdout.buffer)
+"""
+
+
+async def test_a_planner_that_raises_gives_an_empty_plan(caplog: pytest.LogCaptureFixture) -> None:
+    """The process makes the next plan; nothing is restarted."""
+    command = (sys.executable, "-P", "-c", RAISES)
+    async with PlanWorker(LOG, command=command, compiled=False) as worker:
+        (process,) = children_with(RAISES)
+        for number in range(1, 5):
+            request = replace(request_of(number), planner="mine" if number < 4 else "missing")
+            result = await worker.compute(request)
+            if number == 2:
+                assert result == compute_plan(request_of(number))
+                continue
+            assert (result.cells, result.complete, result.unreachable) == ((), False, ())
+            reason = "RuntimeError: seed is odd" if number < 4 else "ImportError: not here"
+            assert result.failure == reason
+        assert children_with(RAISES) == [process]
+    errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
+    assert len(errors) == 3
+    assert "the planner 'mine' failed in plan 1 for 3 robots: RuntimeError: seed is odd" in errors[0]
+    assert "the planner 'missing' failed in plan 4 for 3 robots: ImportError: not here" in errors[2]
+    assert "restarting" not in caplog.text
 
 
 async def test_a_worker_ends_with_its_input() -> None:

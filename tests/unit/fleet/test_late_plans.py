@@ -178,6 +178,26 @@ def test_a_zone_that_was_set_while_a_plan_is_taken_over_counts() -> None:
     assert harness.planner.state.ledger.route("R1") == [0, 1, 2, 3, 4, 5]
 
 
+def test_a_plan_that_failed_is_asked_for_again() -> None:
+    """The robot stands meanwhile, and the planner does not ask at each tick."""
+    harness = PlannerHarness(0)
+    harness.finish_all()
+    harness.tell(GoalSet("R1", 5))
+    for _ in range(3):
+        asked = len(harness.requests)
+        number = harness.requests[-1].number
+        harness.tell(PlanMade(PlanResult(number, (), (), (), complete=False, failure="ValueError: no")))
+        harness.events(10)
+        assert len(harness.requests) <= asked + 1
+        assert harness.sent["R1"] == (0,)
+        harness.now += 6.0
+        harness.stand()
+        harness.tell(Tick())
+        assert len(harness.requests) == asked + 1
+    harness.finish()
+    assert harness.sent["R1"] == (0, 1, 2, 3, 4)
+
+
 def test_a_robot_with_another_goal_waits_for_the_next_plan(pair: PlannerHarness) -> None:
     pair.tell(GoalSet("R2", 3))
     pair.finish()
