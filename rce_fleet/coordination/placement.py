@@ -49,7 +49,7 @@ class Placement:
         while True:
             freed = state.ledger.take_freed()
             yield freed
-            displaced = state.index.displaced.at(freed)
+            displaced = state.index.displaced.at(freed) & state.robots.keys()
             for robot in sorted(displaced):
                 self._dispatcher.watch(state.robots[robot])
             candidates = self.to_settle | state.index.hindered.at(freed)

@@ -118,6 +118,15 @@ def test_two_robots_carried_to_one_border_take_part_again(
     arrive(fleet)
 
 
+def test_a_robot_in_a_cell_of_another_can_be_removed(make_fleet: type[SimulatedClients]) -> None:
+    """Its own cells become free, one of which it overlaps."""
+    fleet = start(make_fleet, 0)
+    carry_to(fleet, 2, 5, right=0.4)
+    fleet.run(lambda: bool(fleet.planner.state.index.displaced.cells))
+    fleet.remove("Robot2")
+    fleet.run(fleet.all_arrived)
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_a_paused_robot_pushed_twice_is_placed_anew(make_fleet: type[SimulatedClients], seed: int) -> None:
     """First to the corner of its cell, and then into the one that it overlapped there."""
