@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from rce_fleet.tasks.records import OUT_MODES
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
     from rce_fleet.tasks.facts import FleetFacts, RobotFacts
 
@@ -97,12 +97,13 @@ class GoalKeeper:
             now: Seconds.
         """
         out: list[tuple[str, int | None]] = []
+        needed = frozenset(wanted.values())
         for robot in facts.robots.values():
             sent = self._sent.get(robot.id)
             if robot.id in wanted:
                 goal = wanted[robot.id]
-            elif sent is not None or (robot.goal is not None and _is_needed(robot, wanted)):
-                goal = None
+            elif sent is not None or _rests_in(robot, needed):
+                goal = None  # another robot shall go to its cell
             else:
                 continue
             if robot.goal == goal:
@@ -131,10 +132,6 @@ class GoalKeeper:
         return sent is None and robot.id not in wanted
 
 
-def _is_needed(robot: RobotFacts, wanted: Mapping[str, int | None]) -> bool:
-    """Return whether another robot shall go to the cell that this one has as its goal, and is in."""
-    return (
-        robot.goal is not None
-        and robot.is_at(robot.goal)
-        and any(cell == robot.goal for other, cell in wanted.items() if other != robot.id)
-    )
+def _rests_in(robot: RobotFacts, cells: Collection[int | None]) -> bool:
+    """Return whether a robot has arrived at its goal, in one of some cells."""
+    return robot.goal is not None and robot.goal in cells and robot.is_at(robot.goal)

@@ -78,18 +78,18 @@ class ChargerQueue:
         used = set(self.charging.values())
         free = [cell for cell in usable if cell not in used]
         self.waiting = {}
+        why_none_is_free = self._why_none_is_free(chargers)
         for robot in wanting:
             nearest = self._ways.nearest(robot, free) if free else None
             if nearest is None:
-                self.waiting[robot.id] = self._why_none(robot, chargers, free)
+                closed = f"no path leads {robot.id} to a charger that is free (cells {_listed(free)})"
+                self.waiting[robot.id] = closed if free else why_none_is_free
             else:
                 self.charging[robot.id] = nearest
                 free.remove(nearest)
 
-    def _why_none(self, robot: RobotFacts, chargers: Sequence[int], free: Sequence[int]) -> str:
-        """Return why a robot gets no charger now, for people."""
-        if free:
-            return f"no path leads {robot.id} to a charger that is free (cells {_listed(free)})"
+    def _why_none_is_free(self, chargers: Sequence[int]) -> str:
+        """Return why robots wait that would reach a charger, for people."""
         stands = [f"{who} stands at {cell}" for cell in chargers if (who := self._ways.stands(cell))]
         if not chargers:
             return "the fleet has no chargers"

@@ -5,16 +5,17 @@ from __future__ import annotations
 import logging
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rce_fleet.exceptions import TaskRefusedError
 from rce_fleet.journal.journal import Journal
-from rce_fleet.manager.goals import NO_ANSWER
+from rce_fleet.manager.goals import NO_ANSWER, GoalKeeper
 from rce_fleet.manager.manager import FleetManager
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.dispatch import TaskRules
-from rce_fleet.tasks.facts import RobotFacts
+from rce_fleet.tasks.facts import FleetFacts, RobotFacts
 from rce_fleet.tasks.order import Action, Order, Stop
 from rce_fleet.tasks.records import GoalEntry, PlannerRun, RobotEntry, Zone
 from rce_fleet.tasks.task import TaskState
@@ -233,3 +234,28 @@ async def test_a_robot_that_joins_late_gets_its_goal(fleet: Fleet) -> None:
     await fleet.step()
     assert fleet.robot().goal == 20
     assert fleet.manager.book.goals["Robot1"].cell == 20
+
+
+class CountedGoals(dict[str, int | None]):
+    """Goals by robot; counts how often one looks at all of them."""
+
+    looks = 0
+
+    def items(self) -> Any:
+        self.looks += 1
+        return super().items()
+
+    def values(self) -> Any:
+        self.looks += 1
+        return super().values()
+
+
+def test_goals_of_robots_at_rest_are_compared_once() -> None:
+    """One of them is in the cell to which another robot shall go: it loses its goal."""
+    facts = FleetFacts()
+    for cell in range(40):
+        facts.robots[f"R{cell}"] = RobotFacts(f"R{cell}", "arrived", cell=cell, goal=cell)
+    facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=50)
+    wanted = CountedGoals({"Robot1": 3})
+    assert GoalKeeper().to_send(facts, wanted, 1.0) == [("R3", None), ("Robot1", 3)]
+    assert wanted.looks == 1
