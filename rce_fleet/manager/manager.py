@@ -394,10 +394,15 @@ class FleetManager:
         self._thread.shutdown()
 
     def _forget_old(self) -> list[tuple[str, str]]:
-        """Forget the oldest tasks that have ended, if there are too many."""
+        """Forget the oldest tasks that have ended, if there are too many; not those that others wait for."""
         if len(self.book.tasks) <= KEEP_ENDED + KEEP_ENDED // 10:
             return []
-        ended = [task for task in self.book.tasks.values() if task.has_ended and task.recurs_at is None]
+        awaited = {name for task in self.book.open_tasks() for name in task.order.after}
+        ended = [
+            task
+            for task in self.book.tasks.values()
+            if task.has_ended and task.recurs_at is None and task.id not in awaited
+        ]
         old = sorted(ended, key=lambda task: task.changed_at)[: max(0, len(ended) - KEEP_ENDED)]
         for task in old:
             self.book.forget(task.number)

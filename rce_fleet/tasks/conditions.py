@@ -82,7 +82,7 @@ class Conditions:
             try:
                 before = self._book.find(name)
             except UnknownTaskError:
-                continue  # It ended so long ago that it was forgotten.
+                continue  # It had ended long ago when an earlier release forgot it.
             if before.state in (TaskState.FAILED, TaskState.CANCELLED):
                 reason = f"{name}, which must be done before, is {before.state.value}"
                 self._book.advance(task, TaskCause.FAIL, now, reason, robot="")

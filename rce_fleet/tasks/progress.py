@@ -250,6 +250,8 @@ class TaskProgress:
     def _is_over(
         self, task: Task, stop: Stop, visit: StopVisit, now: float, robot: RobotFacts | None
     ) -> bool:
+        if task.state is TaskState.CANCELLING and stop.action is Action.CHARGE:
+            return True
         if stop.confirm and not task.confirmed:
             return False
         if _fills_battery(stop):
@@ -283,7 +285,10 @@ class TaskProgress:
 
     def _miss(self, task: Task, robot: RobotFacts | None, now: float, facts: FleetFacts) -> None:
         """Decide about a task whose robot does not answer."""
-        if not facts.is_live or task.has_ended:
+        if not task.is_bound and (task.state is TaskState.CANCELLING or task.next_stop is None):
+            self._finish(task, now)
+            return
+        if not facts.is_live:
             return
         since = robot.away_since if robot is not None else self._unknown_since.setdefault(task.robot, now)
         if robot is None:
@@ -296,8 +301,11 @@ class TaskProgress:
     def _give_up(self, task: Task, now: float, reason: str, *, is_away: bool = False) -> None:
         """Give a task to others, or end it if nothing is left; a bound one waits, and then fails."""
         self.avoid[task.number, task.robot] = now + self._rules.avoid_for
-        if (visit := task.action) is not None and _fills_battery(stop := _stop_of_visit(task, visit)):
-            task = self._acted(task, stop, visit, now)
+        if (visit := task.action) is not None:
+            stop = _stop_of_visit(task, visit)
+            is_cancelled = is_away and task.state is TaskState.CANCELLING
+            if _fills_battery(stop) or (is_cancelled and stop.action not in (Action.PICK, Action.DELIVER)):
+                task = self._acted(task, stop, visit, now)
         if not task.is_bound:
             if task.state is TaskState.CANCELLING:
                 self._book.advance(task, TaskCause.CANCEL, now, reason)

@@ -565,3 +565,92 @@ def test_a_dead_robot_with_a_load_keeps_no_cell(floor: Floor, *, is_cancelled: b
     robot.state, robot.away_since = "idle", float("inf")
     floor.run_until_ended(task)
     assert floor.task(task).loads == 0
+
+
+@pytest.mark.parametrize("action", [Action.GO, Action.PARK, Action.CHARGE])
+def test_a_cancelled_task_ends_with_a_dead_robot(floor: Floor, action: Action) -> None:
+    """It has no load, and the robot does nothing at the stop whose end would count."""
+    robot = floor.add("Robot1", 0)
+    task = floor.book.create(Order((Stop(action, (2,), 7200.0, confirm=True),)), floor.now)
+    floor.run(5)
+    robot.state, robot.away_since = "dead", floor.now
+    floor.book.emit(RobotEntry("Robot1", mode="dead"), "dead", floor.now)
+    floor.run(2)
+    assert floor.task(task).state is TaskState.SUSPENDED
+    floor.book.cancel(task.id, floor.now)
+    floor.run(2)
+    assert floor.task(task).state is TaskState.CANCELLED
+    assert floor.book.task_of("Robot1") is None
+
+
+@pytest.mark.parametrize("seconds", [0.0, 7200.0])
+def test_a_cancelled_task_charges_no_further(floor: Floor, seconds: float) -> None:
+    """Also at a charger that gives nothing: the robot would stand there without end."""
+    floor.add("Robot1", 0, battery=0.3)
+    task = floor.book.create(Order((Stop(Action.CHARGE, (2,), seconds),)), floor.now)
+    floor.run(5)
+    assert floor.task(task).action is not None
+    floor.book.cancel(task.id, floor.now)
+    floor.run(2)
+    assert floor.task(task).state is TaskState.CANCELLED
+
+
+_LOSSES = st.tuples(
+    st.sampled_from(["post", "go", "charge", "hold", "resume", "cancel", "restart", "lose", "kill", "block"]),
+    st.integers(0, 22),
+    st.integers(0, 22),
+    st.integers(1, 40),
+)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(_LOSSES, min_size=5, max_size=25))
+def test_people_can_end_each_task_whatever_happened(things: list[tuple[str, int, int, int]]) -> None:
+    """At the end all robots are dead; tasks are cancelled, and their loads are said to be lost."""
+    shift = Shift()
+    floor = shift.floor
+    for what, first, second, seconds in things:
+        if what == "go":
+            stop = Stop(Action.GO, (8 + first,), 300.0, confirm=second > 11)
+            shift.tasks.append(floor.book.create(Order((stop,)), floor.now))
+        elif what == "charge":
+            shift.tasks.append(floor.book.create(Order((Stop(Action.CHARGE, (8 + first,)),)), floor.now))
+        elif what == "kill":
+            _kill(floor, NAMES[first % len(NAMES)])
+        else:
+            shift.happen(what, first, second)
+        floor.run(seconds)
+    for name in NAMES:
+        _kill(floor, name)
+    floor.run(5)
+    for task in map(floor.task, shift.tasks):
+        if not task.has_ended:
+            floor.book.cancel(task.id, floor.now)
+    floor.run(5)
+    for task in map(floor.task, shift.tasks):
+        if task.is_loaded and not task.has_ended and task.action is None:
+            settle_load(floor.book, task.id, None, floor.now)
+    floor.run(1)
+    assert all(floor.task(task).has_ended for task in shift.tasks)
+    assert all(floor.book.task_of(name) is None for name in NAMES)
+    assert floor.dispatcher.goals() == dict.fromkeys(NAMES)
+
+
+def _kill(floor: Floor, name: str) -> None:
+    robot = floor.facts.robots[name]
+    robot.state, robot.mode, robot.away_since = "dead", "dead", floor.now
+    floor.book.emit(RobotEntry(name, mode="dead"), "dead", floor.now)
+
+
+@pytest.mark.parametrize("state", [TaskState.CANCELLED, TaskState.DONE])
+def test_a_task_of_which_nothing_is_left_needs_no_planner(floor: Floor, state: TaskState) -> None:
+    """Its last action ends while the planner is away, with all robots."""
+    floor.add("Robot1", 0)
+    task = floor.book.create(Order((Stop(Action.GO, (2,), 30.0),)), floor.now)
+    floor.run(5)
+    floor.facts.is_live = False
+    floor.facts.robots.clear()
+    if state is TaskState.CANCELLED:
+        floor.book.cancel(task.id, floor.now)
+    floor.run(40)
+    assert floor.task(task).state is state

@@ -683,3 +683,20 @@ async def test_an_impossible_change_between_occurrences_is_refused(
     before = await _between_occurrences(client)
     assert (await client.ask("PATCH", "/tasks/T1", change))[0] in (409, 422)
     assert client.manager.book.tasks[1] == before
+
+
+async def test_a_task_before_another_one_is_not_forgotten(
+    client: ManagerClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was cancelled: the one that is held until then must not begin as if it had been done."""
+    monkeypatch.setattr(managers, "KEEP_ENDED", 0)
+    await client.ask("POST", "/tasks", GO)
+    await client.ask("POST", "/tasks", {**GO, "after": ["T1"]})
+    await client.ask("POST", "/tasks/T2/hold", {})
+    await client.ask("DELETE", "/tasks/T1")
+    await client.ask("POST", "/tasks/T2/resume", {})
+    client.manager.dispatcher.update(client.manager.clock(), client.manager.facts)
+    assert (await client.ask("GET", "/tasks/T2"))[1]["state"] == "failed"
+    await client.ask("POST", "/tasks", GO)
+    await client.ask("POST", "/tasks/T3/hold", {})
+    assert list(client.manager.book.tasks) == [3]
