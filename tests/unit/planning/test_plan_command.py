@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from rce_fleet.offline.plan_command import plan
 from rce_fleet.planning.checker import check_plan
+from rce_fleet.planning.lacam import LacamPlanner
 from rce_fleet.planning.movingai import read_map
 
 MAP = "type octile\nheight 4\nwidth 6\nmap\n......\n.@@.@.\n.@@.@.\n......\n"
@@ -76,7 +77,10 @@ def test_a_lifelong_run_names_the_goals(files: tuple[Path, Path], tmp_path: Path
         (("--robots 4", "--robots 4 --planner best"), "there is no planner 'best'; installed are"),
         (("\t5\t0\t0\t3", "\t0\t0\t0\t3"), "robots 0 and 1 have the same start, cell 0"),
         (("\t5\t0\t0\t3", "\t1\t1\t0\t3"), "line 3: (1, 1) is not a free cell of the map"),
-        (("......\n.@@.@.\n.@@.@.\n......", "...@..\n.@@@@.\n.@@@@.\n...@.."), "no path leads from cell"),
+        (
+            ("......\n.@@.@.\n.@@.@.\n......", "...@..\n.@@@@.\n.@@@@.\n...@.."),
+            "robot 0: no path leads from its start, cell 0, to its goal, cell 23",
+        ),
     ],
 )
 def test_bad_input_is_a_clear_error(
@@ -95,6 +99,25 @@ def test_bad_input_is_a_clear_error(
     assert code == 1
     assert said in output
     assert not (tmp_path / "plan.json").exists()
+
+
+def test_unreachable_goals_are_found_before_the_search(
+    files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also one of a later block of robots; a search would last until its effort is spent."""
+
+    def search(*_: object) -> None:
+        pytest.fail("a plan was searched")
+
+    monkeypatch.setattr(LacamPlanner, "plan", search)
+    map_, scen = files
+    map_.write_text("type octile\nheight 2\nwidth 52\nmap\n" + "." * 50 + "@.\n" + "." * 50 + "@.\n")
+    goals = [*((column, 1) for column in range(40)), (51, 1)]
+    rows = [f"0\tfloor.map\t52\t2\t{x}\t0\t{gx}\t{gy}\t1.0" for x, (gx, gy) in enumerate(goals)]
+    scen.write_text("version 1\n" + "\n".join(rows) + "\n")
+    code, said = run(map_, "--scen", scen, "--robots", 41, "--output", tmp_path / "plan.json")
+    assert code == 1
+    assert "robot 40: no path leads from its start, cell 40, to its goal, cell 103" in said
 
 
 def test_too_many_lifelong_robots_are_refused(files: tuple[Path, Path], tmp_path: Path) -> None:
