@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import time
 import zlib
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,6 +18,7 @@ from rce_fleet.experiments.bench import CLIENT, SERVER, Bench
 from rce_fleet.experiments.experiment import NOT_ANY, Experiment, Options, Trial
 from rce_fleet.experiments.results import Condition, Row, read_rows, write_rows
 from rce_fleet.experiments.schedule import WARM_UP, Run, remaining, schedule
+from rce_fleet.experiments.systems.base import together
 from rce_fleet.experiments.systems.software import software_of
 
 if TYPE_CHECKING:
@@ -32,9 +34,10 @@ SAMPLE_S = 60.0
 LINK = "link"
 LINK_DELAYS_S = (0.005, 0.0, 0.02)
 LINK_UNITS = {"round_trip": "s", "round_trip_p99": "s", "lost": "", "rate": "bit/s"}
-LINK_SECONDS = 4.0
 TRIES = 2
 """How often a run is tried before its error ends the experiment."""
+QUICK_AT_ONCE = 3
+"""Runs of a quick plan that are under way at once: most of a run is waiting for programs to start."""
 
 
 class Work(NamedTuple):
@@ -59,6 +62,11 @@ class Plan:
     options: Options
     runs: int
     seed: int
+
+    @property
+    def at_once(self) -> int:
+        """How many runs are done at the same time; more than one disturb each other's figures."""
+        return QUICK_AT_ONCE if self.options.quick else 1
 
     def options_of(self, experiment: Experiment) -> Options:
         """Return how an experiment is done: with the software that has its programs."""
@@ -90,7 +98,7 @@ class Plan:
         return [Work(experiment, run) for run in remaining(planned, done)]
 
     def seconds(self, experiment: Experiment, rows: list[Row]) -> float:
-        """Return about how long an experiment still takes."""
+        """Return about how long an experiment still takes, seconds."""
         works = self.works(experiment, rows)
         if not works:
             return 0.0
@@ -98,11 +106,11 @@ class Plan:
         return runs + experiment.preparation_seconds(self.options_of(experiment))
 
     def run_seconds(self, work: Work) -> float:
-        """Return about how long a run takes."""
+        """Return about by how long a run makes the plan longer, seconds."""
         seconds = work.experiment.seconds
         if work.run.number == WARM_UP:
             seconds = work.experiment.warm_up_seconds
-        return seconds(work.run.condition, self.options_of(work.experiment))
+        return seconds(work.run.condition, self.options_of(work.experiment)) / self.at_once
 
 
 class Pace:
@@ -147,6 +155,11 @@ class Runner:
         self._plan = plan
         self._table = folder / TABLE
         self._say = say
+        self._prepared: dict[str, dict[str, float]] = {}
+        """What the preparations of experiments found, by their names."""
+        self._preparing = asyncio.Lock()
+        self._writing = asyncio.Lock()
+        """Held while the rows of a run are written: they stay together."""
 
     def rows(self) -> list[Row]:
         """Return the raw data so far.
@@ -168,19 +181,31 @@ class Runner:
         self._drop_unfinished()
         await self._prepare_software()
         await self._measure_link()
-        pace = Pace(sum(self._plan.seconds(one, self.rows()) for one in self._plan.experiments))
+        rows = self.rows()
+        pace = Pace(sum(self._plan.seconds(one, rows) for one in self._plan.experiments))
+        waiting: deque[tuple[Work, str]] = deque()
         for experiment in self._plan.experiments:
-            works = self._plan.works(experiment, self.rows())
+            works = self._plan.works(experiment, rows)
+            waiting += [(work, f"{number} of {len(works)}") for number, work in enumerate(works, 1)]
             if not works:
                 self._say(f"{experiment.name}: all runs are done")
-                continue
-            prepared = await self._prepare(experiment)
-            pace.done(experiment.preparation_seconds(self._plan.options_of(experiment)))
-            for number, work in enumerate(works, 1):
-                left = pace.left() / 60
-                self._say(f"{_named(work)} ({number} of {len(works)}; about {left:.0f} min left)")
-                await self._do(work, prepared)
-                pace.done(self._plan.run_seconds(work))
+        if self._plan.at_once > 1:  # the longest first: none is left over at the end, alone
+            waiting = deque(sorted(waiting, key=lambda one: -self._plan.run_seconds(one[0])))
+        await together(*(self._do_all(waiting, pace) for _ in range(self._plan.at_once)))
+
+    async def _do_all(self, waiting: deque[tuple[Work, str]], pace: Pace) -> None:
+        """Do runs until none is waiting.
+
+        Args:
+            waiting: The runs, each with its place among those of its experiment.
+            pace: Is told of each run.
+        """
+        while waiting:
+            work, place = waiting.popleft()
+            prepared = await self._prepare(work.experiment, pace)
+            self._say(f"{_named(work)} ({place}; about {pace.left() / 60:.0f} min left)")
+            await self._do(work, prepared)
+            pace.done(self._plan.run_seconds(work))
 
     async def _do(self, work: Work, prepared: dict[str, float]) -> None:
         run = work.run
@@ -201,14 +226,23 @@ class Runner:
         rows = [Row(one.condition, run.number, *one.value) for one in measured]
         took = Row(run.condition, run.number, DONE, time.monotonic() - began, "s")
         attempts = Row(run.condition, run.number, "tries", float(attempt), "")
-        await asyncio.to_thread(write_rows, self._table, [*rows, attempts, took])
+        async with self._writing:
+            await asyncio.to_thread(write_rows, self._table, [*rows, attempts, took])
 
     async def _prepare_software(self) -> None:
         """Have the software make what it needs, before anything is measured."""
         for name in self._plan.options.software:
             await asyncio.to_thread(software_of(name).prepare, self._say)
 
-    async def _prepare(self, experiment: Experiment) -> dict[str, float]:
+    async def _prepare(self, experiment: Experiment, pace: Pace) -> dict[str, float]:
+        """Return what an experiment's preparation finds, which is done once."""
+        async with self._preparing:
+            if experiment.name not in self._prepared:
+                self._prepared[experiment.name] = await self._find(experiment)
+                pace.done(experiment.preparation_seconds(self._plan.options_of(experiment)))
+        return self._prepared[experiment.name]
+
+    async def _find(self, experiment: Experiment) -> dict[str, float]:
         condition = Condition.of(experiment.name, NOT_ANY, NOT_ANY, part=PREPARED)
         found = {row.metric: row.value for row in self.rows() if row.condition == condition}
         options = self._plan.options_of(experiment)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from rce.config import SecretError, new_secret
 from rce_fleet.exceptions import ExperimentError
-from rce_fleet.experiments import node_log
+from rce_fleet.experiments import engine_login, node_log
 from rce_fleet.experiments.bench import CLIENT, SERVER, TAIL_LINES
 from rce_fleet.experiments.systems.base import (
     PATIENCE_S,
@@ -43,9 +43,11 @@ USER = "researcher"
 PASSWORD = "experiment"  # noqa: S105 - of an engine that only the machines of one run reach
 OPERATOR = "server"
 """Robot id of the server's own graph."""
-LOGIN = ".config/rce/login.json"
-"""The operator's token, below the folder of the run."""
+LOGIN = "login.json"
+"""The operator's token, in the folder of the run."""
 POLL_S = 0.2
+_accounts: dict[str, bytes] = {}
+"""The files of an engine's state that has only the user for the robots, by name."""
 
 
 class Cloud(System):
@@ -88,7 +90,10 @@ class Cloud(System):
         self.robots_at = time.time()
         robots = dict(robots_of(flows, self.layout.robots))
         # The others use the container of the first one.
-        await together(self._log_in(), self._robot(1, robots.pop(1)))
+        first = [self._robot(1, robots.pop(1))]
+        if not self.layout.server_graph:  # else there is no output of nodes in containers to read
+            first.append(self._log_in())
+        await together(*first)
         await together(*(self._robot(robot, own) for robot, own in robots.items()))
 
     async def run(self, workload: Workload) -> RunningWorkload:
@@ -186,19 +191,30 @@ class Cloud(System):
             ExperimentError: It does not start.
         """
         bench = self.bench
-        state = ("--state-dir", str(bench.folder / "engine"))
+        state = bench.folder / "engine"
         secret = bench.folder / "secret"
         try:
             await asyncio.to_thread(new_secret, secret)
         except SecretError as error:
             raise ExperimentError(str(error)) from error
-        add = ("rce", "user", "add", USER, "--admin", "--password-stdin", *state)
-        await bench.run(SERVER, "user", add, given=PASSWORD)
+        await self._add_user(state)
         words = ("--no-offer-images", "--bind", bench.address(SERVER), "--secret-file", str(secret))
-        up: tuple[str, ...] = ("rce", "up", *words, *state)
+        up: tuple[str, ...] = ("rce", "up", *words, "--state-dir", str(state))
         if packages is not None:
             up += ("--package-path", str(packages))
         self._engine = await bench.start(SERVER, "engine", up, ready="RCE ready")
+
+    async def _add_user(self, state: Path) -> None:
+        """Have the engine's state have a user for the robots: made once, and then copied."""
+        master = state / "master"
+        if not _accounts:
+            add = ("rce", "user", "add", USER, "--admin", "--password-stdin", "--state-dir", str(state))
+            await self.bench.run(SERVER, "user", add, given=PASSWORD)
+            _accounts.update({file.name: file.read_bytes() for file in master.glob("*.sqlite*")})
+            return
+        master.mkdir(mode=0o700, parents=True)
+        for name, data in _accounts.items():
+            (master / name).write_bytes(data)
 
     async def kill_master(self) -> None:
         """Kill the engine's master; ``rce up`` starts it again by itself."""
@@ -207,7 +223,8 @@ class Cloud(System):
 
     async def _log_in(self) -> None:
         url = f"http://{self.bench.address(SERVER)}:9000/"
-        login = ("rce", "login", url, "--user", USER, "--password-stdin")
+        file = str(self.bench.folder / LOGIN)
+        login = (sys.executable, "-I", "-S", engine_login.__file__, url, USER, file)
         await self.bench.run(SERVER, "login", login, given=PASSWORD)
 
     def _graphs(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The program that prints a node's output: an engine that answers, and one that is away."""
+"""The programs that log in and print a node's output: an engine that answers, and one that is away."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from rce_fleet.experiments import node_log
+from rce_fleet.experiments import engine_login, node_log
 
 TEXT = "what the node printed\n"
 
@@ -31,6 +31,12 @@ class Engine(BaseHTTPRequestHandler):
         self.send_response(self.status)
         self.end_headers()
         self.wfile.write(answer)
+
+    def do_POST(self) -> None:
+        account = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        self.send_response(self.status)
+        self.end_headers()
+        self.wfile.write(json.dumps({"token": f"of {account['userID']} with {account['password']}"}).encode())
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002
         del format, args
@@ -86,3 +92,13 @@ def test_refusal_is_an_error(tmp_path: Path) -> None:
         done = printed(tmp_path, port)
     assert done.returncode != 0
     assert "401" in done.stderr
+
+
+def test_login_writes_what_the_log_needs(tmp_path: Path) -> None:
+    file = tmp_path / "login.json"
+    with engine(200) as port:
+        url = f"http://127.0.0.1:{port}/"
+        argv = [sys.executable, "-I", "-S", engine_login.__file__, url, "researcher", str(file)]
+        subprocess.run(argv, input="experiment", check=True, capture_output=True, text=True)
+    assert json.loads(file.read_text()) == {"url": url, "token": "of researcher with experiment"}
+    assert file.stat().st_mode & 0o077 == 0

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 
 import pytest
@@ -13,6 +16,7 @@ from rce_fleet.experiments.results import Condition, Row, by_condition, read_row
 from rce_fleet.experiments.runner import DONE, LINK, LINK_DELAYS_S, SAMPLE_S, TABLE, Pace, Plan, Runner
 
 OPTIONS = Options(systems=("single_master", "cloud"), software=("rce",))
+QUICK = replace(OPTIONS, quick=True)
 RUNS = 2
 
 
@@ -52,13 +56,21 @@ class Dice(Experiment):
         return trial.measured([Value("eyes", float(1 + trial.seed % 6), "")], colour="red")
 
 
-def runner(folder: Path, dice: Dice, said: list[str], *, runs: int = RUNS, seed: int = 1) -> Runner:
+def runner(
+    folder: Path,
+    dice: Dice,
+    said: list[str],
+    *,
+    runs: int = RUNS,
+    seed: int = 1,
+    options: Options = OPTIONS,
+) -> Runner:
     if not (folder / TABLE).exists():
         conditions = [
             Condition.of(LINK, NOT_ANY, NOT_ANY, delay=round(1000 * delay)) for delay in LINK_DELAYS_S
         ]
         write_rows(folder / TABLE, [Row(condition, 1, "rate", 1.0, "bit/s") for condition in conditions])
-    return Runner(Plan([dice], OPTIONS, runs, seed), folder, said.append)
+    return Runner(Plan([dice], options, runs, seed), folder, said.append)
 
 
 async def test_each_setup_is_warmed_up_and_run(tmp_path: Path) -> None:
@@ -128,3 +140,49 @@ def test_the_rest_takes_as_long_as_what_was_done() -> None:
     assert pace.left() == 200.0, "twice as fast as planned"
     pace.done(500.0)
     assert pace.left() == 0.0
+
+
+class Meeting(Dice):
+    """Dice that are only thrown while another throw is under way, and then have several figures."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.under_way = 0
+        self.met = asyncio.Event()
+
+    def preparation_seconds(self, options: Options) -> float:
+        del options
+        return 0.0
+
+    async def measure(self, trial: Trial) -> list[Measured]:
+        self.under_way += 1
+        if self.under_way > 1:
+            self.met.set()
+        async with asyncio.timeout(60):
+            await self.met.wait()
+        self.under_way -= 1
+        return trial.measured([Value(f"eyes{number}", 1.0, "") for number in range(9)])
+
+
+async def test_runs_of_a_quick_plan_are_done_at_once(tmp_path: Path) -> None:
+    """Their rows stay together, so that a resumed plan finds each one complete."""
+    await runner(tmp_path, Meeting(), [], options=QUICK).run()
+    rows = [row for row in read_rows(tmp_path / TABLE) if row.condition.experiment == "dice"]
+    assert [row.metric for row in rows].count(DONE) == len(OPTIONS.systems) * RUNS
+    runs = [(row.condition.system, row.run) for row in rows]
+    assert [key for key, _ in groupby(runs)] == list(dict.fromkeys(runs))
+
+
+class Stuck(Dice):
+    """Dice of which the first throw does not end, and the others fail."""
+
+    async def measure(self, trial: Trial) -> list[Measured]:
+        self.trials.append(trial)
+        if len(self.trials) == 1:
+            await asyncio.Event().wait()
+        raise ExperimentError("the dice fell off the table")
+
+
+async def test_an_error_of_a_quick_plan_ends_its_other_runs(tmp_path: Path) -> None:
+    with pytest.raises(ExperimentError, match="the dice fell off the table"):
+        await runner(tmp_path, Stuck(), [], options=QUICK).run()
