@@ -56,9 +56,10 @@ SECTIONS = (
         "Machine 2 simulates TurtleBots that publish laser scans; machine 1 subscribes to all scans and "
         "prints them (`printed=yes`) or not. `client_cpu=full` has machine 2 as full with the "
         "simulation as the paper's: it has 0.2 of a core, and making a scan takes so much of it "
-        "(`scan_work`) that the robots of SMS publish at about 7.5 Hz. `rate=free` "
-        "publishes as fast as possible, at most as asked; `rate=fixed` publishes at the same rate in all "
-        "systems. Rates are per robot; a delay is the time from the scan's stamp until it is printed.",
+        "(`scan_work`) that the robots of SMS publish at about 7.5 Hz. With `rate=free`, robots "
+        "publish as fast as they can, at most at 30 Hz; with `rate=fixed`, at 4 Hz, which all systems "
+        "reach. Rates are per robot. A delay is the time from the scan's stamp until it is printed; all "
+        "machines have the same clock.",
         (_DELIVERY, _TRAFFIC, _USE),
     ),
     Section(
@@ -81,16 +82,18 @@ SECTIONS = (
     Section(
         "images",
         "Images",
-        "Images go from one machine to the other, which echoes them on a console (`printed=yes`) or not. "
-        "`rate=carried` is a rate that the link can carry, `rate=above` is above it.",
+        "Images go from machine 2 to machine 1, which prints them on a console (`printed=yes`) or not. "
+        "`rate=carried` is a rate at which the link carries raw images of that size: 20 Hz for 160x120, 3 Hz "
+        "for 640x480, 0.5 Hz for 1920x1080. `rate=above` asks for 30 Hz, more than the link carries. "
+        "`encoding=png` is made by a converter of the engine, so only CRS has it.",
         (_DELIVERY, _TRAFFIC, _USE),
     ),
     Section(
         "scaling",
         "Number of robots",
-        "The same as laser scans, with more robots until something breaks. In CRS, all robots share a "
-        "container (`containers=one`) or have their own (`containers=each`). `start` is the time until the"
-        " topics of all robots arrive.",
+        "Laser scans at 30 Hz as above, not printed, from more and more robots. In CRS, all robots share a "
+        "container (`containers=one`) or have their own (`containers=each`); the other systems have none, "
+        "and their rows say `containers=one`. `start` is the time until the topics of all robots arrive.",
         (
             _DELIVERY,
             TableSpec("Round trip and start", _quantities("round_trip", "start")),
@@ -101,9 +104,14 @@ SECTIONS = (
     Section(
         "robustness",
         "Faults",
-        "A core or a master is killed, or a machine is cut off. Shown is how long connected topics, "
-        "services and new topics were without an answer. What did not come back (`..._came_back` is 0) has"
-        " the time for which it was observed.",
+        "Machine 2 takes a topic of machine 1 (10 messages a second), calls a service there, and looks for "
+        "topics that are newly made there. `core_killed` kills a ROS core: that of machine 1 in SMS and MMS, "
+        "that of machine 2 in CRS. `master_killed` kills what connects the machines: discovery and sync of "
+        "machine 1 in MMS, the engine's master in CRS. What was killed is started again after 5 s; "
+        "the engine starts its master again by itself, at once. `machine_cut` has the link of machine 2 lose "
+        "everything for 20 s. Programs are not started again. `..._stopped` is the longest time without an "
+        "answer, beyond the usual period. What did not come back (`..._came_back` is 0) has the time for "
+        "which it was observed.",
         (
             TableSpec(
                 "Time without an answer",
@@ -121,19 +129,15 @@ SECTIONS = (
         "isolation",
         "What a robot sees of others",
         "Counted from one robot: topics, nodes and parameters of another robot that it sees, and whether "
-        "it can publish to it, call it and end its nodes (1) or not (0).",
+        "it can publish to it, call its service, end its nodes and call its core (1) or not (0). "
+        "`files_to_add` and `lines_to_add` are what has to be written for one more robot.",
         (
             TableSpec(
                 "Visible", _quantities("topics_visible", "topics_others", "nodes_others", "parameters_others")
             ),
-            TableSpec("Possible", _quantities("can_publish", "can_call", "can_end_nodes")),
+            TableSpec("Possible", _quantities("can_publish", "can_call", "can_end_nodes", "can_use_core")),
+            TableSpec("To add a robot", _quantities("files_to_add", "lines_to_add")),
         ),
-    ),
-    Section(
-        "configuration",
-        "What it takes to add a robot",
-        "Files and lines that are written to add a robot.",
-        (TableSpec("To add a robot", _quantities("files_to_add", "lines_to_add")),),
     ),
     Section(
         "offload",
@@ -144,7 +148,10 @@ SECTIONS = (
         "AMCL and `move_base`, `task=planning` asks for a plan across the floor, and `task=mapping` makes a "
         "map of an arc of 2 s. `control_delay` is the time from a scan's stamp until a command or pose that "
         "was made of it, or of a newer scan, is at the robot. A task that is not done within 8 s (4 s for "
-        "four plans) has failed: its time counts as that. Energy is computed by the robot's model.",
+        "four plans) has failed: its time counts as that. Energy is computed by the robot's model. "
+        "Of the tables about break-even, the first one takes the cloud as faster where a verdict would (the "
+        "intervals do not overlap, and the medians differ by 5 %); the second one says where the medians "
+        "cross, however little they differ.",
         (
             TableSpec("Task", _quantities("task_time", "control_delay", "energy", "success")),
             TableSpec("Use", _quantities("robot.cpu", "server.cpu", "robot.network_in", "robot.network_out")),
@@ -156,19 +163,20 @@ LINK = TableSpec("The link as measured", _quantities("round_trip", "round_trip_p
 READING = f"""\
 - *Median and interval.* `7.50 [7.41, 7.62]` is the median of the runs and its {100 * CONFIDENCE:.0f} %
   confidence interval, by the percentile bootstrap with {RESAMPLES} samples. Fewer than {MIN_RUNS} runs have
-  no interval: `7.50 (2 runs)`. `-` was not measured.
+  no interval: `7.50 (2 runs)`. `-` was not measured, or does not apply.
 - *Which rows.* Each number comes from the rows of `results.csv` with the experiment of the section, the
   system, software and factors of the table's row, and the metric of the table's column. A column such as
   `server.network_in + server.network_out` is computed in each run. Warm-ups (run 0) do not count.
 - *Names.* SMS is `single_master`, MMS is `multi_master`, CRS is `cloud` in the raw data. Machine 1 is
   `server`, machine 2 is `client`. Software `ros` is ROS 1 as Debian packages it, with programs in Python
   (rospy); `roscpp` is the same with programs in C++; `rce` is the core and the nodes of RCE. In CRS, the
-  engine and the nodes in containers are RCE; the software is that of the robots. A verdict is about the
-  software of its row only.
+  engine and the nodes in containers are RCE; the software is that of the robots. In MMS, discovery and sync
+  are RCE with any software. A verdict is about the software of its row only.
 - *Verdicts.* A claim *holds* if it holds in all cases (combinations of factors), *does not hold* if it
   holds in none, and otherwise *depends*. A system is *above* another one if their intervals do not overlap
   and the medians differ by at least {100 * (MIN_RATIO - 1):.0f} %. *About the same* are medians of which
-  the largest is at most {SAME_RATIO:g} times the smallest.
+  the largest is at most {SAME_RATIO:g} times the smallest. *Met* counts the comparisons that a claim is
+  made of: "SMS above MMS 1 of 4" is met in one of four cases.
 - *Effect size.* Cliff's delta of two systems: how much likelier a run of the first one is above a run of
   the second one than below, from -1 to +1. Up to 0.147 it is negligible, up to 0.33 small, up to 0.474
   medium, above that large.
@@ -184,8 +192,8 @@ LIMITS = f"""\
 - The paper does not tell all of its set-up. A claim that does not hold here may have held there; the
   verdict is about the versions above.
 - All runs of an experiment were made on one computer in one session: the intervals say how well it repeats
-  itself, not how other computers differ. Of two identical full runs, only some {100 * EXPECTED:.0f} % of the
-  second medians lie in the first intervals.
+  itself, not how other computers differ. Where nothing but chance differs, some {100 * EXPECTED:.0f} % of the
+  medians of another run lie in the intervals; what another full run found is told above.
 - Bootstrap intervals of ten runs are a little too narrow. Among so many comparisons, some differ by chance;
   so a verdict needs a difference of {100 * (MIN_RATIO - 1):.0f} % and looks at all cases.
 - The original programs of fkie and the original Rapyuta are judged only where a row names them.
