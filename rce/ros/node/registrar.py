@@ -59,7 +59,7 @@ class Registrar:
             if topic not in topics.outputs:  # closed meanwhile
                 await master.unregister_publisher(topic)
         for topic, source in list(topics.inputs.items()):
-            await source.register(of_new_master=True)
+            await source.register()
             if topics.inputs.get(topic) is not source:
                 await master.unregister_subscriber(topic)
         for name in list(self.services):

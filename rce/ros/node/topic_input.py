@@ -1,11 +1,16 @@
-"""Subscribing, the network's side: a connection to each publisher of a topic, made again when it is lost."""
+"""Subscribing, the network's side: a connection to each publisher of a topic, made again when it is lost.
+
+As in rospy, a connection ends when the publisher ends it, not when the master ceases to name the publisher.
+A master that was restarted knows no nodes, and a synchronization takes back the nodes of a master or
+discovery that was killed, while they publish as before.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from rce.aio.backoff import Backoff
 from rce.ros.dialing import open_peer_socket
@@ -33,6 +38,18 @@ RETRY = Backoff(first=0.05, longest=5.0, jitter=0.5)
 """Seconds between attempts to reach a publisher: the first wait and the longest."""
 MAX_REGISTRATIONS = 3
 """How often the master is asked for the publishers while it reports changes of them meanwhile."""
+HANGING = 10.0
+"""Seconds for which nothing came from an orphan until, named again, it is connected to anew: the network may
+have been away."""
+
+
+class _Orphan(NamedTuple):
+    """A publisher that the master does not name any more, but whose connection is there."""
+
+    since: float
+    """When the master ceased to name it; the event loop's time, seconds."""
+    messages: int
+    """How many had come by then."""
 
 
 class TopicInput:
@@ -51,11 +68,10 @@ class TopicInput:
         self._publishers: set[str] = set()
         """The slave APIs of all publishers, as the master named them last."""
         self._following: dict[str, asyncio.Task[None]] = {}
-        self._orphans: set[str] = set()
-        """Publishers that a restarted master has not named yet: followed until their connection ends."""
+        self._orphans: dict[str, _Orphan] = {}
+        """By slave API; followed until their connection ends, or the master names them again."""
         self._updates = 0
         """How many changes of the publishers the master has reported."""
-        self._joins_new_master = False
 
     @property
     def tells_latched(self) -> bool:
@@ -112,59 +128,51 @@ class TopicInput:
             elif link.kept is not None:
                 subscriber.sink.deliver(link.kept, True, link.uri)
 
-    async def register(self, *, of_new_master: bool = False) -> None:
+    async def register(self) -> None:
         """Register the subscription at the master, and follow the publishers that it names.
 
         An answer is older or newer than a change that the master reports before it comes. If they differ,
         the master is asked again.
 
-        Args:
-            of_new_master: As for :meth:`set_publishers`.
-
         Raises:
             MasterError: The registration at the master failed.
         """
-        self._joins_new_master = of_new_master
-        try:
-            for _ in range(MAX_REGISTRATIONS):
-                before = self._updates
-                publishers = await self._runtime.master.register_subscriber(
-                    self.topic, self.message_type_name
-                )
-                if not self.subscribers:  # closed meanwhile
-                    return
-                if self._updates == before:
-                    self.set_publishers(publishers, of_new_master=of_new_master)
-                    return
-                if set(publishers) == self._publishers:
-                    return
-        finally:
-            self._joins_new_master = False
+        for _ in range(MAX_REGISTRATIONS):
+            before = self._updates
+            publishers = await self._runtime.master.register_subscriber(self.topic, self.message_type_name)
+            if not self.subscribers:  # closed meanwhile
+                return
+            if self._updates == before:
+                self.set_publishers(publishers)
+                return
+            if set(publishers) == self._publishers:
+                return
 
     def take_update(self, uris: Iterable[str]) -> None:
         """Follow the publishers that the master reports after a change."""
         self._updates += 1
-        self.set_publishers(uris, of_new_master=self._joins_new_master)
+        self.set_publishers(uris)
 
-    def set_publishers(self, uris: Iterable[str], *, of_new_master: bool = False) -> None:
-        """Follow these publishers, given by their slave APIs, and no others.
-
-        Args:
-            uris: The publishers.
-            of_new_master: The master was restarted and may not know all yet: existing connections stay.
-        """
+    def set_publishers(self, uris: Iterable[str]) -> None:
+        """Follow these publishers, given by their slave APIs, and others while their connections last."""
         self._publishers = set(uris)
-        self._follow_publishers(of_new_master=of_new_master)
+        self._follow_publishers()
 
-    def _follow_publishers(self, *, of_new_master: bool = False) -> None:
+    def _follow_publishers(self) -> None:
         wanted = set(self._publishers)
         if not any(subscriber.hears_own for subscriber in self.subscribers):
             wanted.discard(self._own_uri)
-        if of_new_master:
-            self._orphans |= {link.uri for link in self.links}
-        self._orphans -= wanted
-        for uri in self._following.keys() - wanted - self._orphans:
-            self._following.pop(uri).cancel()
+        now = asyncio.get_running_loop().time()
+        links = {link.uri: link for link in self.links if link.is_greeted}
+        for uri in self._orphans.keys() & wanted:
+            since, messages = self._orphans.pop(uri)
+            if uri in links and links[uri].messages == messages and now - since >= HANGING:
+                self._following.pop(uri).cancel()
+        for uri in self._following.keys() - wanted - self._orphans.keys():
+            if uri in links and uri not in self._publishers:
+                self._orphans[uri] = _Orphan(now, links[uri].messages)
+            else:
+                self._following.pop(uri).cancel()
         for uri in wanted - self._following.keys():
             self._following[uri] = self._runtime.tasks.spawn(
                 self._follow(uri), name=f"{self.topic} from {uri}"
@@ -172,11 +180,13 @@ class TopicInput:
 
     def close(self) -> None:
         """Follow no publishers any more."""
+        self._publishers.clear()
         self._orphans.clear()
-        self.set_publishers(())
+        while self._following:
+            self._following.popitem()[1].cancel()
 
     async def _follow(self, uri: str) -> None:
-        """Receive from one publisher for as long as the master names it, reconnecting when needed."""
+        """Receive from one publisher; connect again for as long as the master names it."""
         pauses = RETRY.start()
         while True:
             link = InputLink(self, uri)
@@ -188,7 +198,7 @@ class TopicInput:
             except (RosError, OSError) as error:
                 _log.info("%s from %s: %s", self.topic, uri, str(error) or type(error).__name__)
             if uri in self._orphans:
-                self._orphans.remove(uri)
+                del self._orphans[uri]
                 del self._following[uri]
                 return
             if link.messages:

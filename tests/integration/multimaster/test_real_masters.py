@@ -6,7 +6,7 @@ import asyncio
 import signal
 import sys
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from support.ports import free_port, free_ports
 from rce.ros.core import Graph
 from rce.ros.multimaster.events import EventQueue
 from rce.ros.multimaster.peer_table import PeerEvent
-from rce.ros.node import Publisher
+from rce.ros.node import Node, Publisher
 
 TALKER = """
 import rospy
@@ -176,6 +176,40 @@ async def test_a_killed_discovery_is_noticed_and_taken_back(network: DiscoveryNe
                 await near.until(lambda graph: "/said" not in graph.topic_types)
 
 
+@pytest.mark.parametrize("killed", ["core", "discovery"])
+async def test_a_connection_outlives_killed_programs(network: DiscoveryNetwork, killed: str) -> None:
+    """The graph of the subscriber loses the publisher meanwhile; what it publishes arrives all the same."""
+    port = free_port()
+    core = partial(_program, "core", "from rce.ros.cli.core import core", "--port", str(port), "--no-log")
+    uri = f"http://127.0.0.1:{port}/"
+    discovery = partial(_discovery_process, uri, network.port, "--name", "far", "--rosmaster-hz", "10")
+    programs = {"core": core, "discovery": discovery}
+    async with (
+        network.machine(name="near") as near,
+        AsyncExitStack() as stack,
+        Node("listener", argv=[], master_uri=near.uri, intra_process=False) as listener,
+    ):
+        running = {name: await stack.enter_async_context(make()) for name, make in programs.items()}
+        far = await stack.enter_async_context(node("far", uri))
+        publisher = await far.advertise("said", STRING)
+        heard = await listener.subscribe("said", STRING)
+        await publisher.wait_for_subscribers(timeout=30)
+        (before,) = publisher._output.all_links
+
+        running[killed].kill()
+        await near.until(lambda graph: not graph.publishers("/said"))
+        publisher.publish(data="meanwhile")
+        async with asyncio.timeout(10):
+            assert (await anext(aiter(heard))).data == "meanwhile"
+
+        await stack.enter_async_context(programs[killed]())
+        await near.until(partial(_is_published_by, far.uri, name="/far"), timeout=30)
+        publisher.publish(data="afterwards")
+        async with asyncio.timeout(10):
+            assert (await anext(aiter(heard))).data == "afterwards"
+        assert publisher._output.all_links == [before], "it is not made anew"
+
+
 async def test_a_machine_that_vanished_comes_back_at_other_ports(network: DiscoveryNetwork) -> None:
     """Its master, its discovery and its nodes are others then; of the earlier ones, nothing is left."""
     from rce.ros.core import Core
@@ -202,20 +236,28 @@ async def test_a_machine_that_vanished_comes_back_at_other_ports(network: Discov
         assert not any(master.online for master in near.discovery.masters if master.name == "far")
 
 
-def _is_published_by(uri: str, graph: Graph) -> bool:
-    return graph.publishers("/said") == {"/n": uri}
+def _is_published_by(uri: str, graph: Graph, name: str = "/n") -> bool:
+    return graph.publishers("/said") == {name: uri}
 
 
 @asynccontextmanager
 async def _discovery_process(
     uri: str, mcast_port: int, *more: str
 ) -> AsyncIterator[asyncio.subprocess.Process]:
-    program = await asyncio.create_subprocess_exec(
-        sys.executable,
-        "-c",
-        "import typer; from rce.ros.cli.discovery import discovery; typer.run(discovery)",
+    async with _program(
+        "discovery",
+        "from rce.ros.cli.discovery import discovery",
         *("--master-uri", uri, "--mcast-group", "226.0.0.0@127.0.0.1", "--mcast-port", str(mcast_port)),
         *("--heartbeat-hz", "10", "--rpc-port", str(free_port()), *more),
+    ) as program:
+        yield program
+
+
+@asynccontextmanager
+async def _program(command: str, imported: str, *words: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """A command of ``rce``, killed at the end."""
+    program = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", f"import typer; {imported}; typer.run({command})", *words),
         stdout=asyncio.subprocess.DEVNULL,
     )
     try:
