@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 GROUP = "rce.commands"
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
 
 
 class Plugged(NamedTuple):
@@ -106,8 +108,15 @@ def _add_unavailable(app: typer.Typer, name: str, problem: str) -> None:
 
 
 def main() -> None:
-    """Run the ``rce`` program. If the first word is a command, only this one is imported."""
+    """Run the ``rce`` program. If the first word is a command, only this one is imported.
+
+    Ctrl-C while a command is imported ends the program without a traceback.
+    """
     open_missing_streams()
     points = sorted(entry_points(group=GROUP), key=lambda point: point.name)
     asked = [point for point in points if point.name == sys.argv[1]] if len(sys.argv) > 1 else []
-    build_app(asked or points, listing=not asked)(prog_name="rce")
+    try:
+        app = build_app(asked or points, listing=not asked)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    app(prog_name="rce")

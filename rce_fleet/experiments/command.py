@@ -7,7 +7,7 @@ import contextlib
 import json
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -16,8 +16,9 @@ from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments import environment
 from rce_fleet.experiments.catalogue import experiments_of
 from rce_fleet.experiments.experiment import PAPER_SYSTEMS, Experiment, Options
+from rce_fleet.experiments.machines import check_machines
 from rce_fleet.experiments.ownership import sweep
-from rce_fleet.experiments.report import make_report
+from rce_fleet.experiments.report import make_report, read_second
 from rce_fleet.experiments.runner import TABLE, Plan, Runner
 from rce_fleet.experiments.systems.registry import system_of
 from rce_fleet.experiments.systems.software import SOFTWARES, USUAL, software_of
@@ -95,6 +96,7 @@ def experiment(
     Machines are network namespaces with links like a wireless LAN. Raw data go to results.csv in the folder,
     what they depend on to environment.json. A page of tables, figures and claims is made of them.
     """
+    folder: Path | None = None
     try:
         if name == MAKE_PAGE:
             _report(folders or [], page, second or [])
@@ -106,6 +108,7 @@ def experiment(
         if plan:
             _show(planned, resume)
             return
+        _check_report(page, second or [])
         folder = _folder(planned, resume, output)
         for left in sweep():
             typer.echo(f"removed what an experiment left that was killed: {left}")
@@ -113,17 +116,40 @@ def experiment(
         typer.echo(f"raw data: {folder / TABLE}")
         _report([folder], page, second or [])
     except (ExperimentError, OSError) as error:
-        typer.echo(f"rce experiment: {error}", err=True)
+        typer.echo(f"rce experiment: {_told(error)}", err=True)
         raise typer.Exit(1) from error
-    except asyncio.CancelledError:
-        typer.echo(f"interrupted; go on with --resume {folder}", err=True)
+    except (asyncio.CancelledError, KeyboardInterrupt):
+        typer.echo("interrupted" + (f"; go on with --resume {folder}" if folder else ""), err=True)
         raise typer.Exit(INTERRUPTED) from None
+
+
+def _told(error: Exception) -> str:
+    """Return an error's text; of an error of the system, the file and the reason."""
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
 
 
 def _experiments(name: str, folders: list[Path] | None) -> list[Experiment]:
     if folders:
         raise ExperimentError(f"only {MAKE_PAGE} takes folders; {name} writes to --output DIR")
     return experiments_of(name)
+
+
+def _check_report(page: Path | None, second: list[Path]) -> None:
+    """Make sure, before a run of hours, that its page can be made.
+
+    Raises:
+        ExperimentError: It cannot.
+    """
+    read_second(second)
+    if page is None:
+        return
+    try:
+        page.with_suffix("").mkdir(parents=True, exist_ok=True)
+        page.open("a").close()
+    except OSError as error:
+        raise ExperimentError(f"--page {page} cannot be written: {_told(error)}") from error
 
 
 def _report(folders: list[Path], page: Path | None, second: list[Path]) -> None:
@@ -182,22 +208,26 @@ def _folder(planned: Plan, resume: Path | None, output: Path | None) -> Path:
         raise ExperimentError(
             "--resume DIR goes on in its folder; --output DIR needs a new one: give one of both"
         )
-    description = environment.describe(planned.options, planned.seed, planned.runs)
     if resume is not None:
-        _check_same(resume, description)
+        _check_same(resume, planned)
+        asyncio.run(check_machines())
         return resume
     folder = output or Path(time.strftime("experiment-%Y%m%d-%H%M%S"))
+    if folder.exists():
+        is_started = (folder / environment.FILE).is_file()
+        way = f"go on in it with --resume {folder}" if is_started else "name a new folder"
+        raise ExperimentError(f"{folder} exists already; {way}")
+    asyncio.run(check_machines())
+    description = environment.describe(planned.options, planned.seed, planned.runs)
     try:
         folder.mkdir(parents=True)
         environment.write(folder, description)
-    except FileExistsError:
-        raise ExperimentError(f"{folder} exists already; go on in it with --resume {folder}") from None
     except OSError as error:
-        raise ExperimentError(f"{folder} cannot be made: {error}") from error
+        raise ExperimentError(f"--output {folder} cannot be made: {_told(error)}") from error
     return folder
 
 
-def _check_same(folder: Path, description: dict[str, Any]) -> None:
+def _check_same(folder: Path, planned: Plan) -> None:
     """Make sure that a folder's raw data were made in the same way.
 
     Raises:
@@ -205,8 +235,13 @@ def _check_same(folder: Path, description: dict[str, Any]) -> None:
     """
     try:
         former = environment.read(folder)
+    except (FileNotFoundError, NotADirectoryError):
+        raise ExperimentError(
+            f"--resume {folder}: it is not the folder of an experiment, for there is no {environment.FILE}"
+        ) from None
     except (OSError, ValueError) as error:
-        raise ExperimentError(f"--resume {folder}: {error}") from error
+        raise ExperimentError(f"--resume {folder}: {_told(error)}") from error
+    description = environment.describe(planned.options, planned.seed, planned.runs)
     for key in ("commit", "seed", "options"):
         if former.get(key) != description[key]:
             raise ExperimentError(
@@ -220,7 +255,10 @@ def _shown(value: object) -> str:
 
 
 def _show(planned: Plan, resume: Path | None) -> None:
-    rows = [] if resume is None else Runner(planned, resume, typer.echo).rows()
+    rows = []
+    if resume is not None:
+        _check_same(resume, planned)
+        rows = Runner(planned, resume, typer.echo).rows()
     total = 0.0
     for one in planned.experiments:
         seconds = planned.seconds(one, rows)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Self
 
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.delay_line import LinkShape
+from rce_fleet.experiments.ownership import new_tag
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,7 +35,10 @@ MIN_BURST_BYTES = 3200
 BURST_S = 0.004
 """The longest burst at full speed, seconds at the limited rate: the kernel's clock ticks that often."""
 START_S = 20.0
-TOOLS = ("ip", "tc")
+TOOLS = ("ip", "tc", "setpriv")
+"""Programs by which machines and the programs on them are made."""
+TUN = Path("/dev/net/tun")
+"""The device by which links are emulated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +101,35 @@ class LinkFigures:
     rate: float
 
 
+async def check_machines() -> None:
+    """Make sure that machines can be made on this computer.
+
+    Raises:
+        ExperimentError: They cannot; the text says what is missing.
+    """
+    _check_needs()
+    name = f"{new_tag()}-check"
+    try:
+        await _ip("netns", "add", name)
+    except ExperimentError as error:
+        raise ExperimentError(
+            "machines are network namespaces: making them needs the capabilities CAP_SYS_ADMIN and "
+            f"CAP_NET_ADMIN, which root in a container may not have: {error}"
+        ) from error
+    finally:
+        await _delete_namespace(name)
+
+
+def _check_needs() -> None:
+    missing = [f"the program {tool}" for tool in TOOLS if shutil.which(tool) is None]
+    if os.geteuid() != 0:
+        missing.append("to be root")
+    if not TUN.exists():
+        missing.append(f"the device {TUN}")
+    if missing:
+        raise ExperimentError(f"machines are network namespaces: making them needs {', '.join(missing)}")
+
+
 class MachineNetwork:
     """Machines on one switch, while the ``async with`` block runs.
 
@@ -123,10 +156,7 @@ class MachineNetwork:
         Raises:
             ExperimentError: They cannot be made; the text says what is missing.
         """
-        missing = [tool for tool in TOOLS if shutil.which(tool) is None]
-        if missing or os.geteuid() != 0:
-            needed = f"the program {missing[0]}" if missing else "to be root"
-            raise ExperimentError(f"machines are network namespaces: making them needs {needed}")
+        _check_needs()
         async with AsyncExitStack() as stack:
             switch = await self._namespace(stack, "switch")
             await _ip("-n", switch, "link", "add", "bridge", "type", "bridge", "mcast_snooping", "0")

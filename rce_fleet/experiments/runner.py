@@ -73,10 +73,10 @@ class Plan:
         return experiment.possible(self.options)
 
     def left_out(self) -> list[str]:
-        """Return a line for each experiment that is done without some software, and why.
+        """Return a line for each experiment that is done without some software, or not at all, and why.
 
         Raises:
-            ExperimentError: No experiment can be done with the software.
+            ExperimentError: No experiment can be done with the systems and the software.
         """
         lines = [
             f"{one.name} is not done with the software {software}: it has no program {', '.join(lacking)}"
@@ -84,14 +84,23 @@ class Plan:
             for software in self.options.software
             if (lacking := one.lacking(software))
         ]
-        if lines and not any(self.options_of(one).software for one in self.experiments):
+        options = self.options
+        lines += [
+            f"{one.name} is not done: it has nothing to measure with the systems "
+            f"{', '.join(options.systems)} and the software {', '.join(possible)}"
+            for one in self.experiments
+            if (possible := self.options_of(one).software) and not self._setups(one)
+        ]
+        if lines and not any(map(self._setups, self.experiments)):
             raise ExperimentError("; ".join(lines))
         return lines
 
+    def _setups(self, experiment: Experiment) -> list[Condition]:
+        return experiment.setups(self.options_of(experiment))
+
     def works(self, experiment: Experiment, rows: list[Row]) -> list[Work]:
         """Return the runs of an experiment that are still to be done."""
-        setups = experiment.setups(self.options_of(experiment))
-        planned = schedule(setups, self.runs, self.seed, warm_up=not self.options.quick)
+        planned = schedule(self._setups(experiment), self.runs, self.seed, warm_up=not self.options.quick)
         most = {condition: experiment.most_runs(condition) for condition in dict(planned)}
         planned = [run for run in planned if run.number <= (most[run.condition] or run.number)]
         done = {Run(row.condition, row.run) for row in rows if row.metric == DONE}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -95,25 +96,74 @@ def test_a_plan_says_what_would_run_and_runs_nothing(tmp_path: Path) -> None:
         (["laser", "--systems", "cloud,peer"], "there is no system peer; there is cloud, multi_master"),
         (["laser", "--software", "ros2"], "there is no software ros2; there is ros, roscpp, rce"),
         (["laser", "--systems", ","], "--systems needs at least one name"),
-        (["laser", "--resume", "absent"], "--resume absent: "),
+        (["laser", "--resume", "absent"], "--resume absent: it is not the folder of an experiment"),
+        (["laser", "--resume", "file"], "--resume file: it is not the folder of an experiment"),
+        (["laser", "--resume", "absent", "--plan"], "there is no environment.json"),
+        (["laser", "--runs", "0"], "should be greater than or equal to 1"),
+        (["offload", "--systems", "multi_master"], "it has nothing to measure with the systems multi_master"),
+        (["laser", "--output", "file"], "file exists already; name a new folder"),
+        (
+            ["laser", "--page", "file/page.md"],
+            "--page file/page.md cannot be written: file/page: Not a directory",
+        ),
+        (["laser", "--second", "absent"], "absent is not a folder with raw data: there is no results.csv"),
         (["laser", "--output", "there"], "there exists already; go on in it with --resume there"),
         (["laser", "--output", "a", "--resume", "b"], "give one of both"),
         (["laser", "there"], "only page takes folders"),
         (["page"], "page needs at least one folder of raw data"),
-        (["page", "there"], "results.csv"),
+        (["page", "there"], "there is not a folder with raw data: there is no results.csv"),
         (["laser", "--robots", "50"], "should be less than or equal to 20"),
         (["laser", "--resume", "there", "--seed", "2"], "--resume there: its seed is 1, now it is 2"),
     ],
 )
 def test_bad_input_is_named(tmp_path: Path, words: list[str], text: str) -> None:
     (tmp_path / "there").mkdir()
+    (tmp_path / "file").touch()
     commit = {"commit": described_commit(), "seed": 1}
     (tmp_path / "there" / "environment.json").write_text(json.dumps(commit))
     done = subprocess.run(command(*words), check=False, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode in (1, 2)
     assert text in " ".join(done.stderr.split())
     assert "Traceback" not in done.stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["there"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "there"]
+
+
+@needs_machines
+@pytest.mark.parametrize(
+    ("kept", "text"),
+    [
+        (("tc", "setpriv"), "making them needs the program ip"),
+        (("ip", "tc"), "making them needs the program setpriv"),
+    ],
+)
+def test_missing_programs_are_named(tmp_path: Path, kept: tuple[str, ...], text: str) -> None:
+    for name in kept:
+        found = shutil.which(name)
+        assert found is not None
+        (tmp_path / name).symlink_to(found)
+    done = refused(tmp_path, command("laser", "--quick", "--software", "rce", "--output", tmp_path / "data"))
+    assert text in done.stderr
+    assert not (tmp_path / "data").exists()
+
+
+@needs_machines
+def test_missing_rights_are_named(tmp_path: Path) -> None:
+    words = command("laser", "--quick", "--software", "rce", "--output", tmp_path / "data")
+    setpriv = shutil.which("setpriv")
+    assert setpriv is not None
+    done = refused(Path(os.environ["PATH"]), [setpriv, "--bounding-set", "-sys_admin,-net_admin", *words])
+    assert "needs the capabilities CAP_SYS_ADMIN and CAP_NET_ADMIN" in done.stderr
+    assert not (tmp_path / "data").exists()
+
+
+def refused(path: Path, words: list[str]) -> subprocess.CompletedProcess[str]:
+    """Run a command with a ``PATH``, which must end with an error without a traceback."""
+    done = subprocess.run(
+        words, check=False, capture_output=True, text=True, env=os.environ | {"PATH": str(path)}
+    )
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    return done
 
 
 def described_commit() -> str:

@@ -52,7 +52,7 @@ def make_report(folders: Sequence[Path], *, page: Path, figures: Path, second: S
     """
     parts = read_parts(folders)
     measurements = Measurements.of(rows_of(parts))
-    again = _summaries(second) if second else None
+    again = read_second(second) if second else None
     figures.mkdir(parents=True, exist_ok=True)
     write_summary(figures / SUMMARY, summarize(measurements))
     drawings = figures_of(measurements)
@@ -62,6 +62,19 @@ def make_report(folders: Sequence[Path], *, page: Path, figures: Path, second: S
     where = PurePath(os.path.relpath(figures, page.parent)).as_posix()
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(page_text(measurements, environments_of(parts), drawings, where, again), encoding="utf-8")
+
+
+def read_second(paths: Sequence[Path]) -> list[Summary]:
+    """Return the summary of another run, of folders with its raw data or of files that were kept of it.
+
+    Raises:
+        OSError: A file cannot be read.
+        ExperimentError: A file is not what it must be, or two folders have the same experiment.
+    """
+    files = [path for path in paths if path.is_file()]
+    kept = [one for path in files for one in read_summary(path)]
+    parts = read_parts([path for path in paths if path not in files])
+    return kept + summarize(Measurements.of(rows_of(parts)))
 
 
 def page_text(
@@ -171,11 +184,3 @@ def _repeated(measurements: Measurements, again: Sequence[Summary] | None) -> st
     if again is None:
         return NOT_MEASURED
     return comparison_text(compare(summarize(measurements), again))
-
-
-def _summaries(paths: Sequence[Path]) -> list[Summary]:
-    """Return the summary of another run, of folders with its raw data or of files that were kept of it."""
-    files = [path for path in paths if path.is_file()]
-    kept = [one for path in files for one in read_summary(path)]
-    parts = read_parts([path for path in paths if path not in files])
-    return kept + summarize(Measurements.of(rows_of(parts)))

@@ -43,9 +43,13 @@ class Part:
 
         Raises:
             OSError: A file cannot be read.
-            ExperimentError: A file is not what it must be; the text names it.
+            ExperimentError: A file is not what it must be, or the folder has none; the text names it.
         """
-        return cls(folder, read_rows(folder / TABLE), _environment(folder / ENVIRONMENT))
+        try:
+            rows = read_rows(folder / TABLE)
+        except (FileNotFoundError, NotADirectoryError):
+            raise ExperimentError(f"{folder} is not a folder with raw data: there is no {TABLE}") from None
+        return cls(folder, rows, _environment(folder / ENVIRONMENT))
 
     @property
     def experiments(self) -> list[str]:

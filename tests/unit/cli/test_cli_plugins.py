@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from rce.cli.main import GROUP, build_app
+from rce.cli.main import GROUP, INTERRUPTED, build_app, main
 
 WORKS = 'def command():\n    """Do it."""\n    print("done")\n'
 
@@ -36,3 +36,14 @@ def test_a_command_whose_packages_are_missing_says_so(points: list[EntryPoint]) 
 def test_a_broken_command_is_no_missing_package(points: list[EntryPoint]) -> None:
     with pytest.raises(ModuleNotFoundError):
         build_app(points)
+
+
+def test_ctrl_c_while_a_command_is_imported_ends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "plugged_slow.py").write_text("raise KeyboardInterrupt\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    point = EntryPoint("slow", "plugged_slow:command", GROUP)
+    monkeypatch.setattr(sys.modules["rce.cli.main"], "entry_points", lambda group: [point])
+    monkeypatch.setattr(sys, "argv", ["rce", "slow"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == INTERRUPTED
