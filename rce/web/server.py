@@ -111,6 +111,11 @@ class HttpServer:
         if self._gate is not None:
             await self._gate.close()
         await self._end_application()
+        # aiohttp leaves one open that came while it waited for the others: its client would be answered by an
+        # application that has ended, for as long as it sends requests.
+        for transport in self._guests:
+            if not transport.is_closing():
+                cast("asyncio.Transport", transport).abort()
         await self._server.wait_closed()
 
     # The application
