@@ -43,7 +43,7 @@ OTHERS = {
         ("mapping", "--only", "intel", "--scans", "400"),
     ),
     "fleet": (("light",), ("fleet",), ("traffic",), ("assignment",), ("planning",)),
-    "scale": (("scale",),),
+    "scale": (("scale",), ("store",)),
 }
 """Other programs by part; each prints and saves its own figures. :data:`WITHOUT_ENGINE` need no engine."""
 WITHOUT_ENGINE = ("fleet", "scale")

@@ -196,6 +196,12 @@ _EXPLORATION = [
     )
 ]
 
+_STORE = [
+    Target("etcd, three members: a save of one row, p50", "store.save", _column("p50_ms", rows=1), 3, "ms"),
+    Target("etcd, three members: a save of 64 rows, p99", "store.save", _column("p99_ms", rows=64), 30, "ms"),
+    Target("etcd beside idle masters, each member", "store.idle", _column("cores_percent"), 2, "% of a core"),
+    Target("etcd beside idle masters, each member, PSS", "store.idle", _column("PSS MB"), 100, "MB"),
+]
 _SCALE = [
     Target(
         f"1000 machines, 100 000 containers in the master's state: {what}",
@@ -382,6 +388,7 @@ TARGETS = [
         at_least=True,
     ),
     *_SCALE,
+    *_STORE,
     Target("container start to first message, p50", "start", _column("p50_ms"), 250, "ms"),
     Target("100 containers at once", "many", _column("all at once", containers=100), 20, "s"),
     Target("idle container, PSS", "many", _column("idle container PSS MB"), 15, "MB"),
