@@ -7,7 +7,8 @@ A robot with a goal that can be reached waits for a bounded number of plans:
 - If no path led to its goal because of a robot that took no part in plans, it gets another try as soon as
   that robot leaves a cell.
 - If others wait to pass through the cell in which it has arrived, it makes room for them after ``GIVE_WAY``
-  seconds, and comes back, unless it was sent elsewhere meanwhile.
+  seconds, and comes back, unless it was sent elsewhere meanwhile. If that was in vain, because another robot
+  has to come out again for it, one plan is made for all.
 - If it has stood in its cell for ``patience`` seconds although it has a path, one plan is made for all, in
   which it is the most urgent robot. PIBT brings the most urgent robot nearer to its goal with the first step
   (Okumura et al., "Priority Inheritance with Backtracking for Iterative Multi-agent Path Finding", 2022,
@@ -69,6 +70,9 @@ class StarvationGuard:
         self._planned_at = -inf
         self._tried: dict[str, float] = {}
         self._hinders_since: dict[str, float] = {}
+        self._gave_way: dict[str, set[tuple[float, str, float]]] = {}
+        """For whom robots made room last, with the times at which they and the others were sent to their
+        goals."""
         self._obstacles: frozenset[int] = frozenset()
 
     def note_request(self) -> None:
@@ -81,8 +85,9 @@ class StarvationGuard:
         if now - self._looked_at < LOOK_EVERY:
             return Need(frozenset(paths))
         self._looked_at = now
-        paths |= self._cut_short(now) | self._in_the_way(now)
-        is_starving = any(
+        in_the_way = self._in_the_way(now)
+        paths |= self._cut_short(now) | in_the_way
+        is_starving = self._make_room_again(in_the_way) or any(
             stood_for(self._state, record, now) >= self._settings.patience
             for record in self._state.robots.values()
         )
@@ -142,6 +147,18 @@ class StarvationGuard:
         for robot in due:
             self._hinders_since[robot] = now
         return due
+
+    def _make_room_again(self, robots: set[str]) -> bool:
+        """Return whether one of the robots made room for the same other one before; note that they do now."""
+        state, again = self._state, False
+        for robot in robots:
+            others = state.ledger.visitors(state.ledger.route(robot)[0]) - {robot}
+            pairs = {(state.robots[robot].goal_at, other, state.robots[other].goal_at) for other in others}
+            again |= not pairs.isdisjoint(self._gave_way.get(robot, ()))
+            self._gave_way[robot] = pairs
+        for robot in self._gave_way.keys() - state.robots.keys():
+            del self._gave_way[robot]
+        return again
 
 
 def stood_for(state: FleetState, record: RobotRecord, now: float) -> float:
