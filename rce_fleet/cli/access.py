@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from pydantic import ValidationError
 
 from rce.tls import CertificateError, client_context
 from rce_fleet.client import ApiError, FleetClient
@@ -44,6 +46,25 @@ def set_token(token: str) -> None:
     _TOKEN.set(token)
 
 
+@contextmanager
+def checked() -> Iterator[None]:
+    """Turn a model's complaint about a value of the command line into one about this value.
+
+    Raises:
+        typer.BadParameter: A value is not within its limits.
+    """
+    try:
+        yield
+    except ValidationError as error:
+        found = error.errors(include_url=False)[0]
+        names = [str(step) for step in found["loc"] if not isinstance(step, int)]
+        message = str(found["msg"])
+        raise typer.BadParameter(
+            f"{message[:1].lower()}{message[1:]}, not {found['input']!r}",
+            param_hint=f"{' '.join(names)}" if names else None,
+        ) from None
+
+
 def do(station: str, work: Work) -> None:
     """Run a command with a client; print why if it fails.
 
@@ -51,10 +72,12 @@ def do(station: str, work: Work) -> None:
     refuses that one.
 
     Raises:
+        typer.BadParameter: A value of the command line is not within its limits.
         typer.Exit: It failed, with code 1, or was interrupted, with code 130.
     """
     try:
-        asyncio.run(_do(station, work, _TOKEN.get()))
+        with checked():
+            asyncio.run(_do(station, work, _TOKEN.get()))
     except (StationError, CliError, CertificateError) as error:
         typer.echo(f"rce fleet: {error}", err=True)
         raise typer.Exit(1) from None
@@ -89,7 +112,11 @@ async def _do(station: str, work: Work, token: str) -> None:
 
 async def _work(station: str, work: Work, token: str, authority: str) -> None:
     tls = client_context(Path(authority) if authority else None)
-    async with FleetClient(station, token, tls=tls, attempts=3) as client:
+    try:
+        reached = FleetClient(station, token, tls=tls, attempts=3)
+    except ValueError as error:
+        raise CliError(str(error)) from error
+    async with reached as client:
         await work(client)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rce_fleet.api.tasks import StopModel, TaskChange, TaskModel, TaskRequest
-from rce_fleet.cli.access import STATION, Station, do, echo_table
+from rce_fleet.cli.access import STATION, Station, checked, do, echo_table
 
 if TYPE_CHECKING:
     from rce_fleet.client import FleetClient
@@ -76,22 +76,24 @@ def add(
     station: Station = STATION,
 ) -> None:
     """Create a task; print its id."""
-    stops = [StopModel(action="pick", cell=pick, duration=duration)] if pick is not None else []
-    stops += [StopModel(cell=one, duration=duration) for one in cell or ()]
-    stops += [StopModel(action="deliver", cell=deliver, duration=duration)] if deliver is not None else []
-    if not stops:
+    if pick is None and deliver is None and not cell:
         raise typer.BadParameter("say where: --cell CELL, or --pick CELL --deliver CELL")
     now = time.time()
-    task = TaskRequest(
-        stops=stops,
-        name=name,
-        rounds=rounds,
-        priority=priority,
-        deadline=now + deadline if deadline else None,
-        earliest_start=now + start if start else None,
-        robot=robot,
-        after=after or [],
-    )
+    with checked():
+        stops = [StopModel(action="pick", cell=pick, duration=duration)] if pick is not None else []
+        stops += [StopModel(cell=one, duration=duration) for one in cell or ()]
+        if deliver is not None:
+            stops.append(StopModel(action="deliver", cell=deliver, duration=duration))
+        task = TaskRequest(
+            stops=stops,
+            name=name,
+            rounds=rounds,
+            priority=priority,
+            deadline=now + deadline if deadline else None,
+            earliest_start=now + start if start else None,
+            robot=robot,
+            after=after or [],
+        )
 
     async def work(client: FleetClient) -> None:
         typer.echo((await client.create_task(task, key=key)).id)
@@ -134,9 +136,11 @@ def change(
     if not changes:
         raise typer.BadParameter("say what to change, such as --priority 5")
 
+    with checked():
+        made = TaskChange.model_validate(changes)
+
     async def work(client: FleetClient) -> None:
         known = await client.task(task_id)
-        made = TaskChange.model_validate(changes)
         task = await client.change_task(task_id, made, revision=known.revision)
         typer.echo(f"{task.id} is {task.state}, priority {task.priority}")
 

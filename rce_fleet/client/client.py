@@ -28,6 +28,9 @@ class FleetClient(TaskRequests, RobotRequests, FloorRequests, HistoryRequests):
         token: Bearer token of a user of the engine (``rce token``); empty for a station without logins.
         tls: Checks the station's certificate; None for the authorities that the system trusts.
         attempts: How often a request is sent that can be repeated.
+
+    Raises:
+        ValueError: The URL cannot be that of a station.
     """
 
     async def __aenter__(self) -> Self:

@@ -48,20 +48,24 @@ async def follow_events(transport: Transport, after: int | None) -> AsyncIterato
     Raises:
         ApiError: The station refused.
         EventsRestartedError: The numbers began anew.
+        FleetApiUnavailableError: The stream could not be opened for the first time.
     """
     last = "" if after is None else str(after)
     pauses = RETRY.start()
+    attempts, is_known = 0, False
     while True:
         event = SentEvent()
         headers = {"Last-Event-ID": last} if last else {}
         try:
             async for line in transport.stream("/events", accept="text/event-stream", headers=headers):
-                text = line.decode().rstrip("\r\n")
+                is_known = True
+                text = line.decode(errors="replace").rstrip("\r\n")
                 if text:
                     event.take(text)
                     continue
                 whole, event = event, SentEvent()
                 if not whole.data:
+                    last = whole.id or last
                     continue
                 if whole.name == "gap":
                     raise EventsRestartedError(str(json.loads(whole.data)["journal"]))
@@ -69,5 +73,8 @@ async def follow_events(transport: Transport, after: int | None) -> AsyncIterato
                 pauses.reset()
                 yield whole.data
         except FleetApiUnavailableError:
-            pass  # resumed below
+            attempts += 1
+            if not is_known and attempts >= transport.attempts:
+                raise
+            # Resumed below.
         await asyncio.sleep(pauses.next())

@@ -68,7 +68,7 @@ class HistoryRequests(ApiRequests):
         query = "&".join(f"{name}={value!r}" for name, value in times.items() if value is not None)
         path = f"/history?format=csv{'&' if query else ''}{query}"
         async for line in self._transport.stream(path, accept="text/csv", headers={}):
-            yield line.decode()
+            yield line.decode(errors="replace")
 
     async def events(self, after: int | None = None) -> AsyncIterator[EventModel]:
         """Follow events until the numbers begin anew; a broken stream is resumed where it broke.
@@ -79,6 +79,7 @@ class HistoryRequests(ApiRequests):
         Raises:
             ApiError: The station refused, for example because the login has ended.
             EventsRestartedError: The fleet manager lost its journal; ``events(0)`` follows the new one.
+            FleetApiUnavailableError: The station cannot be reached, and could not be before.
 
         Example:
             ```python

@@ -22,6 +22,9 @@ class ApiRequests:
         token: Bearer token; empty for a station without logins.
         tls: Checks the station's certificate; None for the authorities that the system trusts.
         attempts: How often a request is sent that can be repeated.
+
+    Raises:
+        ValueError: The URL cannot be that of a station.
     """
 
     def __init__(

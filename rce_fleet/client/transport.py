@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Mapping
 from typing import Any
 
 import aiohttp
+from aiohttp import hdrs
 from yarl import URL
 
 from rce.aio.backoff import Backoff
@@ -20,7 +21,9 @@ STREAM_TIMEOUT = aiohttp.ClientTimeout(total=None, sock_connect=10.0, sock_read=
 """The station writes a line every 15 seconds at least."""
 RETRY = Backoff(first=0.2, longest=5.0, jitter=0.5)
 ATTEMPTS = 6
-_BUSY = (429, 503)
+_BUSY = (429, 502, 503, 504)
+"""The station has too much to do or lacks the fleet manager, or a proxy before it lacks the station."""
+_REDIRECTS = 300
 _ERRORS = 400
 
 
@@ -32,15 +35,21 @@ class Transport:
         token: Bearer token; empty for a station without logins.
         tls: Checks the station's certificate; None for the authorities that the system trusts.
         attempts: How often a request is sent that can be repeated.
+
+    Raises:
+        ValueError: The URL cannot be that of a station.
+
+    Attributes:
+        attempts: The same.
     """
 
     def __init__(
         self, url: str, token: str = "", *, tls: ssl.SSLContext | None = None, attempts: int = ATTEMPTS
     ) -> None:
-        self._api = URL(url) / "api/v1"
+        self.attempts = attempts
+        self._api = _station(url) / "api/v1"
         self._headers = {"Authorization": f"Bearer {token}"} if token else {}
         self._tls = tls
-        self._attempts = attempts
         self._session: aiohttp.ClientSession
 
     async def open(self) -> None:
@@ -84,7 +93,7 @@ class Transport:
             try:
                 return await self._once(method, path, body, query, headers)
             except FleetApiUnavailableError:
-                if not repeatable or attempt >= self._attempts:
+                if not repeatable or attempt >= self.attempts:
                     raise
                 await asyncio.sleep(pauses.next())
 
@@ -120,32 +129,58 @@ class Transport:
         """
         try:
             async with self._session.get(
-                self._url(path), headers={"Accept": accept, **headers}, timeout=STREAM_TIMEOUT
+                self._url(path),
+                headers={"Accept": accept, **headers},
+                timeout=STREAM_TIMEOUT,
+                allow_redirects=False,
             ) as reply:
-                if reply.status >= _ERRORS:
+                if reply.status >= _REDIRECTS:
                     await _checked(reply)
+                if reply.content_type != accept:
+                    raise FleetApiUnavailableError(
+                        f"{self._url(path)} answers with {reply.content_type} instead of {accept}; is the URL"
+                        " that of a station, and of the same release?"
+                    )
                 async for line in reply.content:
                     yield line
         except (aiohttp.ClientError, TimeoutError) as error:
-            raise FleetApiUnavailableError(f"the stream of events broke: {error}") from error
+            text = str(error) or "nothing came in time"
+            raise FleetApiUnavailableError(f"the stream from {self._api} broke: {text}") from error
 
     def _url(self, path: str) -> URL:
         return URL(f"{self._api}{path}", encoded=True)
 
 
+def _station(url: str) -> URL:
+    try:
+        found = URL(url)
+    except ValueError:
+        found = URL()
+    if found.scheme not in ("http", "https") or not found.host:
+        raise ValueError(f"the URL of a station must be such as http://127.0.0.1:9080, not {url!r}")
+    return found
+
+
 async def _checked(reply: aiohttp.ClientResponse) -> str:
-    text = await reply.text()
-    if reply.status < _ERRORS:
+    text = await reply.text(errors="replace")
+    if reply.status < _REDIRECTS:
         return text
-    reason = _reason(text) or str(reply.reason)
+    if reply.status < _ERRORS:  # a change that is sent elsewhere as a GET would look as if it was made
+        place = reply.headers.get(hdrs.LOCATION, "another URL")
+        raise error_of(
+            reply.status, f"nothing was done: {reply.url} leads to {place}; use that station's URL"
+        )
+    reason = _reason(reply, text)
     if reply.status in _BUSY:
         raise FleetApiUnavailableError(reason)
     raise error_of(reply.status, reason)
 
 
-def _reason(text: str) -> str:
+def _reason(reply: aiohttp.ClientResponse, text: str) -> str:
+    """Return why a request was refused: as the station says, or the status of a proxy before it."""
     try:
         answer: Any = json.loads(text)
     except ValueError:
-        return text.strip()
+        is_page = reply.content_type == "text/html"
+        return f"{reply.url} answered {reply.status} {reply.reason}" if is_page or not text else text.strip()
     return str(answer.get("error", text)) if isinstance(answer, dict) else text

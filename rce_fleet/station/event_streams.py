@@ -77,7 +77,9 @@ class EventStreams:
         response = web.StreamResponse(headers=headers)
         await response.prepare(request)
         try:
-            await response.write(b"retry: 2000\n\n")
+            # A client that loses the stream before the first event resumes it here, too.
+            begin = "" if cursor.number is None else f"id: {_id_of(cursor, cursor.number)}\n"
+            await response.write(f"retry: 2000\n{begin}\n".encode())
             while True:
                 frames = await _next_frames(cursor)
                 if not await self._access.is_still_allowed(request):
@@ -132,7 +134,12 @@ async def _next_frames(cursor: EventCursor) -> list[str]:
     except EventsRestartedError as error:
         told = json.dumps({"journal": error.journal, "text": str(error)})
         return [f"event: gap\nid: {error.journal}:0\ndata: {told}\n\n"]
-    return [f"id: {cursor.journal}:{one['number']}\ndata: {json.dumps(one)}\n\n" for one in found]
+    return [f"id: {_id_of(cursor, one['number'])}\ndata: {json.dumps(one)}\n\n" for one in found]
+
+
+def _id_of(cursor: EventCursor, number: int) -> str:
+    """Return the id of the event of this number."""
+    return f"{cursor.journal}:{number}" if cursor.journal else str(number)
 
 
 async def _begin(request: web.Request) -> web.StreamResponse:

@@ -169,7 +169,7 @@ class EventCursor:
         self._feed = feed
         self._epoch = feed.epoch
         self.number = feed.newest if number is None else number
-        self.journal = journal
+        self.journal = feed.journal if number is None else journal
 
     async def next(self) -> Sequence[FleetEvent]:
         """Wait for events; none came if it returns none.

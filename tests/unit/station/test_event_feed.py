@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
-from typing import Any
+from typing import Any, cast
 
 import pytest
+from aiohttp import ClientSession, web
+from aiohttp.test_utils import TestServer
 
 from rce_fleet.exceptions import EventsRestartedError
 from rce_fleet.station import events as module
-from rce_fleet.station.event_streams import COLUMNS, csv_rows
+from rce_fleet.station.event_streams import COLUMNS, EventStreams, csv_rows
 from rce_fleet.station.events import EventBatch, EventCursor, EventFeed
 
 
@@ -70,6 +73,21 @@ async def test_a_new_client_gets_events_from_now_on() -> None:
     second = EventCursor(feed, None)
     tell(feed, journal, 5)
     assert numbers(await second.next()) == [5]
+
+
+async def test_a_stream_begins_with_the_id_of_the_newest_event() -> None:
+    """So that a client that loses it before the first event misses none."""
+    journal = Journal(5)
+    feed = EventFeed(journal.ask)
+    tell(feed, journal, 4, 5)
+    app = web.Application()
+    streams = EventStreams(cast("Any", None), feed, cast("Any", None))
+    app.router.add_get("/events", streams.events)
+    async with TestServer(app) as server, ClientSession() as session:
+        asked = session.get(server.make_url("/events"), headers={"Accept": "text/event-stream"})
+        async with asyncio.timeout(60), asked as answer:
+            begin = await answer.content.readuntil(b"\n\n")
+    assert begin == b"retry: 2000\nid: aa:5\n\n"
 
 
 async def test_a_lost_message_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,141 @@
+"""The client of the fleet's API at servers that redirect, fail, end streams, or are no stations."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+from aiohttp import web
+from aiohttp.test_utils import TestServer
+from typer.testing import CliRunner
+
+from rce_fleet.cli.commands import app as commands
+from rce_fleet.client import ApiError, FleetApiUnavailableError, FleetClient
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+NOTHING = "http://127.0.0.1:1"
+
+
+@asynccontextmanager
+async def client_of(handler: Handler, attempts: int = 2) -> AsyncIterator[FleetClient]:
+    """Return a client of a server with one handler for all requests."""
+    app = web.Application()
+    app.router.add_route("*", "/{path:.*}", handler)
+    async with TestServer(app) as server, FleetClient(str(server.make_url("/")), attempts=attempts) as client:
+        yield client
+
+
+async def redirect(_request: web.Request) -> web.Response:
+    return web.Response(status=301, headers={"Location": "https://fleet.example.com/"})
+
+
+@pytest.mark.parametrize("request_name", ["send", "block", "webhook"])
+async def test_a_redirected_change_is_not_taken_as_made(request_name: str) -> None:
+    """A proxy that leads to https answers 301: the client said that the robot was sent."""
+    async with client_of(redirect) as client:
+        made = {
+            "send": client.send("Robot1", 3),
+            "block": client.set_blocked(3, blocked=True),
+            "webhook": client.remove_webhook("1"),
+        }
+        wanted = made.pop(request_name)
+        for other in made.values():
+            other.close()
+        with pytest.raises(ApiError, match=r"nothing was done.*https://fleet\.example\.com/") as refused:
+            await wanted
+    assert refused.value.status == 301
+
+
+@pytest.mark.parametrize("status", [502, 504])
+async def test_a_proxy_without_its_station_is_unavailable(status: int) -> None:
+    """Requests that can be repeated are sent again; the error is not the proxy's page."""
+    asked = 0
+
+    async def fail(_request: web.Request) -> web.Response:
+        nonlocal asked
+        asked += 1
+        return web.Response(status=status, text="<html>", content_type="text/html")
+
+    async with client_of(fail) as client:
+        with pytest.raises(FleetApiUnavailableError, match=f"answered {status}"):
+            await client.task("1")
+    assert asked == 2
+
+
+async def test_an_answer_that_is_not_text_is_an_error_of_the_client() -> None:
+    async def answer(_request: web.Request) -> web.Response:
+        return web.Response(body=b"\xff\xfe", content_type="application/json")
+
+    async with client_of(answer) as client:
+        with pytest.raises(FleetApiUnavailableError, match="not a TaskModel"):
+            await client.task("1")
+
+
+@pytest.mark.parametrize("url", ["127.0.0.1:9080", "", "http://", "ftp://fleet", "http://127.0.0.1:99999"])
+def test_a_url_that_is_none_of_a_station_is_refused(url: str) -> None:
+    with pytest.raises(ValueError, match=r"such as http://127\.0\.0\.1:9080"):
+        FleetClient(url)
+
+
+async def test_events_of_a_station_that_is_not_there_end_with_an_error() -> None:
+    """``rce fleet watch`` with a wrong URL waited without a word."""
+    async with FleetClient(NOTHING, attempts=1) as client, asyncio.timeout(60):
+        with pytest.raises(FleetApiUnavailableError, match=r"127\.0\.0\.1:1"):
+            await anext(client.events())
+
+
+async def test_events_of_another_web_server_end_with_an_error() -> None:
+    async def page(_request: web.Request) -> web.Response:
+        return web.Response(text="<html>", content_type="text/html")
+
+    async with client_of(page) as client, asyncio.timeout(60):
+        with pytest.raises(FleetApiUnavailableError, match="text/html instead of text/event-stream"):
+            await anext(client.events())
+
+
+async def test_a_stream_that_broke_before_its_first_event_is_resumed() -> None:
+    """What happens between the two connections is not left out; a station that fails then is waited for."""
+    asked: list[str] = []
+    texts = {"id": "T1", "name": "done", "user": "", "text": "", "state": "done", "robot": ""}
+    event = {"number": 8, "time": 1.0, "kind": "task", **texts, "revision": 1}
+
+    async def stream(request: web.Request) -> web.StreamResponse:
+        asked.append(request.headers.get("Last-Event-ID", ""))
+        if len(asked) in (2, 3, 4):
+            return web.Response(status=503, text="starting")
+        response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
+        await response.prepare(request)
+        await response.write(b"retry: 2000\nid: abc:7\n\n")
+        if len(asked) > 1:
+            await response.write(f"id: abc:8\ndata: {json.dumps(event)}\n\n".encode())
+        return response
+
+    async with client_of(stream) as client, asyncio.timeout(60):
+        found = await anext(client.events())
+    assert (found.number, asked) == (8, ["", *["abc:7"] * 4])
+
+
+@pytest.mark.parametrize(
+    ("command", "value"),
+    [
+        ("task add --cell 5 --duration -1", "duration"),
+        ("task add --cell -5", "cell"),
+        ("task add --cell 5 --rounds 0", "rounds"),
+        ("task change T1 --priority 99999999999", "priority"),
+        ("send Robot1 --cell -1", "cell"),
+    ],
+)
+def test_rce_fleet_names_a_value_that_is_out_of_range(command: str, value: str) -> None:
+    """It is a usage error; each of them was a traceback."""
+    found = CliRunner().invoke(commands, [*command.split(), "--station", NOTHING])
+    assert (found.exit_code, f"Invalid value for {value}" in found.output) == (2, True), found.output
+
+
+@pytest.mark.parametrize("station", ["127.0.0.1:9080", "", "http://127.0.0.1:99999"])
+def test_rce_fleet_says_what_the_url_of_a_station_is_like(station: str) -> None:
+    found = CliRunner().invoke(commands, ["robots", "--station", station])
+    assert (found.exit_code, "must be such as http://" in found.output) == (1, True), found.output
