@@ -92,12 +92,12 @@ class OccupiedError(FleetError):
 
 
 class PlaceTakenError(FleetError):
-    """A robot or box of the simulated world cannot stand where a robot or a walking person is.
+    """A robot, walking person or box of the simulated world cannot stand where something else is.
 
     Attributes:
         x: The place, metres.
         y: The place, metres.
-        things: Names of the robots and walkers in the way.
+        things: What is in the way: names of robots and walkers, or what it is.
     """
 
     def __init__(self, x: float, y: float, things: tuple[str, ...]) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rce.ros.core import Core
+from rce.ros.errors import MasterError
 from rce.ros.node import Node, TypeRegistry
 from rce.ros.node.clock import PARAMETER as USE_SIM_TIME
 from rce.ros.tf import frames
@@ -16,6 +17,7 @@ from rce_fleet.drivers.report import look_at, write_report
 from rce_fleet.drivers.robot_driver import RobotDriver
 from rce_fleet.drivers.runner import WorldRunner, run_world
 from rce_fleet.drivers.world_services import WorldServices
+from rce_fleet.exceptions import FleetError
 from rce_fleet.simulation.boxes import BoxKeeper
 
 if TYPE_CHECKING:
@@ -127,6 +129,8 @@ class Simulation:
         self._tasks: asyncio.TaskGroup | None = None
         self._graphs: dict[str, _RobotGraph] = {}
         self._ports = 0
+        self._unwritten = ""
+        """Why the last report was not written; empty if it was."""
 
     @property
     def world(self) -> World:
@@ -164,14 +168,22 @@ class Simulation:
 
         Raises:
             ConfigError: Its model is not known.
-            FleetError: It has no room.
+            FleetError: It has no room, or its node cannot be started; then it is not in the world.
         """
         self._scene.place(start, self._world)
-        return await self._start_graph(start.id)
+        try:
+            return await self._start_graph(start.id)
+        except (PortTakenError, MasterError) as error:
+            self._graphs.pop(start.id, None)
+            self._world.remove_robot(start.id)
+            raise FleetError(f"{start.id} was not put in: {error}") from error
 
     async def remove_robot(self, robot: str) -> None:
         """Stop a robot's node, and take the robot out of the world."""
-        await self._graphs.pop(robot).stop()
+        graph = self._graphs.pop(robot, None)
+        if graph is None:  # another request removes it
+            return
+        await graph.stop()
         self._world.remove_robot(robot)
 
     # Inside
@@ -287,8 +299,17 @@ class Simulation:
             await asyncio.sleep(REPORT_EVERY)
 
     def _write_report(self) -> None:
-        if self._report is not None:
+        if self._report is None:
+            return
+        try:
             write_report(look_at(self._world), self._report)
+        except OSError as error:
+            text = f"simulation: the report {self._report} cannot be written: {error.strerror or error}"
+            if text != self._unwritten:
+                self._say(text)
+            self._unwritten = text
+        else:
+            self._unwritten = ""
 
 
 class _RobotGraph:

@@ -147,11 +147,13 @@ class _SpeedMeter:
 
     def measure(self, now: float, simulated: float) -> float | None:
         """Return the speed at the end of each window, else None."""
+        if simulated < self._from:  # time began anew
+            self._since, self._from = now, simulated
         if now - self._since < SPEED_WINDOW:
             return None
         speed = (simulated - self._from) / (now - self._since)
         self._since, self._from = now, simulated
-        return max(speed, 0.0)
+        return speed
 
 
 async def run_world(

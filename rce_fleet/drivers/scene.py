@@ -37,7 +37,7 @@ from rce_fleet.simulation.box import BoxSpec
 from rce_fleet.simulation.light.robots import TIME_STEP
 from rce_fleet.simulation.map_walls import draw_map, walls_of_map
 from rce_fleet.simulation.walls import Walls, grid_walls
-from rce_fleet.simulation.world import Dock, World, WorldSpec
+from rce_fleet.simulation.world import Dock, World, WorldSpec, cell_of_box
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -99,8 +99,10 @@ class Scene(Strict):
     def _check_cells(self) -> Scene:
         if self.map and self.grid_map:
             raise ValueError("a scene has 'map' or 'grid_map', not both")
-        if self.rows * self.columns > MAX_CELLS:
-            raise ValueError(f"{self.rows} x {self.columns} is more than {MAX_CELLS} cells")
+        _check_size(self.rows, self.columns)
+        reserved = sorted(box.id for box in self.loose_boxes if cell_of_box(box.id) is not None)
+        if reserved:
+            raise ValueError(f"{', '.join(reserved)}: boxes in cells have such ids; choose other ids")
         starts = [robot.cell for robot in self.robots if robot.cell is not None]
         starts += [robot.cell for robot in self.light_robots]
         if not self._cells_from_map:
@@ -178,6 +180,10 @@ class Scene(Strict):
             return GridMap(self.rows, self.columns, self.cell_size, self.origin)
         width, height = drawn.size
         rows, columns = (max(1, ceil(length / self.cell_size - 1e-9)) for length in (height, width))
+        try:
+            _check_size(rows, columns)
+        except ValueError as error:
+            raise ConfigError("scene", [Fault("cell_size", f"{error}; choose larger cells")]) from error
         return GridMap(rows, columns, self.cell_size, (drawn.origin.x, drawn.origin.y))
 
     def draw(self, resolution: float = 0.05, *, boxes: bool = False) -> OccupancyMap:
@@ -272,10 +278,21 @@ class Scene(Strict):
                     world.put_box(box.id, box.spec())
             except FleetError as error:
                 faults.append(Fault(f"boxes[{index}]", str(error)))
-        for door in self.doors:
-            world.add_door(door.id, door.spec())
-        for walker in self.walkers:
-            world.add_walker(walker.id, walker.spec())
+        for index, door in enumerate(self.doors):
+            try:
+                world.add_door(door.id, door.spec())
+            except FleetError as error:
+                faults.append(Fault(f"doors[{index}]", str(error)))
+        for index, walker in enumerate(self.walkers):
+            try:
+                world.add_walker(walker.id, walker.spec())
+            except FleetError as error:
+                faults.append(Fault(f"walkers[{index}]", str(error)))
+
+
+def _check_size(rows: int, columns: int) -> None:
+    if rows * columns > MAX_CELLS:
+        raise ValueError(f"{rows} x {columns} is more than {MAX_CELLS} cells")
 
 
 def _check_inside(cells: Iterable[int], count: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from math import hypot, inf, pi
 from typing import Annotated, Any
 
@@ -54,14 +55,15 @@ class WallItem(Strict):
         return self
 
     def _ways(self) -> list[tuple[float, float]]:
-        return [(b[0] - a[0], b[1] - a[1]) for a, b in zip(self.line, self.line[1:], strict=False)]
+        return [(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(self.line)]
 
     def walls(self) -> Walls:
         """Return what it adds to the world."""
         if self.at is not None and self.size is not None:
             block = Block.box(Pose(*self.at, self.yaw), *self.size, glass=self.glass)
             return Walls((block,))
-        lines = polyline(self.line, closed=self.closed)
+        # A closed line may also name its first point again at the end.
+        lines = polyline(self.line, closed=self.closed and self.line[0] != self.line[-1])
         if self.thickness:
             ends = [((ax, ay), (bx, by)) for ax, ay, bx, by in lines.tolist()]
             return Walls(tuple(Block.wall(*both, self.thickness, glass=self.glass) for both in ends))

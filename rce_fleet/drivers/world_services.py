@@ -25,6 +25,7 @@ from rce_fleet.geometry.angles import yaw_of
 from rce_fleet.geometry.poses import Pose, Twist
 from rce_fleet.simulation.box import BoxSpec
 from rce_fleet.simulation.walkers import WalkerSpec
+from rce_fleet.simulation.world import cell_of_box
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher
@@ -149,13 +150,17 @@ class WorldServices:
 
     async def _spawn(self, request: Message) -> Answer:
         name = request.model_name
-        if name in self._names():
+        if name in self._names() or self._runner.world.has_box(name):
             return _refused(f"{name} exists already; choose another name")
         try:
             pose = _pose_of(request.initial_pose, request.reference_frame)
             wanted = _read_spawn(request.model_xml)
             more = ""
             if wanted.box is not None:
+                if not name or cell_of_box(name) is not None:
+                    return _refused(
+                        f"a box cannot be named {name!r}: boxes in cells are; choose another name"
+                    )
                 self._runner.world.put_box(name, BoxSpec(pose, *wanted.box, wanted.glass))
             elif wanted.walker is not None:
                 ways = ((pose.x, pose.y), *wanted.walker)
@@ -181,7 +186,7 @@ class WorldServices:
         name = request.model_name
         if name in self._runner.world.robots:
             await self._robots.remove_robot(name)
-        elif name in self._runner.world.all_boxes:
+        elif self._runner.world.has_box(name):
             self._runner.world.take_box(name)
         elif name in self._runner.world.walkers:
             self._runner.world.remove_walker(name)
@@ -197,11 +202,12 @@ class WorldServices:
         state, world, paused = request.model_state, self._runner.world, self._runner.paused
         try:
             pose = _pose_of(state.pose, state.reference_frame)
+            twist = _twist_of(state.twist)
             if state.model_name in world.robots:
                 world.move_robot(state.model_name, pose, as_start=paused)
-                world.robots[state.model_name].drive(Twist(state.twist.linear.x, state.twist.angular.z))
-            elif world.light is not None and (row := world.light.row(state.model_name)) is not None:
-                world.light.put(row, pose, as_start=paused)
+                world.robots[state.model_name].drive(twist)
+            elif world.light is not None and world.light.row(state.model_name) is not None:
+                world.move_light_robot(state.model_name, pose, as_start=paused)
             elif state.model_name in world.all_boxes:
                 world.move_box(state.model_name, pose)
             elif state.model_name in world.walkers:
@@ -317,6 +323,18 @@ def _pose_of(pose: Message, frame: str) -> Pose:
     if not all(map(isfinite, (x, y, yaw))):
         raise ValueError(f"the pose must be finite numbers, not ({x}, {y}, {yaw})")
     return Pose(x, y, yaw)
+
+
+def _twist_of(twist: Message) -> Twist:
+    """Return the speeds of a message.
+
+    Raises:
+        ValueError: They are not finite.
+    """
+    speed, turn_rate = twist.linear.x, twist.angular.z
+    if not (isfinite(speed) and isfinite(turn_rate)):
+        raise ValueError(f"the speeds must be finite numbers, not {speed} and {turn_rate}")
+    return Twist(speed, turn_rate)
 
 
 def _done(text: str) -> Answer:

@@ -45,9 +45,10 @@ class BatterySpec:
         for name in ("charge", "computing_load"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be within 0 .. 1, not {getattr(self, name)}")
-        if min(self.idle, self.computing, self.drive, self.turn, self.charging) < 0:
-            raise ValueError("powers must not be negative")
-        if not self.voltage_full >= self.voltage_empty > 0:
+        powers = (self.idle, self.computing, self.drive, self.turn, self.charging)
+        if not all(0 <= power < inf for power in powers):
+            raise ValueError("powers must be finite and not negative")
+        if not inf > self.voltage_full >= self.voltage_empty > 0:
             raise ValueError("voltages must be voltage_full >= voltage_empty > 0")
 
 

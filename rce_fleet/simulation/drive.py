@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp, inf, sqrt
+from math import exp, inf, isfinite, sqrt
 from typing import TYPE_CHECKING, ClassVar
 
 from rce_fleet.geometry.poses import Twist
@@ -50,8 +50,10 @@ class DriveSpec:
         for name in ("speed", "turn_rate", "acceleration", "deceleration", "turn_acceleration"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
-        if not (0 <= self.slip < 1 and self.slip_noise >= 0 and self.slip_memory > 0):
-            raise ValueError("slip must be within 0 .. 1, slip_noise not negative, and slip_memory positive")
+        if not (0 <= self.slip < 1 and 0 <= self.slip_noise < inf and self.slip_memory > 0):
+            raise ValueError(
+                "slip must be within 0 .. 1, slip_noise finite and not negative, and slip_memory positive"
+            )
         if not self.command_timeout > 0:
             raise ValueError(f"command_timeout must be positive, not {self.command_timeout}")
 
@@ -85,7 +87,7 @@ class Drive:
         return Twist(self.wheels.speed * grip, self.wheels.turn_rate * grip)
 
     def command(self, twist: Twist) -> None:
-        """Set the wanted speeds; they hold until ``spec.command_timeout``."""
+        """Set the wanted speeds; they hold until ``spec.command_timeout``. What is not finite counts as 0."""
         spec = self.spec
         self._command = Twist(_within(twist.speed, spec.speed), _within(twist.turn_rate, spec.turn_rate))
         self._commanded_at = self._now
@@ -136,6 +138,8 @@ class Normals:
 
 
 def _within(value: float, limit: float) -> float:
+    if not isfinite(value):
+        return 0.0
     return max(-limit, min(limit, value))
 
 

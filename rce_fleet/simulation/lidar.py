@@ -7,7 +7,7 @@ pairs of beam and shape are intersected, instead of every beam with every shape.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot, isfinite, pi
+from math import hypot, inf, isfinite, pi
 from typing import ClassVar
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Indexes = NDArray[np.intp]
 
+MAX_BEAMS = 100_000
 _TURN = 2 * pi
 _TOGETHER = 12
 """Sensors that are computed together: more of them save no more calls, but leave the processor's cache."""
@@ -64,18 +65,20 @@ class LidarSpec:
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "strict": True}
 
     def __post_init__(self) -> None:
-        if self.beams <= 1:
-            raise ValueError(f"beams must be at least 2, not {self.beams}")
+        if not 1 < self.beams <= MAX_BEAMS:
+            raise ValueError(f"beams must be within 2 .. {MAX_BEAMS}, not {self.beams}")
         if not 0 < self.field_of_view <= _TURN + 1e-9:
             raise ValueError(f"field_of_view must be within 0 .. 2 pi radians, not {self.field_of_view}")
         if not 0 <= self.min_range < self.max_range or not isfinite(self.max_range):
             raise ValueError(
                 f"ranges must be 0 <= min_range < max_range, not {self.min_range}, {self.max_range}"
             )
-        if min(self.noise, self.noise_squared, self.quantum) < 0 or not self.rate > 0:
-            raise ValueError(
-                "noise, noise_squared and quantum must not be negative, and rate must be positive"
-            )
+        if not all(0 <= error < inf for error in (self.noise, self.noise_squared, self.quantum)):
+            raise ValueError("noise, noise_squared and quantum must be finite and not negative")
+        if not self.rate > 0:
+            raise ValueError(f"rate must be positive, not {self.rate}")
+        if not all(map(isfinite, (self.x, self.y, self.z, self.yaw))):
+            raise ValueError("x, y, z and yaw must be finite numbers")
         if not (0 <= self.drop_outs <= 1 and 0 <= self.glass_returns <= 1):
             raise ValueError("drop_outs and glass_returns are probabilities within 0 .. 1")
 

@@ -9,8 +9,9 @@ import numpy as np
 from pymunk import BB
 from pymunk.autogeometry import march_soft, simplify_curves
 
+from rce_fleet.exceptions import MapError
 from rce_fleet.geometry.poses import Pose, transform_points
-from rce_fleet.maps.occupancy_map import FREE, OCCUPIED, UNKNOWN, OccupancyMap
+from rce_fleet.maps.occupancy_map import FREE, MAX_CELLS, OCCUPIED, UNKNOWN, OccupancyMap
 from rce_fleet.simulation.lidar import Floats
 from rce_fleet.simulation.walls import Block, Point, Walls, distances
 
@@ -78,11 +79,20 @@ def draw_map(
         inside: Points of the free floor, such as the middles of cells.
         resolution: Edge of a cell, metres.
         margin: Unknown border around the walls, metres.
+
+    Raises:
+        MapError: The map would be too large.
     """
     left, low, right, high = walls.bounds
     first_column, first_row = floor((left - margin) / resolution), floor((low - margin) / resolution)
     columns = ceil((right + margin) / resolution) - first_column + 1
     rows = ceil((high + margin) / resolution) - first_row + 1
+    if rows * columns > MAX_CELLS:
+        raise MapError(
+            f"the map of walls from ({left:g}, {low:g}) to ({right:g}, {high:g}) m would have"
+            f" {columns} x {rows} cells of {resolution:g} m, more than {MAX_CELLS}; remove walls that are far"
+            " away"
+        )
     solid = np.zeros((rows, columns), np.bool_)
     reach = resolution / 2
     for block in walls.blocks:

@@ -11,6 +11,11 @@ from rce_fleet.simulation.lidar import LidarSpec
 from rce_fleet.simulation.noise import EstimateSpec
 from rce_fleet.simulation.odometry import OdometrySpec
 
+RADII = (0.001, 1000.0)
+"""Smallest and largest radius of a hull, metres."""
+MASSES = (0.001, 1e6)
+"""Smallest and largest mass of a robot, kilograms."""
+
 
 @dataclass(frozen=True, slots=True)
 class RobotModel:
@@ -39,8 +44,11 @@ class RobotModel:
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "strict": True}
 
     def __post_init__(self) -> None:
-        if not (self.radius > 0 and self.mass > 0):
-            raise ValueError(f"radius and mass must be positive, not {self.radius} and {self.mass}")
+        # The physics engine ends the program for others.
+        for name, limits in (("radius", RADII), ("mass", MASSES)):
+            low, high = limits
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name} must be within {low:g} .. {high:g}, not {getattr(self, name)}")
         if self.sensor not in self.sensors:
             known = ", ".join(sorted(self.sensors)) or "none"
             raise ValueError(f"the robot has no sensor {self.sensor!r}; its sensors: {known}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp, sqrt
+from math import exp, inf, sqrt
 from typing import TYPE_CHECKING, ClassVar
 
 from rce_fleet.geometry.angles import wrap
@@ -31,8 +31,10 @@ class EstimateSpec:
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "strict": True}
 
     def __post_init__(self) -> None:
-        if min(self.position, self.heading) < 0 or not self.memory > 0:
-            raise ValueError("position and heading must not be negative, and memory must be positive")
+        if not (0 <= self.position < inf and 0 <= self.heading < inf and self.memory > 0):
+            raise ValueError(
+                "position and heading must be finite and not negative, and memory must be positive"
+            )
 
 
 class PoseEstimate:

@@ -11,7 +11,7 @@ those of the model, and they grow linearly with the way, whatever the time step 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import cos, pi, sin, sqrt
+from math import cos, inf, pi, sin, sqrt
 from typing import TYPE_CHECKING, ClassVar
 
 from rce_fleet.geometry.angles import wrap
@@ -54,10 +54,13 @@ class OdometrySpec:
     __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "strict": True}
 
     def __post_init__(self) -> None:
-        if min(self.alpha1, self.alpha2, self.alpha3, self.alpha4) < 0:
-            raise ValueError("alpha1 to alpha4 must not be negative")
-        if min(self.distance_bias, self.turn_bias, self.drift) < 0 or not self.rate > 0:
-            raise ValueError("biases and drift must not be negative, and rate must be positive")
+        alphas = (self.alpha1, self.alpha2, self.alpha3, self.alpha4)
+        if not all(0 <= alpha < inf for alpha in alphas):
+            raise ValueError("alpha1 to alpha4 must be finite and not negative")
+        if not all(0 <= bias < inf for bias in (self.distance_bias, self.turn_bias, self.drift)):
+            raise ValueError("biases and drift must be finite and not negative")
+        if not self.rate > 0:
+            raise ValueError(f"rate must be positive, not {self.rate}")
 
 
 class Odometry:

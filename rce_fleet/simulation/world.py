@@ -6,6 +6,7 @@ to one thread. The caller decides how fast time advances.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, replace
 from math import hypot, inf
 from typing import TYPE_CHECKING
@@ -28,7 +29,7 @@ from rce_fleet.simulation.walkers import Walker, WalkerSpec
 from rce_fleet.simulation.walls import Block, Walls, grid_walls
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Collection, Iterable, Mapping
 
     from rce_fleet.planning.grid import GridMap
     from rce_fleet.simulation.light.bodies import LightModel
@@ -119,12 +120,16 @@ class World:
     @property
     def boxes(self) -> tuple[int, ...]:
         """Cells with a box, ascending."""
-        return tuple(sorted(int(name[len(_CELL) :]) for name in self._boxes if name.startswith(_CELL)))
+        return tuple(sorted(cell for cell in map(cell_of_box, self._boxes) if cell is not None))
 
     @property
     def all_boxes(self) -> Mapping[str, BoxSpec]:
         """The boxes that are there now, by name; that of cell 3 is ``cell_3``. Read only."""
         return self._boxes
+
+    def has_box(self, name: str) -> bool:
+        """Return whether there is a box of this name, now or at other times."""
+        return name in self._boxes or name in self._timed
 
     @property
     def doors(self) -> Mapping[str, Door]:
@@ -147,6 +152,8 @@ class World:
             robot_robot=seen.robot_robot + light.judge.with_robots,
             robot_box=seen.robot_box + light.judge.with_boxes,
             robot_wall=seen.robot_wall + light.judge.with_walls,
+            robot_door=seen.robot_door + light.judge.with_doors,
+            robot_walker=seen.robot_walker + light.judge.with_walkers,
         )
 
     @property
@@ -216,15 +223,31 @@ class World:
             as_start: Whether it also stands there after the next :meth:`reset`.
 
         Raises:
-            PlaceTakenError: Another robot or a walker is there.
+            PlaceTakenError: Something else is there.
         """
         moved = self._robots[robot]
-        self._check_free(pose, moved.radius, but=robot)
+        self._check_free(pose, moved.radius, but=(robot,))
+        self._check_not_solid(pose, moved.radius)
         moved.put(pose)
         if as_start:
             moved.start = pose
         self._space.reindex_shapes_for_body(moved.body)
         self._note_places()
+
+    def move_light_robot(self, robot: str, pose: Pose, *, as_start: bool = False) -> None:
+        """Put a light robot elsewhere; as :meth:`move_robot`.
+
+        Raises:
+            KeyError: There is none of this id.
+            PlaceTakenError: Something else is there.
+        """
+        light = self.light
+        row = None if light is None else light.row(robot)
+        if light is None or row is None:
+            raise KeyError(robot)
+        self._check_free(pose, light.model.radius, but=(robot,))
+        self._check_not_solid(pose, light.model.radius)
+        light.put(row, pose, as_start=as_start)
 
     def remove_robot(self, robot: str) -> None:
         """Remove a robot."""
@@ -263,12 +286,12 @@ class World:
             PlaceTakenError: A robot or a walker is in the way, and the box is not timed.
         """
         if box.timed:
+            self.take_box(name)
             self._timed[name] = box
             self._update_timed()
             return
-        in_the_way = self._near(box.block, 0.0)
-        if in_the_way:
-            raise PlaceTakenError(box.pose.x, box.pose.y, in_the_way)
+        self._check_room(box)
+        self._timed.pop(name, None)
         self._boxes[name] = box
         self._solids.put(name, box.block, Kind.BOX)
         self._show_boxes()
@@ -280,7 +303,9 @@ class World:
             KeyError: There is none of this name.
             PlaceTakenError: A robot or a walker is in the way.
         """
-        self.put_box(name, replace(self._boxes[name], pose=pose))
+        moved = replace(self._boxes[name], pose=pose)
+        self._check_room(moved)
+        self.put_box(name, moved)
 
     def take_box(self, name: str) -> None:
         """Remove a box; do nothing if there is none of this name."""
@@ -305,8 +330,7 @@ class World:
         edges = np.concatenate([self.walls.edges(glass=glass) for glass in (False, True)])
         made = LightRobots(starts, edges, model, seed=self._seed)
         for pose in starts.values():
-            if self.is_solid(pose.x, pose.y, made.model.radius):
-                raise PlaceTakenError(pose.x, pose.y, ("a wall or box",))
+            self._check_not_solid(pose, made.model.radius)
             self._check_free(pose, made.model.radius)
         made.docks = np.array([(dock.x, dock.y, dock.reach) for dock in self.spec.docks]).reshape(-1, 3)
         self.light = made
@@ -314,8 +338,16 @@ class World:
         return made
 
     def add_door(self, door: str, spec: DoorSpec) -> Door:
-        """Add a door."""
-        made = self._doors[door] = Door(door, spec)
+        """Add a door.
+
+        Raises:
+            PlaceTakenError: A robot or a walker is where its leaf is at the start.
+        """
+        made = Door(door, spec)
+        in_the_way = self._near(made.block, 0.0)
+        if in_the_way:
+            raise PlaceTakenError(spec.x, spec.y, in_the_way)
+        self._doors[door] = made
         self._solids.put(door, made.block, Kind.DOOR)
         return made
 
@@ -335,7 +367,7 @@ class World:
             PlaceTakenError: A robot or another walker is there.
         """
         moved = self._walkers[walker]
-        self._check_free(Pose(x, y, 0.0), moved.spec.radius, but=walker)
+        self._check_free(Pose(x, y, 0.0), moved.spec.radius, but=(walker,))
         moved.put(x, y)
         self._space.reindex_shapes_for_body(moved.body)
 
@@ -345,7 +377,12 @@ class World:
         self._space.remove(gone.shape, gone.body)
 
     def add_walker(self, walker: str, spec: WalkerSpec) -> Walker:
-        """Add a walker."""
+        """Add a walker.
+
+        Raises:
+            PlaceTakenError: A robot is at the first waypoint.
+        """
+        self._check_free(Pose(*spec.waypoints[0], 0.0), spec.radius, but=tuple(self._walkers))
         made = self._walkers[walker] = Walker(walker, spec)
         made.shape.collision_type = Kind.WALKER
         self._space.add(made.body, made.shape)
@@ -408,8 +445,9 @@ class World:
 
     def _one_step(self) -> None:
         dt, now = self.spec.time_step, self._steps * self.spec.time_step
+        robots = self._places if self.light is None else np.concatenate((self._places, self.light.discs))
         for walker in self._walkers.values():
-            walker.walk(now, dt, self._places)
+            walker.walk(now, dt, robots)
         for door in self._doors.values():
             if door.advance(now, dt, lambda leaf, apart: bool(self._near(leaf, apart))):
                 self._solids.put(door.id, door.block, Kind.DOOR)
@@ -423,6 +461,9 @@ class World:
         self._update_timed()
         if self.light is not None:
             self.light.others = self._places
+            walkers = [(*walker.position, walker.spec.radius) for walker in self._walkers.values()]
+            self.light.walkers = np.array(walkers, np.float64).reshape(-1, 3)
+            self.light.doors = [door.block for door in self._doors.values()]
             self.light.advance(dt)
             self.min_separation = self.light.judge.min_separation
         elif len(self._robots) > 1:
@@ -472,12 +513,23 @@ class World:
         """Return the robots and walkers that are nearer to a block than ``apart``, metres."""
         return tuple(name for name, x, y, radius in self._discs() if block.distance(x, y) < radius + apart)
 
-    def _check_free(self, pose: Pose, radius: float, but: str = "") -> None:
-        """Raise PlaceTakenError if a robot or a walker is where a disc is to stand."""
+    def _check_room(self, box: BoxSpec) -> None:
+        """Raise PlaceTakenError if a robot or a walker is where a box is to stand."""
+        in_the_way = self._near(box.block, 0.0)
+        if in_the_way:
+            raise PlaceTakenError(box.pose.x, box.pose.y, in_the_way)
+
+    def _check_not_solid(self, pose: Pose, radius: float) -> None:
+        """Raise PlaceTakenError if something solid is where a disc is to stand."""
+        if self.is_solid(pose.x, pose.y, radius):
+            raise PlaceTakenError(pose.x, pose.y, ("a wall, box or door",))
+
+    def _check_free(self, pose: Pose, radius: float, but: Collection[str] = ()) -> None:
+        """Raise PlaceTakenError if a robot or a walker, but for some, is where a disc is to stand."""
         taken = tuple(
             name
             for name, x, y, other in self._discs()
-            if name != but and hypot(x - pose.x, y - pose.y) < radius + other
+            if name not in but and hypot(x - pose.x, y - pose.y) < radius + other
         )
         if taken:
             raise PlaceTakenError(pose.x, pose.y, taken)
@@ -485,3 +537,10 @@ class World:
 
 _CELL = "cell_"
 """Beginning of the name of a cell's box."""
+_CELL_BOX = re.compile(rf"{_CELL}(0|[1-9][0-9]{{0,8}})")
+
+
+def cell_of_box(name: str) -> int | None:
+    """Return the cell whose box has this name; None for other boxes."""
+    found = _CELL_BOX.fullmatch(name)
+    return None if found is None else int(found[1])

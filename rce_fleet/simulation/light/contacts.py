@@ -8,9 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rce_fleet.simulation.lidar import Floats
+from rce_fleet.simulation.walls import distances
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
+
+    from rce_fleet.simulation.walls import Block
 
     Numbers = NDArray[np.int64]
 
@@ -79,17 +84,22 @@ class ContactJudge:
         with_robots: Contacts between two discs.
         with_walls: Contacts between a disc and a wall.
         with_boxes: Contacts between a disc and a box.
+        with_walkers: Contacts between a disc and a walker.
+        with_doors: Contacts between a disc and a door.
         min_separation: Smallest distance between the hulls of two discs so far, metres.
         began: Pairs of discs whose contact began with the last update.
     """
 
     def __init__(self, edges: Floats, is_wall: NDArray[np.bool_], reach: float) -> None:
         self.with_robots = self.with_walls = self.with_boxes = 0
+        self.with_walkers = self.with_doors = 0
         self.min_separation = inf
         self.began: set[tuple[int, int]] = set()
         self._pairs: set[tuple[int, int]] = set()
         self._at_walls: set[int] = set()
         self._at_boxes: set[int] = set()
+        self._at_walkers: set[tuple[int, int]] = set()
+        self._at_doors: set[tuple[int, int]] = set()
         self._reach = reach
         self.set_edges(edges, is_wall)
 
@@ -114,6 +124,26 @@ class ContactJudge:
         self.with_walls += len(walls - self._at_walls)
         self.with_boxes += len(boxes - self._at_boxes)
         self._at_walls, self._at_boxes = walls, boxes
+
+    def update_moving(self, places: Floats, radii: Floats, walkers: Floats, doors: Sequence[Block]) -> None:
+        """Judge the discs beside what moves; there is little of it, so that all pairs are compared.
+
+        Args:
+            places: Middles, shape (N, 2), metres.
+            radii: Radii, shape (N,), metres.
+            walkers: Discs of walkers, shape (K, 3): x, y and radius, metres.
+            doors: The leaves of doors.
+        """
+        at_walkers, at_doors = set(), set()
+        for number, (x, y, radius) in enumerate(walkers.tolist()):
+            near = np.hypot(places[:, 0] - x, places[:, 1] - y) < radii + radius
+            at_walkers |= {(disc, number) for disc in np.flatnonzero(near).tolist()}
+        for number, leaf in enumerate(doors):
+            near = distances(places, np.array(leaf.edges), leaf) < radii
+            at_doors |= {(disc, number) for disc in np.flatnonzero(near).tolist()}
+        self.with_walkers += len(at_walkers - self._at_walkers)
+        self.with_doors += len(at_doors - self._at_doors)
+        self._at_walkers, self._at_doors = at_walkers, at_doors
 
     def _judge_pairs(self, places: Floats, radii: Floats, judged: int) -> None:
         if len(places) <= 1:

@@ -17,9 +17,11 @@ from rce_fleet.simulation.light.contacts import ContactJudge
 from rce_fleet.simulation.light.steering import Steering, limits_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
+
+    from rce_fleet.simulation.walls import Block
 
 TIME_STEP = 0.04
 """Seconds of a step."""
@@ -94,6 +96,12 @@ class LightRobots:
         """Where standing robots are charged, shape (D, 3): x, y and reach, metres."""
         self.others: Floats = np.empty((0, 3))
         """Discs of other robots, shape (K, 3): x, y and radius, metres."""
+        self.walkers: Floats = np.empty((0, 3))
+        """Discs of walkers, likewise."""
+        self.doors: Sequence[Block] = ()
+        """The leaves of doors."""
+        self.speed_limits: Floats = np.full(len(self.names), np.inf)
+        """Highest speeds by row, as programs set them; a reset of the world does not end them."""
         self.reset()
 
     def __len__(self) -> int:
@@ -125,6 +133,7 @@ class LightRobots:
         self.bodies.reset()
         self.batteries = LightBatteries(len(self), self.model.battery)
         self.steering = Steering(len(self), limits_of(self.model))
+        self.steering.speed_limits = self.speed_limits
         self._powered = np.ones((len(self), 1), np.bool_)
         self.goal_lists = [GoalList() for _ in self.names]
         self._busy: set[int] = set()
@@ -157,8 +166,11 @@ class LightRobots:
             self.steering.stop(row)
 
     def limit_speed(self, row: int, speed: float) -> None:
-        """Let a robot drive at most at a speed, metres per second; infinity: as fast as it can."""
-        self.steering.speed_limits[row] = speed
+        """Let a robot drive at most at a speed, metres per second; infinity: as fast as it can.
+
+        A reset of the world does not end it: programs send a limit only when it changes.
+        """
+        self.speed_limits[row] = speed
 
     def take_ended(self) -> list[int]:
         """Return the robots with goals that ended since the last call, see :attr:`goal_lists`."""
@@ -217,6 +229,10 @@ class LightRobots:
                 self._drain(BATTERY_STEPS * TIME_STEP)
             discs = np.concatenate((self.discs, self.others)) if len(self.others) else self.discs
             self.judge.update(discs[:, :2], discs[:, 2], len(self))
+            if len(self.walkers) or self.doors:
+                self.judge.update_moving(
+                    discs[: len(self), :2], discs[: len(self), 2], self.walkers, self.doors
+                )
             if self.judge.began and len(self.contacts) < _CONTACTS:
                 self._note_contacts()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import shutil
+import socket
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -17,7 +18,10 @@ from support.ports import free_port
 
 from rce.ros.node import Node
 from rce.ros.tf import TransformListener
-from rce.ros.types import Message
+from rce.ros.types import Message, TypeRegistry
+from rce_fleet.drivers.program import Simulation
+from rce_fleet.drivers.scene import RobotStart, Scene
+from rce_fleet.exceptions import FleetError
 
 pytestmark = pytest.mark.needs("pymunk")
 
@@ -141,6 +145,7 @@ async def test_things_come_move_and_go_by_services(tmp_path: Path) -> None:
             ("S", "{robot: boat}", "no robot model 'boat'"),
             ("S", "{boxes: 3}", "boxes"),
             ("S", "{}", "either a robot's model, a box or a walker"),
+            ("cell_7", "{box: [0.5, 0.5]}", "boxes in cells are"),
         ):
             answer = await spawn(model_name=name, model_xml=xml, initial_pose=place)
             assert not answer.success
@@ -149,6 +154,12 @@ async def test_things_come_move_and_go_by_services(tmp_path: Path) -> None:
         assert (await move(model_state={"model_name": "R", "pose": place})).success
         assert (await state(model_name="R")).pose.position.x == pytest.approx(6.0)
         assert "there is no 'nothing'" in (await remove(model_name="nothing")).status_message
+        fast = {"linear": {"x": float("nan")}}
+        answer = await move(model_state={"model_name": "R", "pose": place, "twist": fast})
+        assert "the speeds must be finite" in answer.status_message
+        place["position"] = {"x": 3.0, "y": 3.0}
+        answer = await move(model_state={"model_name": "R", "pose": place})
+        assert (answer.success, "a wall, box or door" in answer.status_message) == (False, True)
         for name in ("R", "b"):
             assert (await remove(model_name=name)).success
         world = await node.service_client("/gazebo/get_world_properties", "gazebo_msgs/GetWorldProperties")()
@@ -230,3 +241,42 @@ async def test_a_port_in_use_is_named(tmp_path: Path) -> None:
         _, said = await asyncio.wait_for(process.communicate(), 120)
         assert process.returncode == 1
         assert f"port {port}".encode() in said
+
+
+async def test_a_robot_whose_port_is_taken_is_not_left_in_the_world(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It stood there without a node, and the request had no answer."""
+    said: list[str] = []
+    simulation = Simulation(Scene(), TypeRegistry(), said.append)
+    start, stop = RobotStart(id="R", at=(3.0, 3.0)), asyncio.Event()
+    async with asyncio.TaskGroup() as tasks:
+        tasks.create_task(simulation.run(stop))
+        await until(lambda: "simulation ready: 0 robots, 0 boxes" in said, timeout=60, what="the world runs")
+        with socket.create_server(("", 0)) as taken, monkeypatch.context() as patch:
+            port = taken.getsockname()[1]
+            patch.setattr(simulation, "_next_port", lambda: port)
+            with pytest.raises(FleetError, match=f"R was not put in: .* port {port}"):
+                await simulation.add_robot(start)
+        assert dict(simulation.world.robots) == {}
+        await simulation.add_robot(start)
+        await asyncio.gather(simulation.remove_robot("R"), simulation.remove_robot("R"))
+        assert dict(simulation.world.robots) == {}
+        stop.set()
+
+
+async def test_a_report_that_cannot_be_written_does_not_end_the_world(tmp_path: Path) -> None:
+    """A full disk did; the user is told once."""
+    report = tmp_path / "report" / "world.json"
+    said: list[str] = []
+    simulation = Simulation(Scene(), TypeRegistry(), said.append, report=report)
+    stop = asyncio.Event()
+    async with asyncio.TaskGroup() as tasks:
+        tasks.create_task(simulation.run(stop))
+        await until(lambda: bool(said) and simulation.world.time > 1.2, timeout=60, what="two reports")
+        report.parent.mkdir()
+        await until(report.exists, timeout=60, what="a report")
+        stop.set()
+    assert [line for line in said if "cannot be written" in line] == [
+        f"simulation: the report {report} cannot be written: No such file or directory"
+    ]

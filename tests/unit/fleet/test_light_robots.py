@@ -237,6 +237,10 @@ def test_a_robot_keeps_to_the_limit_of_its_speed() -> None:
     robots.advance(3.0)
     assert robots.twist(0).speed == pytest.approx(0.2, abs=0.01)
     assert robots.twist(1).speed == pytest.approx(0.65, abs=0.01)
+    robots.reset()
+    robots.accept(0, "again", 0.0, 9.0, 1.0)
+    robots.advance(3.0)
+    assert robots.twist(0).speed == pytest.approx(0.2, abs=0.01), "programs send a limit only once"
     robots.limit_speed(0, inf)
     robots.advance(2.0)
     assert robots.twist(0).speed == pytest.approx(0.65, abs=0.01)

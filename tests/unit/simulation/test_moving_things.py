@@ -207,3 +207,78 @@ def test_a_reset_world_begins_anew() -> None:
     assert (world.time, world.collisions.total, world.robots["R1"].distance) == (0.0, 0, 0.0)
     assert hypot(world.robots["R1"].pose.x - 2.5, world.robots["R1"].pose.y - 0.5) == 0.0
     np.testing.assert_array_equal(run(world), first)
+
+
+def test_a_timed_box_that_is_moved_stands_at_the_new_place() -> None:
+    """It was told so, and stayed where it was until it had gone and come again."""
+    world = World(GridMap())
+    world.put_box("crate", BoxSpec(Pose(1.5, 1.5, 0.0), last=5.0))
+    world.move_box("crate", Pose(4.5, 4.5, 0.0))
+    assert (world.is_solid(1.5, 1.5, 0.1), world.is_solid(4.5, 4.5, 0.1)) == (False, True)
+    world.place_robot("R", Pose(6.5, 6.5, 0.0))
+    with pytest.raises(PlaceTakenError, match="R is in the way"):
+        world.move_box("crate", Pose(6.5, 6.5, 0.0))
+    assert world.is_solid(4.5, 4.5, 0.1)
+    world.step(5.0)
+    assert (world.all_boxes, world.has_box("crate")) == ({}, True)
+
+
+def test_robots_are_not_moved_into_solid_things() -> None:
+    """A robot inside of a wall or box could not drive out again."""
+    world = World(GridMap(8, 8, blocked=frozenset({9})))
+    world.add_robot("R", 0)
+    world.add_light_robots({"L": Pose(2.5, 0.5, 0.0), "M": Pose(6.5, 6.5, 0.0)})
+    world.add_box(20)
+    for cell in (9, 20):
+        with pytest.raises(PlaceTakenError, match="a wall, box or door"):
+            world.move_robot("R", Pose(*world.grid.centre(cell), 0.0))
+        with pytest.raises(PlaceTakenError, match="a wall, box or door"):
+            world.move_light_robot("L", Pose(*world.grid.centre(cell), 0.0))
+    with pytest.raises(PlaceTakenError, match="M is in the way"):
+        world.move_light_robot("L", Pose(6.5, 6.5, 0.0))
+    world.move_light_robot("L", Pose(2.6, 0.5, 0.0))
+    world.step(1.0)
+    assert world.collisions.total == 0
+
+
+def test_doors_and_walkers_do_not_begin_in_a_robot() -> None:
+    world = World(GridMap())
+    world.add_robot("R", 0)
+    with pytest.raises(PlaceTakenError, match="R is in the way"):
+        world.add_door("door", DoorSpec(0.5, 0.5))
+    with pytest.raises(PlaceTakenError, match="R is in the way"):
+        world.add_walker("anna", WalkerSpec(((0.5, 0.5),)))
+    assert (dict(world.doors), dict(world.walkers)) == ({}, {})
+
+
+def test_light_robots_contacts_with_doors_and_walkers_count() -> None:
+    world = World(GridMap())
+    world.add_light_robots({"L": Pose(1.5, 1.5, 0.0)})
+    light = world.light
+    assert light is not None
+    world.add_door("door", DoorSpec(3.5, 1.0, yaw=pi / 2, width=1.0))
+    world.add_walker("anna", WalkerSpec(((5.5, 1.5),)))
+    light.accept(0, "a", 1.0, 6.5, 1.5)
+    world.step(15.0)
+    seen = world.collisions
+    assert (seen.robot_door, seen.robot_walker, seen.total) == (1, 1, 2)
+    world.reset()
+    assert world.collisions.total == 0
+
+
+def test_a_walker_stops_for_a_light_robot() -> None:
+    world = World(GridMap())
+    world.add_light_robots({"L": Pose(3.5, 1.5, 0.0)})
+    anna = world.add_walker("anna", WalkerSpec(((1.5, 1.5), (5.5, 1.5)), social_distance=0.4))
+    world.step(5.0)
+    assert anna.waits
+    assert world.collisions.total == 0
+
+
+@pytest.mark.parametrize("name", ["cell_a", "cell_", "cell_1b", "cell_03", "cell_٣"])
+def test_a_boxs_name_may_be_like_that_of_a_cell(name: str) -> None:
+    """A request with such a name ended the simulation."""
+    world = World(GridMap())
+    world.put_box(name, BoxSpec(Pose(1.5, 1.5, 0.0)))
+    world.add_box(30)
+    assert world.boxes == (30,)

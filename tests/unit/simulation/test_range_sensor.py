@@ -126,7 +126,7 @@ def test_a_scan_does_not_depend_on_who_reads_it() -> None:
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ({"beams": 1}, "beams must be at least 2"),
+        ({"beams": 1}, "beams must be within 2"),
         ({"field_of_view": 7.0}, "field_of_view"),
         ({"min_range": 3.0, "max_range": 2.0}, "min_range < max_range"),
         ({"drop_outs": 1.5}, "probabilities"),

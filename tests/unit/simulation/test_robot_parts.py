@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import cos, inf, pi, sin
+from math import cos, inf, nan, pi, sin
 
 import numpy as np
 import pytest
@@ -12,7 +12,9 @@ from rce_fleet.geometry.poses import Pose, Twist
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.simulation.battery import Battery, BatterySpec
 from rce_fleet.simulation.drive import Drive, DriveSpec
+from rce_fleet.simulation.lidar import LidarSpec
 from rce_fleet.simulation.models import RobotModel
+from rce_fleet.simulation.noise import EstimateSpec
 from rce_fleet.simulation.odometry import STRIDE, STRIDE_TURN, Odometry, OdometrySpec
 from rce_fleet.simulation.world import Dock, World, WorldSpec
 
@@ -170,13 +172,34 @@ def test_the_default_battery_never_gets_empty() -> None:
     [
         (lambda: DriveSpec(speed=0.0), "speed must be positive"),
         (lambda: DriveSpec(slip=1.0), "slip must be within"),
-        (lambda: OdometrySpec(alpha2=-1.0), "must not be negative"),
+        (lambda: OdometrySpec(alpha2=-1.0), "not negative"),
         (lambda: BatterySpec(charge=1.5), "charge must be within 0 .. 1"),
         (lambda: RobotModel(sensor="radar"), "no sensor 'radar'; its sensors: lidar"),
-        (lambda: RobotModel(radius=-1.0), "radius and mass must be positive"),
+        (lambda: RobotModel(radius=-1.0), "radius must be within"),
+        (lambda: RobotModel(radius=nan), "radius must be within"),
+        (lambda: RobotModel(mass=inf), "mass must be within"),
+        (lambda: RobotModel(mass=1e-300), "mass must be within"),
+        (lambda: DriveSpec(slip_noise=nan), "slip_noise finite"),
+        (lambda: DriveSpec(slip_noise=inf), "slip_noise finite"),
+        (lambda: OdometrySpec(alpha1=nan), "alpha1 to alpha4 must be finite"),
+        (lambda: OdometrySpec(drift=inf), "biases and drift must be finite"),
+        (lambda: BatterySpec(idle=nan), "powers must be finite"),
+        (lambda: BatterySpec(voltage_full=inf), "voltages must be"),
+        (lambda: EstimateSpec(position=nan), "position and heading must be finite"),
+        (lambda: LidarSpec(noise=nan), "noise_squared and quantum must be finite"),
+        (lambda: LidarSpec(x=nan), "x, y, z and yaw must be finite"),
+        (lambda: LidarSpec(beams=1_000_000_000), "beams must be within"),
     ],
 )
 def test_impossible_parts_are_refused(make: object, words: str) -> None:
     assert callable(make)
     with pytest.raises(ValueError, match=words):
         make()
+
+
+def test_speeds_that_are_not_finite_count_as_0() -> None:
+    """A velocity that is not a number drove the robot at its highest speed."""
+    drive = Drive(DriveSpec(speed=0.5, turn_rate=1.0), np.random.default_rng(0))
+    drive.command(Twist(nan, inf))
+    drive.step(0.1)
+    assert drive.wheels == Twist()

@@ -13,6 +13,7 @@ from rce.config.exceptions import ConfigError
 from rce_fleet.demo.floor import FLOOR
 from rce_fleet.drivers.robot_models import load_model, shipped_models
 from rce_fleet.drivers.scene import load_scene
+from rce_fleet.exceptions import MapError
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.maps.occupancy_map import OccupancyMap
 from rce_fleet.maps.ros_map import load_map, save_map
@@ -209,3 +210,35 @@ def test_drawing_is_exact_on_multiples_of_the_resolution(tmp_path: Path) -> None
     grid = draw_map(scene.floor().walls, [(0.5, 0.5)])
     points = [(0.0, 0.5), (0.05, 0.5), (1.0, 1.0), (0.95, 1.2), (2.0, 0.5), (1.95, 0.5), (1.5, 1.5)]
     assert grid.values_at(points).tolist() == [100, 0, 100, 0, 100, 0, 100]
+
+
+def test_a_closed_wall_may_name_its_first_point_again(tmp_path: Path) -> None:
+    """A thick one ended with a division by zero."""
+    text = "walls: [{line: [[1, 1], [4, 1], [4, 4], [1, 1]], closed: true, thickness: 0.1}]"
+    world = load_scene(write(tmp_path, text)).build()
+    assert (world.is_solid(2.5, 2.5, 0.06), world.is_solid(2.0, 3.0, 0.06)) == (True, False)
+
+
+@pytest.mark.parametrize("cell_size", ["0.002", "1.0e-09"])
+def test_a_map_of_too_many_cells_is_refused(tmp_path: Path, cell_size: str) -> None:
+    save_map(OccupancyMap(np.zeros((100, 100), np.int8)), tmp_path / "map")
+    scene = load_scene(write(tmp_path, f"map: map.yaml\ncell_size: {cell_size}\n"))
+    with pytest.raises(ConfigError, match=r"cell_size: .* more than 1000000 cells; choose larger"):
+        scene.build()
+
+
+def test_a_map_of_walls_that_are_far_away_is_refused(tmp_path: Path) -> None:
+    scene = load_scene(write(tmp_path, "walls: [{line: [[0, 0], [1.0e+7, 1.0e+7]]}]"))
+    with pytest.raises(MapError, match="remove walls that are far away"):
+        scene.draw()
+
+
+def test_doors_and_walkers_that_begin_in_a_robot_are_named(tmp_path: Path) -> None:
+    text = """
+robots: [{id: Robot1, cell: 0}]
+doors: [{id: door, at: [0.5, 0.5]}]
+walkers: [{id: anna, waypoints: [[4, 4]]}, {id: bert, waypoints: [[0.5, 0.6]]}]
+"""
+    with pytest.raises(ConfigError) as error:
+        load_scene(write(tmp_path, text)).build()
+    assert [fault.place for fault in error.value.faults] == ["doors[0]", "walkers[1]"]

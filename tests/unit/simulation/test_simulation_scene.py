@@ -51,6 +51,7 @@ def test_the_world_is_as_the_scene_says() -> None:
         ({"rows": 0}, "rows"),
         ({"rows": 10_000, "columns": 10_000}, "more than"),
         ({"colour": "red"}, "colour"),
+        ({"boxes": [{"id": "cell_3", "at": [1.5, 1.5]}]}, "cell_3: boxes in cells have such ids"),
     ],
 )
 def test_a_bad_scene_is_refused(tmp_path: Path, scene: dict[str, Any], words: str) -> None:
