@@ -37,6 +37,8 @@ BURST_S = 0.004
 START_S = 20.0
 TOOLS = ("ip", "tc", "setpriv")
 """Programs by which machines and the programs on them are made."""
+_ENDED_WITH_PARENT = ("setpriv", "--pdeathsig", "KILL")
+"""Words before a command that end it if this process is killed."""
 TUN = Path("/dev/net/tun")
 """The device by which links are emulated."""
 
@@ -235,13 +237,15 @@ class MachineNetwork:
         command = (sys.executable, "-m", "rce_fleet.experiments.link_probe")
         target = self.machines[other]
         server = await asyncio.create_subprocess_exec(
-            *(*target.prefix, *command, "serve", target.address), stdout=asyncio.subprocess.PIPE
+            *(*target.prefix, *_ENDED_WITH_PARENT, *command, "serve", target.address),
+            stdout=asyncio.subprocess.PIPE,
         )
         try:
             assert server.stdout is not None
             async with asyncio.timeout(START_S):
                 await server.stdout.readline()
-            shown = await _run(*self.machines[name].prefix, *command, "measure", target.address)
+            asking = (*self.machines[name].prefix, *_ENDED_WITH_PARENT, *command)
+            shown = await _run(*asking, "measure", target.address)
         finally:
             await _end(server)
         return LinkFigures(**json.loads(shown))

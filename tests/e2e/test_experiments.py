@@ -12,7 +12,9 @@ import time
 import tomllib
 from pathlib import Path
 
+import psutil
 import pytest
+from support.engine import command_line
 from support.experiments import TIMEOUT_S, command, left_behind, run, started
 
 from rce_fleet.experiments.catalogue import EXPERIMENTS
@@ -43,6 +45,28 @@ def test_what_a_killed_experiment_leaves_is_removed_by_the_next_one(tmp_path: Pa
     assert done.returncode == 0, done.stderr
     assert f"removed what an experiment left that was killed: rcx{process.pid}." in done.stdout
     assert left_behind(process.pid) == []
+
+
+@needs_machines
+def test_no_program_outlives_a_killed_experiment(tmp_path: Path) -> None:
+    """While the link is measured: the program that measures would wait for an answer that does not come."""
+    words = command("round-trip", "--quick", "--software", "rce", "--output", tmp_path / "data")
+    process = subprocess.Popen(words)
+    deadline = time.monotonic() + TIMEOUT_S
+    while not (found := children(process.pid, "link_probe measure")):
+        assert time.monotonic() < deadline, "the link is not measured"
+        time.sleep(0.02)
+    found += children(process.pid, "")
+    process.kill()
+    process.communicate()
+    _, alive = psutil.wait_procs(found, timeout=60)
+    assert alive == []
+
+
+def children(pid: int, text: str) -> list[psutil.Process]:
+    """Return the descendants of a process whose command line has a text."""
+    found = psutil.Process(pid).children(recursive=True)
+    return [child for child in found if text in " ".join(command_line(child))]
 
 
 @needs_machines
