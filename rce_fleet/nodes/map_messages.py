@@ -10,7 +10,7 @@ import numpy as np
 from rce.ros.tf import Transform, Vector
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.localization.scan import LaserScan
-from rce_fleet.nodes.planar import pose_fields
+from rce_fleet.nodes.planar import angles_from_above, pose_fields
 
 if TYPE_CHECKING:
     from rce.ros.types import Message, Time
@@ -78,13 +78,14 @@ def read_scan(message: Message, base_from_laser: Transform) -> LaserScan:
     if not 1 <= count <= MAX_BEAMS or abs(count - expected) > max(_SLACK, 0.02 * expected):
         raise ValueError(f"it has {count} ranges; its angles are those of {expected:.0f}")
     forward = base_from_laser.rotation.rotate(Vector(x=1.0))
-    upwards = base_from_laser.rotation.rotate(Vector(z=1.0)).z > 0
-    side = 1.0 if upwards else -1.0
+    angle_min, angle_increment = angles_from_above(
+        base_from_laser, message.angle_min, message.angle_increment
+    )
     at = base_from_laser.translation
     return LaserScan(
         np.asarray(message.ranges, np.float64),
-        side * message.angle_min,
-        side * message.angle_increment,
+        angle_min,
+        angle_increment,
         message.range_min,
         message.range_max,
         Pose(at.x, at.y, atan2(forward.y, forward.x)),

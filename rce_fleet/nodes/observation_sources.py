@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rce.ros.tf import ExtrapolationError, Transform, TransformError, TransformListener, Vector
+from rce.ros.tf import ExtrapolationError, Transform, TransformError, TransformListener
 from rce_fleet.navigation.costmap.observation import Observation, observe_points, observe_scan
 from rce_fleet.navigation.scans import fault_of_scan, fault_of_stamp
-from rce_fleet.nodes.planar import pose_of
+from rce_fleet.nodes.planar import angles_from_above, pose_of
 from rce_fleet.nodes.robot_place import full_name, named_in_message
 
 if TYPE_CHECKING:
@@ -143,12 +143,9 @@ def _fault(message: Message, source: ObservationSource, now: float) -> str:
 def _observe(message: Message, source: ObservationSource, at: Transform, stamp: float) -> Observation:
     sensor = pose_of(at)
     if source.data_type == "LaserScan":
-        # A lidar that is mounted upside down turns clockwise.
-        turn = -1.0 if at.rotation.rotate(_UP).z < 0 else 1.0
         return observe_scan(
             np.asarray(message.ranges, np.float64),
-            turn * message.angle_min,
-            turn * message.angle_increment,
+            *angles_from_above(at, message.angle_min, message.angle_increment),
             (message.range_min, message.range_max),
             sensor,
             source,
@@ -183,6 +180,3 @@ def points_of_cloud(message: Message) -> NDArray[np.float64]:
     rows = rows.reshape(message.height, message.row_step)[:, : message.width * message.point_step]
     table = np.frombuffer(rows.tobytes(), np.dtype(layout))
     return np.stack([table[name].astype(np.float64) for name in names], axis=1)
-
-
-_UP = Vector(0.0, 0.0, 1.0)

@@ -27,7 +27,7 @@ from rce_fleet.navigation.scans import fault_of_scan, fault_of_stamp
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
 from rce_fleet.nodes.grid_messages import GRID_TOPIC
 from rce_fleet.nodes.parameters import read_parameters
-from rce_fleet.nodes.planar import fault_of_map_frame, pose_of, read_map, read_pose
+from rce_fleet.nodes.planar import angles_from_above, fault_of_map_frame, pose_of, read_map, read_pose
 from rce_fleet.nodes.robot_place import full_name, named_in_message
 from rce_fleet.nodes.throttled_log import ThrottledLog
 
@@ -203,7 +203,9 @@ class ObstacleCellsNode:
         )
         ranges = np.asarray(message.ranges, np.float64)
         ranges = np.where(ranges >= limits[1], np.inf, ranges)
-        seen = observe_scan(ranges, angles[0], angles[2], limits, pose_of(found.transform), source, stamp)
+        mounted = found.transform
+        first, step = angles_from_above(mounted, angles[0], angles[2])
+        seen = observe_scan(ranges, first, step, limits, pose_of(mounted), source, stamp)
         others = self._others
         suspects = others.blocked | self._reported
         findings = watch.take(seen, now, robots=self._places(now), held=others.held, suspects=suspects)

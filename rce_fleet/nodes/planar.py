@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rce.ros.tf import Vector
 from rce_fleet.exceptions import MapError
 from rce_fleet.geometry.angles import quaternion_z, yaw_of
 from rce_fleet.geometry.poses import Pose, Twist
@@ -20,11 +21,26 @@ if TYPE_CHECKING:
 
 _LEAST_TURN = 1e-3
 """A quaternion shorter than this is not a rotation."""
+_UP = Vector(0.0, 0.0, 1.0)
 
 
 def pose_of(transform: Transform) -> Pose:
     """Return a transform's part in the plane."""
     return Pose(transform.translation.x, transform.translation.y, transform.yaw)
+
+
+def angles_from_above(mounted: Transform, angle_min: float, angle_increment: float) -> tuple[float, float]:
+    """Return the direction of a scan's first beam and the angle to the next, counter-clockwise from above.
+
+    They count from the yaw of :func:`pose_of`. A lidar that is mounted upside down turns clockwise.
+
+    Args:
+        mounted: The lidar's frame in one whose z points upwards.
+        angle_min: Direction of the first beam in the lidar's frame, radians.
+        angle_increment: Angle from one beam to the next there, radians.
+    """
+    turn = -1.0 if mounted.rotation.rotate(_UP).z < 0 else 1.0
+    return turn * angle_min, turn * angle_increment
 
 
 def read_pose(message: Message) -> Pose:

@@ -25,7 +25,7 @@ from rce_fleet.navigation.safety.seen import Scan, sensor_pose
 from rce_fleet.navigation.scans import fault_of_scan, fault_of_stamp
 from rce_fleet.nodes.diagnostics import Diagnostics, Level
 from rce_fleet.nodes.parameters import read_parameters
-from rce_fleet.nodes.planar import pose_of, read_pose, read_twist, twist_fields
+from rce_fleet.nodes.planar import angles_from_above, pose_of, read_pose, read_twist, twist_fields
 from rce_fleet.nodes.robot_place import full_name, named_in_message
 from rce_fleet.nodes.throttled_log import ThrottledLog
 
@@ -144,7 +144,8 @@ class VelocityLimiterNode:
             ranges = np.where(ranges >= limits[1], np.inf, ranges)
             ranges = np.where(ranges < limits[0], np.nan, ranges)
         sensor = Pose.from_array(sensor_pose(at, pose_of(mounted.transform)))
-        self._limiter.take_scan(Scan(stamp, sensor, ranges, angles[0], angles[2], limits[0]))
+        first, step = angles_from_above(mounted.transform, angles[0], angles[2])
+        self._limiter.take_scan(Scan(stamp, sensor, ranges, first, step, limits[0]))
 
     def _refuse(self, subject: str, text: str) -> None:
         self._faults[subject] = text
