@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rce_fleet.geometry.poses import Pose, Twist
-from rce_fleet.navigation.planners.trajectories import free_steps
+from rce_fleet.navigation.planners.trajectories import free_steps, stopping_distance
 from rce_fleet.navigation.safety.seen import Scan, SeenPoints, in_frame
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ class Verdict:
 
 
 STANDING = Twist()
+_BESIDE = "an obstacle is beside the robot"
 
 
 class VelocityLimiter:
@@ -153,13 +154,21 @@ class VelocityLimiter:
     def _limit_drive(self, twist: Twist, points: Floats, delay: float) -> tuple[float, str]:
         """Return the share of a command that passes, and why not more."""
         limits = self.parameters
-        speed = abs(twist.speed)
-        reach = speed * delay + speed * speed / (2 * limits.deceleration)
+        speed, curvature = abs(twist.speed), abs(twist.turn_rate / twist.speed)
+        turns = not self.footprint.is_round and curvature > 0
+        reach = float(stopping_distance(speed, limits.deceleration, delay))
+        if turns:  # The corners swing until the turn has ended too, which may take longer.
+            angle = float(stopping_distance(twist.turn_rate, limits.angular_deceleration, delay))
+            reach = max(reach, angle / curvature)
         free = self.free_distance(twist, points, reach)
         allowed, reason = speed, ""
         if free < reach:
-            allowed = allowed_speed(free, limits.deceleration, delay)
+            allowed = min(speed, allowed_speed(free, limits.deceleration, delay))
             reason = f"an obstacle is {free + limits.margin:.2f} m ahead"
+            if turns:
+                rate = allowed_speed(free * curvature, limits.angular_deceleration, delay)
+                if rate / curvature < allowed:
+                    allowed, reason = rate / curvature, _BESIDE
         unseen = limits.unseen_speed
         if allowed > unseen and not self._is_seen(0.0 if twist.speed > 0 else pi):
             allowed, reason = unseen, "no scan covers the direction"
@@ -175,16 +184,14 @@ class VelocityLimiter:
             return 1.0, ""
         limits = self.parameters
         rate = abs(twist.turn_rate)
-        reach = rate * delay + rate * rate / (2 * limits.angular_deceleration)
+        reach = float(stopping_distance(rate, limits.angular_deceleration, delay))
         count = max(1, ceil(reach / _ANGLE_STEP))
         yaws = np.sign(twist.turn_rate) * reach * np.arange(count + 1) / count
         poses = np.stack((np.zeros(count + 1), np.zeros(count + 1), yaws), axis=1)
         free = self._free_share(poses, points) * reach
         if free >= reach:
             return 1.0, ""
-        return allowed_speed(
-            free, limits.angular_deceleration, delay
-        ) / rate, "an obstacle is beside the robot"
+        return allowed_speed(free, limits.angular_deceleration, delay) / rate, _BESIDE
 
     def free_distance(self, twist: Twist, points: Floats, reach: float) -> float:
         """Return how far the robot can drive on an arc until it is ``margin`` from an obstacle, metres.
@@ -196,10 +203,12 @@ class VelocityLimiter:
         """
         sight = reach + self.footprint.circumscribed_radius + self.parameters.margin
         near = points[np.hypot(*points.T) <= sight]
-        count = max(1, ceil(reach / _STEP))
-        driven = reach * np.arange(count + 1) / count
         direction = np.sign(twist.speed)
         curvature = twist.turn_rate / twist.speed
+        count = max(1, ceil(reach / _STEP))
+        if not self.footprint.is_round:
+            count = max(count, ceil(reach * abs(curvature) / _ANGLE_STEP))
+        driven = reach * np.arange(count + 1) / count
         yaws = direction * driven * curvature
         chord = direction * driven * np.sinc(yaws / 2 / np.pi)
         poses = np.stack((chord * np.cos(yaws / 2), chord * np.sin(yaws / 2), yaws), axis=1)

@@ -247,3 +247,21 @@ def test_time_that_jumps_back_begins_anew() -> None:
     stage.take_scan(scan(stamp=1.0))
     stage.take_command(Twist(0.5, 0.0), 1.0)
     assert stage.limit(1.0).twist == Twist(0.5, 0.0)
+
+
+PLANK = Footprint(corners=((0.5, 0.1), (-0.5, 0.1), (-0.5, -0.1), (0.5, -0.1)))
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.002, -0.002, 0.05, 0.1])
+def test_a_polygon_that_creeps_needs_room_to_turn(speed: float) -> None:
+    """The corners swing until the turn has ended, which a small forward speed does not shorten."""
+    seen = circles((0.4, 0.28, 0.05), (-0.4, -0.28, 0.05))
+    stage = limiter(footprint=PLANK, seen=seen)
+    stage.take_command(Twist(speed, 2.0), 0.0)
+    rate = stage.limit(0.0).twist.turn_rate
+    assert 0.0 < rate < 1.2
+    parameters = stage.parameters
+    angle = rate * parameters.delay + rate**2 / (2 * parameters.angular_deceleration)
+    yaws = np.linspace(0.0, angle, 50)
+    poses = np.stack((np.zeros(50), np.zeros(50), yaws), axis=1)
+    assert PLANK.clearance(poses, seen.hits).min() >= parameters.margin - 0.02
