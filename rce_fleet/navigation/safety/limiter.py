@@ -40,6 +40,8 @@ _OWN_BODY = 0.05
 """Points deeper inside the outline than this are the robot itself, such as a mast, metres."""
 _JUMP = 1.0
 """Odometry that moves by more than this between two poses has jumped, metres."""
+_TIME_JUMP = 0.1
+"""Time that goes back by more than this was set anew, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,11 +85,13 @@ class VelocityLimiter:
         self._commanded_at = float("-inf")
         self._pose: Pose | None = None
         self._posed_at = float("-inf")
+        self._now = float("-inf")
 
     # What comes in
 
     def take_command(self, twist: Twist, now: float) -> None:
         """Take a command. One that is not finite counts as a command to stand."""
+        self._note_time(now)
         valid = isfinite(twist.speed) and isfinite(twist.turn_rate)
         self._command = twist if valid else STANDING
         self._commanded_at = now
@@ -116,6 +120,7 @@ class VelocityLimiter:
 
     def limit(self, now: float) -> Verdict:
         """Return the speeds for the wheels at a time."""
+        self._note_time(now)
         problem = self._problem(now)
         if problem:
             return Verdict(STANDING, problem, stopped=True)
@@ -135,6 +140,14 @@ class VelocityLimiter:
             share, reason = self._limit_drive(twist, points, delay)
         passed = Twist(twist.speed * share, twist.turn_rate * share)
         return Verdict(passed, reason if share < 1 else "")
+
+    def _note_time(self, now: float) -> None:
+        """Forget all inputs when time was set back: by their stamps they would not become late."""
+        if now < self._now - _TIME_JUMP:
+            self.seen.forget()
+            self._pose = None
+            self._commanded_at = self._posed_at = float("-inf")
+        self._now = now
 
     def _problem(self, now: float) -> str:
         limits = self.parameters

@@ -265,3 +265,23 @@ def test_a_polygon_that_creeps_needs_room_to_turn(speed: float) -> None:
     yaws = np.linspace(0.0, angle, 50)
     poses = np.stack((np.zeros(50), np.zeros(50), yaws), axis=1)
     assert PLANK.clearance(poses, seen.hits).min() >= parameters.margin - 0.02
+
+
+def test_clocks_set_back_stop_the_robot_until_news() -> None:
+    """Else the last command counted until the time before came again, with nothing behind it."""
+    stage = VelocityLimiter(PARAMETERS, DISC)
+
+    def take(now: float) -> None:
+        stage.take_pose(HERE, now)
+        stage.take_scan(scan(stamp=now))
+        stage.take_command(Twist(0.5, 0.0), now)
+
+    take(1000.0)
+    assert stage.limit(1000.0).twist == Twist(0.5, 0.0)
+    for now in (900.0, 900.1, 950.0, 1000.0):
+        assert stage.limit(now).stopped
+    take(1000.1)
+    assert stage.limit(1000.1).twist == Twist(0.5, 0.0)
+    stage.limit(900.0)
+    take(900.1)
+    assert stage.limit(900.1).twist == Twist(0.5, 0.0)
