@@ -113,6 +113,9 @@ class VelocityLimiterNode:
         jump = self._watch.check(pose, stamp)
         if jump:
             self._throttled_log.warn("jump", f"{jump}; what was seen before is forgotten")
+            self._limiter.seen.forget()
+        if jump or (self._odometry and stamp < self._odometry[-1][0]):
+            self._odometry.clear()  # Scans from now on must not be placed by poses from before.
         self._limiter.take_pose(pose, stamp)
         self._faults.pop("odom", None)
         self._odometry.append((stamp, pose))

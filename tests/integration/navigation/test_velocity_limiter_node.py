@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from math import inf, pi
 from typing import Any
@@ -33,6 +33,7 @@ class Senses:
     Attributes:
         odometry: Pose of the robot.
         ranges: Of the scan, in the lidar's frame, from -pi on.
+        scans: Whether scans are published; without them the stamp of the last one is kept.
         command: To be limited.
         passed: What the stage let pass.
     """
@@ -42,6 +43,7 @@ class Senses:
         self._mounted = mounted
         self.odometry = Pose(0.0, 0.0, 0.0)
         self.ranges = np.full(BEAMS, inf)
+        self.scans = True
         self.command = AHEAD
         self.passed: asyncio.Queue[Twist] = asyncio.Queue()
 
@@ -56,27 +58,28 @@ class Senses:
         edge = StampedTransform("base_link", "laser", self._mounted, node.now())
         frames.publish(transforms=[edge.fields])
         await node.subscribe("cmd_vel", "geometry_msgs/Twist", self._take)
+        stamp = node.now()
         while True:
-            header: dict[str, Any] = {"stamp": node.now(), "frame_id": "laser"}
+            stamp = node.now() if self.scans else stamp
+            header: dict[str, Any] = {"stamp": stamp, "frame_id": "laser"}
             out["odom"].publish(header=header, pose={"pose": pose_fields(self.odometry)})
-            out["scan"].publish(
-                header=header, angle_min=-pi, angle_max=pi - 2 * pi / BEAMS, angle_increment=2 * pi / BEAMS,
-                range_min=0.05, range_max=6.0, ranges=self.ranges.tolist(),
-            )  # fmt: skip
+            if self.scans:
+                out["scan"].publish(
+                    header=header, angle_min=-pi, angle_max=pi - 2 * pi / BEAMS,
+                    angle_increment=2 * pi / BEAMS, range_min=0.05, range_max=6.0,
+                    ranges=self.ranges.tolist(),
+                )  # fmt: skip
             out["raw_cmd_vel"].publish(**twist_fields(self.command))
             await asyncio.sleep(EVERY)
 
     def _take(self, message: Message) -> None:
         self.passed.put_nowait(read_twist(message))
 
-    async def next_passed(self, command: Twist) -> Twist:
-        """Give a command, and return what passes of it after a while."""
-        self.command = command
-        for _ in range(10):  # more than the commands and scans that are on their way
-            await asyncio.wait_for(self.passed.get(), 30)
-        while not self.passed.empty():
-            self.passed.get_nowait()
-        return await asyncio.wait_for(self.passed.get(), 30)
+    async def wait_for(self, is_right: Callable[[Twist], bool]) -> None:
+        """Wait until what passes is as expected."""
+        async with asyncio.timeout(30):
+            while not is_right(await self.passed.get()):
+                pass
 
 
 @asynccontextmanager
@@ -93,9 +96,7 @@ async def stage(mounted: Transform) -> AsyncIterator[Senses]:
         )
         tasks = [asyncio.create_task(one.run()) for one in (senses, VelocityLimiterNode(node, parameters))]
         try:
-            async with asyncio.timeout(60):
-                while await senses.passed.get() != AHEAD:
-                    pass
+            await senses.wait_for(lambda twist: twist == AHEAD)
             yield senses
         finally:
             for task in tasks:
@@ -108,6 +109,19 @@ async def test_a_lidar_upside_down_sees_the_right_side() -> None:
     async with stage(Transform.make(roll=pi)) as senses:
         angles = -pi + np.arange(BEAMS) * 2 * pi / BEAMS
         senses.ranges = np.where(np.abs(angles + 0.9) < 0.25, 0.35, inf)
-        to_the_left = await senses.next_passed(Twist(0.6, 2.8))
-        assert to_the_left.speed < 0.5
-        assert await senses.next_passed(Twist(0.6, -2.8)) == Twist(0.6, -2.8)
+        senses.command = Twist(0.6, 2.8)
+        await senses.wait_for(lambda twist: twist.turn_rate > 0 and twist.speed < 0.5)
+        senses.command = Twist(0.6, -2.8)
+        await senses.wait_for(lambda twist: twist == Twist(0.6, -2.8))
+
+
+async def test_odometry_that_turns_at_once_forgets_the_scan() -> None:
+    """The box is ahead; a compass that is set anew turns the odometry, but not the robot."""
+    async with stage(Transform()) as senses:
+        angles = -pi + np.arange(BEAMS) * 2 * pi / BEAMS
+        senses.ranges = np.where(np.abs(angles) < 0.3, 0.25, inf)
+        senses.command = Twist(0.6, 0.0)
+        await senses.wait_for(lambda twist: 0.0 < twist.speed < 0.2)
+        senses.scans, senses.odometry = False, Pose(0.0, 0.0, pi)
+        for _ in range(20):
+            assert (await asyncio.wait_for(senses.passed.get(), 30)).speed < 0.2
