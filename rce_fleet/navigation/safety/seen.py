@@ -27,7 +27,7 @@ _KEEP_WITHIN = 2.0
 """Points farther away than this are not remembered, metres."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scan:
     """A scan with its place in the odometry's frame.
 

@@ -285,3 +285,11 @@ def test_clocks_set_back_stop_the_robot_until_news() -> None:
     stage.limit(900.0)
     take(900.1)
     assert stage.limit(900.1).twist == Twist(0.5, 0.0)
+
+
+def test_scans_with_the_same_stamp_are_both_taken() -> None:
+    stage = limiter()
+    for stamp in (0.0, 0.1, 0.3, 0.5, 0.9):
+        stage.take_scan(scan(5.0 - stamp, stamp))
+    assert stage.seen.newest is not None
+    assert stage.seen.newest.stamp == 0.9
