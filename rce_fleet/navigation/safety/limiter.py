@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rce_fleet.geometry.angles import wrap_array
 from rce_fleet.geometry.poses import Pose, Twist
 from rce_fleet.navigation.planners.trajectories import free_steps, stopping_distance
 from rce_fleet.navigation.safety.seen import Scan, SeenPoints, in_frame
@@ -42,6 +43,8 @@ _JUMP = 1.0
 """Odometry that moves by more than this between two poses has jumped, metres."""
 _TIME_JUMP = 0.1
 """Time that goes back by more than this was set anew, seconds."""
+_VIEW = pi / 18
+"""A scan tells of a direction if one of its beams this near to it does, radians."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +187,7 @@ class VelocityLimiter:
                     allowed, reason = rate / curvature, _BESIDE
         unseen = limits.unseen_speed
         if allowed > unseen and not self._is_seen(0.0 if twist.speed > 0 else pi):
-            allowed, reason = unseen, "no scan covers the direction"
+            allowed, reason = unseen, "no scan tells of the direction"
         if limits.walking_speed > 0:
             assert self._pose is not None
             beside = self._allowed_beside_moving(twist, in_frame(self._pose, self.seen.moving), delay)
@@ -246,16 +249,17 @@ class VelocityLimiter:
         return allowed_speed(clear - limits.walking_speed * delay, limits.deceleration, slow)
 
     def _is_seen(self, direction: float) -> bool:
-        """Return whether the newest scan has a beam in a direction, seen from the robot."""
+        """Return whether the newest scan tells of a direction, seen from the robot.
+
+        Beams that are NaN tell nothing: a lidar that is covered, or something nearer than it can measure.
+        """
         scan, pose = self.seen.newest, self._pose
         assert scan is not None
         assert pose is not None
-        ahead = np.array(((direction + pose.yaw),))
-        point = np.stack((scan.sensor.x + np.cos(ahead), scan.sensor.y + np.sin(ahead)), axis=1)
-        off = float(np.arctan2(point[0, 1] - scan.sensor.y, point[0, 0] - scan.sensor.x)) - scan.sensor.yaw
-        sign = 1.0 if scan.angle_increment > 0 else -1.0
-        beam = (sign * (off - scan.angle_min) % (2 * pi)) / abs(scan.angle_increment)
-        return beam <= len(scan.ranges) - 1 or beam >= 2 * pi / abs(scan.angle_increment) - 1
+        step = abs(scan.angle_increment)
+        beams = scan.sensor.yaw + scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
+        off = np.abs(wrap_array(beams - direction - pose.yaw))
+        return bool((off <= step).any() and (off[~np.isnan(scan.ranges)] <= max(step, _VIEW)).any())
 
 
 def allowed_speed(free: float, deceleration: float, delay: float) -> float:

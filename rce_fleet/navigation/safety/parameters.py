@@ -21,7 +21,7 @@ class SafetyParameters:
         margin: Distance to an obstacle at which the robot stands, metres.
         max_speed: Highest speed that passes, m/s.
         max_turn_rate: Highest turn rate that passes, rad/s.
-        unseen_speed: Highest speed in a direction that no scan covers, m/s.
+        unseen_speed: Highest speed in a direction of which no scan tells, m/s.
         walking_speed: How fast something that moves may come nearer, m/s; 0: motion is not watched.
         scan_timeout: A scan older than this stops the robot, seconds.
         command_timeout: A command older than this stops it, seconds.

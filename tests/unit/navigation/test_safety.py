@@ -293,3 +293,18 @@ def test_scans_with_the_same_stamp_are_both_taken() -> None:
         stage.take_scan(scan(5.0 - stamp, stamp))
     assert stage.seen.newest is not None
     assert stage.seen.newest.stamp == 0.9
+
+
+@pytest.mark.parametrize("speed", [0.5, -0.5])
+def test_where_beams_tell_nothing_the_robot_is_slow(speed: float) -> None:
+    """A lidar that is covered sends NaN, or ranges below its least one."""
+    stage = limiter(seen=scan(nan))
+    stage.take_command(Twist(speed, 0.0), 0.0)
+    verdict = stage.limit(0.0)
+    assert abs(verdict.twist.speed) == PARAMETERS.unseen_speed
+    assert "no scan tells" in verdict.reason
+    ranges = np.full(BEAMS, inf)
+    ranges[::2] = nan  # single echoes were lost
+    seeing = limiter(seen=scan(ranges))
+    seeing.take_command(Twist(speed, 0.0), 0.0)
+    assert seeing.limit(0.0).twist == Twist(speed, 0.0)
