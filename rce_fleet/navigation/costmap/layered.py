@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rce_fleet.geometry.poses import transform_points
 from rce_fleet.navigation.costmap.cost_grid import NOWHERE, Area, CostGrid, shift_of
 from rce_fleet.navigation.costmap.inflation_layer import InflationLayer
 from rce_fleet.navigation.costmap.layer import Layer, fill_of
@@ -72,12 +73,11 @@ class LayeredCostmap:
         return self.static is None or self.static.has_map
 
     def set_map(self, picture: OccupancyMap) -> None:
-        """Set the map; a costmap that does not roll takes on its size, place and resolution."""
+        """Set the map; a costmap that does not roll takes on its resolution, and covers all of it."""
         if self.static is None:
             return
         self.static.set_map(picture)
-        place = (picture.origin.x, picture.origin.y)
-        size = (picture.rows, picture.columns)
+        size, place = _box_of(picture)
         same = (size, picture.resolution, place) == (self.grid.shape, self.grid.resolution, self.grid.origin)
         if not self.parameters.rolling_window and not same:
             self.grid = CostGrid(*size, picture.resolution, place, fill=self._fill)
@@ -139,3 +139,16 @@ class LayeredCostmap:
         for layer in self._layers:
             layer.move(grid, rows, columns)
         self._outdated = grid.whole
+
+
+def _box_of(picture: OccupancyMap) -> tuple[tuple[int, int], tuple[float, float]]:
+    """Return rows and columns, and the outer corner of cell (0, 0), of the upright box around a map."""
+    origin, size = picture.origin, picture.resolution
+    if not origin.yaw:
+        return (picture.rows, picture.columns), (origin.x, origin.y)
+    width, height = picture.size
+    corners = np.array(((0.0, 0.0), (width, 0.0), (width, height), (0.0, height)))
+    turned = transform_points(origin.as_array(), corners)
+    low, extent = turned.min(axis=0), np.ptp(turned, axis=0)
+    columns, rows = (ceil(each / size - 1e-6) for each in extent)
+    return (rows, columns), (float(low[0]), float(low[1]))

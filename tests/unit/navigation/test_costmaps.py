@@ -146,6 +146,20 @@ def test_a_rotated_map_is_sampled_at_its_place() -> None:
     assert costmap.grid.cost_at(0.5, -0.25) == FREE
 
 
+@pytest.mark.parametrize("yaw", [pi / 2, -pi / 2, pi, 0.3, -2.0])
+def test_a_costmap_covers_all_of_a_rotated_map(yaw: float) -> None:
+    picture = np.full((20, 50), 100, np.int8)
+    drawn = OccupancyMap(picture, 0.1, Pose(1.0, -2.0, yaw))
+    costmap = LayeredCostmap(CostmapParameters(static_layer=StaticLayerParameters()), Footprint(0.2))
+    costmap.set_map(drawn)
+    costmap.update(ORIGIN, 0.0)
+    places = drawn.cell_to_world(np.argwhere(picture > 0).reshape(20, 50, 2)[1:-1, 1:-1].reshape(-1, 2))
+    assert (costmap.grid.costs_at(places, outside=UNKNOWN) == LETHAL).all()
+    lethal = np.argwhere(costmap.grid.values == LETHAL)
+    assert len(lethal) == pytest.approx(picture.size, rel=0.05)
+    assert (drawn.values_at(costmap.grid.centres_of(lethal)) == 100).all()
+
+
 def test_an_update_replaces_a_part_of_the_map() -> None:
     costmap = LayeredCostmap(CostmapParameters(static_layer=StaticLayerParameters()), Footprint(0.2))
     costmap.set_map(OccupancyMap(np.zeros((10, 10), np.int8), 0.1))
