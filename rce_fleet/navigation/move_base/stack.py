@@ -118,6 +118,8 @@ class NavigationStack:
             situation: What is known; the obstacles are filled in from the local costmap.
         """
         if not situation.problem:
+            if self.local_costmap.static is not None:
+                self.local_costmap.static.place(situation.local_from_global.inverse())
             self.local_costmap.update(situation.pose, situation.now)
             limits = self.settings.local_planner
             reach = (

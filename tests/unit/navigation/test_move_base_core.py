@@ -8,12 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rce_fleet.geometry.poses import Pose, Twist
+from rce_fleet.geometry.poses import Pose, Twist, transform_points
+from rce_fleet.maps.occupancy_map import OccupancyMap
 from rce_fleet.navigation.costmap.cost_grid import CostGrid
 from rce_fleet.navigation.costmap.costs import LETHAL
 from rce_fleet.navigation.costmap.footprint import Footprint
 from rce_fleet.navigation.costmap.layered import LayeredCostmap
-from rce_fleet.navigation.costmap.parameters import CostmapParameters, ObstacleLayerParameters
+from rce_fleet.navigation.costmap.parameters import (
+    CostmapParameters,
+    ObstacleLayerParameters,
+    StaticLayerParameters,
+)
 from rce_fleet.navigation.move_base.core import Decision, Ending, MoveBase, State
 from rce_fleet.navigation.move_base.parameters import MoveBaseParameters
 from rce_fleet.navigation.move_base.recovery import BackUp, ClearCostmaps, Rotate, Wait
@@ -294,6 +299,27 @@ def test_the_default_behaviors_are_those_of_ros_and_two_more() -> None:
     wrong = replace(NavigationSettings(), recoveries=(RecoverySpec("x", "y/Z"),))
     with pytest.raises(ValueError, match="recovery behavior x: expected one of"):
         NavigationStack(wrong)
+
+
+def test_a_local_costmap_draws_the_map_where_it_is() -> None:
+    """The local costmap is in the odometry's frame, which lies askew on the map and drifts."""
+    local = CostmapParameters(
+        global_frame="odom", rolling_window=True, width=4.0, height=4.0, static_layer=StaticLayerParameters()
+    )
+    stack = NavigationStack(replace(NavigationSettings(), local_costmap=local))
+    picture = np.zeros((60, 60), np.int8)
+    picture[20:24, 30:34] = 100
+    drawn = OccupancyMap(picture, 0.1)
+    stack.local_costmap.set_map(drawn)
+    box = drawn.cell_to_world(np.argwhere(picture > 0))
+    for odom_from_map in (Pose(0.0, 0.0, 0.0), Pose(0.5, -0.7, 0.4), Pose(0.6, -0.7, 0.5)):
+        at = odom_from_map.compose(Pose(3.0, 2.0, 0.0))
+        stack.control(Situation(1.0, 0.1, at, local_from_global=odom_from_map))
+        grid = stack.local_costmap.grid
+        inside = box[(np.abs(box - box.mean(axis=0)) < 0.11).all(axis=1)]
+        assert (grid.costs_at(transform_points(odom_from_map.as_array(), inside)) == LETHAL).all()
+        lethal = grid.centres_of(np.argwhere(grid.values == LETHAL))
+        assert (drawn.values_at(transform_points(odom_from_map.inverse().as_array(), lethal)) == 100).all()
 
 
 # Parameters
