@@ -209,7 +209,7 @@ class MoveBase:
         if situation.problem:
             # Patience begins anew: the robot stands because it must not drive, not because it cannot.
             self._begin_times_anew(situation.now)
-            self._local.reset()
+            self._local.stand()
             return Decision(text=situation.problem)
         self._watch_motion(situation)
         if self.state is State.CONTROLLING:

@@ -97,9 +97,14 @@ class LocalPlanner:
         if self._path is not None:
             self._path = self._path.moved(path)
 
+    def stand(self) -> None:
+        """Take note that the robot was stopped; the path and the progress on it stay."""
+        self._command, self._turning = Twist(), False
+
     def reset(self) -> None:
         """Drop the path; the robot stands."""
-        self._path, self._command, self._turning, self._near_goal = None, Twist(), False, False
+        self.stand()
+        self._path, self._near_goal = None, False
 
     def step(self, pose: Pose, measured: Twist, obstacles: Floats, dt: float) -> ControlStep:
         """Return the speeds for the next ``dt`` seconds.

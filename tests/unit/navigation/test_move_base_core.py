@@ -149,6 +149,22 @@ def test_a_problem_stops_the_robot_until_it_is_gone() -> None:
     assert robot.run(30.0).ending is Ending.SUCCEEDED
 
 
+def test_after_a_problem_the_robot_drives_straight_on() -> None:
+    """It was far along its path, which it does not follow from the beginning again."""
+    robot = Robot(MoveBaseParameters())
+    robot.costs = CostGrid(40, 400, 0.1)
+    robot.plan = make_plan(robot.costs, HERE, Pose(35.0, 1.0, 0.0))
+    robot.core.start(robot.now)
+    robot.run(40.0)
+    assert robot.pose.x > 20.0
+    robot.problem = "transforms are late"
+    robot.run(0.5)
+    robot.problem = ""
+    for _ in range(20):
+        assert abs(robot.step().twist.turn_rate) < 0.1
+    assert robot.twist.speed > 0.4
+
+
 def test_a_blocked_path_is_planned_anew() -> None:
     robot = Robot(MoveBaseParameters())
     robot.core.start(robot.now)
