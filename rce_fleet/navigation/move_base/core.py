@@ -232,9 +232,10 @@ class MoveBase:
         if step.following is Following.REACHED:
             self._end(Ending.SUCCEEDED, "Goal reached.")
             return self.step(situation, costs)
-        wants_plan = parameters.planner_frequency > 0 and (
+        is_due = parameters.planner_frequency > 0 and (
             now - self._asked_at >= 1 / parameters.planner_frequency - situation.dt / 2
         )
+        wants_plan = False
         if step.following is Following.BLOCKED:
             wants_plan = True
             if now - self._valid_control_at > parameters.controller_timeout:
@@ -247,11 +248,12 @@ class MoveBase:
         if oscillates:
             self._give_up_or_recover("the robot is oscillating")
             return Decision(step.twist)
-        wanted = wants_plan and self._wants_plan(now)
+        wanted = (is_due and self._wants_plan(now, 0.0)) or (wants_plan and self._wants_plan(now))
         return Decision(step.twist, wants_plan=wanted, trajectory=step.trajectory)
 
-    def _wants_plan(self, now: float) -> bool:
-        if self._waits_for_plan or now - self._asked_at < REPLAN_EVERY:
+    def _wants_plan(self, now: float, least: float = REPLAN_EVERY) -> bool:
+        """Return whether to ask for a plan, at least ``least`` seconds after the last one; note it."""
+        if self._waits_for_plan or now - self._asked_at < least:
             return False
         self._waits_for_plan, self._asked_at = True, now
         return True

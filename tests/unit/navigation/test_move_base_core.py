@@ -182,6 +182,14 @@ def test_plans_are_renewed_at_the_planner_frequency() -> None:
     assert robot.plans == 4
 
 
+@pytest.mark.parametrize("frequency", [0.5, 1.0, 2.0, 5.0, 10.0])
+def test_planner_frequencies_are_held(frequency: float) -> None:
+    robot = Robot(MoveBaseParameters(planner_frequency=frequency))
+    robot.core.start(robot.now)
+    robot.run(4.0)
+    assert robot.plans == pytest.approx(4.0 * frequency, abs=1)
+
+
 class Noted(Wait):
     """A recovery behavior that takes half a second, and notes that it began."""
 
