@@ -138,6 +138,8 @@ class MoveBase:
         self._path = np.empty((0, 3))
         self._next_recovery = 0
         self._recovery: Recovery | None = None
+        self._has_begun = False
+        """Whether the recovery behavior was started, in the time that is now."""
         self._cause = ""
         self._ending: tuple[Ending, str] | None = None
         self._asked_at = self._planned_at = self._valid_plan_at = self._valid_control_at = float("-inf")
@@ -199,6 +201,7 @@ class MoveBase:
         """
         if situation.now < self._now - TIME_JUMP:
             self._begin_times_anew(situation.now)
+            self._has_begun = False
         self._now = situation.now
         if self._ending is not None:
             ending, text = self._ending
@@ -291,7 +294,10 @@ class MoveBase:
             self._recovery = self._recoveries[self._next_recovery]
             self._next_recovery += 1
             self.recovered += 1
+            self._has_begun = False
+        if not self._has_begun:
             self._recovery.start(situation)
+            self._has_begun = True
         step = self._recovery.step(situation)
         if not step.done:
             return Decision(step.twist)

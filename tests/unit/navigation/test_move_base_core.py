@@ -435,3 +435,14 @@ def test_time_that_jumps_back_does_not_stop_planning() -> None:
     robot.run(1.0)
     assert robot.plans >= 2
     assert robot.run(30.0).ending is Ending.SUCCEEDED
+
+
+def test_time_that_jumps_back_restarts_a_recovery() -> None:
+    """A behavior that waits would wait until the time before comes again."""
+    robot = Robot(MoveBaseParameters(planner_timeout=0.5), [Wait("wait", 2.0)])
+    robot.plan = NO_WAY
+    robot.core.start(robot.now)
+    robot.run(1.5)
+    assert robot.state() is State.RECOVERING
+    robot.now = 5.0
+    assert robot.run(10.0).ending is Ending.ABORTED
