@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import bisect
+import struct
+from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import pairwise
-from math import atan2, inf, isfinite
+from math import atan2, inf, isfinite, isnan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rosbags.rosbag1 import Reader, ReaderError
+from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from rce_fleet.exceptions import LogError
@@ -18,9 +21,10 @@ from rce_fleet.geometry.poses import Pose
 from rce_fleet.mapping.records import LaserRecord, ScanLog
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from rosbags.interfaces import Connection
     from rosbags.typesys.store import Typestore
 
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
@@ -29,6 +33,11 @@ TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 TRANSFORM_TOPICS = ("/tf_static", "/tf")
 BACKWARDS_S = 1.0
 MAX_FAULTS = 100
+_DAMAGED = (
+    *(ReaderError, SerdeError, struct.error),
+    *(AssertionError, EOFError, LookupError, MemoryError, OSError, OverflowError, RuntimeError, ValueError),
+)
+"""What the library raises where a file is damaged."""
 
 
 @dataclass(slots=True)
@@ -45,7 +54,8 @@ def read_bag(path: Path, *, scan: str = "/scan", odometry: str = "/odom") -> Sca
     """Read the scans of a bag, each with the odometry at its time.
 
     Odometry is interpolated between the messages around a scan. The laser's pose on the base comes from
-    ``/tf_static`` or ``/tf``; without transforms the laser is at the base.
+    ``/tf_static`` or ``/tf``; without transforms the laser is at the base. Messages that cannot be used, and
+    what follows damage of the file, are left out and listed in ``faults`` of the result.
 
     Args:
         path: The bag.
@@ -56,12 +66,14 @@ def read_bag(path: Path, *, scan: str = "/scan", odometry: str = "/odom") -> Sca
         LogError: The bag cannot be read, or has no messages of these types on these topics.
     """
     try:
-        with Reader(path) as reader:
-            _check_topic(reader, path, scan, SCAN_TYPE, "--scan")
-            _check_topic(reader, path, odometry, ODOMETRY_TYPE, "--odom")
-            contents = _read(reader, path, scan, odometry)
-    except (ReaderError, OSError) as error:
-        raise LogError(f"{path}: cannot be read as a ROS 1 bag: {error}") from error
+        reader = Reader(path)
+        reader.open()
+    except _DAMAGED as error:
+        raise LogError(f"{path}: cannot be read as a ROS 1 bag: {_words(error)}") from error
+    with closing(reader):
+        _check_topic(reader, path, scan, SCAN_TYPE, "--scan")
+        _check_topic(reader, path, odometry, ODOMETRY_TYPE, "--odom")
+        contents = _read(reader, path, scan, odometry)
     if not contents.scans or not contents.odometry:
         empty = scan if not contents.scans else odometry
         raise LogError(f"{path}: the topic {empty} has no usable message")
@@ -100,25 +112,49 @@ def _read(reader: Reader, path: Path, scan: str, odometry: str) -> _Contents:
         if each.topic in {scan, odometry}
         or (each.topic in TRANSFORM_TOPICS and each.msgtype in TRANSFORM_TYPES)
     ]
-    for connection, _, raw in reader.messages(connections=wanted):
+    for connection, _, raw in _messages(reader, path, wanted, contents):
         try:
             kind = TRANSFORM_TYPES[0] if connection.msgtype in TRANSFORM_TYPES else connection.msgtype
             message: Any = store.deserialize_ros1(raw, kind)
-        except (ValueError, IndexError, KeyError, AssertionError) as error:
-            _fault(contents, f"{path}: a message on {connection.topic} cannot be read: {error}")
+        except _DAMAGED as error:
+            _fault(contents, f"{path}: a message on {connection.topic} cannot be read: {_words(error)}")
             continue
         if connection.topic == scan:
-            contents.scans.append((_seconds(message.header.stamp), message))
+            _take_scan(contents, path, message)
         elif connection.topic == odometry:
             _take_odometry(contents, path, message)
         else:
-            _take_transforms(contents, message, is_static=connection.topic == "/tf_static")
+            _take_transforms(contents, path, message, is_static=connection.topic == "/tf_static")
     return contents
 
 
 def _fault(contents: _Contents, text: str) -> None:
     if len(contents.faults) < MAX_FAULTS:
         contents.faults.append(text)
+
+
+def _messages(
+    reader: Reader, path: Path, wanted: Sequence[Connection], contents: _Contents
+) -> Iterator[tuple[Connection, int, bytes]]:
+    """Yield messages as far as the file is not damaged."""
+    try:
+        yield from reader.messages(connections=wanted)
+    except _DAMAGED as error:
+        contents.faults.append(f"{path}: the bag is damaged, and the rest is left out: {_words(error)}")
+
+
+def _words(error: BaseException) -> str:
+    return str(error) or type(error).__name__
+
+
+def _take_scan(contents: _Contents, path: Path, message: Any) -> None:
+    stamp = _seconds(message.header.stamp)
+    if not all(map(isfinite, (message.angle_min, message.angle_increment))) or isnan(message.range_max):
+        _fault(
+            contents, f"{path}: the angles or limits of the scan at {stamp:.3f} s are not finite; left out"
+        )
+        return
+    contents.scans.append((stamp, message))
 
 
 def _take_odometry(contents: _Contents, path: Path, message: Any) -> None:
@@ -131,11 +167,14 @@ def _take_odometry(contents: _Contents, path: Path, message: Any) -> None:
     contents.odometry.append((stamp, pose))
 
 
-def _take_transforms(contents: _Contents, message: Any, *, is_static: bool) -> None:
+def _take_transforms(contents: _Contents, path: Path, message: Any, *, is_static: bool) -> None:
     for each in message.transforms:
         child = each.child_frame_id.strip("/")
+        pose = _pose(each.transform.translation, each.transform.rotation)
+        if not all(map(isfinite, (pose.x, pose.y, pose.yaw))):
+            _fault(contents, f"{path}: a transform to {child!r} is not finite; left out")
+            continue
         if is_static or child not in contents.transforms:
-            pose = _pose(each.transform.translation, each.transform.rotation)
             contents.transforms[child] = (each.header.frame_id.strip("/"), pose)
 
 

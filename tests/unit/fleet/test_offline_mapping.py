@@ -6,8 +6,11 @@ import gzip
 import json
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from io import StringIO
+from math import nan
 from pathlib import Path
+from random import Random
 
 import numpy as np
 import pytest
@@ -107,6 +110,38 @@ def test_a_truncated_bag_is_refused(tmp_path: Path) -> None:
     (tmp_path / "run.bag").write_bytes(content[:3000])
     with pytest.raises(LogError, match=r"run\.bag: cannot be read as a ROS 1 bag"):
         read_log(tmp_path / "run.bag")
+
+
+def test_a_damaged_bag_is_read_as_far_as_possible_or_refused(tmp_path: Path) -> None:
+    """Half of these damages ended ``rce map`` with a traceback."""
+    log = tmp_path / "run.bag"
+    write_bag(log, drive(12)[1])
+    content = log.read_bytes()
+    draw = Random(3)
+    told = 0
+    refused: list[str] = []
+    for _ in range(40):
+        damaged = bytearray(content)
+        place = draw.randrange(13, len(content) - 4)
+        damaged[place : place + 4] = draw.choice((bytes(4), b"\xff" * 4, draw.randbytes(4)))
+        log.write_bytes(damaged)
+        try:
+            told += bool(read_log(log).faults)
+        except LogError as error:
+            refused.append(str(error))
+    assert told
+    assert refused
+    assert all(text.startswith(str(log)) for text in refused)
+
+
+@pytest.mark.parametrize("wrong", ["angle_min", "angle_increment", "range_max"])
+def test_scans_of_a_bag_without_numbers_are_left_out(tmp_path: Path, wrong: str) -> None:
+    records = drive(4)[1]
+    records[1] = replace(records[1], **{wrong: nan})  # type: ignore[arg-type]  # all three are floats
+    write_bag(tmp_path / "run.bag", records)
+    found = read_log(tmp_path / "run.bag")
+    assert (len(found.records), len(found.faults)) == (3, 1)
+    assert "are not finite; left out" in found.faults[0]
 
 
 @pytest.mark.parametrize("content", [None, "", "ODOM 0 0 0 0 0 0 1 host 1\n"])
