@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 _FREE = frozenset(".GS")
 _BLOCKED = frozenset("@OTW")
 _SCEN_FIELDS = 9
+_DIGITS = 20
+"""More than the number of rows or columns has."""
 MAX_CELLS = 4_000_000
 """Maximum size of a map, so that a wrong header does not fill the memory."""
 
@@ -43,6 +45,11 @@ def parse_map(text: str, *, cell_size: float = 1.0) -> GridMap:
     body = lines[first : first + rows]
     if len(body) < rows:
         raise MapError(f"the map has {len(body)} rows; its header says {rows}", line=len(lines))
+    more = next(
+        (first + rows + index for index, line in enumerate(lines[first + rows :]) if line.strip()), None
+    )
+    if more is not None:
+        raise MapError(f"the map has more rows than the {rows} of its header", line=more + 1)
     blocked: set[int] = set()
     for row, line in enumerate(body):
         if len(line) != columns:
@@ -63,8 +70,8 @@ def _header(lines: list[str]) -> tuple[int, int, int]:
         if key == "map":
             break
         if key in ("height", "width"):
-            if not value.strip().isdecimal():
-                raise MapError(f"{key} is not a number: {value!r}", line=index + 1)
+            if not value.strip().isdecimal() or len(value) > _DIGITS:
+                raise MapError(f"{key} is not a number of cells: {value[:40]!r}", line=index + 1)
             sizes[key] = int(value)
         elif key != "type":
             raise MapError(f"unknown header line {line!r}", line=index + 1)
