@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import shutil
 import signal
 from collections.abc import Callable, Coroutine, Iterable
@@ -157,7 +158,9 @@ def demo(
         count = robots or (DEFAULT_ROBOTS if scen is None else DEFAULT_ROBOTS_OF_SCEN)
         fleet = _choose_fleet(count, full_stack, find_world(world), seed, scen)
         _refuse_light_robots(mode, offload=offload, slam=slam, light=fleet.has_light)
-        _check_duration(duration, mode, headless=headless)
+        _check_duration(duration, timeout, mode, headless=headless)
+        if report is not None and headless:
+            _check_report(report)
         if timeout is None:
             timeout = TIMEOUT + TIMEOUT_PER_ROBOT * max(0, count - MANY) + (duration or 0.0)
         ports = _choose_ports(headless, given, _needed_ports(mode, core_uri), replicas)
@@ -222,8 +225,21 @@ def _choose_fleet(
     return _Fleet(scenario, full_stack, world)
 
 
-def _check_duration(duration: float | None, mode: Mode, *, headless: bool) -> None:
+def _check_report(report: Path) -> None:
+    """Raise DemoError if a report cannot be written at the end of the run."""
+    if report.is_dir():
+        raise DemoError(f"--report {report} is a folder: give a file")
+    if not os.access(report if report.exists() else report.parent, os.W_OK):
+        why = "cannot be written to" if report.parent.is_dir() else "is not in a folder that exists"
+        raise DemoError(f"--report {report} {why}: give another file")
+
+
+def _check_duration(duration: float | None, timeout: float | None, mode: Mode, *, headless: bool) -> None:
     """Raise DemoError if tasks cannot be streamed."""
+    if duration is not None and timeout is not None and timeout <= duration:
+        raise DemoError(
+            f"--timeout {timeout:g} ends the run before its --duration of {duration:g} s: leave --timeout out"
+        )
     if duration is not None and not headless:
         raise DemoError("--duration is for headless runs: add --headless")
     if duration is not None and mode is not Mode.CLOUD:
@@ -273,13 +289,17 @@ async def _headless(
         f"{len(config.scenario.robots)} robots, mode {config.mode}, seed {config.seed}, at most {timeout:g} s"
     )
     result = await run_headless(config, timeout, say, show)
+    faults = result.faults
     if report is not None:
-        result.write(report)
-    for fault in result.faults:
+        try:
+            result.write(report)
+        except OSError as error:
+            faults.append(f"the report {report} cannot be written: {error.strerror or error}")
+    for fault in faults:
         typer.echo(f"rce demo: {fault}", err=True)
     if result.ok:
         say(result.summary)
-    return 0 if result.ok else 1
+    return 1 if faults else 0
 
 
 async def _with_page(config: DemoConfig, show: Callable[[str], None], *, auto: bool) -> int:
