@@ -106,12 +106,17 @@ class Assigner:
         """Return why a robot's battery is not enough for the rest of a task; empty if it is."""
         if robot.battery is not None and not charges(task):
             needed = self.battery_needed(robot.profile, effort, chargers)
+            if needed == inf:
+                return "no path leads from its last stop to a charger"
             if robot.battery < needed:
                 return f"its battery has {robot.battery:.0%}; task and way to a charger need {needed:.0%}"
         return ""
 
     def battery_needed(self, profile: RobotProfile, effort: Effort, chargers: Sequence[int]) -> float:
-        """Return the share of a full battery that a robot must have to begin with a task."""
+        """Return the share of a full battery that a robot must have to begin with a task.
+
+        Infinite: no path leads from its end to a charger.
+        """
         ways = [self._travel.metres(effort.end, cell) for cell in chargers if effort.end is not None]
         to_charger = min(ways, default=0.0)
         return share_needed(effort, profile, to_charger) + self._levels.critical

@@ -157,7 +157,7 @@ class Dispatcher:
             return self._begins(task, now, facts.robots.get(task.robot), working)
 
         avoided = self._progress.avoid.keys()
-        for choice in self._assigner.choose(ready, free, now, book.places.chargers, avoided, begins):
+        for choice in self._assigner.choose(ready, free, now, self._open_chargers(), avoided, begins):
             self._start(choice.task, choice.robot, now)
             idle.pop(choice.robot, None)
         self.chargers.update(idle, book.places.chargers, taken)
@@ -233,8 +233,16 @@ class Dispatcher:
             return ""
         free = self._free(robot)
         effort = effort_of(task, free.cell, self._travel, free.profile)
-        lack = self._assigner.lack_of_energy(task, free, effort, self._book.places.chargers)
+        lack = self._assigner.lack_of_energy(task, free, effort, self._open_chargers())
         return "" if effort.first == inf else lack
+
+    def _open_chargers(self) -> tuple[int, ...]:
+        """Return the chargers that are not blocked.
+
+        While all are, batteries need only their critical share beside what a task takes: a person who stands
+        on the only charger does not stop the fleet.
+        """
+        return tuple(cell for cell in self._book.places.chargers if cell not in self._facts.shut)
 
     def _is_idle(self, robot: RobotFacts) -> bool:
         entry = self._book.entry(robot.id)
@@ -327,7 +335,7 @@ class Dispatcher:
         reason = misfit(task, name, free.profile)
         if not reason and self._book.task_of(name) is None:
             effort = effort_of(task, free.cell, self._travel, free.profile)
-            reason = self._assigner.refuse(task, free, effort, self._book.places.chargers)
+            reason = self._assigner.refuse(task, free, effort, self._open_chargers())
         return f"{name} cannot do it: {reason}" if reason else ""
 
     def _explain(self, facts: FleetFacts, now: float) -> None:
@@ -338,6 +346,7 @@ class Dispatcher:
             if robot.cell is not None and not self._book.entry(robot.id).is_out
         ]
         known: dict[object, str] = {}
+        chargers = self._open_chargers()
         waiting = [self._book.tasks[ready.number] for ready in self._conditions.ready]
         waiting = [task for task in waiting if task.state is TaskState.QUEUED]
         begin = self._explained % len(waiting) if waiting else 0
@@ -348,5 +357,5 @@ class Dispatcher:
                 replace(task.order, name="", priority=0, deadline=None, earliest_start=None),
             )
             if like not in known:
-                known[like] = why_none(task, robots, self._travel, self._assigner, self._book.places.chargers)
+                known[like] = why_none(task, robots, self._travel, self._assigner, chargers)
             self._conditions.note(task, known[like], now)

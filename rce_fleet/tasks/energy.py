@@ -95,9 +95,11 @@ def share_needed(effort: Effort, profile: RobotProfile, to_charger: float = 0.0)
     Args:
         effort: The task's.
         profile: The robot's.
-        to_charger: Metres from the last stop to the nearest charger.
+        to_charger: Metres from the last stop to the nearest charger; infinite: there is no way.
     """
     metres = effort.first + effort.metres + to_charger
+    if metres == inf:
+        return inf  # a robot that takes nothing while it stands would need inf * 0
     seconds = metres / profile.speed + effort.acting
     drawn = metres * profile.drive
     drawn += (seconds * profile.idle + effort.acting * profile.acting) / _SECONDS_PER_HOUR

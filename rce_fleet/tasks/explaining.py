@@ -43,9 +43,10 @@ def why_none(
             return ""
         lacks.add(lack)
     cells = ", ".join(str(cell) for cell in dict.fromkeys(task.order.cells()))
-    worst = next(lack for lack in ("energy", "capacity", "path") if lack in lacks)
+    worst = next(lack for lack in ("energy", "capacity", "charger", "path") if lack in lacks)
     return {
         "path": f"no path leads any robot to all of its stops (cells {cells})",
+        "charger": f"no path leads from its last stop to a charger (cells {', '.join(map(str, chargers))})",
         "capacity": "no robot's battery is large enough for it, even when it is full; split the task",
         "energy": "no robot's battery has enough energy for it now; it waits until one has charged",
     }[worst]
@@ -54,13 +55,15 @@ def why_none(
 def _lack(
     task: Task, robot: FreeRobot, travel: TravelCosts, assigner: Assigner, chargers: Sequence[int]
 ) -> str:
-    """Return what a robot lacks for a task: a path, capacity or energy; empty: nothing."""
+    """Return what a robot lacks for a task: a path, a charger, capacity or energy; empty: nothing."""
     effort = effort_of(task, robot.cell, travel, robot.profile)
     if effort.first == inf:
         return "path"
     if robot.battery is None or charges(task):
         return ""
     needed = assigner.battery_needed(robot.profile, effort, chargers)
+    if needed == inf:
+        return "charger"
     return "capacity" if needed > 1 else "energy" if robot.battery < needed else ""
 
 

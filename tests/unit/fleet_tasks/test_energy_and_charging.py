@@ -54,6 +54,27 @@ def test_no_task_without_energy_for_the_way_back(hungry: Floor) -> None:
     assert (hungry.task(task).state, hungry.task(task).robot) == (TaskState.RUNNING, "Robot2")
 
 
+def test_a_blocked_charger_stops_no_task(hungry: Floor) -> None:
+    """While none can be driven to, the way there does not count, also for a task that runs."""
+    hungry.add("Robot1", 0, battery=0.9)
+    hungry.facts.shut, hungry.facts.map_revision = frozenset({56}), 1
+    first = hungry.go(3, 7)
+    hungry.run(2)
+    assert hungry.task(first).state is TaskState.RUNNING
+    hungry.run(40)
+    assert hungry.task(first).state is TaskState.DONE
+
+
+def test_a_task_beyond_all_chargers_says_so(hungry: Floor) -> None:
+    """The charger is not blocked, but no path leads to it: a robot would end there with an empty battery."""
+    hungry.add("Robot1", 0, battery=0.9)
+    hungry.facts.shut, hungry.facts.map_revision = frozenset({48, 57}), 1
+    task = hungry.go(7)
+    hungry.run(15)
+    assert hungry.task(task).state is TaskState.QUEUED
+    assert hungry.task(task).reason == "no path leads from its last stop to a charger (cells 56)"
+
+
 def test_energy_is_checked_before_each_further_stop(hungry: Floor) -> None:
     """The battery turns out to be worse than it was at the start: another robot makes the second stop."""
     robot = hungry.add("Robot1", 0, battery=0.9)
