@@ -242,7 +242,8 @@ class Dispatcher:
         While all are, batteries need only their critical share beside what a task takes: a person who stands
         on the only charger does not stop the fleet.
         """
-        return tuple(cell for cell in self._book.places.chargers if cell not in self._facts.shut)
+        shut = frozenset() if self._facts is None else self._facts.shut
+        return tuple(cell for cell in self._book.places.chargers if cell not in shut)
 
     def _is_idle(self, robot: RobotFacts) -> bool:
         entry = self._book.entry(robot.id)
