@@ -25,7 +25,7 @@ from rce_fleet.demo.config import CoreProgram, DemoConfig, MachineBackend, Mode,
 from rce_fleet.demo.exceptions import DemoError
 from rce_fleet.demo.modes import start_demo
 from rce_fleet.demo.random_goals import send_random_goals
-from rce_fleet.demo.resources import ANY, Ports, run_folder
+from rce_fleet.demo.resources import ANY, MAX_PORT, Ports, run_folder
 from rce_fleet.demo.scenario import MANY, choose_scenario
 from rce_fleet.demo.worlds import NamedWorld, find_world
 from rce_fleet.exceptions import FleetError
@@ -107,23 +107,29 @@ def demo(
     auto: Annotated[
         bool, typer.Option("--auto/--no-auto", help="Send robots to random goals until you set a goal.")
     ] = True,
-    port: Annotated[int | None, typer.Option(help="Port of the page [9080; headless: any].")] = None,
-    http_port: Annotated[
-        int | None, typer.Option(help="Port of the engine's clients and REST [9000].")
+    port: Annotated[
+        int | None, typer.Option(min=0, max=MAX_PORT, help="Port of the page [9080; headless: any].")
     ] = None,
-    control_port: Annotated[int | None, typer.Option(help="Port of the engine's task sets [8080].")] = None,
-    ws_port: Annotated[int | None, typer.Option(help="Port of the robots' WebSockets [9010].")] = None,
+    http_port: Annotated[
+        int | None, typer.Option(min=0, max=MAX_PORT, help="Port of the engine's clients and REST [9000].")
+    ] = None,
+    control_port: Annotated[
+        int | None, typer.Option(min=0, max=MAX_PORT, help="Port of the engine's task sets [8080].")
+    ] = None,
+    ws_port: Annotated[
+        int | None, typer.Option(min=0, max=MAX_PORT, help="Port of the robots' WebSockets [9010].")
+    ] = None,
     robot_link_port: Annotated[
-        int | None, typer.Option(help="Port of links to robot endpoints [10030].")
+        int | None, typer.Option(min=0, max=MAX_PORT, help="Port of links to robot endpoints [10030].")
     ] = None,
     container_link_port: Annotated[
-        int | None, typer.Option(help="Port of links to containers [10031].")
+        int | None, typer.Option(min=0, max=MAX_PORT, help="Port of links to containers [10031].")
     ] = None,
     runtime: Annotated[
         Runtime | None, typer.Option(help="Runtime of the containers (default: auto).")
     ] = None,
     core_port: Annotated[
-        int | None, typer.Option(help="Port of the ROS core of --mode single [11311].")
+        int | None, typer.Option(min=0, max=MAX_PORT, help="Port of the ROS core of --mode single [11311].")
     ] = None,
     core: Annotated[
         CoreProgram, typer.Option(help="Program that is the ROS core of --mode single.")

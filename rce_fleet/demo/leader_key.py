@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import sys
 import termios
@@ -58,15 +59,17 @@ async def _kill(urls: Sequence[str], say: Callable[[str], None]) -> None:
 
 @contextmanager
 def _keys(loop: asyncio.AbstractEventLoop, kill: Callable[[], None]) -> Iterator[None]:
-    """Read keys one by one, if there is a terminal."""
-    if not sys.stdin.isatty():
+    """Read keys one by one, if there is a terminal and it is this program's now."""
+    if sys.stdin is None or not sys.stdin.isatty() or not _is_ours(file := sys.stdin.fileno()):
         yield
         return
-    file = sys.stdin.fileno()
     before = termios.tcgetattr(file)
 
     def read() -> None:
-        text = os.read(file, 64)
+        try:
+            text = os.read(file, 64)
+        except OSError:  # the terminal is gone
+            text = b""
         if not text:
             loop.remove_reader(file)
         elif KEY.encode() in text.lower():
@@ -78,4 +81,13 @@ def _keys(loop: asyncio.AbstractEventLoop, kill: Callable[[], None]) -> Iterator
         yield
     finally:
         loop.remove_reader(file)
-        termios.tcsetattr(file, termios.TCSADRAIN, before)
+        if _is_ours(file):
+            termios.tcsetattr(file, termios.TCSADRAIN, before)
+
+
+def _is_ours(terminal: int) -> bool:
+    """Return whether this program is in the foreground: in the background a change of modes would stop it."""
+    try:
+        return os.tcgetpgrp(terminal) == os.getpgrp()
+    except OSError as error:
+        return error.errno == errno.ENOTTY  # that of another session stops no program; others are gone

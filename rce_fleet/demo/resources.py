@@ -16,11 +16,12 @@ from pathlib import Path
 
 import psutil
 
-from rce_fleet.demo.exceptions import PortInUseError
+from rce_fleet.demo.exceptions import DemoError, PortInUseError
 
 LOOPBACK = "127.0.0.1"
 QUIET_PORTS = range(12000, 32000)
 """Ports below the system's ephemeral range."""
+MAX_PORT = 65535
 ATTEMPTS = 100
 PREFIX = "rce-demo-"
 LOCK = "lock"
@@ -99,6 +100,8 @@ def _bind(port: int, option: str) -> Iterator[int]:
 
 
 def _listen(port: int, option: str) -> socket.socket:
+    if port > MAX_PORT:
+        raise DemoError(f"there is no port {port}; choose another one with {option}")
     try:
         return socket.create_server((LOOPBACK, port))
     except OSError as error:
@@ -153,11 +156,19 @@ def run_folder(keep_in: Path | None = None) -> Iterator[Path]:
     Args:
         keep_in: Parent of a folder that is kept. If None, the folder is temporary: it is removed at the end,
             as are folders of earlier demos that were killed.
+
+    Raises:
+        DemoError: It cannot be created.
     """
     if keep_in is not None:
-        keep_in.mkdir(parents=True, exist_ok=True)
-        stamp = time.strftime("demo-%Y%m%d-%H%M%S-")
-        yield Path(tempfile.mkdtemp(prefix=stamp, dir=keep_in.absolute()))
+        try:
+            keep_in.mkdir(parents=True, exist_ok=True)
+            stamp = time.strftime("demo-%Y%m%d-%H%M%S-")
+            made = Path(tempfile.mkdtemp(prefix=stamp, dir=keep_in.absolute()))
+        except OSError as error:
+            text = f"--state-dir {keep_in} cannot be used: {error.strerror or error}; give another folder"
+            raise DemoError(text) from error
+        yield made
         return
     remove_abandoned(Path(tempfile.gettempdir()))
     with tempfile.TemporaryDirectory(prefix=PREFIX, ignore_cleanup_errors=True) as name:

@@ -20,7 +20,7 @@ from rce.ros.types import TypeRegistry
 from rce_client.exceptions import RefusedError
 from rce_fleet.drivers.cell_watch import CellWatch, GraphCellWatch
 from rce_fleet.drivers.engine_cell_watch import EngineCellWatch, WorldAccount
-from rce_fleet.drivers.program import Cores, PortTakenError, RunOptions, Simulation
+from rce_fleet.drivers.program import MAX_PORT, Cores, PortTakenError, RunOptions, Simulation
 from rce_fleet.drivers.scene import load_scene
 from rce_fleet.exceptions import FleetError
 from rce_fleet.maps.ros_map import save_map
@@ -98,10 +98,18 @@ def sim(
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of all noise, instead of the scene's.")] = None,
     core_port: Annotated[
-        int, typer.Option(help="Port of the first robot's ROS core; the others follow. 0: any free ports.")
+        int,
+        typer.Option(
+            min=0,
+            max=MAX_PORT,
+            help="Port of the first robot's ROS core; the others follow. 0: any free ports.",
+        ),
     ] = DEFAULT_PORT,
     world_port: Annotated[
-        int, typer.Option(help="Port of the core with the world's services; 0: any free port.")
+        int,
+        typer.Option(
+            min=0, max=MAX_PORT, help="Port of the core with the world's services; 0: any free port."
+        ),
     ] = DEFAULT_PORT - 1,
     core: Annotated[
         list[str] | None,

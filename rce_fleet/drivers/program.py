@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Cores", "RunOptions", "Simulation", "run_world"]
 
+MAX_PORT = 65535
 REPORT_EVERY = 0.5
 """Seconds between two reports."""
 ROBOT_NODE = "robot"
@@ -84,7 +85,7 @@ class RunOptions:
 
 
 class PortTakenError(Exception):
-    """The port of a core is in use."""
+    """The port of a core is in use, or there is none left."""
 
 
 class Simulation:
@@ -254,8 +255,14 @@ class Simulation:
         """Return the port of the next robot's core."""
         if not self._options.core_port:
             return 0
+        port = self._options.core_port + self._ports
+        if port > MAX_PORT:
+            first = self._options.core_port
+            raise PortTakenError(
+                f"there are too few ports from {first} on for all cores; choose smaller ones"
+            )
         self._ports += 1
-        return self._options.core_port + self._ports - 1
+        return port
 
     async def _start_core(self, stack: AsyncExitStack, port: int, whose: str) -> str:
         core = Core(port=port)

@@ -73,7 +73,9 @@ def ui(
         str,
         typer.Option(help="Instead of CONFIG: ROS master of a planner that runs without the engine."),
     ] = "",
-    port: Annotated[int, typer.Option(help="Port of the page and the API; 0: any free port.")] = PORT,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of the page and the API; 0: any free port.")
+    ] = PORT,
     bind: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     public_name: Annotated[
         list[str] | None,

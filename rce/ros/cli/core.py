@@ -23,7 +23,7 @@ GOODBYE_S = 0.1
 @from_file("core")
 def core(
     port: Annotated[
-        int, typer.Option("--port", "-p", help="Port to listen on; 0: any free port.")
+        int, typer.Option("--port", "-p", min=0, max=65535, help="Port to listen on; 0: any free port.")
     ] = DEFAULT_PORT,
     bind: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for all.")] = "127.0.0.1",
     advertised: Annotated[

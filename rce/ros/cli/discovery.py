@@ -32,8 +32,12 @@ def discovery(
     mcast_group: Annotated[
         str, typer.Option(help="Multicast group as GROUP@INTERFACE; INTERFACE is a name or an address.")
     ] = _DEFAULT.mcast_group,
-    mcast_port: Annotated[int, typer.Option(help="UDP port of heartbeats.")] = _DEFAULT.mcast_port,
-    rpc_port: Annotated[int, typer.Option(help="Port of the RPC server; 0: the master's plus 300.")] = 0,
+    mcast_port: Annotated[
+        int, typer.Option(min=1, max=65535, help="UDP port of heartbeats.")
+    ] = _DEFAULT.mcast_port,
+    rpc_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of the RPC server; 0: the master's plus 300.")
+    ] = 0,
     rpc_addr: Annotated[str, typer.Option(help="Address of the RPC server; default: all.")] = "",
     heartbeat_hz: Annotated[float, typer.Option(help="Heartbeats per second.")] = _DEFAULT.heartbeat_hz,
     rosmaster_hz: Annotated[

@@ -51,7 +51,14 @@ def launch(
         typer.Option("--one-process", help="Run nodes of Python packages in this process, to save memory."),
     ] = False,
     port: Annotated[
-        int, typer.Option("--port", "-p", help="Port of a master on this machine; default: ROS_MASTER_URI.")
+        int,
+        typer.Option(
+            "--port",
+            "-p",
+            min=0,
+            max=65535,
+            help="Port of a master on this machine; default: ROS_MASTER_URI.",
+        ),
     ] = 0,
     sigint_timeout: Annotated[
         float, typer.Option(help="Seconds that a node may take to end on SIGINT.")

@@ -215,8 +215,9 @@ async def test_a_killed_world_comes_back_for_its_listeners(tmp_path: Path) -> No
         ((), "robots: [{id: R, at: [0, 0]}]", 2, b"robots[0]"),
         (("--factor", "-1"), SCENE, 2, b"0 or more"),
         (("--core", "http://127.0.0.1:1/"), SCENE, 1, b"127.0.0.1:1"),
+        (("--core-port", "99999"), SCENE, 2, b"Invalid value for '--core-port'"),
     ],
-    ids=["bad scene", "no room", "bad factor", "no master"],
+    ids=["bad scene", "no room", "bad factor", "no master", "no port"],
 )
 async def test_wrong_input_ends_the_program(
     tmp_path: Path, options: tuple[str, ...], scene: str, code: int, words: bytes
