@@ -232,7 +232,7 @@ class ObstacleCellsNode:
         fresh = [
             (pose.x, pose.y, radius)
             for seen_at, pose in self._others.poses.values()
-            if now - seen_at <= POSES_LAST
+            if 0 <= now - seen_at <= POSES_LAST
         ]
         return np.array(fresh, np.float64).reshape(-1, 3)
 
@@ -259,7 +259,7 @@ class ObstacleCellsNode:
             self._blocked_out.publish(data=list(findings.blocked))
         if self._freed:
             self._freed_out.publish(data=sorted(self._freed))
-        self._freed = {cell: at for cell, at in self._freed.items() if now - at < FREED_FOR}
+        self._freed = {cell: at for cell, at in self._freed.items() if 0 <= now - at < FREED_FOR}
 
 
 def _same_place(one: OccupancyMap, other: OccupancyMap) -> bool:

@@ -8,7 +8,7 @@ is free again once most of it was seen to be free.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import pi
+from math import ceil, floor, inf, pi
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,6 +30,12 @@ if TYPE_CHECKING:
 
 _MOST, _OCCUPIED = 4, 2
 """Evidence of a part: hits add 1 and rays that pass take 1 away, within 0 .. 4; from 2 on it is occupied."""
+_FRESH = 2.0
+"""A part that was seen to be free counts as free for so long, seconds."""
+_BEGINNING = 10.0
+"""What the watch's own time begins with, seconds: 0 is a part that was never seen."""
+_TIME_JUMP = 1.0
+"""Time that goes back by more than this began anew, with a simulation or a bag, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,13 +98,9 @@ class CellWatch:
         self.parameters = parameters
         self._known = known
         self._away = None if known is None else distance_field(known, 1.0)
-        count = parameters.parts
-        shape = (fleet.rows * count, fleet.columns * count)
-        self._evidence = np.zeros(shape, np.int8)
-        self._seen_at = np.full(shape, -np.inf, np.float32)
-        self._part = fleet.resolution / count
-        self._since: dict[int, tuple[bool, float]] = {}
-        self._start = 0.0
+        self._part = fleet.resolution / parameters.parts
+        self._now = -inf
+        self._begin(-inf)
 
     def take(
         self,
@@ -118,7 +120,9 @@ class CellWatch:
             held: Cells that other robots hold; nothing in them is reported, and what was seen is forgotten.
             suspects: Cells that are blocked as far as the fleet knows; they are reported if they are free.
         """
-        self._start = self._start or now
+        if now < self._now - _TIME_JUMP or self._now == -inf:
+            self._begin(now)
+        self._now = now
         sensor = self._local(np.array(((seen.x, seen.y),)))[0]
         hits = self._foreign(seen.hits, robots)
         self._update(seen, hits, now)
@@ -140,6 +144,16 @@ class CellWatch:
             elif cell in suspects and self._seen_free(cell, now):
                 freed.append(cell)
         return Findings(tuple(blocked), tuple(freed))
+
+    def _begin(self, now: float) -> None:
+        """Forget all that was seen."""
+        count = self.parameters.parts
+        shape = (self.fleet.rows * count, self.fleet.columns * count)
+        # Zeros: memory of parts that no scan reaches is not used.
+        self._evidence: NDArray[np.int8] = np.zeros(shape, np.int8)
+        self._seen_at: NDArray[np.float32] = np.zeros(shape, np.float32)
+        self._since: dict[int, tuple[bool, float]] = {}
+        self._start = now - _BEGINNING
 
     # Parts
 
@@ -184,10 +198,13 @@ class CellWatch:
 
     def _in_sight(self, sensor: Floats) -> list[int]:
         """Return the cells whose middle is in sight."""
-        count = self.parameters.parts
-        rows, columns = np.mgrid[0 : self.fleet.rows, 0 : self.fleet.columns]
-        away = np.hypot((columns + 0.5) * count - sensor[0], (rows + 0.5) * count - sensor[1]) * self._part
-        return [int(cell) for cell in np.flatnonzero(away.reshape(-1) <= self.parameters.sight)]
+        x, y = sensor / self.parameters.parts
+        reach = self.parameters.sight / self.fleet.resolution
+        low, left = max(floor(y - reach), 0), max(floor(x - reach), 0)
+        high, right = min(ceil(y + reach), self.fleet.rows), min(ceil(x + reach), self.fleet.columns)
+        rows, columns = np.mgrid[low : max(low, high), left : max(left, right)]
+        near = np.hypot(columns + 0.5 - x, rows + 0.5 - y) <= reach
+        return [int(cell) for cell in rows[near] * self.fleet.columns + columns[near]]
 
     def _square(self, cell: int) -> tuple[slice, slice]:
         count = self.parameters.parts
@@ -206,7 +223,7 @@ class CellWatch:
 
     def _seen_free(self, cell: int, now: float) -> bool:
         """Return whether most of a cell was seen to be free a moment ago."""
-        fresh = self._seen_at[self._square(cell)] >= now - self._start - 2.0
+        fresh = self._seen_at[self._square(cell)] >= now - self._start - _FRESH
         return float(fresh.mean()) >= self.parameters.seen_share
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from math import inf, pi
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,11 +49,36 @@ def watch_for(watch: CellWatch, seen: Observation, begin: float, **others: objec
 HERE = Pose(0.5, 1.5, 0.0)
 
 
+def resident() -> int:
+    """Return how much memory this process has, bytes."""
+    return int(Path("/proc/self/statm").read_text("ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
 def test_a_box_that_fills_a_cell_is_reported_and_freed() -> None:
     watch = CellWatch(fleet(), WatchParameters())
     assert watch_for(watch, look(HERE, BOX), 1.0) == Findings((6,), ())
     assert watch_for(watch, look(HERE, BOX), 3.0, suspects=(6,)).freed == ()
     assert watch_for(watch, look(HERE), 5.0, suspects=(6,)) == Findings((), (6,))
+
+
+def test_time_that_jumps_back_begins_a_watch_anew() -> None:
+    """A cell is found blocked, and free, within a second, not when the time before comes again."""
+    watch = CellWatch(fleet(), WatchParameters())
+    watch_for(watch, look(HERE, BOX), 1000.0)
+    assert watch_for(watch, look(HERE, BOX), 1.0) == Findings((6,), ())
+    assert watch_for(watch, look(HERE, BOX), 3.0, suspects=(6,)).freed == ()
+    assert watch_for(watch, look(HERE), 5.0, suspects=(6,)) == Findings((), (6,))
+
+
+def test_a_watch_of_a_large_floor_takes_little_memory() -> None:
+    """Only what is near the robot: a floor of half a kilometre has 400 million parts."""
+    floor = OccupancyMap(np.zeros((1000, 1000), np.int8), 0.5)
+    before = resident()
+    watch = CellWatch(floor, WatchParameters())
+    for place in (10.0, 250.0, 490.0):
+        seen = look(Pose(place, place, 0.0), (place + 1.7, place - 0.3, place + 2.3, place + 0.3))
+        assert watch_for(watch, seen, 1.0).blocked
+    assert resident() - before < 100e6
 
 
 def test_a_cell_that_no_one_suspects_is_not_freed() -> None:
