@@ -97,7 +97,7 @@ class CostmapPublisher:
                 "height": rows,
                 "origin": pose_fields(Pose(*grid.origin, 0.0)),
             },
-            data=to_occupancy(grid.values).reshape(-1).tolist(),
+            data=to_occupancy(grid.values).reshape(-1),
         )
 
     def _publish_update(self, header: dict[str, Any], area: Area) -> None:
@@ -108,5 +108,5 @@ class CostmapPublisher:
             y=area.low,
             width=values.shape[1],
             height=values.shape[0],
-            data=values.reshape(-1).tolist(),
+            data=values.reshape(-1),
         )
