@@ -88,6 +88,13 @@ class MoveBaseNode:
         ]
         for publisher in publishers:
             await publisher.start()
+        try:
+            await self._drive(publishers, diagnostics)
+        finally:  # Also after an error: wheels keep their last command.
+            self._velocity.publish(twist_fields(STANDING))
+
+    async def _drive(self, publishers: list[CostmapPublisher], diagnostics: Diagnostics) -> None:
+        node, stack = self._node, self.stack
         async with TransformListener(node, prefix="") as transforms:
             costmaps = (stack.global_costmap, stack.local_costmap)
             world, local = (one.parameters for one in costmaps)
@@ -110,13 +117,12 @@ class MoveBaseNode:
             self._goals = MoveBaseGoals(node, self, transforms, self._throttled_log)
             async with self._goals, asyncio.TaskGroup() as tasks:
                 told = float("-inf")
-                async for _ in node.rate(parameters.controller_frequency):
+                async for _ in node.rate(self._settings.move_base.controller_frequency):
                     self._step(tasks, publishers)
                     now = node.time()
                     if not 0 <= now - told < DIAGNOSTICS_EVERY:
                         told = now
                         self._report(diagnostics)
-        self._velocity.publish(twist_fields(STANDING))
 
     # For the goals
 

@@ -66,6 +66,14 @@ class VelocityLimiterNode:
         self._stopped = await node.advertise("~emergency_stopped", "std_msgs/Bool", latch=True)
         self._stopped.publish(data=False)
         diagnostics = await Diagnostics.start(node, "velocity_limiter: safety")
+        try:
+            await self._limit(diagnostics)
+        finally:  # Also after an error: wheels keep their last command.
+            self._limiter.stop("the safety stage has ended")
+            self._out.publish(twist_fields(STANDING))
+
+    async def _limit(self, diagnostics: Diagnostics) -> None:
+        node = self._node
         async with TransformListener(node, prefix="") as self._tf:
             await node.subscribe("odom", "nav_msgs/Odometry", self._take_odometry)
             await node.subscribe("scan", "sensor_msgs/LaserScan", self._take_scan)
@@ -80,7 +88,6 @@ class VelocityLimiterNode:
                 if not 0 <= now - told < DIAGNOSTICS_EVERY:
                     told = now
                     self._report(diagnostics)
-        self._out.publish(twist_fields(STANDING))
 
     # What comes in
 

@@ -135,6 +135,24 @@ async def test_a_robot_drives_around_a_box_to_its_goal(core: Core) -> None:
         assert names == {"/move_base: navigation", "/velocity_limiter: velocity_limiter: safety"}
 
 
+async def test_an_error_stops_the_robot(core: Core, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The node ends by it, and wheels keep their last command."""
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("a test wants it")
+
+    async with navigation(core) as (judge, robot, base), client_of(judge) as client:
+        raw: list[Message] = []
+        await judge.subscribe("raw_cmd_vel", "geometry_msgs/Twist", raw.append)
+        await client.send(goal_to(3.2, 1.0))
+        async with asyncio.timeout(60):
+            while robot.world.twist.speed < 0.3:
+                await asyncio.sleep(0.05)
+            monkeypatch.setattr(base.stack, "control", fail)
+            while raw[-1].linear.x:
+                await asyncio.sleep(0.05)
+
+
 async def test_cancelling_stops_the_robot_at_once(core: Core) -> None:
     async with navigation(core) as (judge, robot, base), client_of(judge) as client:
         raw: list[Message] = []

@@ -36,7 +36,10 @@ class Senses:
         scans: Whether scans are published; without them the stamp of the last one is kept.
         command: To be limited.
         passed: What the stage let pass.
+        stage: The task of the stage.
     """
+
+    stage: asyncio.Task[None]
 
     def __init__(self, node: Node, mounted: Transform) -> None:
         self._node = node
@@ -94,7 +97,8 @@ async def stage(mounted: Transform) -> AsyncIterator[Senses]:
         parameters = SafetyParameters(
             robot_radius=0.2, walking_speed=0.0, scan_timeout=5.0, command_timeout=5.0, transform_timeout=5.0
         )
-        tasks = [asyncio.create_task(one.run()) for one in (senses, VelocityLimiterNode(node, parameters))]
+        senses.stage = asyncio.create_task(VelocityLimiterNode(node, parameters).run())
+        tasks = [asyncio.create_task(senses.run()), senses.stage]
         try:
             await senses.wait_for(lambda twist: twist == AHEAD)
             yield senses
@@ -125,3 +129,13 @@ async def test_odometry_that_turns_at_once_forgets_the_scan() -> None:
         senses.scans, senses.odometry = False, Pose(0.0, 0.0, pi)
         for _ in range(20):
             assert (await asyncio.wait_for(senses.passed.get(), 30)).speed < 0.2
+
+
+async def test_a_stage_that_ends_early_stops_the_wheels() -> None:
+    async with stage(Transform()) as senses:
+        senses.stage.cancel()
+        await asyncio.wait((senses.stage,))
+        await senses.wait_for(lambda twist: twist == Twist())
+        await asyncio.sleep(4 * EVERY)  # commands come as before
+        while not senses.passed.empty():
+            assert senses.passed.get_nowait() == Twist()
