@@ -48,12 +48,16 @@ class Placement:
     Attributes:
         pose: x, y (metres) and yaw (radians) of the frame in the map frame.
         note: What the operator should know about it; empty if it is exact.
+        is_upside_down: Whether the frame's z points downwards, as that of a scanner that hangs.
     """
 
     pose: tuple[float, float, float]
     note: str = ""
+    is_upside_down: bool = False
 
 
+_CLOCKWISE = frozenset({"angle_min", "angle_increment"})
+"""Fields of a scan that change their sign with the side from which it is seen."""
 OLD_S = 5.0
 """Difference between a live message's stamp and the time from which the operator is told."""
 _WALL_CLOCK_FROM_S = 1e9
@@ -84,6 +88,9 @@ def encode(robot: str, layer: str, data: LayerData, placement: Placement) -> byt
     """
     if not all(map(isfinite, placement.pose)):
         raise LayerError(f"the pose of frame {data.frame_id!r} on the map is not finite: {placement.pose}")
+    fields = dict(data.fields)
+    if placement.is_upside_down:  # Seen from above, such a scanner turns clockwise.
+        fields |= {name: -fields[name] for name in fields.keys() & _CLOCKWISE}
     header = {
         "type": "layer",
         "robot": robot,
@@ -92,7 +99,7 @@ def encode(robot: str, layer: str, data: LayerData, placement: Placement) -> byt
         "frame": data.frame_id,
         "pose": [round(value, 4) for value in placement.pose],
         "notes": [*data.notes, *filter(None, [placement.note])],
-        **data.fields,
+        **fields,
     }
     text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-(len(text) + ALIGNMENT) % ALIGNMENT)

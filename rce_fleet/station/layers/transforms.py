@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from rce.ros.tf import Buffer, StampedTransform, TransformError
+from rce.ros.tf import Buffer, StampedTransform, TransformError, Vector
 from rce.ros.tf.exceptions import ExtrapolationError
 from rce.ros.types import Time, TypesError
 from rce_fleet.station.layers.frames import LayerError, Placement
@@ -94,7 +94,8 @@ class RobotTransforms:
             which = "older" if apart > 0 else "newer"
             note = f"placed by a transform that is {abs(apart):.1f} s {which}" if abs(apart) > LATE_S else ""
         moved = found.transform.translation
-        return Placement((moved.x, moved.y, found.transform.yaw), note)
+        up = found.transform.rotation.rotate(Vector(z=1.0))
+        return Placement((moved.x, moved.y, found.transform.yaw), note, is_upside_down=up.z < 0)
 
     def _notice_jump(self, stamp_ns: int) -> None:
         """Forget transforms from before a simulation that began anew."""

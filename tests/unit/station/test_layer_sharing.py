@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
@@ -13,7 +14,7 @@ from support.layers import STATE, header, pose, transform
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
 from rce_fleet.station.layers import sources
-from rce_fleet.station.layers.frames import LayerError
+from rce_fleet.station.layers.frames import LayerData, LayerError, encode
 from rce_fleet.station.layers.hub import LayerHub
 from rce_fleet.station.layers.kinds import LAYERS, LayerTopic
 from rce_fleet.station.layers.sources import LayerSource, Take, Tell
@@ -162,6 +163,20 @@ def test_a_message_newer_than_its_transforms_has_a_note() -> None:
     placed = make_transforms().place("/laser", 13_000_000_000)
     assert placed.pose == pytest.approx((2.5, 0.0, 0.0))
     assert placed.note == "placed by a transform that is 2.0 s older"
+
+
+def test_a_scanner_that_hangs_is_seen_from_above() -> None:
+    made = make_transforms()
+    hanging = transform("base_link", "hanging", 0.0, 0.5, 0.0, 0.0)
+    hanging["transform"]["rotation"] = {"x": 1.0, "w": 0.0}
+    made.take_static(written("tf2_msgs/TFMessage", transforms=[hanging]))
+    assert not made.place("laser", 0).is_upside_down
+    placed = made.place("hanging", 0)
+    assert placed.is_upside_down
+    fields = {"angle_min": -1.0, "angle_increment": 0.1, "range_min": 0.1}
+    frame = encode("Robot1", "scan", LayerData("hanging", 0, fields, b""), placed)
+    shown = json.loads(frame[4 : 4 + int.from_bytes(frame[:4], "little")])
+    assert {name: shown[name] for name in fields} == {**fields, "angle_min": 1.0, "angle_increment": -0.1}
 
 
 def test_time_that_begins_anew_forgets_transforms() -> None:
