@@ -52,8 +52,10 @@ class Area(NamedTuple):
         )
 
     def clipped(self, rows: int, columns: int) -> Area:
-        """Return the part inside a grid of that size."""
-        return Area(max(self.low, 0), max(self.left, 0), min(self.high, rows), min(self.right, columns))
+        """Return the part inside a grid of that size; nowhere if it is outside."""
+        low, left = max(self.low, 0), max(self.left, 0)
+        # An index below 0 counts from the end: an area below the grid must not end there.
+        return Area(low, left, max(min(self.high, rows), 0), max(min(self.right, columns), 0))
 
 
 NOWHERE = Area(0, 0, 0, 0)

@@ -172,6 +172,24 @@ def test_an_update_replaces_a_part_of_the_map() -> None:
         costmap.static.update_map(np.full((2, 3), 100, np.int8), 9, 9)
 
 
+@pytest.mark.parametrize(
+    "place", [(-3.0, 1.0), (1.0, -3.0), (-3.0, -3.0), (9.0, 1.0), (1.0, 9.0), (9.0, -3.0)]
+)
+def test_around_a_place_off_the_costmap_is_no_cell(place: tuple[float, float]) -> None:
+    grid = CostGrid(40, 60, 0.1)
+    assert grid.values[grid.area_around(*place, 0.5).slices].size == 0
+
+
+def test_clearing_around_a_robot_off_the_map_keeps_nothing() -> None:
+    parameters = CostmapParameters(obstacle_layer=ObstacleLayerParameters(), width=4.0, height=4.0)
+    costmap = LayeredCostmap(parameters, Footprint(0.2))
+    assert costmap.obstacles is not None
+    costmap.obstacles._mark(costmap.grid, np.array(((1.0, 1.0), (2.0, 2.0))))
+    costmap.clear_outside(Pose(-2.0, -2.0, 0.0), 1.0)
+    costmap.update(ORIGIN, 0.0)
+    assert not (costmap.grid.values == LETHAL).any()
+
+
 # Sensors
 
 
