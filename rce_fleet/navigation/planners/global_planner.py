@@ -9,7 +9,7 @@ plan costs what its way is long, not what the map is large.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil
+from math import ceil, hypot, isnan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -85,7 +85,8 @@ def make_plan(
         start: Where the way begins.
         goal: Where it ends, in the costmap's frame too.
         parameters: Of the planner.
-        tolerance: How far from the goal the way may end, metres; None: ``default_tolerance``.
+        tolerance: How far from the goal the way may end, metres; infinity: anywhere; None:
+            ``default_tolerance``.
     """
     settings = parameters or GlobalPlannerParameters()
     reach = settings.default_tolerance if tolerance is None else tolerance
@@ -94,6 +95,10 @@ def make_plan(
             return _failed(f"the {name} ({pose.x}, {pose.y}, {pose.yaw}) is not finite")
     if not grid.has(start.x, start.y):
         return _failed(f"the start ({start.x:.2f}, {start.y:.2f}) is off the costmap{_extent(grid)}")
+    if isnan(reach):
+        return _failed("the tolerance is not a number")
+    rows, columns = grid.shape
+    reach = min(reach, hypot(goal.x - start.x, goal.y - start.y) + hypot(rows, columns) * grid.resolution)
     first = grid.cell_of(start.x, start.y)
     for area, radius in _windows(grid, first, goal, reach):
         window = _Window(grid, area, steps_of(grid.values[area.slices], allow_unknown=settings.allow_unknown))

@@ -233,3 +233,13 @@ def test_a_line_is_split_into_the_cells_it_crosses(
     crossed = set(zip(rows.tolist(), columns.tolist(), strict=True))
     off_edges = np.abs(at - np.round(at)).min(axis=1) > 1e-6
     assert {(int(r), int(c)) for r, c in np.floor(at[off_edges])} <= crossed
+
+
+def test_a_tolerance_may_be_infinite_but_not_nan() -> None:
+    grid = CostGrid(20, 30, 0.1)
+    grid.values[:, 25:] = LETHAL
+    goal = Pose(2.8, 1.0, 0.0)
+    plan = make_plan(grid, Pose(0.5, 1.0, 0.0), goal, tolerance=inf)
+    assert plan.found
+    assert plan.path[-1, 0] == pytest.approx(2.45)
+    assert not make_plan(grid, Pose(0.5, 1.0, 0.0), goal, tolerance=nan).found
