@@ -20,6 +20,8 @@ STILL_THERE = 0.5
 """A goal is kept while a frontier has a point this near to its middle, metres."""
 PROGRESS = 0.1
 """A robot that came nearer by this has made progress, metres."""
+TIME_JUMP = 1.0
+"""Time that goes back by more than this began anew, with a simulation or a bag, seconds."""
 MAP_WAIT = 10.0
 """So long the last goal's scans may take until they are on the map, seconds: gmapping draws every five."""
 
@@ -67,7 +69,7 @@ class Explorer:
         self.goals = 0
         self._nearest = inf
         self._progress_at = 0.0
-        self._ended_at = -inf
+        self._ended_at = self._now = -inf
 
     def update(self, search: FrontierSearch, drawn_at: float, now: float) -> Action:
         """Return what to do with the newest map.
@@ -77,6 +79,9 @@ class Explorer:
             drawn_at: When the map came, seconds.
             now: Seconds; on the same clock.
         """
+        if now < self._now - TIME_JUMP:
+            self._progress_at, self._ended_at = now, -inf
+        self._now = now
         if self.target is not None:
             held = self._follow(self.target, search, now)
             if held is not None:

@@ -248,6 +248,16 @@ def test_a_goal_without_progress_is_given_up() -> None:
     assert explorer.update(search_of(ONE_END), 33.0, 33.0) is Action.DONE
 
 
+def test_time_that_jumps_back_does_not_hold_up_exploration() -> None:
+    explorer = Explorer(PARAMETERS)
+    explorer.update(search_of(ONE_END), 1000.0, 1000.0)
+    for now in (1.0, 15.0, 31.0):
+        assert explorer.update(search_of(ONE_END), now, now) is Action.KEEP
+    explorer.update(search_of(ONE_END), 32.0, 32.0)
+    assert explorer.target is None
+    assert explorer.update(search_of(ONE_END), 1.0, 1.0) is Action.DONE
+
+
 def test_progress_is_what_counts_not_time() -> None:
     explorer = Explorer(PARAMETERS)
     explorer.update(search_of(ONE_END), 0.0, 0.0)
