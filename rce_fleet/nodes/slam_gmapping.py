@@ -193,7 +193,8 @@ class SlamGmappingNode:
         estimate = Pose.from_array(self._filter.estimate)
         self._map_from_odom = estimate.compose(Pose(*record.odometry).inverse())
         now = self._node.time()
-        if updated and (self._map is None or now - self._map_at >= self._parameters.map_update_interval):
+        is_young = 0 <= now - self._map_at < self._parameters.map_update_interval
+        if updated and (self._map is None or not is_young):
             self._map_at = now
             self._map = map_of(self._filter.store, self._filter.best, self._parameters.occupied_threshold)
         return updated

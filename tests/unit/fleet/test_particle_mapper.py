@@ -25,6 +25,7 @@ from rce_fleet.mapping.gmapping.particles import (
 )
 from rce_fleet.mapping.occupancy_mapping import map_of
 from rce_fleet.mapping.records import LaserRecord
+from rce_fleet.nodes.slam_gmapping import SlamGmappingNode, SlamGmappingParameters
 
 
 def run(
@@ -154,3 +155,27 @@ def test_ancestry_follows_resampled_particles() -> None:
     ways.choose(np.array([1, 2, 2]))
     assert ways.path(0)[:, 0].tolist() == [2, 6]
     assert ways.path(1)[:, 0].tolist() == [0, 7]
+
+
+class ClockOnly:
+    """Stands for a node where only the time is asked for."""
+
+    seconds = 0.0
+
+    def time(self) -> float:
+        return self.seconds
+
+
+def test_maps_are_drawn_on_when_time_jumps_back() -> None:
+    """Else the next map would come when the time before is reached again."""
+    clock = ClockOnly()
+    parameters = SlamGmappingParameters(particles=1, linear_update=0.0, angular_update=0.0, seed=1)
+    node = SlamGmappingNode(clock, parameters)  # type: ignore[arg-type] # it stands for one
+    _, records = drive(4)
+    drawn = []
+    for clock.seconds, record in zip((1000.0, 1001.0, 3.0, 4.0), records, strict=True):
+        node._use(record)
+        drawn.append(node._map)
+    assert drawn[1] is drawn[0]
+    assert drawn[2] is not drawn[0]
+    assert drawn[3] is drawn[2]
