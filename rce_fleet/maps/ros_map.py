@@ -74,7 +74,12 @@ def load_map(path: Path | str) -> OccupancyMap:
         MapError: The file or its image cannot be read; the text names the file, the key and what is expected.
     """
     header = read_header(Path(path))
-    return OccupancyMap(_values(_pixels(header.image), header)[::-1], header.resolution, header.origin)
+    pixels = _pixels(header.image)
+    if pixels.dtype == np.uint8:
+        values = _values_of_grey(np.asarray(pixels, np.uint8), header)
+    else:
+        values = _values(np.asarray(pixels, np.float64), header)
+    return OccupancyMap(values[::-1], header.resolution, header.origin)
 
 
 def save_map(
@@ -184,16 +189,18 @@ def _origin(path: Path, found: dict[object, object]) -> Pose:
 # The image
 
 
-def _pixels(path: Path) -> NDArray[np.float64]:
-    """Return the image's bytes, shape (height, width, channels), 0 .. 255."""
+def _pixels(path: Path) -> NDArray[np.uint8] | NDArray[np.float64]:
+    """Return the image's bytes, 0 .. 255: shape (height, width) if it is grey, else (..., channels)."""
     try:
         with Image.open(path) as image:
             width, height = image.size
             if width * height > MAX_CELLS:
                 raise MapError(f"{path}: {width} x {height} pixels are more than {MAX_CELLS}")
             wide = image.mode.startswith("I")  # 16 bits
-            if not wide and image.mode not in ("L", "LA", "RGB", "RGBA"):
-                pixels = np.asarray(image.convert("L" if image.mode == "1" else "RGBA"), np.float64)
+            if image.mode in ("1", "L"):
+                return np.asarray(image.convert("L"), np.uint8)
+            if not wide and image.mode not in ("LA", "RGB", "RGBA"):
+                pixels = np.asarray(image.convert("RGBA"), np.float64)
             else:
                 pixels = np.asarray(image, np.float64)
     except UnidentifiedImageError as error:
@@ -203,6 +210,19 @@ def _pixels(path: Path) -> NDArray[np.float64]:
     if wide:
         pixels = pixels * (_WHITE / 65535)
     return pixels[..., None] if pixels.ndim == 2 else pixels  # noqa: PLR2004  # rows and columns
+
+
+def _values_of_grey(pixels: NDArray[np.uint8], header: MapHeader) -> NDArray[np.int8]:
+    """Return values of cells of a grey image, shape (height, width), without numbers larger than a byte.
+
+    A floor of 500 m has a hundred million pixels.
+    """
+    is_used = np.zeros(_WHITE + 1, np.bool_)
+    is_used[pixels] = True
+    shades = np.flatnonzero(is_used)
+    table = np.zeros(_WHITE + 1, np.int8)
+    table[shades] = _values(shades.astype(np.float64)[:, None, None], header)[:, 0]
+    return np.asarray(table[pixels])
 
 
 def _values(pixels: NDArray[np.float64], header: MapHeader) -> NDArray[np.int8]:

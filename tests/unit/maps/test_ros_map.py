@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -137,3 +138,18 @@ def test_files_that_hold_no_map(tmp_path: Path) -> None:
         load_map(tmp_path / "map.yaml")
     with pytest.raises(MapError, match="cannot be written"):
         save_map(OccupancyMap(np.zeros((1, 1), np.int8)), tmp_path / "gone" / "map")
+
+
+@pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
+def test_a_large_map_takes_few_bytes_for_a_pixel(tmp_path: Path, mode: str) -> None:
+    """A floor of 500 m at 5 cm is 100 MB; numbers of 64 bits made more than 2 GB of it."""
+    pixels = np.random.default_rng(1).integers(0, 101, (1000, 1000)).astype(np.uint8)
+    path = write(tmp_path, pixels, mode=mode)
+    tracemalloc.start()
+    try:
+        grid = load_map(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert grid.data.shape == pixels.shape
+    assert peak < 8 * pixels.size
