@@ -92,6 +92,7 @@ def test_map_values_become_costs() -> None:
     assert from_occupancy(values, track_unknown=False)[0, 0] == FREE
     assert from_occupancy(values, trinary=False)[0, 2] == 127
     assert from_occupancy(values, lethal_threshold=50)[0, 2] == LETHAL
+    assert from_occupancy(values, lethal_threshold=0, trinary=False).tolist() == [[UNKNOWN, *3 * [LETHAL]]]
 
 
 @given(
