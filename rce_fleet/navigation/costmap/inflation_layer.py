@@ -70,8 +70,9 @@ class InflationLayer:
         np.copyto(below, np.maximum(below, costs), where=~unknown)
         np.copyto(below, costs, where=unknown & (costs >= least))
 
-    def clear(self, _grid: CostGrid, _keep: Area) -> None:
+    def clear(self, _grid: CostGrid, _keep: Area) -> Area:
         """Do nothing: the layer stores nothing."""
+        return NOWHERE
 
     def _costs_by_square(self, resolution: float, reach: int) -> NDArray[np.uint8]:
         """Return the cost for each squared distance in cells; the last entry is for those beyond reach."""

@@ -30,8 +30,8 @@ class Layer(Protocol):
     def update_costs(self, grid: CostGrid, area: Area) -> None:
         """Write the layer's costs of an area over those of the layers below."""
 
-    def clear(self, grid: CostGrid, keep: Area) -> None:
-        """Forget what is stored of the cells outside ``keep``."""
+    def clear(self, grid: CostGrid, keep: Area) -> Area:
+        """Forget what is stored of the cells outside ``keep``; return which costs may have changed."""
 
 
 def write_larger(below: NDArray[np.uint8], costs: NDArray[np.uint8]) -> None:

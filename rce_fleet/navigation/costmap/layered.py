@@ -118,8 +118,7 @@ class LayeredCostmap:
     def clear(self, keep: Area = NOWHERE) -> None:
         """Forget what sensors saw outside an area; without one everywhere. The map stays."""
         for layer in self._layers:
-            layer.clear(self.grid, keep)
-        self._outdated = self.grid.whole
+            self._outdated = self._outdated.joined(layer.clear(self.grid, keep))
 
     def clear_outside(self, robot: Pose, side: float) -> None:
         """Forget what sensors saw outside a square of edge ``side`` (metres) around the robot."""

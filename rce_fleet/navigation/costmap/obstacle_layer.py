@@ -107,14 +107,16 @@ class ObstacleLayer:
         write = write_larger if self.parameters.combination_method else write_known
         write(grid.values[area.slices], self._costs[area.slices])
 
-    def clear(self, grid: CostGrid, keep: Area) -> None:
-        """Forget the marks outside an area, and the observations."""
+    def clear(self, grid: CostGrid, keep: Area) -> Area:
+        """Forget the marks outside an area, and the observations; return the cells that had marks."""
         inside = keep.clipped(*grid.shape)
+        marked = _bounds_of(self._costs != self._fill)
         costs, hits = self._costs, self.hits
         self.match(grid)
         self._costs[inside.slices], self.hits[inside.slices] = costs[inside.slices], hits[inside.slices]
         for kept in self._kept.values():
             kept.clear()
+        return marked
 
     def _drop_old(self, kept: list[Observation], since: float) -> None:
         """Leave the newest observation, and those that are younger than ``since``."""
@@ -190,6 +192,14 @@ def _bounds(cells: NDArray[np.intp]) -> Area:
     low, left = cells.min(axis=0)
     high, right = cells.max(axis=0)
     return Area(int(low), int(left), int(high) + 1, int(right) + 1)
+
+
+def _bounds_of(mask: NDArray[np.bool_]) -> Area:
+    """Return the smallest area with all cells that are set, shape (rows, columns)."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return NOWHERE
+    return Area(int(rows[0]), int(columns[0]), int(rows[-1]) + 1, int(columns[-1]) + 1)
 
 
 def lethal_points(grid: CostGrid, layer: ObstacleLayer | None, area: Area) -> Floats:

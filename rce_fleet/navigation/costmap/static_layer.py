@@ -103,8 +103,9 @@ class StaticLayer:
         write = write_larger if self.parameters.use_maximum else write_known
         write(grid.values[area.slices], self._sampled(self._map, grid, area))
 
-    def clear(self, _grid: CostGrid, _keep: Area) -> None:
+    def clear(self, _grid: CostGrid, _keep: Area) -> Area:
         """Do nothing: a map is not forgotten."""
+        return NOWHERE
 
     def _sampled(self, picture: CostGrid, grid: CostGrid, area: Area) -> NDArray[np.uint8]:
         if self._is_aligned(picture, grid):

@@ -181,6 +181,34 @@ def test_around_a_place_off_the_costmap_is_no_cell(place: tuple[float, float]) -
     assert grid.values[grid.area_around(*place, 0.5).slices].size == 0
 
 
+def test_clearing_computes_costs_anew_where_marks_were() -> None:
+    """Of a large floor the rest stays as it is: it would take a second, in which the robot is not driven."""
+    picture = np.zeros((200, 300), np.int8)
+    picture[::20] = 100
+    parameters = CostmapParameters(
+        static_layer=StaticLayerParameters(),
+        obstacle_layer=ObstacleLayerParameters(),
+        inflation_layer=InflationParameters(inflation_radius=0.3),
+    )
+    costmap = LayeredCostmap(parameters, Footprint(0.2))
+    costmap.set_map(OccupancyMap(picture, 0.1))
+    costmap.update(ORIGIN, 0.0)
+    before = costmap.grid.values.copy()
+    assert costmap.obstacles is not None
+    costmap.obstacles._mark(costmap.grid, np.array(((10.05, 5.05), (10.45, 5.55))))
+    assert costmap.update(ORIGIN, 0.1) == Area(0, 0, 0, 0)
+    costmap.clear()
+    assert costmap.update(ORIGIN, 0.2) == Area(47, 97, 59, 108)
+    assert (costmap.grid.values == before).all()
+    costmap.obstacles._mark(costmap.grid, np.array(((10.05, 5.05), (20.05, 5.55))))
+    costmap.clear_outside(Pose(10.0, 5.0, 0.0), 1.0)
+    costmap.update(ORIGIN, 0.3)
+    assert costmap.grid.cost_at(10.05, 5.05) == LETHAL
+    costmap.clear()
+    costmap.update(ORIGIN, 0.4)
+    assert (costmap.grid.values == before).all()
+
+
 def test_clearing_around_a_robot_off_the_map_keeps_nothing() -> None:
     parameters = CostmapParameters(obstacle_layer=ObstacleLayerParameters(), width=4.0, height=4.0)
     costmap = LayeredCostmap(parameters, Footprint(0.2))
