@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from rce_fleet.navigation.costmap.footprint import Footprint
+
+MAX_CELLS = 100_000_000
+"""Maximum size of a costmap without a map, so that a wrong parameter does not fill the memory."""
+
 
 @dataclass(frozen=True, slots=True)
 class ObservationSource:
@@ -149,6 +154,12 @@ class CostmapGridParameters:
         for name in ("update_frequency", "width", "height", "resolution", "transform_tolerance"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected a number above 0, found {getattr(self, name)}")
+        cells = self.width / self.resolution * (self.height / self.resolution)
+        if cells > MAX_CELLS:
+            raise ValueError(
+                f"width, height, resolution: expected at most {MAX_CELLS} cells, found {cells:.0f}"
+            )
+        Footprint.read(self.footprint, self.robot_radius, self.footprint_padding)
 
 
 @dataclass(frozen=True)

@@ -426,6 +426,25 @@ def test_wrong_parameters_are_named() -> None:
     assert "~TrajectoryPlannerROS/max_vel_x is 'fast', must be a number" in texts
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("footprint", "[[0.2, 0.2], [0.2", "footprint: expected [[x, y], ...]"),
+        ("footprint", "[[1, 0], [2, 0], [2, 1]]", "footprint: expected a polygon around the robot's centre"),
+        ("robot_radius", -1.0, "robot_radius: expected metres above 0"),
+        ("footprint_padding", -1.0, "robot_radius: expected metres above 0"),
+        ("resolution", 1e-9, "expected at most 100000000 cells"),
+        ("width", 1e9, "expected at most 100000000 cells"),
+    ],
+)
+def test_wrong_costmaps_are_told_and_the_node_starts(name: str, value: object, words: str) -> None:
+    settings, problems = read_settings({"local_costmap": {name: value}})
+    assert [(words in one.text, f"~local_costmap/{name}" in one.text) for one in problems] == [(True, True)]
+    usual, _ = read_settings({"local_costmap": {}})
+    assert settings == usual
+    NavigationStack(settings)
+
+
 def test_time_that_jumps_back_does_not_stop_planning() -> None:
     robot = Robot(MoveBaseParameters())
     robot.core.start(robot.now)
