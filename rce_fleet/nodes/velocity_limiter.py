@@ -45,9 +45,15 @@ class VelocityLimiterNode:
         self._node = node
         self._parameters = parameters
         self._throttled_log = ThrottledLog(node)
-        footprint = Footprint.read(
-            parameters.footprint, parameters.robot_radius, parameters.footprint_padding
-        )
+        self._unsafe = ""
+        """Why no command may pass: the robot's outline is not known."""
+        try:
+            footprint = Footprint.read(
+                parameters.footprint, parameters.robot_radius, parameters.footprint_padding
+            )
+        except ValueError as error:
+            self._unsafe = f"the parameters of the outline cannot be used: {error}"
+            footprint = Footprint(SafetyParameters().robot_radius)
         self._limiter = VelocityLimiter(parameters, footprint)
         self._odometry: list[tuple[float, Pose]] = []
         self._last = Verdict(STANDING)
@@ -189,6 +195,8 @@ class VelocityLimiterNode:
         if self._node.is_shutdown:
             return
         verdict = self._limiter.limit(self._node.time())
+        if self._unsafe:
+            verdict = Verdict(STANDING, self._unsafe, stopped=True)
         if verdict.stopped and not self._last.stopped and "no command" not in verdict.reason:
             self._throttled_log.warn("stop", f"the robot stands: {verdict.reason}")
         self._limited += bool(verdict.reason and not verdict.stopped)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from math import inf, pi
 from typing import Any
 
@@ -25,6 +26,9 @@ pytestmark = pytest.mark.timeout(120)
 BEAMS = 360
 EVERY = 0.05
 AHEAD = Twist(0.3, 0.0)
+PARAMETERS = SafetyParameters(
+    robot_radius=0.2, walking_speed=0.0, scan_timeout=5.0, command_timeout=5.0, transform_timeout=5.0
+)
 
 
 class Senses:
@@ -42,7 +46,7 @@ class Senses:
     stage: asyncio.Task[None]
 
     def __init__(self, node: Node, mounted: Transform) -> None:
-        self._node = node
+        self.node = node
         self._mounted = mounted
         self.odometry = Pose(0.0, 0.0, 0.0)
         self.ranges = np.full(BEAMS, inf)
@@ -52,7 +56,7 @@ class Senses:
 
     async def run(self) -> None:
         """Publish until cancelled."""
-        node = self._node
+        node = self.node
         kinds: dict[str, str] = {
             "odom": "nav_msgs/Odometry", "scan": "sensor_msgs/LaserScan", "raw_cmd_vel": "geometry_msgs/Twist"
         }  # fmt: skip
@@ -86,21 +90,20 @@ class Senses:
 
 
 @asynccontextmanager
-async def stage(mounted: Transform) -> AsyncIterator[Senses]:
-    """Run the safety stage of a robot whose lidar is mounted in some way."""
+async def stage(
+    mounted: Transform, parameters: SafetyParameters = PARAMETERS, first: Twist = AHEAD
+) -> AsyncIterator[Senses]:
+    """Run the safety stage of a robot whose lidar is mounted in some way, until ``first`` passes."""
     async with (
         Core(port=0) as core,
         Node("velocity_limiter", argv=[], master_uri=core.uri) as node,
         Node("robot", argv=[], master_uri=core.uri) as robot,
     ):
         senses = Senses(robot, mounted)
-        parameters = SafetyParameters(
-            robot_radius=0.2, walking_speed=0.0, scan_timeout=5.0, command_timeout=5.0, transform_timeout=5.0
-        )
         senses.stage = asyncio.create_task(VelocityLimiterNode(node, parameters).run())
         tasks = [asyncio.create_task(senses.run()), senses.stage]
         try:
-            await senses.wait_for(lambda twist: twist == AHEAD)
+            await senses.wait_for(lambda twist: twist == first)
             yield senses
         finally:
             for task in tasks:
@@ -137,5 +140,23 @@ async def test_a_stage_that_ends_early_stops_the_wheels() -> None:
         await asyncio.wait((senses.stage,))
         await senses.wait_for(lambda twist: twist == Twist())
         await asyncio.sleep(4 * EVERY)  # commands come as before
+        while not senses.passed.empty():
+            assert senses.passed.get_nowait() == Twist()
+
+
+async def test_a_robot_of_unknown_outline_stands_and_says_why() -> None:
+    """To take the default outline would let a larger robot hit what it passes."""
+    wrong = replace(PARAMETERS, footprint="[[0.5, 0.3], [0.5")
+    async with stage(Transform(), wrong, Twist()) as senses:
+        states: asyncio.Queue[str] = asyncio.Queue()
+
+        def take(message: Message) -> None:
+            for status in message.status:
+                states.put_nowait(status.message)
+
+        await senses.node.subscribe("/diagnostics", "diagnostic_msgs/DiagnosticArray", take)
+        async with asyncio.timeout(60):
+            while "expected [[x, y], ...], found '[[0.5, 0.3], [0.5'" not in await states.get():
+                pass
         while not senses.passed.empty():
             assert senses.passed.get_nowait() == Twist()
