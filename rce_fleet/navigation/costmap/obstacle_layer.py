@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 
+MAX_KEPT = 1000
+"""Observations of a source that are kept, however long it persists."""
 JUMP = 1.0
 """A message that is older than the one before by more than this came after a jump of time, seconds."""
 
@@ -63,7 +65,7 @@ class ObstacleLayer:
         if kept and kept[-1].stamp - observation.stamp > JUMP:
             kept.clear()  # Time jumped back: a simulation or a bag began anew.
         kept.append(observation)
-        self._drop_old(kept, observation.stamp - self.sources[source].observation_persistence)
+        self._drop_old(source, observation.stamp)
 
     def late_sources(self, now: float) -> list[str]:
         """Return the sources whose last observation is older than their ``expected_update_rate`` allows."""
@@ -92,7 +94,7 @@ class ObstacleLayer:
         changed = NOWHERE
         observations = []
         for name, kept in self._kept.items():
-            self._drop_old(kept, now - self.sources[name].observation_persistence)
+            self._drop_old(name, now)
             observations += [(self.sources[name], one) for one in kept]
         for source, one in observations:
             changed = changed.joined(self._clear_rays(grid, one, source.raytrace_min_range))
@@ -118,10 +120,16 @@ class ObstacleLayer:
             kept.clear()
         return marked
 
-    def _drop_old(self, kept: list[Observation], since: float) -> None:
-        """Leave the newest observation, and those that are younger than ``since``."""
-        newest = max((one.stamp for one in kept), default=0.0)
-        kept[:] = [one for one in kept if one.stamp >= min(since, newest)]
+    def _drop_old(self, source: str, now: float) -> None:
+        """Leave a source's newest observation, and with a persistence those that are younger than it."""
+        kept, persistence = self._kept[source], self.sources[source].observation_persistence
+        newest = max(kept, key=lambda one: one.stamp, default=None)
+        if newest is None:
+            return
+        if persistence > 0:
+            kept[:] = [one for one in kept if one.stamp >= min(now - persistence, newest.stamp)][-MAX_KEPT:]
+        else:  # Of several with its stamp, as while simulated time stands still, the last.
+            kept[:] = [[one for one in kept if one.stamp == newest.stamp][-1]]
 
     def _clear_rays(self, grid: CostGrid, seen: Observation, nearest: float) -> Area:
         if not len(seen.bearings):

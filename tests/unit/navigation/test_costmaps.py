@@ -25,6 +25,7 @@ from rce_fleet.navigation.costmap.costs import (
 from rce_fleet.navigation.costmap.footprint import Footprint
 from rce_fleet.navigation.costmap.layered import LayeredCostmap
 from rce_fleet.navigation.costmap.observation import observe_points, observe_scan
+from rce_fleet.navigation.costmap.obstacle_layer import MAX_KEPT
 from rce_fleet.navigation.costmap.parameters import (
     CostmapParameters,
     InflationParameters,
@@ -179,6 +180,21 @@ def test_an_update_replaces_a_part_of_the_map() -> None:
 def test_around_a_place_off_the_costmap_is_no_cell(place: tuple[float, float]) -> None:
     grid = CostGrid(40, 60, 0.1)
     assert grid.values[grid.area_around(*place, 0.5).slices].size == 0
+
+
+@pytest.mark.parametrize(("persistence", "most"), [(0.0, 1), (5.0, MAX_KEPT)])
+def test_while_time_stands_still_few_observations_are_kept(persistence: float, most: int) -> None:
+    """A simulation that is paused may publish scans; each update uses all that are kept."""
+    source = replace(SOURCE, observation_persistence=persistence)
+    costmap = local_costmap(replace(LOCAL, sources={"scan": source}))
+    assert costmap.obstacles is not None
+    for step in range(1200):
+        at = Pose(1e-4 * step, 0.0, 0.0)
+        seen = observe_scan(wall_ahead(1.0)[::90], -pi, pi / 2, (0.05, 6.0), at, source, 7.0)
+        costmap.obstacles.take("scan", seen)
+    kept = costmap.obstacles._kept["scan"]
+    assert len(kept) == most
+    assert kept[-1].x == pytest.approx(0.1199)
 
 
 def test_clearing_computes_costs_anew_where_marks_were() -> None:
