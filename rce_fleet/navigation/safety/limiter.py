@@ -259,7 +259,10 @@ class VelocityLimiter:
         step = abs(scan.angle_increment)
         beams = scan.sensor.yaw + scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
         off = np.abs(wrap_array(beams - direction - pose.yaw))
-        return bool((off <= step).any() and (off[~np.isnan(scan.ranges)] <= max(step, _VIEW)).any())
+        if not (off <= step).any():
+            return False
+        tells = off <= max(step, _VIEW)
+        return self.parameters.missing_is_free or bool((tells & ~np.isnan(scan.ranges)).any())
 
 
 def allowed_speed(free: float, deceleration: float, delay: float) -> float:

@@ -22,6 +22,8 @@ class SafetyParameters:
         max_speed: Highest speed that passes, m/s.
         max_turn_rate: Highest turn rate that passes, rad/s.
         unseen_speed: Highest speed in a direction of which no scan tells, m/s.
+        missing_is_free: Whether a beam that is NaN or shorter than ``range_min`` tells that nothing is there,
+            for lidars whose drivers do not send ``inf``; a covered lidar is not noticed then.
         walking_speed: How fast something that moves may come nearer, m/s; 0: motion is not watched.
         scan_timeout: A scan older than this stops the robot, seconds.
         command_timeout: A command older than this stops it, seconds.
@@ -42,6 +44,7 @@ class SafetyParameters:
     max_speed: float = 0.65
     max_turn_rate: float = 3.14
     unseen_speed: float = 0.1
+    missing_is_free: bool = False
     walking_speed: float = 1.0
     scan_timeout: float = 0.5
     command_timeout: float = 0.5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import cos, inf, nan, pi, sin
 
 import numpy as np
@@ -308,3 +309,12 @@ def test_where_beams_tell_nothing_the_robot_is_slow(speed: float) -> None:
     seeing = limiter(seen=scan(ranges))
     seeing.take_command(Twist(speed, 0.0), 0.0)
     assert seeing.limit(0.0).twist == Twist(speed, 0.0)
+
+
+@pytest.mark.parametrize(("sensor", "allowed"), [(HERE, 0.5), (Pose(0.0, 0.0, pi), PARAMETERS.unseen_speed)])
+def test_a_driver_may_send_nan_where_nothing_is(sensor: Pose, allowed: float) -> None:
+    """As a parameter says; a direction beside the scan, here behind a sensor of 180 degrees, is not seen."""
+    half = Scan(0.0, sensor, np.full(BEAMS // 2, nan), -pi / 2, STEP, 0.05)
+    stage = limiter(replace(PARAMETERS, missing_is_free=True), seen=half)
+    stage.take_command(Twist(0.5, 0.0), 0.0)
+    assert stage.limit(0.0).twist.speed == allowed
