@@ -7,6 +7,7 @@ folders) has a name that begins with its tag: ``rcx``, the id of its process, a 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import re
@@ -47,19 +48,31 @@ def sweep() -> list[str]:
     Raises:
         OSError: Something cannot be removed.
     """
-    namespaces = [name for name in _namespaces() if is_abandoned(name)]
-    groups = [path for path in _groups() if is_abandoned(path.name)]
-    folders = [path for path in Path(tempfile.gettempdir()).glob("rcx*") if is_abandoned(path.name)]
-    end_all(lambda: {*_in_namespaces(namespaces), *_in_groups(groups)})
-    for name in namespaces:
-        _ip("netns", "del", name)
-    for name in (name for name in _interfaces() if is_abandoned(name)):
-        _ip("link", "del", name)
-    for path in groups:
-        remove_group(path)
-    for path in folders:
-        shutil.rmtree(path)
-    return [*namespaces, *sorted({path.name for path in groups}), *(path.name for path in folders)]
+    with _alone():
+        namespaces = [name for name in _namespaces() if is_abandoned(name)]
+        groups = [path for path in _groups() if is_abandoned(path.name)]
+        folders = [path for path in Path(tempfile.gettempdir()).glob("rcx*") if is_abandoned(path.name)]
+        end_all(lambda: {*_in_namespaces(namespaces), *_in_groups(groups)})
+        for name in namespaces:
+            _ip("netns", "del", name)
+        for name in (name for name in _interfaces() if is_abandoned(name)):
+            _ip("link", "del", name)
+        for path in groups:
+            remove_group(path)
+        for path in folders:
+            shutil.rmtree(path)
+        return [*namespaces, *sorted({path.name for path in groups}), *(path.name for path in folders)]
+
+
+@contextlib.contextmanager
+def _alone() -> Iterator[None]:
+    """Wait until no other experiment removes what was left: both would remove the same things."""
+    folder = os.open(tempfile.gettempdir(), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(folder)
 
 
 def end_all(find: Callable[[], set[int]]) -> None:
