@@ -89,11 +89,11 @@ def _targets(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def _judged(target: Target, figure: float | None) -> str:
-    wanted = f"{'≥' if target.at_least else '≤'} {target.limit:g} {target.incarnation}"
+    wanted = f"{'≥' if target.at_least else '≤'} {target.limit:g} {target.unit}"
     if figure is None:
         return f"not measured | {wanted} | "
     verdict = "met" if target.is_met(figure) else "**missed**"
-    return f"{figure:g} {target.incarnation} | {wanted} | {verdict}"
+    return f"{figure:g} {target.unit} | {wanted} | {verdict}"
 
 
 def _shown(value: object) -> str:

@@ -14,12 +14,11 @@ import argparse
 import contextlib
 import gc
 import tracemalloc
-from collections.abc import Iterator
 from time import thread_time
 from typing import Any
 
 from benchmarks.figures import percentile, save, show
-from benchmarks.targets import TARGETS
+from benchmarks.targets import beside_targets
 from rce.control import CONTROL_VERSION, EndpointStatus, Hello, MachineInfo, TaskSetKind
 from rce.model import InterfaceSpec, NodeSpec, Resources
 from rce_master.exceptions import NoRoomError
@@ -179,18 +178,8 @@ def main() -> None:
     show("Placing, processor time", suites["placing"])
     show("The store, and the state that is loaded from it", suites["store"])
     if not options.quick:
-        show("Beside the targets", list(_beside_targets(suites)))
+        show("Beside the targets", list(beside_targets("scale", suites)))
     print("results:", save("scale", suites))
-
-
-def _beside_targets(suites: dict[str, list[dict[str, Any]]]) -> Iterator[dict[str, Any]]:
-    for target in TARGETS:
-        part, _, suite = target.suite.partition(".")
-        figure = target.read(suites[suite]) if part == "scale" else None
-        if figure is not None:
-            met = "met" if target.is_met(figure) else "missed"
-            limit = f"{target.limit:g} {target.incarnation}"
-            yield {"figure": target.what, "measured": figure, "target": limit, "": met}
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
 from pathlib import Path
 from time import perf_counter
@@ -23,7 +23,7 @@ import psutil
 
 from benchmarks.engine import BIN, free_ports, pss
 from benchmarks.figures import percentile, save, show
-from benchmarks.targets import TARGETS
+from benchmarks.targets import beside_targets
 from rce.supervision.process import Child
 from rce_master.exceptions import StoreError
 from rce_master.store.base import Row
@@ -149,18 +149,8 @@ def main() -> None:
     suites = asyncio.run(measure(quick=options.quick))
     show("A save in etcd, three members", suites["save"])
     show("One member of etcd beside idle masters", suites["idle"])
-    show("Beside the targets", list(_beside_targets(suites)))
+    show("Beside the targets", list(beside_targets("store", suites)))
     print("results:", save("store", suites))
-
-
-def _beside_targets(suites: dict[str, list[dict[str, Any]]]) -> Iterator[dict[str, Any]]:
-    for target in TARGETS:
-        part, _, suite = target.suite.partition(".")
-        figure = target.read(suites[suite]) if part == "store" else None
-        if figure is not None:
-            met = "met" if target.is_met(figure) else "missed"
-            limit = f"{target.limit:g} {target.incarnation}"
-            yield {"figure": target.what, "measured": figure, "target": limit, "": met}
 
 
 if __name__ == "__main__":

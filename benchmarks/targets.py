@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +25,7 @@ class Target:
     read: Callable[[Rows], float | None]
     """Finds the figure; None if the rows do not contain it."""
     limit: float
-    incarnation: str
+    unit: str
     at_least: bool = False
 
     def is_met(self, figure: float) -> bool:
@@ -393,3 +393,23 @@ TARGETS = [
     Target("100 containers at once", "many", _column("all at once", containers=100), 20, "s"),
     Target("idle container, PSS", "many", _column("idle container PSS MB"), 15, "MB"),
 ]
+
+
+def beside_targets(part: str, suites: Mapping[str, Rows]) -> Iterator[dict[str, Any]]:
+    """Yield rows that show what a part has measured beside its targets.
+
+    Args:
+        part: Name of the part.
+        suites: Its rows, by suite.
+    """
+    for target in TARGETS:
+        own, _, suite = target.suite.partition(".")
+        figure = target.read(suites[suite]) if own == part else None
+        if figure is not None:
+            met = "met" if target.is_met(figure) else "missed"
+            yield {
+                "figure": target.what,
+                "measured": figure,
+                "target": f"{target.limit:g} {target.unit}",
+                "": met,
+            }

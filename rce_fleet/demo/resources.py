@@ -101,7 +101,7 @@ def _bind(port: int, option: str) -> Iterator[int]:
 
 def _listen(port: int, option: str) -> socket.socket:
     if port > MAX_PORT:
-        raise DemoError(f"there is no port {port}; choose another one with {option}")
+        raise DemoError(f"{port} cannot be a port; choose another one with {option}")
     try:
         return socket.create_server((LOOPBACK, port))
     except OSError as error:

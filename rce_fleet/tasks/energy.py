@@ -95,7 +95,7 @@ def share_needed(effort: Effort, profile: RobotProfile, to_charger: float = 0.0)
     Args:
         effort: The task's.
         profile: The robot's.
-        to_charger: Metres from the last stop to the nearest charger; infinite: there is no way.
+        to_charger: Metres from the last stop to the nearest charger; infinite: no way leads there.
     """
     metres = effort.first + effort.metres + to_charger
     if metres == inf:

@@ -91,7 +91,7 @@ class Cloud(System):
         robots = dict(robots_of(flows, self.layout.robots))
         # The others use the container of the first one.
         first = [self._robot(1, robots.pop(1))]
-        if not self.layout.server_graph:  # else there is no output of nodes in containers to read
+        if not self.layout.server_graph:  # else nodes in containers write nothing that is read
             first.append(self._log_in())
         await together(*first)
         await together(*(self._robot(robot, own) for robot, own in robots.items()))

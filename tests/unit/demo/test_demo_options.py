@@ -31,7 +31,7 @@ def test_ports_that_cannot_be_are_usage_errors(port: str) -> None:
 
 
 def test_masters_ports_after_the_last_one_are_refused() -> None:
-    with pytest.raises(DemoError, match="no port 65536; choose another one with --http-port"):
+    with pytest.raises(DemoError, match="65536 cannot be a port; choose another one with --http-port"):
         Ports(http=65534, control=0).in_rows(3)
 
 
