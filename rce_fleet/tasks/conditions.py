@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rce_fleet.tasks.book import TaskBook
 
 NOT_BEGUN = frozenset({TaskState.QUEUED, TaskState.ASSIGNED})
+_FAIL_WHEN_LATE = NOT_BEGUN | {TaskState.HELD}
 
 
 class Conditions:
@@ -70,7 +71,7 @@ class Conditions:
         deadline = task.order.deadline
         if deadline is None or task.late or now < deadline:
             return task
-        if task.order.when_late is WhenLate.FAIL and task.state in NOT_BEGUN and not task.visits:
+        if task.order.when_late is WhenLate.FAIL and task.state in _FAIL_WHEN_LATE and not task.visits:
             reason = "its deadline passed before a robot began with it"
             return self._book.advance(task, TaskCause.FAIL, now, reason, robot="", late=True)
         late = replace(task, late=True, revision=task.revision + 1)

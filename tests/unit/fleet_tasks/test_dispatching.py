@@ -254,6 +254,30 @@ def test_deadlines_are_noted_or_end_a_task(floor: Floor) -> None:
     assert floor.task(gone).state is TaskState.FAILED
 
 
+@pytest.mark.parametrize("is_sent", [False, True])
+def test_a_held_task_that_none_began_fails_at_its_deadline(floor: Floor, is_sent: bool) -> None:
+    """A robot that was only on its way has not begun; a robot that holds a load keeps the task."""
+    gone = floor.go(63, deadline=floor.now + 5, when_late=WhenLate.FAIL)
+    rule = {"deadline": floor.now + 8, "when_late": WhenLate.FAIL}
+    loaded = floor.deliver(1, 20, 1.0, priority=1, **rule)
+    floor.add("Robot1", 0)
+    floor.run(1)
+    assert floor.task(loaded).robot == "Robot1"
+    if is_sent:
+        floor.add("Robot2", 40)
+        floor.run(1)
+        assert floor.task(gone).state is TaskState.RUNNING
+    floor.book.hold(gone.id, floor.now)
+    floor.run(2)
+    assert floor.task(gone).state is TaskState.HELD
+    floor.run(2)
+    floor.book.hold(loaded.id, floor.now)
+    floor.run(6)
+    assert (floor.task(gone).state, floor.task(gone).late) == (TaskState.FAILED, True)
+    assert "its deadline passed" in floor.task(gone).reason
+    assert (floor.task(loaded).state, floor.task(loaded).late) == (TaskState.HELD, True)
+
+
 def test_a_task_recurs_without_piling_up(floor: Floor) -> None:
     first = floor.go(1, every=10.0, occurrences=3)
     floor.run(45)  # no robot: occurrences that are due wait
