@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from rce_fleet.tasks.energy import BatteryLevels
     from rce_fleet.tasks.facts import RobotFacts
@@ -13,6 +13,18 @@ if TYPE_CHECKING:
 
 _LISTED = 5
 """So many chargers are named to people."""
+
+
+class ChargerUser(NamedTuple):
+    """An idle robot that charges, or goes to a charger for that.
+
+    Attributes:
+        robot: Its name.
+        can_leave: Whether its battery is sufficient, so that it makes room for a robot that needs to charge.
+    """
+
+    robot: str
+    can_leave: bool
 
 
 class ChargerQueue:
@@ -40,6 +52,25 @@ class ChargerQueue:
         if robot.id in self.charging:
             return robot.battery >= self._levels.sufficient
         return robot.battery > self._levels.critical
+
+    def users(self, idle: Iterable[RobotFacts], chargers: Collection[int]) -> dict[int, ChargerUser]:
+        """Return which idle robots use chargers, by the charger's cell.
+
+        A robot that stands at a charger uses it also before :meth:`adopt` knows of it, as after a restart.
+
+        Args:
+            idle: Robots without a task that can be sent somewhere.
+            chargers: Cells with chargers.
+        """
+        found = {}
+        for robot in idle:
+            cell = self.charging.get(robot.id)
+            if cell is None and robot.cell in chargers and self._wants(robot, full=True):
+                cell = robot.cell
+            if cell is not None:
+                can_leave = robot.battery is None or robot.battery >= self._levels.sufficient
+                found[cell] = ChargerUser(robot.id, can_leave)
+        return found
 
     def adopt(self, idle: Mapping[str, RobotFacts], chargers: Sequence[int], taken: Collection[int]) -> None:
         """Let robots that stand at a charger charge on, as after a restart; forget those that left.

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
     from rce_fleet.tasks.book import TaskBook
+    from rce_fleet.tasks.charging import ChargerUser
     from rce_fleet.tasks.facts import FleetFacts, RobotFacts
 
 QUEUES_EVERY = 2.0
@@ -141,7 +142,8 @@ class Dispatcher:
         self._profiles = zone_profiles(book, facts, self.rules.profile)
         if facts.grid is not None:
             self._travel.set_map(facts.grid, facts.shut, book.zones, facts.map_revision)
-        self._progress.update(now, facts, self._nearest, self._short_of_energy)
+        users = self._charger_users(facts)
+        self._progress.update(now, facts, self._nearest, self._short_of_energy, users)
         self._release_misfits(now)
         ready = self._conditions.update(now)
         if facts.grid is None or not facts.is_live:
@@ -246,6 +248,11 @@ class Dispatcher:
         return tuple(cell for cell in self._book.places.chargers if cell not in shut)
 
     def _is_idle(self, robot: RobotFacts) -> bool:
+    def _charger_users(self, facts: FleetFacts) -> dict[int, ChargerUser]:
+        chargers, charging = {*self._book.places.chargers}, self.chargers.charging
+        near = (each for each in facts.robots.values() if each.cell in chargers or each.id in charging)
+        return self.chargers.users(filter(self._is_idle, near), chargers)
+
         entry = self._book.entry(robot.id)
         busy = entry.mode != AUTOMATIC or robot.by_hand
         return robot.is_driven and not busy and self._book.task_of(robot.id) is None

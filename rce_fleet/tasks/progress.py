@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from rce_fleet.tasks.order import Action, Stop
 from rce_fleet.tasks.task import RETURN, StopVisit, Task, TaskCause, TaskState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
     from rce_fleet.tasks.book import TaskBook
+    from rce_fleet.tasks.charging import ChargerUser
     from rce_fleet.tasks.facts import FleetFacts, RobotFacts
 
 
@@ -70,6 +72,7 @@ class TaskProgress:
         facts: FleetFacts,
         nearest: Callable[[RobotFacts, Iterable[int]], int | None],
         short_of_energy: Callable[[Task, RobotFacts], str] = lambda _task, _robot: "",
+        charger_users: Mapping[int, ChargerUser] = MappingProxyType({}),
     ) -> None:
         """Take over what the robots did.
 
@@ -78,8 +81,11 @@ class TaskProgress:
             facts: The robots.
             nearest: Returns which of some cells a robot reaches first; None: it reaches none of them.
             short_of_energy: Returns why a robot's battery is not enough for the rest of a task; empty: it is.
+            charger_users: Idle robots that charge, by the charger's cell: a stop that charges leaves them
+                there until their battery is sufficient.
         """
         self._nearest, self._short_of_energy = nearest, short_of_energy
+        self._charger_users = charger_users
         self.avoid = {pair: until for pair, until in self.avoid.items() if until > now}
         self._taken = self.targets()
         self.standing = self._standing(facts)
@@ -180,15 +186,17 @@ class TaskProgress:
     def _choose(self, task: Task, stop: Stop, robot: RobotFacts, now: float) -> Task:
         """Choose the cell of a stop; without one that is free, the task says what it waits for."""
         cells = stop.cells
+        users: Mapping[int, ChargerUser] = {}
         if stop.action is Action.CHARGE:
-            cells = cells or self._book.places.chargers
+            cells, users = cells or self._book.places.chargers, self._charger_users
         elif stop.action is Action.PARK:
             cells = cells or self._book.places.parking or ((robot.cell,) if robot.cell is not None else ())
-        taken = {cell: self._taken[cell] for cell in cells if self._taken.get(cell, robot.id) != robot.id}
+        taken = {cell: user.robot for cell, user in users.items() if cell in cells and not user.can_leave}
+        taken |= {cell: self._taken[cell] for cell in cells if self._taken.get(cell, robot.id) != robot.id}
         free = [cell for cell in cells if cell not in taken]
-        clear = [cell for cell in free if self.standing.get(cell, robot.id) == robot.id]
+        clear = [cell for cell in free if self.standing.get(cell, robot.id) == robot.id and cell not in users]
         chosen = self._nearest(robot, clear)
-        if chosen is None:  # a robot that stands there may drive on before this one arrives
+        if chosen is None:  # a robot that stands there may drive on before this one arrives, or has to leave
             chosen = self._nearest(robot, free)
         if chosen is not None and chosen == task.target:
             return task

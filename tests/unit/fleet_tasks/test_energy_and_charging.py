@@ -146,6 +146,42 @@ def test_a_charge_stop_goes_to_a_charger(hungry: Floor) -> None:
 
 
 @pytest.mark.parametrize("away", ["unknown", "joining", "silent", "held", "no battery", "not live"])
+@pytest.mark.parametrize("cells", [(), (56,)])
+@pytest.mark.parametrize("is_restarted", [False, True])
+def test_a_charge_stop_waits_for_a_robot_that_charges(
+    hungry: Floor, cells: tuple[int, ...], is_restarted: bool
+) -> None:
+    """Until that one's battery is sufficient; it was sent away from its charger with an empty battery."""
+    charging = hungry.add("Robot1", 56, battery=0.12)
+    hungry.run(2)
+    assert hungry.dispatcher.activity("Robot1") == "charging"
+    robot = hungry.add("Robot2", 58, battery=0.3)
+    task = hungry.book.create(Order((Stop(Action.CHARGE, cells),), robot="Robot2"), hungry.now)
+    hungry.run(1)
+    assert hungry.task(task).state is TaskState.RUNNING
+    if is_restarted:
+        hungry.restart()
+    hungry.run(30)
+    assert (charging.cell, hungry.dispatcher.activity("Robot1")) == (56, "charging")
+    assert hungry.task(task).reason == "waits for cell 56, which Robot1 uses"
+    charging.battery = 0.41
+    hungry.run(20)
+    assert (hungry.task(task).action is not None, robot.cell) == (True, 56)
+    assert charging.cell != 56
+
+
+def test_a_charge_stop_takes_a_charger_that_none_uses(hungry: Floor) -> None:
+    """It is farther away than the one whose robot could leave."""
+    hungry.book.emit(Places(chargers=(56, 63)), "places", hungry.now)
+    hungry.add("Robot1", 56, battery=0.45)
+    hungry.run(2)
+    hungry.add("Robot2", 48, battery=0.5)
+    task = hungry.book.create(Order((Stop(Action.CHARGE),), robot="Robot2"), hungry.now)
+    hungry.run(2)
+    assert hungry.task(task).target == 63
+    assert hungry.dispatcher.chargers.charging == {"Robot1": 56}
+
+
 def test_a_charge_stop_does_not_end_while_its_robot_is_away(hungry: Floor, away: str) -> None:
     """The planner or the manager was restarted, or the robot is silent for a moment: it still charges."""
     robot = hungry.add("Robot1", 0, battery=0.2)
