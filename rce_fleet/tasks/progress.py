@@ -232,11 +232,11 @@ class TaskProgress:
         stop = _stop_of_visit(task, visit)
         return self._acted(task, stop, visit, now) if self._is_over(task, stop, visit, now, robot) else task
 
-    def _acted(self, task: Task, stop: Stop, visit: StopVisit, now: float) -> Task:
-        """Note that an action has ended."""
-        loads = task.loads + (stop.action is Action.PICK) - (stop.action is Action.DELIVER)
-        if visit.stop == RETURN:
-            loads = 0
+    def _acted(self, task: Task, stop: Stop, visit: StopVisit, now: float, *, is_given: bool = True) -> Task:
+        """Note that an action has ended; a load that was not given away is still on the robot."""
+        loads = task.loads + (stop.action is Action.PICK)
+        if is_given and stop.action is Action.DELIVER:
+            loads = 0 if visit.stop == RETURN else loads - 1
         ended = replace(
             task,
             visits=(*task.visits[:-1], replace(visit, ended_at=now)),
@@ -312,8 +312,11 @@ class TaskProgress:
         if (visit := task.action) is not None:
             stop = _stop_of_visit(task, visit)
             is_cancelled = is_away and task.state is TaskState.CANCELLING
-            if _fills_battery(stop) or (is_cancelled and stop.action not in (Action.PICK, Action.DELIVER)):
-                task = self._acted(task, stop, visit, now)
+            is_handling = stop.action in (Action.PICK, Action.DELIVER)
+            # A robot that is only silent may be moving the load now: that takes its time.
+            can_end = not is_handling or self._book.entry(task.robot).is_out
+            if _fills_battery(stop) or (is_cancelled and can_end):
+                task = self._acted(task, stop, visit, now, is_given=not is_cancelled)
         if not task.is_bound:
             if task.state is TaskState.CANCELLING:
                 self._book.advance(task, TaskCause.CANCEL, now, reason)

@@ -13,7 +13,7 @@ from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.loads import settle_load
 from rce_fleet.tasks.order import Action, Order, Stop, WhenLate
 from rce_fleet.tasks.records import Places, RobotEntry, RobotProfile
-from rce_fleet.tasks.task import Task, TaskState
+from rce_fleet.tasks.task import RETURN, Task, TaskState
 
 from .conftest import Floor
 
@@ -605,6 +605,50 @@ def test_a_cancelled_task_ends_with_a_dead_robot(floor: Floor, action: Action) -
     floor.run(2)
     assert floor.task(task).state is TaskState.CANCELLED
     assert floor.book.task_of("Robot1") is None
+
+
+@pytest.mark.parametrize("stop", [0, 1, RETURN])
+def test_a_cancelled_task_asks_for_the_load_of_a_dead_robot_at_once(floor: Floor, stop: int) -> None:
+    """A robot that died while it takes a load or gives it away may have it; the task waited for two hours."""
+    robot = floor.add("Robot1", 0)
+    seconds = (7200.0 if stop == 0 else 1.0, 1.0 if stop == 0 else 7200.0)
+    stops = (Stop(Action.PICK, (2,), seconds[0]), Stop(Action.DELIVER, (5,), seconds[1]))
+    task = floor.book.create(Order(stops), floor.now)
+    if stop == RETURN:
+        while floor.task(task).loads == 0:
+            floor.run(1)
+        floor.book.cancel(task.id, floor.now)
+    floor.run(15)
+    assert floor.task(task).visits[-1].stop == stop
+    assert floor.task(task).action is not None
+    robot.state, robot.away_since = "dead", floor.now
+    floor.book.emit(RobotEntry("Robot1", mode="dead"), "dead", floor.now)
+    floor.run(1)
+    floor.book.cancel(task.id, floor.now)
+    floor.run(1)
+    assert (floor.task(task).state, floor.task(task).action) == (TaskState.CANCELLING, None)
+    assert floor.task(task).loads == 1
+    settle_load(floor.book, task.id, 2, floor.now)
+    assert floor.task(task).state is TaskState.CANCELLED
+    assert floor.book.task_of("Robot1") is None
+
+
+@pytest.mark.parametrize("state", ["silent", "unknown"])
+def test_a_cancelled_pick_of_a_silent_robot_takes_its_time(floor: Floor, state: str) -> None:
+    """It may be lifting the load now, and drives away with it when it is heard again."""
+    robot = floor.add("Robot1", 0)
+    task = floor.deliver(2, 20, 60.0)
+    floor.run(5)
+    assert floor.task(task).action is not None
+    if state == "silent":
+        robot.state, robot.away_since = state, floor.now
+    else:
+        del floor.facts.robots["Robot1"]
+    floor.book.cancel(task.id, floor.now)
+    floor.run(30)
+    assert floor.task(task).action is not None
+    floor.run(40)
+    assert (floor.task(task).action, floor.task(task).loads) == (None, 1)
 
 
 @pytest.mark.parametrize("seconds", [0.0, 7200.0])
