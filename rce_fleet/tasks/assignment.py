@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from rce_fleet.limits import MOST_LATE, within
-from rce_fleet.tasks.energy import BatteryLevels, Effort, charges, effort_of, share_needed
+from rce_fleet.tasks.energy import BatteryLevels, Effort, charges, driven, effort_of, share_needed
 from rce_fleet.tasks.matching import cheapest_pairs
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -95,7 +95,7 @@ class Assigner:
         return worth
 
     def refuse(self, task: Task, robot: FreeRobot, effort: Effort, chargers: Sequence[int]) -> str:
-        """Return why a robot cannot do a task; empty if it can."""
+        """Return why a robot cannot do a task, whose effort is in metres driven; empty if it can."""
         if reason := misfit(task, robot.id, robot.profile):
             return reason
         if effort.first == inf:
@@ -115,9 +115,12 @@ class Assigner:
     def battery_needed(self, profile: RobotProfile, effort: Effort, chargers: Sequence[int]) -> float:
         """Return the share of a full battery that a robot must have to begin with a task.
 
-        Infinite: no path leads from its end to a charger.
+        Infinite: no path leads from its end to a charger. Chargers in zones that are closed to the robot do
+        not count.
         """
-        ways = [self._travel.metres(effort.end, cell) for cell in chargers if effort.end is not None]
+        zones = driven(profile.zone_cost)
+        end, open_ones = effort.end, [cell for cell in chargers if self._travel.is_open(cell, zones)]
+        ways = [self._travel.metres(end, cell, zones) for cell in open_ones if end is not None]
         to_charger = min(ways, default=0.0)
         return share_needed(effort, profile, to_charger) + self._levels.critical
 
@@ -211,7 +214,8 @@ class Assigner:
                     effort = group.tails[row]._replace(first=first)
                 else:
                     effort = effort_of(task, robot.cell, self._travel, robot.profile)
-                    if self.refuse(task, robot, effort, chargers):
+                    taken = effort_of(task, robot.cell, self._travel, robot.profile, in_metres=True)
+                    if self.refuse(task, robot, taken, chargers):
                         costs[row, column] = inf
                         refused = True
                         continue
@@ -225,24 +229,29 @@ class Assigner:
 
     def _price(self, tasks: Sequence[Task], group: _Group, now: float, chargers: Sequence[int]) -> None:
         """Write what tasks cost the robots of one profile, and how far they are, into the group."""
-        profile = group.profile
+        profile, travel = group.profile, self._travel
+        zones = driven(profile.zone_cost)
         to_chargers: NDArray[np.float32] | None = None
-        if chargers:
-            to_chargers = np.min([self._travel.field(cell) for cell in chargers], axis=0)
+        if open_ones := [cell for cell in chargers if travel.is_open(cell, zones)]:
+            to_chargers = np.min([travel.field(cell, zones) for cell in open_ones], axis=0)
         ways = group.ways = np.full((len(tasks), len(group.names)), inf, np.float32)
+        metres = ways if zones == profile.zone_cost else ways.copy()
         needed = np.full(len(tasks), -inf)
         for row, task in enumerate(tasks):
             tail = self._tail(task, group)
             if tail is None:
                 continue
             group.tails[row] = tail
-            self._write_ways(task, group, ways[row])
+            self._write_ways(task, group, ways[row], profile.zone_cost)
+            if metres is not ways:
+                self._write_ways(task, group, metres[row], zones)
+                tail = self._tail(task, group, in_metres=True) or tail
             if not charges(task):
                 end = tail.end
                 to_charger = 0.0 if to_chargers is None or end is None else float(to_chargers[end])
                 needed[row] = share_needed(tail._replace(first=0.0), profile, to_charger)
         needed += self._levels.critical
-        self._forbid_beyond_batteries(group, needed)
+        self._forbid_beyond_batteries(group, metres, needed)
         nearest = ways.min(axis=1, initial=inf)
         worth = np.zeros(len(tasks))
         for row, tail in group.tails.items():
@@ -251,41 +260,46 @@ class Assigner:
         group.costs = np.divide(ways, profile.speed, dtype=np.float64)
         group.costs -= worth[:, None]
 
-    def _forbid_beyond_batteries(self, group: _Group, needed: NDArray[np.float64]) -> None:
+    def _forbid_beyond_batteries(
+        self, group: _Group, metres: NDArray[np.float32], needed: NDArray[np.float64]
+    ) -> None:
         """Make ways infinite that lead robots so far that their batteries are not enough for the task then.
 
         Args:
             group: Robots, and their ways.
+            metres: What they drive on these, shape (tasks, robots).
             needed: What each task needs after its first stop, shares of a battery.
         """
         if np.isnan(group.batteries).all():
             return
         each = share_needed(Effort(1.0, 0.0, 0.0, None), group.profile)
         with np.errstate(divide="ignore", invalid="ignore"):  # an unknown battery forbids nothing
-            rows = np.flatnonzero(group.ways.max(axis=1) > (np.nanmin(group.batteries) - needed) / each)
+            rows = np.flatnonzero(metres.max(axis=1) > (np.nanmin(group.batteries) - needed) / each)
             ways = group.ways[rows]
-            ways[ways > (group.batteries - needed[rows, None]) / each] = inf
+            ways[metres[rows] > (group.batteries - needed[rows, None]) / each] = inf
         group.ways[rows] = ways
 
-    def _tail(self, task: Task, group: _Group) -> Effort | None:
+    def _tail(self, task: Task, group: _Group, *, in_metres: bool = False) -> Effort | None:
         """Return what a task costs a robot of a profile after its first stop; None if it can never do it."""
         if misfit(task, task.order.robot or group.names[0], group.profile):
             return None
         stop = task.next_stop
         start = stop.cells[0] if stop is not None and stop.cells else int(group.cells[0])
-        tail = effort_of(task, start, self._travel, group.profile)
+        tail = effort_of(task, start, self._travel, group.profile, in_metres=in_metres)
         return tail if tail.first < inf else None
 
-    def _write_ways(self, task: Task, group: _Group, ways: NDArray[np.float32]) -> None:
+    def _write_ways(
+        self, task: Task, group: _Group, ways: NDArray[np.float32], zones: Mapping[str, float]
+    ) -> None:
         """Write the metres to the first stop of a task for each robot that it is for, shape (robots,)."""
         stop = task.next_stop
         cells = stop.cells if stop is not None else ()
         if len(cells) == 1:
-            self._travel.field(cells[0], group.profile.zone_cost).take(group.cells, out=ways, mode="clip")
+            self._travel.field(cells[0], zones).take(group.cells, out=ways, mode="clip")
         else:
             ways[:] = inf if cells else 0.0
             for cell in cells:
-                np.minimum(ways, self._travel.field(cell, group.profile.zone_cost)[group.cells], out=ways)
+                np.minimum(ways, self._travel.field(cell, zones)[group.cells], out=ways)
         if task.order.robot:
             place = group.places.get(task.order.robot)
             way = inf if place is None else ways[place]

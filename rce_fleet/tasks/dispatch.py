@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot, misfit
 from rce_fleet.tasks.charging import ChargerQueue
 from rce_fleet.tasks.conditions import Conditions
-from rce_fleet.tasks.energy import BatteryLevels, effort_of
+from rce_fleet.tasks.energy import BatteryLevels, driven, effort_of
 from rce_fleet.tasks.explaining import why_none
 from rce_fleet.tasks.idle_ways import IdleWays
 from rce_fleet.tasks.parking import Parking, ParkingCells
@@ -110,7 +110,8 @@ class Dispatcher:
         if not tasks:
             return False
         self._profiles = zone_profiles(book, facts, self.rules.profile)
-        zone_costs = {str(cost): cost for cost in (self.profile(name).zone_cost for name in facts.robots)}
+        costs = [self.profile(name).zone_cost for name in facts.robots]
+        zone_costs = {str(cost): cost for each in costs for cost in (each, driven(each))}
         missing: dict[str, set[int]] = {name: set() for name in zone_costs}
         tasks.sort(key=lambda task: (-task.order.priority, task.number))
         for task in tasks:
@@ -234,7 +235,7 @@ class Dispatcher:
         if robot.cell is None or robot.battery is None or not self._travel.has_map:
             return ""
         free = self._free(robot)
-        effort = effort_of(task, free.cell, self._travel, free.profile)
+        effort = effort_of(task, free.cell, self._travel, free.profile, in_metres=True)
         lack = self._assigner.lack_of_energy(task, free, effort, self._open_chargers())
         return "" if effort.first == inf else lack
 
@@ -247,12 +248,12 @@ class Dispatcher:
         shut = frozenset() if self._facts is None else self._facts.shut
         return tuple(cell for cell in self._book.places.chargers if cell not in shut)
 
-    def _is_idle(self, robot: RobotFacts) -> bool:
     def _charger_users(self, facts: FleetFacts) -> dict[int, ChargerUser]:
         chargers, charging = {*self._book.places.chargers}, self.chargers.charging
         near = (each for each in facts.robots.values() if each.cell in chargers or each.id in charging)
         return self.chargers.users(filter(self._is_idle, near), chargers)
 
+    def _is_idle(self, robot: RobotFacts) -> bool:
         entry = self._book.entry(robot.id)
         busy = entry.mode != AUTOMATIC or robot.by_hand
         return robot.is_driven and not busy and self._book.task_of(robot.id) is None
@@ -342,7 +343,7 @@ class Dispatcher:
         free = self._free(robot)
         reason = misfit(task, name, free.profile)
         if not reason and self._book.task_of(name) is None:
-            effort = effort_of(task, free.cell, self._travel, free.profile)
+            effort = effort_of(task, free.cell, self._travel, free.profile, in_metres=True)
             reason = self._assigner.refuse(task, free, effort, self._open_chargers())
         return f"{name} cannot do it: {reason}" if reason else ""
 

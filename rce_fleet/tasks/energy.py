@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from rce_fleet.tasks.order import Action
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rce_fleet.tasks.records import RobotProfile
     from rce_fleet.tasks.task import Task
     from rce_fleet.tasks.travel import TravelCosts
@@ -62,14 +64,33 @@ class Effort(NamedTuple):
         return (self.first + self.metres) / profile.speed + self.acting
 
 
-def effort_of(task: Task, start: int, travel: TravelCosts, profile: RobotProfile) -> Effort:
+def driven(zone_cost: Mapping[str, float]) -> dict[str, float]:
+    """Return of zones' costs those that change what a robot drives: it cannot enter the zone.
+
+    Other costs only count when a task is given to a robot: the planner does not know them, and a metre takes
+    as much out of the battery as elsewhere.
+    """
+    return {name: factor for name, factor in zone_cost.items() if factor == inf}
+
+
+def effort_of(
+    task: Task, start: int, travel: TravelCosts, profile: RobotProfile, *, in_metres: bool = False
+) -> Effort:
     """Return what the rest of a task costs a robot that stands in a cell.
 
     Each stop is made in the one of its cells that is nearest to the stop before. Stops without cells, at any
     charger or parking place, count nothing.
+
+    Args:
+        task: The task.
+        start: Where the robot stands.
+        travel: Distances.
+        profile: The robot's.
+        in_metres: Return the metres that are driven, as batteries need them, not what they count in zones.
     """
     here, first, metres, acting = start, 0.0, 0.0, 0.0
     zones = profile.zone_cost
+    counted = driven(zones) if in_metres else zones
     is_first = True
     order = task.order
     for number in range(task.position, order.length):
@@ -78,7 +99,7 @@ def effort_of(task: Task, start: int, travel: TravelCosts, profile: RobotProfile
         if not stop.cells:
             continue
         cell = stop.cells[0] if len(stop.cells) == 1 else travel.nearest(here, stop.cells, zones)
-        way = inf if cell is None else travel.metres(here, cell, zones)
+        way = inf if cell is None else travel.metres(here, cell, counted)
         if way == inf or cell is None:
             return Effort(inf, inf, acting, None)
         if is_first:
@@ -93,7 +114,7 @@ def share_needed(effort: Effort, profile: RobotProfile, to_charger: float = 0.0)
     """Return the share of a full battery that a task takes, with the way to a charger after it.
 
     Args:
-        effort: The task's.
+        effort: The task's, with metres as they are driven.
         profile: The robot's.
         to_charger: Metres from the last stop to the nearest charger; infinite: no way leads there.
     """

@@ -56,7 +56,7 @@ def _lack(
     task: Task, robot: FreeRobot, travel: TravelCosts, assigner: Assigner, chargers: Sequence[int]
 ) -> str:
     """Return what a robot lacks for a task: a path, a charger, capacity or energy; empty: nothing."""
-    effort = effort_of(task, robot.cell, travel, robot.profile)
+    effort = effort_of(task, robot.cell, travel, robot.profile, in_metres=True)
     if effort.first == inf:
         return "path"
     if robot.battery is None or charges(task):

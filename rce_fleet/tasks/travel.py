@@ -162,6 +162,10 @@ class TravelCosts:
         distance, goal = min(found, default=(inf, -1))
         return goal if distance < inf else None
 
+    def is_open(self, cell: int, zone_cost: Mapping[str, float] | None = None) -> bool:
+        """Return whether a robot may enter a cell: it is not shut, and not in a zone that is closed to it."""
+        return self._can_enter(cell, _costs(zone_cost))
+
     def _can_enter(self, goal: int, costs: Costs) -> bool:
         forbidden = (name for name, factor in costs if factor == inf)
         return goal not in self._shut and not any(goal in self._zones.get(name, ()) for name in forbidden)

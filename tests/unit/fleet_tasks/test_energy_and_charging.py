@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf
 from typing import Any
 
@@ -145,7 +146,6 @@ def test_a_charge_stop_goes_to_a_charger(hungry: Floor) -> None:
     hungry.run_until_ended(task)
 
 
-@pytest.mark.parametrize("away", ["unknown", "joining", "silent", "held", "no battery", "not live"])
 @pytest.mark.parametrize("cells", [(), (56,)])
 @pytest.mark.parametrize("is_restarted", [False, True])
 def test_a_charge_stop_waits_for_a_robot_that_charges(
@@ -182,6 +182,7 @@ def test_a_charge_stop_takes_a_charger_that_none_uses(hungry: Floor) -> None:
     assert hungry.dispatcher.chargers.charging == {"Robot1": 56}
 
 
+@pytest.mark.parametrize("away", ["unknown", "joining", "silent", "held", "no battery", "not live"])
 def test_a_charge_stop_does_not_end_while_its_robot_is_away(hungry: Floor, away: str) -> None:
     """The planner or the manager was restarted, or the robot is silent for a moment: it still charges."""
     robot = hungry.add("Robot1", 0, battery=0.2)
@@ -264,6 +265,51 @@ def test_a_zone_costs_a_robot_more() -> None:
     travel.set_map(grid, frozenset(), zone, 0)
     assert travel.metres(0, 4) == 4.0
     assert travel.metres(0, 4, {"ice": 3.0}) == 6.0
+
+
+def test_the_way_to_a_charger_leads_around_a_robots_forbidden_cells(hungry: Floor) -> None:
+    """3 m to the stop; from there to the charger 4 m, or 18 m around the cells that Robot1 may not enter."""
+    wall = Zone("wall", "blocked", tuple(range(32, 39)), robots=("Robot1",))
+    hungry.book.emit(wall, "zone", hungry.now)
+    hungry.add("Robot1", 0, battery=0.30)
+    task = hungry.go(24)
+    hungry.run(3)
+    assert hungry.task(task).state is TaskState.QUEUED
+    assert "enough energy for it now" in hungry.task(task).reason
+    hungry.add("Robot2", 0, battery=0.30)
+    hungry.run(3)
+    assert hungry.task(task).robot == "Robot2"
+
+
+def test_a_charger_that_is_closed_to_a_robot_keeps_no_task_from_it(hungry: Floor) -> None:
+    hungry.book.emit(Zone("dock", "blocked", (56,), robots=("Robot1",)), "zone", hungry.now)
+    hungry.add("Robot1", 0, battery=0.30)
+    task = hungry.go(7, 3)
+    hungry.run_until_ended(task)
+    assert hungry.task(task).state is TaskState.DONE
+
+
+@pytest.mark.parametrize("cells", [(3,), (3, 4)])
+def test_a_dear_zone_takes_no_more_energy(hungry: Floor, cells: tuple[int, ...]) -> None:
+    """The planner does not know cost zones: robots drive the same metres. The task was refused for good."""
+    hungry.book.emit(Zone("mud", "cost", tuple(range(64)), 100.0), "zone", hungry.now)
+    hungry.add("Robot1", 0, battery=0.9)
+    order = Order((Stop(Action.GO, cells), Stop(Action.GO, (7,))))
+    task = hungry.book.create(order, hungry.now)
+    hungry.run_until_ended(task)
+    assert [visit.robot for visit in hungry.task(task).visits] == ["Robot1", "Robot1"]
+
+
+def test_a_cheap_zone_takes_no_less_energy(hungry: Floor) -> None:
+    """7 m to the stop and 14 m to the charger; the robot would have stood still before it was there."""
+    hungry.book.emit(Zone("main", "cost", tuple(range(64)), 1.0), "zone", hungry.now)
+    cheap = replace(HUNGRY, zone_cost={"main": 0.01})
+    hungry.book.emit(RobotEntry("Robot1", profile=cheap), "profile", hungry.now)
+    hungry.add("Robot1", 0, battery=0.30)
+    task = hungry.go(7)
+    hungry.run(3)
+    assert hungry.task(task).state is TaskState.QUEUED
+    assert "enough energy for it now" in hungry.task(task).reason
 
 
 def test_a_robot_may_leave_a_blocked_cell_but_not_enter_it() -> None:
