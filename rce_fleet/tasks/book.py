@@ -44,6 +44,8 @@ class TaskBook(FleetTables):
     def create(self, order: Order, now: float, *, user: str = "", key: str = "") -> Task:
         """Accept a task; a second request with the same key returns the first one's task.
 
+        Of a recurring task whose first occurrence was forgotten, that is the oldest one that is known.
+
         Args:
             order: What is to be done.
             now: Seconds since 1970.
@@ -54,11 +56,10 @@ class TaskBook(FleetTables):
             TaskRefusedError: It cannot be carried out.
             KeyReusedError: The key belongs to a task with another order.
         """
-        if key and (known := self._by_key.get((user, key))) is not None:
-            task = self.tasks[known]
-            if task.asked != digest(order):
-                raise KeyReusedError(f"the key {key!r} belongs to {task.id}, which has another content")
-            return task
+        if key and (known := self.with_key(user, key)) is not None:
+            if known.asked != digest(order):
+                raise KeyReusedError(f"the key {key!r} belongs to {known.id}, which has another content")
+            return known
         check_order(order)
         if self.grid is not None:
             check_cells(order, self.grid)
@@ -292,11 +293,12 @@ class TaskBook(FleetTables):
             self.last_task,
             order,
             task.requester,
-            "",
+            task.key,
             now,
             now,
             occurrence=number,
             recurs_at=None if last else due + every,
+            asked=task.asked,
         )
         self.emit(
             following, "created", now, text=f"occurrence {number} of the task that began with {task.id}"

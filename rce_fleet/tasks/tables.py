@@ -62,7 +62,8 @@ class FleetTables:
         self._open: dict[int, None] = {}
         self._by_robot: dict[str, int] = {}
         self._queues: dict[str, dict[int, None]] = {}
-        self._by_key: dict[tuple[str, str], int] = {}
+        self._by_key: dict[tuple[str, str], dict[int, None]] = {}
+        """Numbers of the tasks with a key: of a recurring task all occurrences, the first one first."""
         self._out: list[FleetEvent] = []
 
     # Records and events
@@ -107,11 +108,13 @@ class FleetTables:
         return out
 
     def forget(self, number: int) -> None:
-        """Forget a task that has ended, and its key."""
+        """Forget a task that has ended, and its key with the last occurrence that has it."""
         task = self.tasks.pop(number)
         self._open.pop(number, None)
-        if self._by_key.get((task.requester, task.key)) == number:
-            del self._by_key[task.requester, task.key]
+        numbers = self._by_key.get((task.requester, task.key), {})
+        numbers.pop(number, None)
+        if not numbers:
+            self._by_key.pop((task.requester, task.key), None)
 
     # Questions
 
@@ -126,6 +129,16 @@ class FleetTables:
         if task is None or task.id != task_id:
             raise UnknownTaskError(f"there is no task {task_id!r}")
         return task
+
+    def with_key(self, requester: str, key: str) -> Task | None:
+        """Return the oldest known task that has a requester's key; None: there is none."""
+        number = next(iter(self._by_key.get((requester, key), ())), None)
+        return None if number is None else self.tasks[number]
+
+    @property
+    def open_count(self) -> int:
+        """How many tasks have not ended."""
+        return len(self._open)
 
     def open_tasks(self) -> Iterator[Task]:
         """Return the tasks that have not ended, oldest first."""
@@ -189,7 +202,7 @@ class FleetTables:
         self.tasks[task.number] = task
         self.last_task = max(self.last_task, task.number)
         if task.key:
-            self._by_key.setdefault((task.requester, task.key), task.number)
+            self._by_key.setdefault((task.requester, task.key), {})[task.number] = None
         if task.has_ended:
             self._open.pop(task.number, None)
         else:

@@ -685,6 +685,31 @@ async def test_an_impossible_change_between_occurrences_is_refused(
     assert client.manager.book.tasks[1] == before
 
 
+async def test_the_key_of_a_recurring_task_lasts_as_long_as_it_recurs(
+    client: ManagerClient, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The request that is sent again when its first occurrence is forgotten makes no second series."""
+    monkeypatch.setattr(managers, "KEEP_ENDED", 0)
+    task = await _between_occurrences(client, key="round-1")
+    assert task.recurs_at is not None
+    client.manager.dispatcher.update(task.recurs_at + 1, client.manager.facts)
+    await client.ask("POST", "/tasks", {"stops": [{"cell": 3}]})
+    await client.ask("POST", "/tasks", {"stops": [{"cell": 4}]})
+    assert (await client.ask("GET", "/tasks/T1"))[0] == 404, "its first occurrence was not forgotten"
+    again = {**GO, "repeat": {"every": 3600, "count": 5}, "key": "round-1"}
+    status, body, _ = await client.ask("POST", "/tasks", again)
+    assert (status, body["id"], body["occurrence"]) == (200, "T2", 2)
+    assert (await client.ask("POST", "/tasks", {**again, "priority": 1}))[0] == 409
+    await client.manager.close()
+    following = ManagerClient(tmp_path / "j.sqlite")
+    client.manager, client.journal = following.manager, following.journal
+    assert (await following.ask("POST", "/tasks", again))[1]["id"] == "T2"
+    await following.ask("DELETE", "/tasks/T2")
+    await following.ask("POST", "/tasks", GO)
+    await following.ask("POST", "/tasks", GO)
+    assert (await following.ask("POST", "/tasks", again))[0] == 201
+
+
 async def test_a_task_before_another_one_is_not_forgotten(
     client: ManagerClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
