@@ -395,7 +395,7 @@ class FleetManager:
 
     def _forget_old(self) -> list[tuple[str, str]]:
         """Forget the oldest tasks that have ended, if there are too many; not those that others wait for."""
-        if len(self.book.tasks) <= KEEP_ENDED + KEEP_ENDED // 10:
+        if len(self.book.tasks) - self.book.open_count <= KEEP_ENDED + KEEP_ENDED // 10:
             return []
         awaited = {name for task in self.book.open_tasks() for name in task.order.after}
         ended = [

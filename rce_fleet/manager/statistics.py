@@ -76,7 +76,7 @@ class FleetStatistics:
             tasks_done=len(done),
             tasks_failed=sum(task.state is TaskState.FAILED for task in ended),
             tasks_cancelled=sum(task.state is TaskState.CANCELLED for task in ended),
-            tasks_open=sum(1 for _ in book.open_tasks()),
+            tasks_open=book.open_count,
             tasks_per_hour=len(done) * 3600 / seconds,
             waiting_s=_mean(waits),
             duration_s=_mean(lasts),

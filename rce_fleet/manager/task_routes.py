@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from rce_fleet.api.tasks import HoldRequest, LoadRequest, TaskChange, TaskPage, TaskRequest
 from rce_fleet.manager.convert import changed_order, read_order, show_task
-from rce_fleet.manager.requests import BadRequestError, Call, FleetAnswer, Route, shown
+from rce_fleet.manager.requests import BadRequestError, Call, FleetAnswer, Route, problem, shown
 from rce_fleet.tasks.loads import settle_load
 from rce_fleet.tasks.task import TaskState
 
@@ -27,10 +27,9 @@ async def create(call: Call) -> FleetAnswer:
     if call.request.key and model.key not in ("", call.request.key):
         raise BadRequestError("the header Idempotency-Key and the field key differ; give one of them")
     book = call.manager.book
-    if sum(1 for _ in book.open_tasks()) >= MOST_OPEN:
-        return FleetAnswer(
-            429, f'{{"error": "there are {MOST_OPEN} open tasks; wait until some have ended"}}'
-        )
+    is_known = bool(key) and book.with_key(call.request.user, key) is not None
+    if book.open_count >= MOST_OPEN and not is_known:
+        return problem(429, f"there are {MOST_OPEN} open tasks; wait until some have ended")
     before = book.number
     task = book.create(read_order(model), call.now, user=call.request.user, key=key)
     is_new = book.number != before
@@ -47,7 +46,10 @@ async def listed(call: Call) -> FleetAnswer:
         possible = ", ".join([*(state.value for state in TaskState), *_MORE_STATES])
         raise BadRequestError(f"unknown state {min(unknown)!r}; possible are {possible}")
     limit = call.count("limit", 100, 1000) or 100
-    is_descending = call.query.get("order", "asc") == "desc"
+    order = call.query.get("order", "asc")
+    if order not in ("asc", "desc"):
+        raise BadRequestError(f"order must be asc or desc, not {order!r}")
+    is_descending = order == "desc"
     cursor = call.query.get("cursor", "")
     if cursor and not (cursor.isdecimal() and len(cursor) < 19):  # noqa: PLR2004 - digits of a 64-bit number
         raise BadRequestError(f"cursor must be the field next of a page before, not {cursor!r}")

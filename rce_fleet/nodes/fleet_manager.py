@@ -144,7 +144,7 @@ class ManagerNode:
         await node.subscribe("/fleet/changes", "fleet/FleetChanges", self._take_changes)
         await node.subscribe("/fleet/requestedCells", "std_msgs/Int32MultiArray", self._take_requested)
         await node.advertise_service("/fleet/request", "fleet/Request", answer)
-        node.log.info("the fleet manager has %d open tasks", sum(1 for _ in self._manager.book.open_tasks()))
+        node.log.info("the fleet manager has %d open tasks", self._manager.book.open_count)
         async with asyncio.TaskGroup() as tasks:
             others = [tasks.create_task(self._follow_planner()), tasks.create_task(self._look_around())]
             is_compiling = False

@@ -17,6 +17,7 @@ import pytest
 from rce_fleet.exceptions import JournalError
 from rce_fleet.journal.journal import Journal
 from rce_fleet.manager import manager as managers
+from rce_fleet.manager import task_routes
 from rce_fleet.manager.fleet_routes import ROUTES as FLEET_ROUTES
 from rce_fleet.manager.goals import GoalKeeper
 from rce_fleet.manager.manager import FleetManager
@@ -683,6 +684,28 @@ async def test_an_impossible_change_between_occurrences_is_refused(
     before = await _between_occurrences(client)
     assert (await client.ask("PATCH", "/tasks/T1", change))[0] in (409, 422)
     assert client.manager.book.tasks[1] == before
+
+
+async def test_a_known_key_gives_its_task_also_with_too_many_open_tasks(
+    client: ManagerClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first answer was lost: 429 would say that the task was not accepted."""
+    monkeypatch.setattr(task_routes, "MOST_OPEN", 2)
+    assert (await client.ask("POST", "/tasks", GO, key="order-1"))[0] == 201
+    assert (await client.ask("POST", "/tasks", GO, key="order-2"))[0] == 201
+    status, body, _ = await client.ask("POST", "/tasks", GO, key="order-3")
+    assert (status, "2 open tasks" in body["error"]) == (429, True)
+    status, body, _ = await client.ask("POST", "/tasks", GO, key="order-1")
+    assert (status, body["id"]) == (200, "T1")
+    await client.ask("DELETE", "/tasks/T2")
+    assert (await client.ask("POST", "/tasks", GO, key="order-3"))[0] == 201
+
+
+@pytest.mark.parametrize("order", ["DESC", "newest", ""])
+async def test_an_unknown_order_of_tasks_is_refused(client: ManagerClient, order: str) -> None:
+    """It was taken for ascending."""
+    status, body, _ = await client.ask("GET", f"/tasks?order={order}")
+    assert (status, body["error"]) == (422, f"order must be asc or desc, not {order!r}")
 
 
 async def test_the_key_of_a_recurring_task_lasts_as_long_as_it_recurs(
