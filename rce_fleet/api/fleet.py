@@ -198,7 +198,9 @@ class FleetMapModel(ApiModel):
 class StatisticsModel(ApiModel):
     """What the fleet did in a time."""
 
-    seconds: float = Field(description="Length of the time.")
+    seconds: float = Field(
+        description="Length of the time; shorter than asked for if tasks that ended in it were forgotten."
+    )
     tasks_done: int
     tasks_failed: int
     tasks_cancelled: int

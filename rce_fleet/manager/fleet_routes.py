@@ -202,7 +202,8 @@ async def statistics(call: Call) -> FleetAnswer:
     if seconds is None:
         raise BadRequestError("seconds must be a number")
     manager = call.manager
-    return shown(manager.statistics.show(call.now, seconds, manager.facts, manager.book))
+    known_since = manager.known_since()
+    return shown(manager.statistics.show(call.now, seconds, manager.facts, manager.book, known_since))
 
 
 async def events(call: Call) -> FleetAnswer:

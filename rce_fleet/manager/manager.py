@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
+from math import inf
 from typing import TYPE_CHECKING, Any, Protocol, assert_never
 
 from rce_fleet.exceptions import JournalError
@@ -392,6 +393,14 @@ class FleetManager:
             await asyncio.wait([self._writer])
         await self._in_thread(self._journal.close)
         self._thread.shutdown()
+
+    def known_since(self) -> float:
+        """Return from when on all tasks that have ended are known, seconds since 1970; ``-inf``: all are."""
+        book = self.book
+        if book.last_task <= len(book.tasks):
+            return -inf
+        ended = sorted(task.changed_at for task in book.tasks.values() if task.has_ended)
+        return ended[-KEEP_ENDED] if 0 < KEEP_ENDED <= len(ended) else ended[0] if ended else self.clock()
 
     def _forget_old(self) -> list[tuple[str, str]]:
         """Forget the oldest tasks that have ended, if there are too many; not those that others wait for."""

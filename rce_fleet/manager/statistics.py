@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from math import inf
 from typing import TYPE_CHECKING
 
 from rce_fleet.api.fleet import StatisticsModel
@@ -61,10 +62,21 @@ class FleetStatistics:
                 minute.busy += passed * (book.task_of(robot.id) is not None)
         return ended
 
-    def show(self, now: float, seconds: float, facts: FleetFacts, book: TaskBook) -> StatisticsModel:
-        """Return the figures of the last seconds."""
-        since = now - seconds
-        ended = [task for task in book.tasks.values() if task.has_ended and task.changed_at >= since]
+    def show(
+        self, now: float, seconds: float, facts: FleetFacts, book: TaskBook, known_since: float = -inf
+    ) -> StatisticsModel:
+        """Return the figures of the last seconds.
+
+        Args:
+            now: Seconds since 1970.
+            seconds: Length of the time; it is shorter in the figures if tasks of it were forgotten.
+            facts: The robots.
+            book: The tasks.
+            known_since: From when on no task that has ended was forgotten, seconds since 1970.
+        """
+        since = max(now - seconds, min(known_since, now - 1.0))
+        seconds = now - since
+        ended = [task for task in book.tasks.values() if task.has_ended and task.changed_at > since]
         done = [task for task in ended if task.state is TaskState.DONE]
         waits = [task.started_at - task.created_at for task in done if task.started_at is not None]
         lasts = [task.changed_at - task.started_at for task in done if task.started_at is not None]

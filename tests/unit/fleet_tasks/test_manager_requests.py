@@ -708,6 +708,31 @@ async def test_an_unknown_order_of_tasks_is_refused(client: ManagerClient, order
     assert (status, body["error"]) == (422, f"order must be asc or desc, not {order!r}")
 
 
+async def test_statistics_say_how_far_back_tasks_are_known(
+    client: ManagerClient, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Ten tasks an hour are done, and the newest three are kept: as if a day had three tasks."""
+    now = 1e6
+    client.manager.clock = lambda: now
+    assert (await client.ask("GET", "/statistics?seconds=86400"))[1]["seconds"] == 86400
+    monkeypatch.setattr(managers, "KEEP_ENDED", 3)
+    for _ in range(10):
+        now += 360.0
+        _, task, _ = await client.ask("POST", "/tasks", GO)
+        ended = client.manager.book.find(task["id"])
+        client.manager.book.emit(replace(ended, state=TaskState.DONE, changed_at=now), "finished", now)
+        await client.manager.commit()
+    figures = (await client.ask("GET", "/statistics?seconds=86400"))[1]
+    assert (figures["tasks_done"], figures["seconds"]) == (2, 720.0)
+    assert figures["tasks_per_hour"] == pytest.approx(10.0)
+    assert (await client.ask("GET", "/statistics?seconds=600"))[1]["seconds"] == 600
+    await client.manager.close()
+    following = ManagerClient(tmp_path / "j.sqlite")
+    client.manager = following.manager
+    following.manager.clock = lambda: now
+    assert (await following.ask("GET", "/statistics?seconds=86400"))[1] == figures
+
+
 async def test_the_key_of_a_recurring_task_lasts_as_long_as_it_recurs(
     client: ManagerClient, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
