@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+from typing import Literal
 
 from pydantic import Field
 
@@ -15,6 +16,9 @@ MAX_AGE_S = 300.0
 """Seconds after which a receiver takes a delivery for a replay."""
 
 
+EventKind = Literal["task", "robot", "goal", "fleet", "planner", "places", "zone", "cells"]
+
+
 class WebhookRequest(ApiModel):
     """A receiver of events."""
 
@@ -22,9 +26,9 @@ class WebhookRequest(ApiModel):
     secret: str = Field(
         default="", description="Key of the signature; empty: one is made and returned once.", max_length=200
     )
-    kinds: list[str] = Field(
+    kinds: list[EventKind] = Field(
         default_factory=list,
-        description="Kinds of events: task, robot, goal, fleet, planner, places, zone, cells; empty: all.",
+        description="Kinds of events; empty: all.",
         max_length=20,
     )
     allow_private: bool = Field(

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import pytest
+from pydantic import ValidationError
 
-from rce_fleet.api.webhooks import WebhookRequest, sign, verify
+from rce_fleet.api.webhooks import EventKind, WebhookRequest, sign, verify
 from rce_fleet.exceptions import RequestRefusedError
 from rce_fleet.station.webhook_sender import PublicResolver
 from rce_fleet.station.webhook_store import MAX_WEBHOOKS, WebhookStore, check_url
+from rce_fleet.tasks.records import RECORD_TYPES
 
 BODY = b'{"events": []}'
 
@@ -105,6 +108,13 @@ def test_webhooks_are_kept_where_only_the_owner_reads(tmp_path: Path) -> None:
     assert (kept.position, kept.failures, kept.secret, kept.kinds) == (12, 2, made.secret, ("task",))
     assert again.remove(made.id)
     assert not again.remove(made.id)
+
+
+def test_a_kind_that_no_event_has_is_refused() -> None:
+    """A receiver of ``tasks`` got nothing, without a word."""
+    assert get_args(EventKind) == tuple(RECORD_TYPES)
+    with pytest.raises(ValidationError, match=r"kinds\.0"):
+        WebhookRequest.model_validate({"url": "https://example.com/", "kinds": ["tasks"]})
 
 
 def test_there_are_at_most_so_many() -> None:
