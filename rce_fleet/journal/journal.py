@@ -59,8 +59,10 @@ WITHOUT ROWID;
 """
 _QUERY = """
 SELECT * FROM events
-WHERE number > ? AND time >= ? AND time < ? AND (? = '' OR id = ?) ORDER BY number LIMIT ?
+WHERE number > :after AND time >= :since AND time < :until {of_one} ORDER BY number LIMIT :limit
 """
+_OF_ONE = "AND id = :id"
+"""A condition of its own: with ``:id = '' OR id = :id`` SQLite would look at all events, not at the index."""
 _LAST_TASK = """
 SELECT max(CAST(substr(id, 2) AS INTEGER)) FROM (
     SELECT id FROM events WHERE kind = 'task' UNION ALL SELECT id FROM records WHERE kind = 'task'
@@ -175,10 +177,15 @@ class Journal:
         Raises:
             JournalError: The file cannot be read.
         """
-        since = -inf if query.since is None else query.since
-        until = inf if query.until is None else query.until
-        values = (query.after, since, until, query.id, query.id, query.limit)
-        rows = self._run(lambda db: db.execute(_QUERY, values).fetchall(), "read")
+        text = _QUERY.format(of_one=_OF_ONE if query.id else "")
+        values = {
+            "after": query.after,
+            "since": -inf if query.since is None else query.since,
+            "until": inf if query.until is None else query.until,
+            "id": query.id,
+            "limit": query.limit,
+        }
+        rows = self._run(lambda db: db.execute(text, values).fetchall(), "read")
         return [dict(zip(_COLUMNS, row, strict=True)) for row in rows]
 
     def forget_events(self, before: int) -> None:

@@ -70,6 +70,25 @@ def test_events_are_found_by_number_time_and_id(tmp_path: Path) -> None:
     journal.close()
 
 
+def test_events_of_one_task_are_found_without_looking_at_all(tmp_path: Path) -> None:
+    """The journal has 200 000 events, and whoever waits for it to be written waits for the search, too."""
+    book, journal = filled(), Journal(tmp_path / "j.sqlite")
+    for _ in range(2000):
+        book.create(ORDER, 9.0)
+    journal.append(book.take_events())
+    steps = [0]
+
+    def count() -> int:
+        steps[0] += 1
+        return 0
+
+    journal._db.set_progress_handler(count, 100)
+    assert [event["name"] for event in journal.events(EventQuery(id="T1"))] == ["created", "held"]
+    journal._db.set_progress_handler(None, 0)
+    journal.close()
+    assert steps[0] < 10
+
+
 def test_a_newer_journal_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "j.sqlite"
     Journal(path).close()
