@@ -167,7 +167,9 @@ def _response(request: web.Request, answer: dict[str, Any]) -> web.Response:
     headers: dict[str, str] = {hdrs.ETAG: revision} if revision else {}
     if status in (429, 503):
         headers["Retry-After"] = _RETRY_S
-    if request.method == "GET" and revision and request.headers.get(hdrs.IF_NONE_MATCH) == revision:
+    # Tasks and chargers also say what changes without a revision: when a task ends, which robots charge.
+    is_whole = request.method == "GET" and request.path.startswith(f"{PREFIX}/zones/")
+    if is_whole and revision and request.headers.get(hdrs.IF_NONE_MATCH) == revision:
         return web.Response(status=304, headers=headers)
     return web.Response(
         status=status, text=str(answer["body"]), content_type="application/json", headers=headers

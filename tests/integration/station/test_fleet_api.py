@@ -143,7 +143,11 @@ async def check_requests(fleet: ManagedFleet) -> None:
         status, said, _ = await ask(erp, "GET", "/robots?limit=9999")
         assert (status, "limit" in said["error"]) == (422, True)
         _, _, tag = await ask(erp, "GET", "/chargers")
-        assert (await ask(erp, "GET", "/chargers", If_None_Match=tag))[0] == 304
+        status, body, _ = await ask(erp, "GET", "/chargers", If_None_Match=tag)
+        assert (status, body["charging"]) == (200, {}), "who charges changes without the revision"
+        zone = {"kind": "slow", "cells": [3], "value": 0.3}
+        _, _, tag = await ask(erp, "PUT", "/zones/gate", zone)
+        assert (await ask(erp, "GET", "/zones/gate", If_None_Match=tag))[0] == 304
         assert (await ask(erp, "GET", "/map"))[1]["rows"] == 8
         assert [(one.name, one.done) for one in users.actions][:1] == [("create_task", True)]
         async with session_of(url, "viewer") as viewer:
