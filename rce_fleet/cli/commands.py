@@ -8,8 +8,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rce.printable import for_terminal, one_line
 from rce_fleet.cli import tasks
-from rce_fleet.cli.access import STATION, Station, Token, do, echo_table, set_token
+from rce_fleet.cli.access import (
+    STATION,
+    AsJson,
+    AsJsonLines,
+    SendLogin,
+    Station,
+    Token,
+    do,
+    echo_json,
+    echo_json_line,
+    echo_table,
+    set_token,
+)
 from rce_fleet.exceptions import EventsRestartedError
 
 if TYPE_CHECKING:
@@ -21,9 +34,9 @@ app.command("tasks")(tasks.tasks)
 
 
 @app.callback()
-def fleet(token: Token = "") -> None:
+def fleet(token: Token = "", send_login: SendLogin = False) -> None:
     """Control a fleet through its station."""
-    set_token(token)
+    set_token(token, sends_login=send_login)
 
 
 Robot = Annotated[str, typer.Argument(help="The robot.")]
@@ -32,12 +45,16 @@ Reason = Annotated[str, typer.Option(help="For people.")]
 
 
 @app.command("robots")
-def robots(station: Station = STATION) -> None:
+def robots(json_: AsJson = False, station: Station = STATION) -> None:
     """List robots with their tasks and batteries."""
 
     async def work(client: FleetClient) -> None:
+        found = await client.robots()
+        if json_:
+            echo_json(found)
+            return
         rows = []
-        for robot in await client.robots():
+        for robot in found:
             battery = "-" if robot.battery is None else f"{robot.battery:.0%}"
             cell, goal = ("-" if number is None else str(number) for number in (robot.cell, robot.goal))
             task = " ".join(filter(None, (robot.task, *robot.queue))) or "-"
@@ -119,6 +136,7 @@ def watch(
     after: Annotated[
         int | None, typer.Option(help="Begin after the event of this number [the newest].")
     ] = None,
+    json_: AsJsonLines = False,
     station: Station = STATION,
 ) -> None:
     """Follow what happens until Ctrl-C."""
@@ -128,8 +146,12 @@ def watch(
         while True:
             try:
                 async for event in client.events(number):
-                    clock = time.strftime("%H:%M:%S", time.localtime(event.time))
-                    typer.echo(f"{event.number}  {clock}  {event.text or f'{event.id}: {event.name}'}")
+                    if json_:
+                        echo_json_line(event)
+                    else:
+                        clock = time.strftime("%H:%M:%S", time.localtime(event.time))
+                        text = one_line(event.text or f"{event.id}: {event.name}")
+                        typer.echo(f"{event.number}  {clock}  {text}")
                     sys.stdout.flush()
             except EventsRestartedError as error:
                 typer.echo(f"rce fleet: {error}", err=True)
@@ -141,13 +163,20 @@ def watch(
 @app.command("history")
 def history(
     hours: Annotated[float, typer.Option(help="How far back.", min=0.0)] = 24.0,
+    json_: AsJsonLines = False,
     station: Station = STATION,
 ) -> None:
     """Print what happened as CSV."""
 
     async def work(client: FleetClient) -> None:
-        async for line in client.history_csv(since=time.time() - 3600.0 * hours):
-            typer.echo(line, nl=False)
+        since = time.time() - 3600.0 * hours
+        if json_:
+            async for event in client.history(since=since):
+                echo_json_line(event)
+            return
+        shows = for_terminal if sys.stdout.isatty() else str
+        async for line in client.history_csv(since=since):
+            typer.echo(shows(line), nl=False)
 
     do(station, work)
 
@@ -155,12 +184,16 @@ def history(
 @app.command("statistics")
 def statistics(
     hours: Annotated[float, typer.Option(help="How far back.", min=0.001)] = 1.0,
+    json_: AsJson = False,
     station: Station = STATION,
 ) -> None:
     """Show what the fleet did."""
 
     async def work(client: FleetClient) -> None:
         found = await client.statistics(3600.0 * hours)
+        if json_:
+            echo_json(found)
+            return
         rows = [(name, "-" if value is None else f"{value:g}") for name, value in found]
         echo_table(("figure", "value"), rows)
 

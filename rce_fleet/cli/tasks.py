@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rce_fleet.api.tasks import StopModel, TaskChange, TaskModel, TaskRequest
-from rce_fleet.cli.access import STATION, Station, checked, do, echo_table
+from rce.printable import one_line
+from rce_fleet.api.tasks import RepeatModel, StopModel, TaskChange, TaskModel, TaskRequest
+from rce_fleet.cli.access import STATION, AsJson, Station, checked, do, echo_json, echo_table
 
 if TYPE_CHECKING:
     from rce_fleet.client import FleetClient
@@ -23,13 +24,18 @@ def tasks(
         str, typer.Option(help="States, separated by commas; also open, ended, recurring and all.")
     ] = "open",
     robot: Annotated[str, typer.Option(help="Only tasks that this robot does.")] = "",
+    json_: AsJson = False,
     station: Station = STATION,
 ) -> None:
     """List tasks."""
 
     async def work(client: FleetClient) -> None:
         wanted = () if state == "all" else state.split(",")
-        rows = [_row(task) async for task in client.tasks(state=wanted, robot=robot)]
+        found = [task async for task in client.tasks(state=wanted, robot=robot)]
+        if json_:
+            echo_json(found)
+            return
+        rows = [_row(task) for task in found]
         echo_table(("task", "state", "robot", "target", "priority", "until", "what"), rows)
 
     do(station, work)
@@ -71,6 +77,12 @@ def add(
     robot: Annotated[str, typer.Option(help="The only robot that may do it.")] = "",
     after: Annotated[list[str] | None, typer.Option(help="A task that must be done before.")] = None,
     rounds: Annotated[int, typer.Option(help="How often the stops are made.")] = 1,
+    every: Annotated[
+        float | None, typer.Option(help="Seconds from one occurrence to the next: the task recurs.")
+    ] = None,
+    count: Annotated[
+        int | None, typer.Option(help="Occurrences in all, with --every [until it is cancelled].")
+    ] = None,
     name: Annotated[str, typer.Option(help="For people.")] = "",
     key: Annotated[str, typer.Option(help="Your own key: the same key makes one task only.")] = "",
     station: Station = STATION,
@@ -78,6 +90,8 @@ def add(
     """Create a task; print its id."""
     if pick is None and deliver is None and not cell:
         raise typer.BadParameter("say where: --cell CELL, or --pick CELL --deliver CELL")
+    if count is not None and every is None:
+        raise typer.BadParameter("say how often the task recurs: --every SECONDS", param_hint="count")
     now = time.time()
     with checked():
         stops = [StopModel(action="pick", cell=pick, duration=duration)] if pick is not None else []
@@ -93,6 +107,7 @@ def add(
             earliest_start=now + start if start else None,
             robot=robot,
             after=after or [],
+            repeat=None if every is None else RepeatModel(every=every, count=count),
         )
 
     async def work(client: FleetClient) -> None:
@@ -102,17 +117,18 @@ def add(
 
 
 @app.command("show")
-def show(task_id: Id, station: Station = STATION) -> None:
+def show(task_id: Id, json_: AsJson = False, station: Station = STATION) -> None:
     """Show a task."""
 
     async def work(client: FleetClient) -> None:
         task = await client.task(task_id)
+        if json_:
+            echo_json(task)
+            return
         echo_table(("task", "state", "robot", "target", "priority", "until", "what"), [_row(task)])
         for visit in task.visits:
-            end = _clock(visit.ended_at)
-            typer.echo(
-                f"stop {visit.stop}: {visit.robot} in cell {visit.cell}, {_clock(visit.started_at)} to {end}"
-            )
+            when = f"{_clock(visit.started_at)} to {_clock(visit.ended_at)}"
+            typer.echo(f"stop {visit.stop}: {one_line(visit.robot)} in cell {visit.cell}, {when}")
 
     do(station, work)
 

@@ -182,12 +182,12 @@ async def run_command(url: str, login: Path) -> tuple[int | None, str]:
 
 
 async def check_logins_of_the_command(fleet: ManagedFleet, login: Path) -> None:
-    there = {"url": "http://other.example.org:9000/", "user": "ada", "expires": time.time() + 3600}
+    there = {"url": "http://localhost:9000/", "user": "ada", "expires": time.time() + 3600}
     for token, refused in (("viewer", False), ("stranger", True)):
         login.write_text(json.dumps({**there, "token": token}))
         async with fleet_station(fleet.core.uri, authenticator=RoleAuthenticator()) as url:
             code, told = await run_command(url, login)
-            expected = "the login at http://other.example.org:9000/ is not valid" if refused else "Robot2"
+            expected = "the login at http://localhost:9000/ is not valid" if refused else "Robot2"
             assert (code, expected in told) == (int(refused), True), told
         async with fleet_station(fleet.core.uri, authenticator=LoopbackAuthenticator()) as url:
             code, told = await run_command(url, login)

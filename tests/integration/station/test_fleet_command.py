@@ -1,0 +1,212 @@
+"""``rce fleet`` at a station: which token it sends, JSON, recurring tasks, texts with control codes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from aiohttp import web
+from aiohttp.test_utils import TestServer
+from typer.testing import CliRunner
+
+from rce_fleet.api.fleet import FleetRobotModel, RobotList, StatisticsModel
+from rce_fleet.api.tasks import TaskModel, TaskPage, TaskRequest
+from rce_fleet.cli.access import TOKEN_VARIABLE, why_not_sent
+from rce_fleet.cli.commands import app as commands
+from rce_master.cli.credentials import FILE_VARIABLE
+
+TOKEN = "of-the-login"
+BELL = "box\x1b]0;owned\x07"
+TASK = TaskModel.model_validate(
+    {
+        "id": "T7",
+        "stops": [{"cell": 5}],
+        "name": BELL,
+        "state": "running",
+        "reason": BELL,
+        "question": "",
+        "robot_assigned": "R1",
+        "target": 5,
+        "position": 0,
+        "loads": 0,
+        "visits": [{"stop": 0, "robot": BELL, "cell": 5, "started_at": 1.0, "ended_at": None}],
+        "requester": "erp",
+        "key": "",
+        "created_at": 1.0,
+        "changed_at": 1.0,
+        "started_at": 1.0,
+        "expected_end": None,
+        "late": False,
+        "occurrence": 1,
+        "revision": 1,
+    }
+)
+ROBOT = FleetRobotModel.model_validate(
+    {
+        "id": "R1",
+        "state": "idle",
+        "activity": "idle",
+        "mode": "automatic",
+        "reason": BELL,
+        "cell": 5,
+        "goal": None,
+        "battery": 0.5,
+        "task": None,
+        "queue": [],
+        "profile": {},
+        "revision": 1,
+    }
+)
+FIGURES = StatisticsModel.model_validate(dict.fromkeys(StatisticsModel.model_fields, 0))
+
+
+class Station:
+    """A web server with the routes of a station, and the tokens and bodies that came to it."""
+
+    def __init__(self) -> None:
+        self.tokens: list[str] = []
+        self.bodies: list[Any] = []
+        self.wants = ""
+        """The token that it asks for; empty: none."""
+
+    async def answer(self, request: web.Request) -> web.Response:
+        self.tokens.append(request.headers.get("Authorization", "").removeprefix("Bearer "))
+        if self.wants and self.tokens[-1] != self.wants:
+            return web.json_response({"error": "log in"}, status=401)
+        if request.can_read_body:
+            self.bodies.append(await request.json())
+        path = request.path.removeprefix("/api/v1/")
+        if path == "robots":
+            shown = RobotList(robots=[ROBOT]).model_dump_json()
+        elif path == "tasks" and request.method == "GET":
+            shown = TaskPage(tasks=[TASK], next=None).model_dump_json()
+        elif path == "statistics":
+            shown = FIGURES.model_dump_json()
+        else:
+            shown = TASK.model_dump_json()
+        return web.Response(text=shown, content_type="application/json")
+
+
+@pytest.fixture
+def station() -> Station:
+    return Station()
+
+
+@pytest.fixture
+async def url(station: Station) -> AsyncIterator[str]:
+    app = web.Application()
+    app.router.add_route("*", "/{path:.*}", station.answer)
+    async with TestServer(app) as server:
+        yield str(server.make_url("/"))
+
+
+@pytest.fixture(autouse=True)
+def login(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    file = tmp_path / "login.json"
+    monkeypatch.setenv(FILE_VARIABLE, str(file))
+    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    monkeypatch.delenv("RCE_STATION", raising=False)
+    return file
+
+
+def keep_login(file: Path, engine: str) -> None:
+    kept = {"url": engine, "user": "ada", "token": TOKEN, "expires": time.time() + 3600}
+    file.write_text(json.dumps(kept))
+
+
+async def run(url: str, *words: str) -> tuple[int, str]:
+    """Run a command in a thread; return its exit code, and what it prints."""
+
+    def invoke() -> tuple[int, str]:
+        found = CliRunner().invoke(commands, words, env={"RCE_STATION": url})
+        return found.exit_code, found.output
+
+    return await asyncio.to_thread(invoke)
+
+
+async def test_a_login_is_not_sent_to_a_station_of_others(station: Station, url: str, login: Path) -> None:
+    keep_login(login, "http://engine.example.org:9000/")
+    assert (await run(url, "robots"))[0] == 0
+    assert station.tokens == [""]
+    station.wants = TOKEN
+    code, told = await run(url, "robots")
+    assert (code, station.tokens[1:]) == (1, [""])
+    assert "127.0.0.1 is not a host of that engine" in told
+    assert "--send-login" in told
+    assert (await run(url, "--send-login", "robots"))[0] == 0
+    assert station.tokens[2:] == [TOKEN]
+
+
+async def test_a_login_is_sent_to_the_station_beside_its_engine(
+    station: Station, url: str, login: Path
+) -> None:
+    keep_login(login, "http://one.example.org:9000/,http://localhost:9000/")
+    station.wants = TOKEN
+    assert (await run(url, "robots"))[0] == 0
+    assert station.tokens == [TOKEN]
+    assert (await run(url, "--token", "another", "robots"))[0] == 1
+    assert station.tokens[1:] == ["another"]
+
+
+@pytest.mark.parametrize(
+    ("engine", "station", "why"),
+    [
+        ("http://cloud:9000/", "http://cloud:9080", ""),
+        ("http://cloud:9000/", "http://CLOUD.:9080", ""),
+        ("http://cloud:9000/", "https://cloud", ""),
+        ("https://cloud:9000/", "https://cloud", ""),
+        ("https://cloud:9000/", "http://cloud:9080", "not encrypted"),
+        ("https://localhost:9000/", "http://[::1]:9080", ""),
+        ("http://a:9000/,http://b:9000/", "http://b:9080", ""),
+        ("http://cloud:9000/", "http://cloud.example.org:9080", "not a host of that engine"),
+        ("http://cloud:9000/", "http://cloud@evil.example.org:9080", "evil.example.org is not a host"),
+        ("http://cloud:9000/", "http://127.0.0.1:9080", "not a host of that engine"),
+        ("http://cloud:9000/", "http://[::1", "cannot be read"),
+    ],
+)
+def test_the_token_of_a_login_stays_with_its_engine(engine: str, station: str, why: str) -> None:
+    found = why_not_sent(engine, station)
+    assert why in found
+    assert bool(why) == bool(found)
+
+
+async def test_rce_fleet_prints_json(url: str) -> None:
+    """As the API returns it; a terminal interprets nothing in it."""
+    robots = ["robots", "--json"]
+    for words, expected in (
+        (robots, [ROBOT.model_dump(mode="json")]),
+        (["tasks", "--json"], [TASK.model_dump(mode="json")]),
+        (["task", "show", "T7", "--json"], TASK.model_dump(mode="json")),
+        (["statistics", "--json"], FIGURES.model_dump(mode="json")),
+    ):
+        code, told = await run(url, *words)
+        assert (code, json.loads(told)) == (0, expected), words
+        assert "\x1b" not in told
+
+
+@pytest.mark.parametrize("words", [["robots"], ["tasks"], ["task", "show", "T7"]])
+async def test_rce_fleet_prints_no_control_codes(url: str, words: list[str]) -> None:
+    """A task's name or reason is written by another user."""
+    code, told = await run(url, *words)
+    assert (code, "owned" in told) == (0, True)
+    assert "\x1b" not in told
+    assert "\x07" not in told
+
+
+async def test_rce_fleet_adds_a_recurring_task(station: Station, url: str) -> None:
+    code, told = await run(url, "task", "add", "--cell", "5", "--every", "3600", "--count", "10")
+    assert (code, told) == (0, "T7\n")
+    task = TaskRequest.model_validate(station.bodies[0])
+    assert task.repeat is not None
+    assert (task.repeat.every, task.repeat.count) == (3600, 10)
+    assert (await run(url, "task", "add", "--cell", "5", "--every", "60"))[0] == 0
+    assert station.bodies[1]["repeat"]["count"] is None
+    for wrong, value in ((["--count", "2"], "count"), (["--every", "0"], "every")):
+        code, told = await run(url, "task", "add", "--cell", "5", *wrong)
+        assert (code, f"Invalid value for {value}" in told) == (2, True), told
+    assert len(station.bodies) == 2
