@@ -120,7 +120,7 @@ def _annotation(field: Field) -> Any:
     if get_origin(rule.type) is list or (isinstance(rule.type, type) and issubclass(rule.type, Struct)):
         return Annotated[Any, AfterValidator(_specs(rule))]
     if rule.words:
-        return Annotated[Any, AfterValidator(_fitting(rule.type, rule.words))]
+        return Annotated[Any, AfterValidator(_fitting(rule))]
     if get_origin(rule.type) is tuple:
         items: Any = types.GenericAlias(tuple, (_text_or_number(get_args(rule.type)[0]), ...))
         return Annotated[items, Option(strict=False)]
@@ -185,12 +185,14 @@ def _specs(rule: AsWritten) -> Callable[[Any], Any]:
     return check
 
 
-def _fitting(kind: Any, words: str) -> Callable[[Any], Any]:
+def _fitting(rule: AsWritten) -> Callable[[Any], Any]:
+    """Check a value whose rule has words for a wrong type; it stays as it was written."""
+
     def check(value: Any) -> Any:
         try:
-            msgspec.convert(value, kind)
+            rule.read(msgspec.convert(value, rule.type))
         except msgspec.ValidationError as error:
-            raise ValueError(words) from error
+            raise ValueError(rule.words) from error
         return value
 
     return check

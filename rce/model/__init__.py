@@ -3,7 +3,7 @@
 The surfaces' spellings of it are in :mod:`rce.model.spelling`, its wire form is in :mod:`rce.model.written`.
 """
 
-from rce.model.checks import DEFAULT_PREFIX, find_circle
+from rce.model.checks import DEFAULT_PREFIX, find_circle, read_parameter_value
 from rce.model.faults import FaultCode, FieldFault, Path, SpecError, join_path
 from rce.model.names import (
     MAX_NAME_LENGTH,
@@ -107,6 +107,7 @@ __all__ = [
     "newest",
     "read_cores",
     "read_memory",
+    "read_parameter_value",
     "split_package",
     "write_bandwidth",
     "write_cores",

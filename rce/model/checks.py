@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ipaddress
+import math
 import re
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from rce.model.specs import ParameterValue
 
 # A folder of the machine, or an image's name as in registries: no spaces, no option of a command line.
 _IMAGE = re.compile(r"(/[^\x00-\x1f]*|[A-Za-z0-9][A-Za-z0-9._:/@+-]*)")
@@ -16,6 +19,7 @@ _MAX_IMAGE = 255
 DEFAULT_PREFIX = 24
 """Prefix of a group's address without one."""
 _SHORTEST_PREFIX, _LONGEST_PREFIX = 8, 30
+_INT32 = 2**31
 
 
 def read_image(text: str) -> str:
@@ -41,6 +45,20 @@ def read_group_address(text: str) -> str:
     return text
 
 
+def read_parameter_value(value: ParameterValue) -> ParameterValue:
+    """Check that a parameter server can keep a value, and that JSON can carry it to one.
+
+    Raises:
+        ValueError: A number is not finite, or has more than 32 bits.
+    """
+    for item in value if isinstance(value, list) else [value]:
+        if isinstance(item, int) and not -_INT32 <= item < _INT32:
+            raise ValueError(f"must fit into 32 bits, the size of ROS's integers, not {_shown(item)}")
+        if isinstance(item, float) and not math.isfinite(item):
+            raise ValueError(f"must be a finite number, not {item}")
+    return value
+
+
 def find_circle(start: str, after: Mapping[str, Sequence[str]]) -> list[str]:
     """Find a cycle on which a node comes after itself.
 
@@ -61,6 +79,11 @@ def find_circle(start: str, after: Mapping[str, Sequence[str]]) -> list[str]:
             seen.add(way[-1])
             ways += [[*way, tag] for tag in after.get(way[-1], ())]
     return []
+
+
+def _shown(number: int) -> str:
+    """Write an integer, or its size: Python does not convert thousands of digits to text."""
+    return str(number) if number.bit_length() <= 128 else f"one of {number.bit_length()} bits"  # noqa: PLR2004
 
 
 def _address_problem(text: str) -> str:

@@ -14,7 +14,7 @@ from typing import Annotated
 from msgspec import Meta, Struct, field
 
 from rce.model import written
-from rce.model.checks import read_group_address, read_image
+from rce.model.checks import read_group_address, read_image, read_parameter_value
 from rce.model.names import InterfaceType
 from rce.model.quantities import (
     read_bandwidth,
@@ -155,7 +155,11 @@ class ParameterSpec(Struct, frozen=True, kw_only=True):
     name: Annotated[str, AsWritten(written.RosName)]
     value: Annotated[
         ParameterValue,
-        AsWritten(written.Value, words="must be a number, a boolean, a string, or a list of such"),
+        AsWritten(
+            written.Value,
+            read_parameter_value,
+            words="must be a number, a boolean, a string, or a list of such",
+        ),
     ]
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
 from rce.control import EndpointState, EndpointStatus, LinkAddress, NodeState, NodeStatus
-from rce.model import NodeSpec, ParameterValue, find_circle
+from rce.model import NodeSpec, ParameterValue, find_circle, read_parameter_value
 from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
 from rce_master.state import (
     activity,
@@ -34,8 +33,6 @@ if TYPE_CHECKING:
         RemoveNode,
         SetParameter,
     )
-
-_INT32 = 2**31
 
 _EVENTS = {
     EndpointState.STARTING: ContainerEvent.STARTING,
@@ -161,13 +158,11 @@ def delete_parameter(tx: Transaction, command: DeleteParameter) -> None:
 
 
 def _check_value(name: str, value: ParameterValue) -> None:
-    for item in value if isinstance(value, list) else [value]:
-        if isinstance(item, int) and not -_INT32 <= item < _INT32:
-            raise InvalidRequestError(
-                f"parameter {name!r}: {item} does not fit into 32 bits, the size of ROS's integers"
-            )
-        if isinstance(item, float) and not math.isfinite(item):
-            raise InvalidRequestError(f"parameter {name!r}: {item} is not a finite number")
+    """Refuse what a task set of the release before passes on unchecked."""
+    try:
+        read_parameter_value(value)
+    except ValueError as error:
+        raise InvalidRequestError(f"parameter {name!r}: {error}") from error
 
 
 def find(tx: Transaction, user: str, tag: str) -> Container:

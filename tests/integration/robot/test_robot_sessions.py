@@ -264,6 +264,20 @@ async def test_requests_go_to_the_master_in_order_and_errors_come_back(cloud: Cl
     assert cloud.master.requests[2][2] == {"removeNodes": [{"containerTag": "c1", "nodeTag": "n"}]}
 
 
+async def test_a_parameter_that_is_no_number_leaves_the_master_alone(
+    dial: Dial, robot_of: type[Robot]
+) -> None:
+    """One robot's NaN must not end the connection that the requests of all robots take."""
+    async with running_cloud(in_patches=True) as cloud, dial(cloud) as socket:
+        robot, peer = robot_of(socket), cloud.master.peer
+        item = {"containerTag": "c", "name": "p", "value": float("nan")}
+        await robot.send("CN", {"setParam": [item]})
+        assert "data.setParam[0].value: must be a finite number" in await robot.get("ER")
+        await robot.send("DC", {"containerTag": "c"})
+        await cloud.master.changed.until(lambda: any(kind == "DC" for _, kind, _ in cloud.master.requests))
+        assert cloud.master.peer is peer
+
+
 async def test_a_leaving_robots_last_requests_are_carried_out(cloud: Cloud, robot: Robot) -> None:
     for number in range(20):
         await robot.send("DC", {"containerTag": f"c{number}"})

@@ -194,6 +194,14 @@ def test_every_fault_is_listed() -> None:
     )
 
 
+@pytest.mark.parametrize("value", [float("nan"), [1, float("inf")], 2**31])
+def test_a_parameter_that_no_server_keeps_is_refused(value: object) -> None:
+    data = good()
+    data["parameters"][0]["value"] = value
+    (fault,) = faults(data)
+    assert fault.startswith("parameters[0].value: must ")
+
+
 def test_unknown_key_gets_a_suggestion() -> None:
     data = good()
     data["interfaces"][1]["itype"] = data["interfaces"][1].pop("iType")

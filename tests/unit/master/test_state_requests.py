@@ -203,7 +203,7 @@ def test_parameters_are_set_and_replaced(world: World) -> None:
     before = revision(world, "c")
     set_([1, "a", False])
     assert revision(world, "c") == before
-    with pytest.raises(InvalidRequestError, match="does not fit into 32 bits"):
+    with pytest.raises(InvalidRequestError, match="must fit into 32 bits"):
         set_(2**31)
     with pytest.raises(InvalidRequestError, match="finite"):
         set_([1.0, float("nan")])

@@ -21,6 +21,17 @@ def test_cores_must_be_a_number_that_json_can_hold(cpu: float) -> None:
         read_request("CC", {"containerTag": "c", "containerData": {"cpu": cpu}})
 
 
+@pytest.mark.parametrize("value", ["NaN", "-Infinity", "[1, NaN]", "2147483648", "1" + 4000 * "0"])
+def test_parameters_must_be_numbers_that_json_and_ros_can_hold(value: str) -> None:
+    """JSON would carry ``null`` in place of NaN to the master, which takes that for garbage."""
+    text = '{"type": "CN", "data": {"setParam": [{"containerTag": "c", "name": "p", "value": VALUE}]}}'
+    request = decode(text.replace("VALUE", value))
+    assert isinstance(request, ConfigureComponents)
+    assert not request.set_param
+    (fault,) = request.faults
+    assert str(fault).startswith("data.setParam[0].value: must ")
+
+
 @pytest.mark.parametrize("half", [r"\ud800", r"\uDFFF", r"x\uD83D"])
 def test_half_a_character_is_refused_beside_a_nan_too(half: str) -> None:
     text = '{"type": "CN", "data": {"x": NaN, "deleteParam": [{"containerTag": "c", "name": "HALF"}]}}'
