@@ -263,7 +263,12 @@ class TaskBook(FleetTables):
             raise TaskRefusedError(f"{task.id} is {task.state.value}: it cannot be {cause.value}")
 
     def _check_after(self, order: Order, task: Task | None = None) -> None:
-        """Check that the tasks before it exist, and that none of them waits for it."""
+        """Check that the tasks before it exist, and that none of them waits for it.
+
+        Args:
+            order: What is asked for.
+            task: The task that is changed; None: a new one, for which no other can wait yet.
+        """
         waiting, seen = list(order.after), set[str]()
         while waiting:
             before = waiting.pop()
@@ -273,7 +278,8 @@ class TaskBook(FleetTables):
                 continue
             seen.add(before)
             try:
-                waiting += self.find(before).order.after
+                known = self.find(before)
+                waiting += known.order.after if task is not None else ()
             except UnknownTaskError as error:
                 if before in order.after:
                     raise TaskRefusedError(f"the task cannot come after {before}: {error}") from error

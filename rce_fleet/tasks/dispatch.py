@@ -82,7 +82,7 @@ class Dispatcher:
         self._explained = 0
         self._facts: FleetFacts | None = None
         self._measured: set[int] = set()
-        """Numbers of tasks; the distances to their stops were measured."""
+        """Numbers of open tasks; the distances to their stops were measured."""
         self._measured_epoch = 0
 
     def profile(self, robot: str) -> RobotProfile:
@@ -106,7 +106,9 @@ class Dispatcher:
         travel.set_map(facts.grid, facts.shut, book.zones, facts.map_revision)
         if travel.epoch != self._measured_epoch:
             self._measured_epoch, self._measured = travel.epoch, set()
-        tasks = [task for task in book.open_tasks() if task.number not in self._measured]
+        open_tasks = list(book.open_tasks())
+        self._measured.intersection_update([task.number for task in open_tasks])
+        tasks = [task for task in open_tasks if task.number not in self._measured]
         if not tasks:
             return False
         self._profiles = zone_profiles(book, facts, self.rules.profile)

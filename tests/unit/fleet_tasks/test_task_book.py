@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from rce_fleet.exceptions import KeyReusedError, RevisionError, TaskRefusedError, UnknownTaskError
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.book import TaskBook
 from rce_fleet.tasks.order import Action, Order, Stop
-from rce_fleet.tasks.task import TaskState
+from rce_fleet.tasks.task import Task, TaskState
 
 GO = Order((Stop(Action.GO, (5,)),))
 DELIVERY = Order((Stop(Action.PICK, (3,), 2.0), Stop(Action.DELIVER, (12,), 2.0)))
@@ -64,6 +66,27 @@ def test_impossible_orders_are_refused(book: TaskBook, order: Order, reason: str
         book.create(order, 0.0)
     assert not book.tasks
     assert book.take_events() == []
+
+
+def test_a_task_after_a_long_chain_looks_at_the_one_before_it_only(
+    book: TaskBook, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No other task can wait for a new one: to look along the chain made 10 000 tasks take minutes."""
+    last = book.create(GO, 0.0)
+    for _ in range(200):
+        last = book.create(replace(GO, after=(last.id,)), 0.0)
+    asked: list[str] = []
+    find = book.find
+
+    def noted(task_id: str) -> Task:
+        asked.append(task_id)
+        return find(task_id)
+
+    monkeypatch.setattr(book, "find", noted)
+    book.create(replace(GO, after=(last.id,)), 0.0)
+    assert asked == [last.id]
+    with pytest.raises(TaskRefusedError, match="T1 would wait for itself"):
+        book.change("T1", replace(GO, after=(last.id,)), 1.0)
 
 
 def test_an_old_revision_changes_nothing(book: TaskBook) -> None:

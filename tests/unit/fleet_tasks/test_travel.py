@@ -95,3 +95,19 @@ def test_new_grid_is_measured_in_slices(floor: Any) -> None:
     floor.run(1)
     assert len(travel._fields) == known
     assert not floor.dispatcher.measure(floor.facts)
+
+
+def test_distances_are_measured_ahead_however_many_tasks_there_were(
+    floor: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After as many tasks as distances are kept, each step measured them alone, and stopped for it."""
+    floor.grid = floor.facts.grid = floor.book.grid = GridMap(10, 30)
+    monkeypatch.setattr(travel_module, "MOST_BYTES", 20 * 4 * 300)
+    floor.add("Robot1", 0)
+    for cell in range(30):
+        task = floor.go(cell)
+        floor.dispatcher.measure(floor.facts)
+        floor.book.cancel(task.id, floor.now)
+    floor.go(299)
+    floor.dispatcher.measure(floor.facts)
+    assert floor.dispatcher._travel.missing([299]) == []
