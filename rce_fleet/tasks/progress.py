@@ -124,12 +124,21 @@ class TaskProgress:
             self._give_up(task, now, f"{robot.id} was taken out of service", is_away=True)
             return
         if task.state is TaskState.SUSPENDED:
+            if not self._can_continue(task, robot):
+                return
             task = self._book.advance(task, TaskCause.CONTINUE, now, f"{robot.id} can continue")
         task = self._end_action(task, now, robot)
         while not task.has_ended and task.action is None:
             if not self._go(task, robot, now, facts):
                 return
             task = self._end_action(self._book.tasks[task.number], now, robot)
+
+    def _can_continue(self, task: Task, robot: RobotFacts) -> bool:
+        """Return whether a path leads a robot with a load to its next stop; people are asked meanwhile."""
+        stop = task.next_stop
+        if task.action is not None or not task.is_loaded or stop is None:
+            return True
+        return self._nearest(robot, self._cells_of(stop, robot)) is not None
 
     def _go(self, task: Task, robot: RobotFacts, now: float, facts: FleetFacts) -> bool:
         """Send the robot to the next stop; return whether it is there and its action began."""
@@ -185,12 +194,8 @@ class TaskProgress:
 
     def _choose(self, task: Task, stop: Stop, robot: RobotFacts, now: float) -> Task:
         """Choose the cell of a stop; without one that is free, the task says what it waits for."""
-        cells = stop.cells
-        users: Mapping[int, ChargerUser] = {}
-        if stop.action is Action.CHARGE:
-            cells, users = cells or self._book.places.chargers, self._charger_users
-        elif stop.action is Action.PARK:
-            cells = cells or self._book.places.parking or ((robot.cell,) if robot.cell is not None else ())
+        cells = self._cells_of(stop, robot)
+        users = self._charger_users if stop.action is Action.CHARGE else {}
         taken = {cell: user.robot for cell, user in users.items() if cell in cells and not user.can_leave}
         taken |= {cell: self._taken[cell] for cell in cells if self._taken.get(cell, robot.id) != robot.id}
         free = [cell for cell in cells if cell not in taken]
@@ -217,12 +222,21 @@ class TaskProgress:
             self._book.emit(task, "waits", now, text=f"{task.id} {reason}")
         if (
             not waits
-            and not task.is_loaded
+            and (not task.is_loaded or task.state is TaskState.RUNNING)
             and now - max(robot.moved_at, task.changed_at) > self._rules.unreachable_after
         ):
             self._give_up(task, now, reason)
             return self._book.tasks[task.number]
         return task
+
+    def _cells_of(self, stop: Stop, robot: RobotFacts) -> tuple[int, ...]:
+        """Return the cells of which any one serves for a stop."""
+        places = self._book.places
+        if stop.action is Action.CHARGE:
+            return stop.cells or places.chargers
+        if stop.action is Action.PARK:
+            return stop.cells or places.parking or ((robot.cell,) if robot.cell is not None else ())
+        return stop.cells
 
     def _end_action(self, task: Task, now: float, robot: RobotFacts | None = None) -> Task:
         """End the action that is under way, if its time has come. An action is never begun twice."""

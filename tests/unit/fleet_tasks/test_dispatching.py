@@ -564,6 +564,33 @@ def test_a_task_whose_stops_were_all_made_is_done(floor: Floor, how: str) -> Non
     assert floor.task(task).state is TaskState.DONE
 
 
+@pytest.mark.parametrize("is_on_its_way", [False, True])
+@pytest.mark.parametrize("answer", ["freed", "told"])
+def test_a_load_without_a_path_is_asked_for_until_it_is_settled(
+    floor: Floor, answer: str, *, is_on_its_way: bool
+) -> None:
+    """The question was there for one step; then the task ran, with a robot that stood still."""
+    floor.add("Robot1", 0)
+    task = floor.deliver(3, 60)
+    while floor.task(task).target != (60 if is_on_its_way else 3):
+        floor.run(1)
+    floor.facts.shut, floor.facts.map_revision = frozenset({60}), 1
+    floor.run(60)
+    events = len(floor.events)
+    floor.run(300)
+    assert (floor.task(task).state, floor.task(task).loads) == (TaskState.SUSPENDED, 1)
+    assert "Where is the load that Robot1 has?" in floor.task(task).question
+    assert len(floor.events) == events
+    assert [event.name for event in floor.events].count("question") == 1
+    if answer == "told":
+        settle_load(floor.book, task.id, 5, floor.now)
+    floor.facts.shut, floor.facts.map_revision = frozenset(), 2
+    floor.run_until_ended(task)
+    assert floor.task(task).state is TaskState.DONE
+    picked = [visit.cell for visit in floor.task(task).visits]
+    assert picked == ([3, 5, 60] if answer == "told" else [3, 60])
+
+
 @pytest.mark.parametrize("is_cancelled", [False, True])
 def test_a_dead_robot_with_a_load_keeps_no_cell(floor: Floor, *, is_cancelled: bool) -> None:
     """Others go to the cell to which it was on its way."""
