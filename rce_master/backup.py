@@ -45,9 +45,11 @@ Export: TypeAlias = Callable[[], AbstractContextManager[Path]]
 
 _ATTEMPTS = 5
 _STORE = {FILE_NAME, f"{FILE_NAME}-wal", f"{FILE_NAME}-shm", f"{FILE_NAME}-journal"}
-_LEFT_OUT = {*_STORE, "lock", ARCHIVES, SNAPSHOTS, "etcd", "etcd.yaml"}
+_LEFT_OUT = {*_STORE, "lock", ARCHIVES, SNAPSHOTS, "etcd"}
 """What is copied in another way, snapshots, which have the users' files, and a member of etcd, if it has the
 same state folder."""
+_OF_ETCD = "etcd."
+"""How the names of its other files begin: its configuration, and data that ``rce cluster recover`` keeps."""
 _PIECE = 1 << 20
 
 
@@ -77,7 +79,8 @@ def back_up(folders: Mapping[str, Path], out: Path, export: Export | None = None
         export: Gives an SQLite file with the contents of a store that is elsewhere.
 
     Raises:
-        BackupError: The folder has no state, the state cannot be copied, or the file exists already.
+        BackupError: The folder has no state, the state cannot be copied, or the file exists already or
+            would be in a folder that is copied.
     """
     store = folders[MASTER] / FILE_NAME
     if export is None and not store.exists():
@@ -87,6 +90,9 @@ def back_up(folders: Mapping[str, Path], out: Path, export: Export | None = None
         )
     if out.exists():
         raise BackupError(f"{out} is there already; name another file, or remove it")
+    for folder in folders.values():
+        if out.resolve().is_relative_to(folder.resolve()):
+            raise BackupError(f"{out} would be a part of the next backup: name a file outside of {folder}")
     try:
         descriptor, name = tempfile.mkstemp(dir=out.parent, prefix=f".{out.name}-")
         try:
@@ -271,6 +277,7 @@ def _files(folders: Mapping[str, Path], store: Path) -> Iterator[tuple[str, Path
             inside = path.relative_to(folder)
             left_out = part == MASTER and (
                 inside.parts[0] in _LEFT_OUT
+                or inside.parts[0].startswith(_OF_ETCD)
                 or (certificates is not None and path.is_relative_to(certificates))
             )
             if path.is_file() and not path.is_symlink() and not left_out:
