@@ -38,7 +38,7 @@ from rce_master.store.etcd import EtcdClient, EtcdStore
 from rce_master.store.etcd.layout import prepare
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
 
     from rce_master.cli.credentials import Credentials
     from rce_master.state.commands import Command
@@ -131,19 +131,25 @@ class OfflineState:
         self._term = term
         self._audit = audit
 
-    async def do(self, command: Command, action: str, subject: str) -> None:
+    async def do(
+        self, command: Command, action: str, subject: str, *, is_done: Callable[[], bool] = lambda: True
+    ) -> None:
         """Apply a change, store it, and write it to the audit log.
 
         Args:
-            command: The change.
+            command: The change; repeated until it is done.
             action: What the audit log calls it, as for the same change over the API.
             subject: What it is about.
+            is_done: Tells whether it is, of one that exceeds the work of one command.
 
         Raises:
             MasterError: The state does not allow it, or it cannot be stored.
         """
-        rows = self.state.apply(command, time.monotonic()).rows()
-        await self._store.save(rows, self._term)
+        while True:
+            rows = self.state.apply(command, time.monotonic()).rows()
+            await self._store.save(rows, self._term)
+            if is_done():
+                break
         self._audit.add(_caller(), action, subject, address=OFFLINE)
 
 

@@ -188,7 +188,9 @@ class _StoreDirectory:
         await self._offline.do(command, "set_role", f"{name}/{role}")
 
     async def remove(self, name: str) -> None:
-        await self._offline.do(commands.RemoveUser(name=name), "remove_user", name)
+        users = self._offline.state.tables.users
+        command = commands.RemoveUser(name=name)
+        await self._offline.do(command, "remove_user", name, is_done=lambda: name not in users)
 
     def close(self) -> None:
         self._authenticator.close()

@@ -56,7 +56,10 @@ class SetRole:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemoveUser:
-    """Remove a user with all robots, containers and tokens."""
+    """Remove a user with all robots, containers and tokens.
+
+    What exceeds the work of one command is left with the user: repeat it until the user is gone.
+    """
 
     name: str
 

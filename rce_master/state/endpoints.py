@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from rce_master.state.tables import Tables
     from rce_master.state.wiring_records import Connection, Link
 
+_REMOVAL = 100
+"""The work of removing an endpoint or a connection, as :attr:`StateSettings.max_work` counts it."""
+_INTERFACE = 10
+"""The work of removing an interface."""
 _SMALL = 32 * 2**10
 """Endpoints up to this size are not checked: their number limits them sufficiently."""
 
@@ -43,6 +47,12 @@ def grown(tx: Transaction, endpoint: Endpoint, part: object, instead_of: object 
                 f"your robots and containers would hold more than {settings.max_user_bytes} bytes"
             )
     return size
+
+
+def removal_work(tables: Tables, id_: str) -> int:
+    """Return the work of :func:`remove`."""
+    connections, interfaces = (one.count("endpoint", id_) for one in (tables.connections, tables.interfaces))
+    return _REMOVAL * (1 + connections) + _INTERFACE * interfaces
 
 
 def remove(tx: Transaction, id_: str, reason: str) -> None:

@@ -28,10 +28,8 @@ if TYPE_CHECKING:
 
 DRAINED = "this robot process is being emptied; connect again"
 """What robots of a drained task set are told."""
-_REMOVAL = 100
-"""The work of removing a robot or a connection, as :attr:`StateSettings.max_work` counts it."""
-_INTERFACE = 10
-"""The work of removing an interface."""
+_SENDING_AWAY = 100
+"""The work of sending a robot away, as :attr:`StateSettings.max_work` counts it."""
 
 
 def login(tx: Transaction, command: RobotLogin) -> None:
@@ -154,7 +152,7 @@ def empty_drained(tx: Transaction) -> None:
             assert isinstance(robot, Robot)
             if tx.is_out_of_work():
                 return
-            tx.spend(_REMOVAL)
+            tx.spend(_SENDING_AWAY)
             send_away(tx, robot, DRAINED, elsewhere=True)
 
 
@@ -183,8 +181,7 @@ def expire(tx: Transaction) -> None:
         if live.session is RobotSession.ABSENT and waited >= tx.settings.robot_grace:
             if tx.is_out_of_work():
                 return
-            tx.spend(_REMOVAL * (1 + tx.tables.connections.count("endpoint", robot.id)))
-            tx.spend(_INTERFACE * tx.tables.interfaces.count("endpoint", robot.id))
+            tx.spend(endpoints.removal_work(tx.tables, robot.id))
             live.after(RobotEvent.EXPIRE, tx.now)  # it is checked, and nothing is left to record
             endpoints.remove(tx, robot.id, "the robot stayed away")
             tx.happen("robot_gone", robot.id, "its interfaces and connections were removed")

@@ -60,14 +60,17 @@ def set_role(tx: Transaction, command: SetRole) -> None:
 
 
 def remove_user(tx: Transaction, command: RemoveUser) -> None:
-    """Remove a user with all robots, containers, packages, volumes and tokens."""
+    """Remove a user with all robots, containers, packages, volumes and tokens; the user itself at last."""
     user = _find(tx, command.name)
     _keep_an_admin(tx, user)
-    for endpoint in tx.tables.endpoints.by("user", user.name):
-        endpoints.remove(tx, endpoint.id, "the user was removed")
     _forget_login(tx, user.name)
     for token in tx.tables.tokens.by("user", user.name):
         tokens.forget(tx, token, "the user was removed")
+    for endpoint in tx.tables.endpoints.by("user", user.name):
+        if tx.is_out_of_work():
+            return
+        tx.spend(endpoints.removal_work(tx.tables, endpoint.id))
+        endpoints.remove(tx, endpoint.id, "the user was removed")
     packages.forget_user(tx, user.name)
     volumes.forget_user(tx, user.name)
     limits.forget(tx, user.name)

@@ -17,6 +17,7 @@ from rce.control.model import (
     NodeStatus,
 )
 from rce_master.auth import client_digest
+from rce_master.state.settings import StateSettings
 
 if TYPE_CHECKING:
     from integration.master.conftest import RunSite, Site
@@ -72,6 +73,20 @@ async def test_users_are_managed_by_administrators(site: Site) -> None:
     await site.api("DELETE", "/users/anna", status=204)
     await site.api("GET", "/user", token=anna, status=401)
     await site.api("DELETE", "/users/anna", status=404)
+
+
+async def test_a_large_user_is_removed_by_one_request(run_site: RunSite) -> None:
+    """Though the state takes several steps for it."""
+    async with run_site(state=StateSettings(max_work=1)) as site:
+        await site.api("POST", "/users", {"name": "anna", "password": "one"}, status=201)
+        anna = await site.login("anna", "one")
+        for tag in ("a", "b", "c"):
+            await site.api("POST", "/containers", {"tag": tag}, token=anna, status=204)
+        await site.api("DELETE", "/users/anna", status=204)
+        assert [user["name"] for user in (await site.api("GET", "/users"))["users"]] == ["testUser"]
+        await site.api("POST", "/users", {"name": "anna", "password": "two"}, status=201)
+        anna = await site.login("anna", "two")
+        assert (await site.api("GET", "/containers", token=anna))["containers"] == []
 
 
 async def test_everybody_sees_their_own(site: Site) -> None:

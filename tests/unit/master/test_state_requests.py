@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 from support.master_world import World
 
@@ -285,6 +287,29 @@ def test_the_last_administrator_stays(world: World) -> None:
         world.do(commands.RemoveUser(name="root"))
     world.user("second", UserRole.ADMIN)
     world.do(commands.RemoveUser(name="root"))
+
+
+def test_a_large_user_is_removed_by_several_commands() -> None:
+    """None of them does more than its share, and the user is there until the last."""
+    world = World(StateSettings(max_work=1000))
+    world.robot_set()
+    world.container_set()
+    world.container()
+    for number in range(30):
+        world.login(f"rob{number}")
+        for tag in ("a", "b"):
+            world.interface(f"rob{number}/{tag}", "SubscriberConverter")
+    world.interface("c/in", "PublisherInterface")
+    for number in range(30):
+        world.connect(f"rob{number}/a", "c/in")
+    left = [len(world.state.tables.endpoints)]
+    while "anna" in world.state.tables.users:
+        world.do(commands.RemoveUser(name="anna"))
+        left.append(len(world.state.tables.endpoints))
+    assert left[-1] == 0
+    assert len(left) > 3
+    assert max(before - after for before, after in itertools.pairwise(left)) < 15
+    assert not world.state.tables.links
 
 
 def test_a_removed_user_leaves_nothing(world: World) -> None:
