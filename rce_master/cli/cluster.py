@@ -9,6 +9,7 @@ import shlex
 import shutil
 import socket
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 from urllib.parse import urlsplit
@@ -21,6 +22,7 @@ from rce.config.store_address import DEFAULT_PREFIX
 from rce.masters import split_addresses
 from rce.own_process import end_signals
 from rce.services.units import SYSTEM_STATE, Role
+from rce.supervision.process import end_with
 from rce.tls import CertificateError
 from rce.tls.choice import TlsChoice
 from rce.tls.folder import CertificateFolder
@@ -248,7 +250,9 @@ class _Local:
 
     async def _run_etcd(self, steps: Callable[[], Awaitable[Sequence[Member]]]) -> None:
         process = await asyncio.create_subprocess_exec(
-            find_etcd(), "--config-file", str(self.machine.config), stdin=asyncio.subprocess.DEVNULL
+            *(find_etcd(), "--config-file", str(self.machine.config)),
+            stdin=asyncio.subprocess.DEVNULL,
+            preexec_fn=partial(end_with, os.getpid()),
         )
         loop = asyncio.get_running_loop()
         ending = asyncio.Event()

@@ -8,12 +8,14 @@ import os
 import shutil
 import socket
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import yaml
 
 from rce.config.store_address import DEFAULT_PREFIX
+from rce.supervision.process import end_with
 from rce_master.cluster.client import ClusterClient, ask_all
 from rce_master.cluster.files import Machine, find_etcd, read_config
 from rce_master.cluster.joining import START_S, check_ports
@@ -132,6 +134,7 @@ async def _run_alone(machine: Machine, data: Path, tls: Context | None) -> None:
         stdin=asyncio.subprocess.DEVNULL,
         user=user,
         group=group,
+        preexec_fn=partial(end_with, os.getpid()),
     )
     try:
         endpoint = _client_of(machine, machine.host, client)
