@@ -35,6 +35,10 @@ MEMBERS = 3
 ROWS = (1, 16, 64)
 BODY = b"x" * 1000
 START_S = 60.0
+SETTLE_S = 5.0
+"""From the start of the masters until etcd is measured."""
+IDLE_S, SAVES = 30.0, 1000
+QUICK_IDLE_S, QUICK_SAVES = 10.0, 200
 _NO_OUTPUT = asyncio.subprocess.DEVNULL
 
 
@@ -73,6 +77,7 @@ async def saves(endpoints: list[str], count: int) -> list[dict[str, Any]]:
         store = EtcdStore(client, "/bench")
         term = await store.begin_term()
         for rows in ROWS:
+            print(f"{count} saves of {rows} rows", flush=True)
             times = []
             for number in range(count):
                 made = [Row("t", f"{(number * rows + each) % 1000}", BODY) for each in range(rows)]
@@ -103,6 +108,7 @@ async def idle(
     """Run masters that have nothing to do, and measure the members."""
     async with AsyncExitStack() as stack:
         for number in range(MEMBERS):
+            print(f"a master starts: {number + 1} of {MEMBERS}", flush=True)
             http, control = free_ports(2)
             argv = [
                 *(str(BIN / "rce-master"), "--dev", "--store", f"etcd://{','.join(endpoints)}"),
@@ -115,7 +121,10 @@ async def idle(
             async for line in child.lines():
                 if "stand-by: " in line:
                     break
-        await asyncio.sleep(seconds / 2)
+            else:
+                raise RuntimeError(f"master {number} ended")
+        print(f"etcd is measured beside idle masters for {seconds:g} s", flush=True)
+        await asyncio.sleep(SETTLE_S)
         before = [_used(member) for member in members]
         await asyncio.sleep(seconds)
         cores = [(_used(member) - was) / seconds for member, was in zip(members, before, strict=True)]
@@ -135,8 +144,8 @@ async def measure(*, quick: bool) -> dict[str, list[dict[str, Any]]]:
     folder = Path(tempfile.mkdtemp(prefix="rce-bench-", dir="/tmp"))
     try:
         async with etcd(folder) as (endpoints, members):
-            quiet = await idle(endpoints, members, folder, 10.0 if quick else 60.0)
-            return {"save": await saves(endpoints, 200 if quick else 2000), "idle": [quiet]}
+            quiet = await idle(endpoints, members, folder, QUICK_IDLE_S if quick else IDLE_S)
+            return {"save": await saves(endpoints, QUICK_SAVES if quick else SAVES), "idle": [quiet]}
     finally:
         shutil.rmtree(folder)
 
