@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import aiohttp
@@ -16,7 +18,7 @@ from rce.web.origin import is_foreign
 from rce_master.http.forwarded import HEADER
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncIterator, Callable
     from typing import Self
 
     from multidict import CIMultiDictProxy
@@ -88,6 +90,8 @@ class Forwarder:
         self._proxies = proxies
         self._tls = tls
         self._failures = Failures()
+        self._ends: dict[asyncio.Timeout, int] = {}
+        """What ends each running request, and the term of the leader that was asked."""
         self._session: aiohttp.ClientSession
 
     async def __aenter__(self) -> Self:
@@ -105,6 +109,26 @@ class Forwarder:
 
     async def __aexit__(self, *_: object) -> None:
         await self._session.close()
+
+    def led_by(self, term: int) -> None:
+        """End requests whose leader leads no more: it may have vanished, and would be waited for in vain.
+
+        Args:
+            term: Of the leading master; 0: none leads.
+        """
+        now = asyncio.get_running_loop().time()
+        for end in [end for end, asked in self._ends.items() if asked != term]:
+            del self._ends[end]
+            end.reschedule(now)
+
+    @asynccontextmanager
+    async def _while_leading(self, leader: Leader) -> AsyncIterator[None]:
+        async with asyncio.timeout(None) as end:
+            self._ends[end] = leader.term
+            try:
+                yield
+            finally:
+                self._ends.pop(end, None)
 
     async def forward(self, request: web.Request, leader: Leader | None) -> web.StreamResponse:
         """Send a request on, and return the leader's answer.
@@ -125,15 +149,18 @@ class Forwarder:
         response: web.StreamResponse | None = None
         sent = Sent()
         try:
-            async with self._session.request(
-                request.method,
-                URL(leader.url.rstrip("/") + request.rel_url.raw_path_qs, encoded=True),
-                headers=self._headers(request, leader),
-                data=request.content if request.body_exists else None,
-                allow_redirects=False,
-                ssl=self._tls() if self._tls is not None else True,
-                trace_request_ctx=sent,
-            ) as reply:
+            async with (
+                self._while_leading(leader),
+                self._session.request(
+                    request.method,
+                    URL(leader.url.rstrip("/") + request.rel_url.raw_path_qs, encoded=True),
+                    headers=self._headers(request, leader),
+                    data=request.content if request.body_exists else None,
+                    allow_redirects=False,
+                    ssl=self._tls() if self._tls is not None else True,
+                    trace_request_ctx=sent,
+                ) as reply,
+            ):
                 response = web.StreamResponse(
                     status=reply.status, reason=reply.reason, headers=_without(reply.headers)
                 )
@@ -162,7 +189,8 @@ class Forwarder:
             if request.transport is not None:
                 request.transport.abort()  # so that the client does not take the part for the whole
             return response
-        self._failures.note(f"{request.method} {request.path} was not answered by {leader.name}: {error}")
+        why = str(error) or "it leads no more"
+        self._failures.note(f"{request.method} {request.path} was not answered by {leader.name}: {why}")
         if not sent.begun or request.method in _SAFE:
             raise NotForwardedError(f"{leader.name}, which led until now, does not answer") from error
         text = f"{leader.name}, which led until now, did not answer: it may have done this or not; look first"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -31,6 +32,25 @@ async def ending_master() -> AsyncIterator[str]:
     server = await asyncio.start_server(end, "127.0.0.1", 0)
     try:
         yield f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/"
+    finally:
+        server.close()
+
+
+@asynccontextmanager
+async def silent_master() -> AsyncIterator[tuple[str, asyncio.Event]]:
+    """Give the address of a master that answers nothing, and what is set when it has got a request."""
+    asked = asyncio.Event()
+
+    async def take(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(asyncio.IncompleteReadError):
+            await reader.readuntil(b"\r\n\r\n")
+            asked.set()
+            await reader.read()
+        writer.transport.abort()
+
+    server = await asyncio.start_server(take, "127.0.0.1", 0)
+    try:
+        yield f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/", asked
     finally:
         server.close()
 
@@ -74,6 +94,34 @@ async def test_a_stand_by_tells_that_a_request_may_be_done(method: str, status: 
             for expected in (status, 503):  # the second request finds no leader
                 async with session.request(method, standby.make_url("/a")) as reply:
                     assert reply.status == expected
+
+
+@pytest.mark.parametrize(("method", "status"), [("POST", 502), ("GET", 503)])
+async def test_a_request_to_a_leader_that_vanished_ends_with_its_lead(method: str, status: int) -> None:
+    """Its machine was cut off: no connection breaks, and TCP would go on for many minutes."""
+    async with (
+        silent_master() as (leader, asked),
+        Forwarder(ForwardingKey(b"k" * 32), TrustedProxies()) as forwarder,
+    ):
+
+        async def forward(request: web.Request) -> web.StreamResponse:
+            try:
+                return await forwarder.forward(request, Leader("first", 4, leader))
+            except NotForwardedError:
+                return web.Response(status=503)
+
+        app = web.Application()
+        app.router.add_route("*", "/a", forward)
+        async with TestServer(app) as standby, aiohttp.ClientSession() as session:
+            asking = asyncio.create_task(session.request(method, standby.make_url("/a")))
+            await asyncio.wait_for(asked.wait(), 30.0)
+            forwarder.led_by(4)
+            await asyncio.sleep(0.1)
+            assert not asking.done()
+            forwarder.led_by(0)
+            async with await asyncio.wait_for(asking, 30.0) as reply:
+                assert reply.status == status
+            forwarder.led_by(5)  # it has ended
 
 
 async def test_rce_repeats_what_a_leader_left_open(monkeypatch: pytest.MonkeyPatch) -> None:
