@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -25,10 +26,10 @@ from rce_master.store.etcd.layout import Keys
 from rce_master.store.etcd.store import load_rows
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import AsyncIterator, Callable, Iterable
 
     from rce_master.state.settings import StateSettings
-    from rce_master.store.etcd.client import EtcdClient
+    from rce_master.store.etcd.client import EtcdClient, Watch
     from rce_master.store.etcd.wire import Watched
 
 _log = logging.getLogger(__name__)
@@ -39,6 +40,8 @@ STALLED_S = 3.0
 """How long the copy may be behind until another member of etcd is watched."""
 CATCH_UP_S = 1.0
 """How long a takeover waits for the events before it."""
+TRUSTED_S = 1.0
+"""How long the copy may be behind until the watch is not relied on to tell of a change of the lead."""
 _PAUSE_S = 1.0
 _RELOAD = Backoff(first=1.0, longest=60.0)
 
@@ -98,6 +101,7 @@ class StateFollower:
     Attributes:
         lag: How far the copy is behind.
         loads: How often the whole state was loaded.
+        on_leadership: Called when the watch tells of a change of the lead or of the drains, and when it ends.
     """
 
     def __init__(
@@ -118,8 +122,10 @@ class StateFollower:
         """Rows that the last check read."""
         self._event = asyncio.Event()
         self._is_taken = False
+        self._watch: Watch | None = None
         self.lag = Lag()
         self.loads = 0
+        self.on_leadership: Callable[[], None] = lambda: None
 
     async def run(self) -> None:
         """Follow until cancelled, or until the copy is taken."""
@@ -135,6 +141,12 @@ class StateFollower:
                 level = logging.DEBUG
             self._drop()
             await asyncio.sleep(pauses.next())
+
+    @property
+    def is_watching(self) -> bool:
+        """Whether a watch tells of changes, at the member of etcd that answers requests."""
+        there = self._watch is not None and self._client.uses(self._watch)
+        return there and self.seconds_behind < TRUSTED_S
 
     @property
     def seconds_behind(self) -> float:
@@ -156,7 +168,7 @@ class StateFollower:
         """
         try:
             async with asyncio.timeout(CATCH_UP_S):
-                while self._watched < revision and self._state is not None:
+                while self._watched < revision and self._watch is not None:
                     self._event.clear()
                     await self._event.wait()
         except TimeoutError:
@@ -219,7 +231,7 @@ class StateFollower:
             return
         began = self._clock()
         check_at = began + VERIFY_S
-        async with self._client.watch(self._keys.root, self._watched + 1) as watch:
+        async with self._watching() as watch:
             while self._state is state:
                 seen = await watch.next(_PAUSE_S)
                 if seen is not None:
@@ -230,14 +242,30 @@ class StateFollower:
                 if self.lag.seconds(now) > STALLED_S and now - began > STALLED_S:
                     watch.give_up()
                     return
+                if not self._client.uses(watch):
+                    await asyncio.sleep(_PAUSE_S)  # the next watch may be passed over as soon
+                    return
                 if now >= check_at:
                     await self._verify(state)
                     check_at = now + VERIFY_S
+
+    @asynccontextmanager
+    async def _watching(self) -> AsyncIterator[Watch]:
+        async with self._client.watch(self._keys.root, self._watched + 1) as watch:
+            self._watch = watch
+            try:
+                yield watch
+            finally:
+                self._watch = None
+                self._event.set()
+                self.on_leadership()
 
     def _apply(self, state: State, seen: Watched) -> None:
         for change in seen.changes:
             if change.key == self._keys.last:
                 self.lag.has(change.revision, self._clock())
+            elif change.key == self._keys.leader or change.key.startswith(self._keys.drained):
+                self.on_leadership()
             elif change.key.startswith(self._keys.tables) and change.revision > self._verified:
                 self._assign(state, change.key, change.value)
         if seen.revision > self._watched:

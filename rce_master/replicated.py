@@ -157,11 +157,11 @@ class ReplicatedMaster:
         )
         assert settings.etcd is not None
         follower = StateFollower(etcd, settings.etcd.prefix, settings.state, asyncio.get_running_loop().time)
-        keeper.on_save = follower.saw
         async with AsyncExitStack() as waiting, self._session() as session:
             beside = await waiting.enter_async_context(TaskScope())
             beside.spawn(follower.run(), name="copy of the state")
             forwarder = await waiting.enter_async_context(self._forwarder())
+            _tell_each_other(keeper, follower, forwarder)
             server = HttpServer(
                 make_standby_app(keeper, follower, forwarder, for_leader, names, settings.allowed_origins),
                 settings.bind,
@@ -244,6 +244,12 @@ class ReplicatedMaster:
             host = await own_address((*others, *settings.etcd.hosts)[0], ETCD_PORT)
         scheme, port = url.partition("://")[0], url.rstrip("/").rpartition(":")[2]
         return f"{scheme}://{in_url(host)}:{port}/"
+
+
+def _tell_each_other(keeper: LeadershipKeeper, follower: StateFollower, forwarder: Forwarder) -> None:
+    keeper.on_save, keeper.on_look = follower.saw, forwarder.led_by
+    keeper.is_watched = lambda: follower.is_watching
+    follower.on_leadership = keeper.wake
 
 
 async def _prepare(client: EtcdClient, prefix: str) -> None:

@@ -66,7 +66,11 @@ LEADER_HEADER = "RCE-Leader"
 RENEWALS = 6
 """Renewals of a lease in the time that it lasts."""
 POLL_S = 0.25
-"""Longest time from one look of a stand-by at the leader key to the next: a hand-over takes no longer."""
+"""Longest time from one look of a stand-by at the leader key to the next, while it does not watch the key."""
+WATCHED_POLL_S = 2.0
+"""The same while it does. A watch tells of a change at once, but one that is silent proves nothing: its
+connection may be dead, its member of etcd cut off from the others, and releases of etcd have lost events.
+Only a read that a majority agrees on proves that a master leads."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +91,13 @@ class LeaseSettings:
 
     @property
     def poll(self) -> float:
-        """Time from one look of a stand-by at the leader key to the next."""
+        """Time from one look of a stand-by at the leader key to the next, without a watch of the key."""
         return min(POLL_S, self.ttl / (2 * RENEWALS))
+
+    @property
+    def watched_poll(self) -> float:
+        """The same while a watch tells of changes."""
+        return max(self.poll, min(WATCHED_POLL_S, self.ttl - self.renewal))
 
 
 class LeadershipCore:

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 LOOK_S = 2.0
-"""Time from one look of the leader at the drains to the next; its own REST API makes it look at once."""
+"""Time from one look of a drained leader to the next, for a stand-by that can lead; and after a failure."""
+RARE_LOOK_S = 30.0
+"""The same of a leader that is not drained: drains go by its own REST API, which makes it look at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +109,10 @@ class MasterDrains:
             StoreError: etcd did not take it, or does not tell.
         """
         key = self._keys.drained + name
-        await self._client.transact([], [Put(key, b"{}") if drained else Delete(key)])
-        self._changed.set()
+        try:
+            await self._client.transact([], [Put(key, b"{}") if drained else Delete(key)])
+        finally:  # without an answer it may have been done
+            self._changed.set()
 
     async def run(self) -> None:
         """Look at the drains, until cancelled.
@@ -118,14 +122,16 @@ class MasterDrains:
         """
         while True:
             self._changed.clear()
+            pause = LOOK_S
             try:
                 await self._look()
+                pause = LOOK_S if self.is_drained else RARE_LOOK_S
             except StoreError as error:
                 if isinstance(error, FencedError):
                     raise
                 _log.debug("the drains of masters cannot be read: %s", error)
             try:
-                async with asyncio.timeout(LOOK_S):
+                async with asyncio.timeout(pause):
                     await self._changed.wait()
             except TimeoutError:
                 continue

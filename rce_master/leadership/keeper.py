@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import math
 import time
@@ -47,6 +48,8 @@ class LeadershipKeeper:
         lease: The number of the lease by which this master leads; 0: it has none.
         is_drained: Whether this master is drained, as a stand-by saw it last.
         on_save: Called by a stand-by with the revision of the last save that it sees.
+        on_look: Called by a stand-by with the term of the leading master when it has looked; 0: none leads.
+        is_watched: Tells a stand-by whether :meth:`wake` is called when the leadership changes.
     """
 
     def __init__(
@@ -70,6 +73,13 @@ class LeadershipKeeper:
         self.fault = ""
         self.is_drained = False
         self.on_save: Callable[[int], None] | None = None
+        self.on_look: Callable[[int], None] = lambda _: None
+        self.is_watched: Callable[[], bool] = lambda: False
+        self._woken = asyncio.Event()
+
+    def wake(self) -> None:
+        """Let a stand-by look at etcd now: the leadership has changed, or is not watched any more."""
+        self._woken.set()
 
     def newest_term(self) -> int:
         """Return the newest term that this master knows; 0: none."""
@@ -84,10 +94,19 @@ class LeadershipKeeper:
             The store of the new term, and what tells whether it still lasts.
         """
         while True:
+            self._woken.clear()
             if await self._look() and await self._campaign():
                 assert self._store is not None
                 return self._store, Fence(self.core, self._clock, self._name)
-            await asyncio.sleep(self.core.settings.poll)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(self._pause()):
+                    await self._woken.wait()
+
+    def _pause(self) -> float:
+        """Return the longest time until the next look, seconds."""
+        settings = self.core.settings
+        knows = self.leader is not None and not self.fault
+        return settings.watched_poll if knows and self.is_watched() else settings.poll
 
     async def _look(self) -> bool:
         """Look at etcd; return whether to try to take the lead."""
@@ -98,6 +117,7 @@ class LeadershipKeeper:
             return self.core.looked(is_led=None, is_drained=self.is_drained, now=self._clock())
         self._note("")
         self.leader, self.is_drained = seen.leader, self._name in seen.drained
+        self.on_look(self.newest_term())
         if self.on_save is not None:
             self.on_save(seen.last)
         return self.core.looked(is_led=self.leader is not None, is_drained=self.is_drained, now=self._clock())

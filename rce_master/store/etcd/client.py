@@ -58,14 +58,19 @@ class _FailedError(Exception):
 class Watch:
     """What etcd tells of a watch, line by line.
 
+    Args:
+        member: The number of the member that is watched.
+
     Attributes:
         content: Of the answer.
+        member: The number of the member.
         is_given_up: Whether the next watch asks another member.
     """
 
     content: aiohttp.StreamReader
 
-    def __init__(self) -> None:
+    def __init__(self, member: int) -> None:
+        self.member = member
         self.is_given_up = False
         self._read = bytearray()
         self._looked = 0
@@ -252,7 +257,7 @@ class EtcdClient:
         assert self._session is not None
         used = self._current
         endpoint = self._endpoints[used]
-        watch = Watch()
+        watch = Watch(used)
         try:
             async with self._session.post(
                 f"{'http' if self._tls is None else 'https'}://{endpoint}/v3/watch",
@@ -271,6 +276,10 @@ class EtcdClient:
         finally:
             if watch.is_given_up and used == self._current:
                 self._current = (used + 1) % len(self._endpoints)
+
+    def uses(self, watch: Watch) -> bool:
+        """Return whether requests go to the member of a watch; if not, it has failed since."""
+        return watch.member == self._current
 
     # Leases
 
