@@ -34,6 +34,9 @@ class Estimate(NamedTuple):
 def estimate(values: Sequence[float], *, seed: int = 0) -> Estimate:
     """Return the median of runs with its 95 % confidence interval, by the percentile bootstrap.
 
+    With few runs it is too narrow: with ten a little, and with three it is the range of the values, which has
+    the true median in 75 of 100 experiments.
+
     Source: B. Efron, R. J. Tibshirani, "An Introduction to the Bootstrap", 1993, chapter 13.
 
     Args:

@@ -29,6 +29,15 @@ def test_the_interval_covers_the_true_median() -> None:
     assert covered >= 176
 
 
+def test_the_interval_of_three_runs_is_their_range() -> None:
+    """By hand: all three are above the true median, or all below it, in 2 / 8 of the experiments."""
+    random = np.random.default_rng(7)
+    samples = random.normal(0.0, 1.0, (400, 3))
+    found = [estimate(list(sample)) for sample in samples]
+    assert [(one.low, one.high) for one in found] == [(min(sample), max(sample)) for sample in samples]
+    assert sum(0.0 in one for one in found) / len(found) == pytest.approx(0.75, abs=0.06)
+
+
 def test_few_runs_have_no_interval() -> None:
     found = estimate([1.0, 3.0])
     assert (found.median, found.runs) == (2.0, 2)
