@@ -63,6 +63,11 @@ class TaskProgress:
         self._taken: dict[int, str] = {}
         self._unknown_since: dict[str, float] = {}
         """Of robots with a task that the planner does not know."""
+        self._retry_at: dict[int, float] = {}
+        """When a robot tries again to bring a load for which it found no way, by task: until then its task is
+        suspended, so that people can say where the load is."""
+        self._asked: dict[int, int] = {}
+        """The stop before which people were asked for a load, by task."""
         self._warned: dict[int, int] = {}
         """The stop before which people were told of a low battery, by task."""
 
@@ -92,7 +97,11 @@ class TaskProgress:
         self._unknown_since = {
             name: since for name, since in self._unknown_since.items() if name not in facts.robots
         }
-        self._warned = {number: stop for number, stop in self._warned.items() if number in self._book.tasks}
+        self._retry_at = {number: at for number, at in self._retry_at.items() if at > now}
+        self._asked, self._warned = (
+            {number: stop for number, stop in told.items() if number in self._book.tasks}
+            for told in (self._asked, self._warned)
+        )
         for task in self._book.active_tasks():
             robot = facts.robots.get(task.robot)
             if task.state is TaskState.HELD:
@@ -124,7 +133,7 @@ class TaskProgress:
             self._give_up(task, now, f"{robot.id} was taken out of service", is_away=True)
             return
         if task.state is TaskState.SUSPENDED:
-            if not self._can_continue(task, robot):
+            if task.number in self._retry_at or not self._can_continue(task, robot):
                 return
             task = self._book.advance(task, TaskCause.CONTINUE, now, f"{robot.id} can continue")
         task = self._end_action(task, now, robot)
@@ -341,15 +350,22 @@ class TaskProgress:
             return
         what = f"its load is on {task.robot}" if task.is_loaded else f"{task.robot} acts for it"
         if task.state is TaskState.RUNNING:
-            target = None if task.action is None else task.target  # others can use its cell meanwhile
-            suspended = self._book.advance(task, TaskCause.SUSPEND, now, f"{what}: {reason}", target=target)
-            if suspended.question:
-                self._book.emit(suspended, "question", now, text=suspended.question)
+            self._suspend(task, now, f"{what}: {reason}", is_away=is_away)
         elif now - task.changed_at > self._rules.load_lost_after:
             self._book.advance(task, TaskCause.FAIL, now, f"{what}; it did not come back: {reason}")
         elif is_away and task.action is None and task.target is not None:
             waits = replace(task, target=None, revision=task.revision + 1)
             self._book.emit(waits, "waits", now, text=f"{what}: {reason}")
+
+    def _suspend(self, task: Task, now: float, text: str, *, is_away: bool) -> None:
+        """Suspend a task; ask people for its load: once for each stop, and each time its robot is away."""
+        target = None if task.action is None else task.target  # others can use its cell meanwhile
+        suspended = self._book.advance(task, TaskCause.SUSPEND, now, text, target=target)
+        if not is_away and task.is_loaded:
+            self._retry_at[task.number] = now + self._rules.unreachable_after
+        if suspended.question and (is_away or self._asked.get(task.number) != task.position):
+            self._asked[task.number] = task.position
+            self._book.emit(suspended, "question", now, text=suspended.question)
 
 
 def _stop_of_visit(task: Task, visit: StopVisit) -> Stop:

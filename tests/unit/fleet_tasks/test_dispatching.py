@@ -591,6 +591,30 @@ def test_a_load_without_a_path_is_asked_for_until_it_is_settled(
     assert picked == ([3, 5, 60] if answer == "told" else [3, 60])
 
 
+def test_people_can_answer_for_a_load_while_its_robot_is_stuck(floor: Floor) -> None:
+    """It tries again and again; they are asked once, and have time to say where the load is."""
+    floor.add("Robot1", 0)
+    task = floor.deliver(3, 60)
+    while not floor.task(task).is_loaded:
+        floor.run(1)
+    floor.stuck.add("Robot1")
+    states = []
+    for _ in range(600):
+        floor.run(1)
+        states.append(floor.task(task).state)
+    names = [event.name for event in floor.events]
+    assert states.count(TaskState.SUSPENDED) >= 60
+    assert names.count("continued") >= 3
+    assert names.count("question") == 1
+    while floor.task(task).state is not TaskState.SUSPENDED:
+        floor.run(1)
+    floor.run(5)
+    settle_load(floor.book, task.id, 5, floor.now)
+    floor.stuck.clear()
+    floor.run_until_ended(task)
+    assert floor.task(task).state is TaskState.DONE
+
+
 @pytest.mark.parametrize("is_cancelled", [False, True])
 def test_a_dead_robot_with_a_load_keeps_no_cell(floor: Floor, *, is_cancelled: bool) -> None:
     """Others go to the cell to which it was on its way."""
