@@ -90,6 +90,26 @@ def stop(robot: Robot, station: Station = STATION) -> None:
     do(station, work)
 
 
+@app.command("pause")
+def pause(robot: Robot, reason: Reason = "", station: Station = STATION) -> None:
+    """Let a robot stand still; it keeps its task."""
+
+    async def work(client: FleetClient) -> None:
+        typer.echo(f"{robot} is {(await client.pause_robot(robot, reason)).activity}")
+
+    do(station, work)
+
+
+@app.command("resume")
+def resume(robot: Robot, station: Station = STATION) -> None:
+    """End a robot's pause, emergency stop or manual mode."""
+
+    async def work(client: FleetClient) -> None:
+        typer.echo(f"{robot} is {(await client.resume_robot(robot)).activity}")
+
+    do(station, work)
+
+
 @app.command("take-out")
 def take_out(robot: Robot, reason: Reason = "", station: Station = STATION) -> None:
     """Take a robot out of service; others get its tasks."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rce.printable import one_line
-from rce_fleet.api.tasks import RepeatModel, StopModel, TaskChange, TaskModel, TaskRequest
+from rce_fleet.api.tasks import LoadRequest, RepeatModel, StopModel, TaskChange, TaskModel, TaskRequest
 from rce_fleet.cli.access import STATION, AsJson, Station, checked, do, echo_json, echo_table
 
 if TYPE_CHECKING:
@@ -129,6 +129,9 @@ def show(task_id: Id, json_: AsJson = False, station: Station = STATION) -> None
         for visit in task.visits:
             when = f"{_clock(visit.started_at)} to {_clock(visit.ended_at)}"
             typer.echo(f"stop {visit.stop}: {one_line(visit.robot)} in cell {visit.cell}, {when}")
+        if task.question:
+            answer = f"rce fleet task load {task_id} --cell CELL, or --lost"
+            typer.echo(f"{one_line(task.question)} ({answer})")
 
     do(station, work)
 
@@ -184,6 +187,37 @@ def resume(task_id: Id, station: Station = STATION) -> None:
 
     async def work(client: FleetClient) -> None:
         task = await client.resume_task(task_id)
+        typer.echo(f"{task.id} is {task.state}")
+
+    do(station, work)
+
+
+@app.command("confirm")
+def confirm(task_id: Id, station: Station = STATION) -> None:
+    """Confirm the action that is under way."""
+
+    async def work(client: FleetClient) -> None:
+        task = await client.confirm_action(task_id)
+        typer.echo(f"{task.id}: the action at stop {task.position} is confirmed")
+
+    do(station, work)
+
+
+@app.command("load")
+def load(
+    task_id: Id,
+    cell: Annotated[int | None, typer.Option(help="Where the load is; a robot takes it there.")] = None,
+    lost: Annotated[bool, typer.Option("--lost", help="The load is lost; the task fails.")] = False,
+    station: Station = STATION,
+) -> None:
+    """Say where a load is whose robot does not come back."""
+    if (cell is None) is not lost:
+        raise typer.BadParameter("say where the load is: --cell CELL, or --lost")
+    with checked():
+        LoadRequest(cell=cell)
+
+    async def work(client: FleetClient) -> None:
+        task = await client.settle_load(task_id, cell)
         typer.echo(f"{task.id} is {task.state}")
 
     do(station, work)

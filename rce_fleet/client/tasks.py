@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import AsyncIterator, Iterable
 
-from rce_fleet.api.tasks import HoldRequest, TaskChange, TaskModel, TaskPage, TaskRequest
+from rce_fleet.api.tasks import HoldRequest, LoadRequest, TaskChange, TaskModel, TaskPage, TaskRequest
 from rce_fleet.client.requests import ApiRequests, if_match, path_part
 
 
@@ -119,6 +119,23 @@ class TaskRequests(ApiRequests):
         """
         path = f"/tasks/{path_part(task_id)}/confirm"
         return await self._send("POST", path, TaskModel, headers=if_match(revision), repeatable=False)
+
+    async def settle_load(self, task_id: str, cell: int | None, *, revision: int | None = None) -> TaskModel:
+        """Say where the load of a task is whose robot does not come back; sent once.
+
+        Args:
+            task_id: The task; its ``question`` says that people have to decide.
+            cell: Where the load is: any robot picks it up there and continues, and a cancelled task ends.
+                None: it is lost, and the task fails.
+            revision: The revision that the task must have; None: any.
+
+        Example:
+            ```python
+            await fleet.settle_load("T7", cell=12)
+            ```
+        """
+        path, body = f"/tasks/{path_part(task_id)}/load", LoadRequest(cell=cell)
+        return await self._send("POST", path, TaskModel, body, headers=if_match(revision), repeatable=False)
 
     async def reassign_task(self, task_id: str, *, revision: int | None = None) -> TaskModel:
         """Take a task from its robot, so that another one gets it; sent once.

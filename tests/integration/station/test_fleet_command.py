@@ -29,7 +29,7 @@ TASK = TaskModel.model_validate(
         "name": BELL,
         "state": "running",
         "reason": BELL,
-        "question": "",
+        "question": "Where is the load that R1 has?",
         "robot_assigned": "R1",
         "target": 5,
         "position": 0,
@@ -71,6 +71,7 @@ class Station:
     def __init__(self) -> None:
         self.tokens: list[str] = []
         self.bodies: list[Any] = []
+        self.changes: list[str] = []
         self.wants = ""
         """The token that it asks for; empty: none."""
 
@@ -81,7 +82,11 @@ class Station:
         if request.can_read_body:
             self.bodies.append(await request.json())
         path = request.path.removeprefix("/api/v1/")
-        if path == "robots":
+        if request.method != "GET":
+            self.changes.append(f"{request.method} {path}")
+        if path.startswith("robots/"):
+            shown = ROBOT.model_dump_json()
+        elif path == "robots":
             shown = RobotList(robots=[ROBOT]).model_dump_json()
         elif path == "tasks" and request.method == "GET":
             shown = TaskPage(tasks=[TASK], next=None).model_dump_json()
@@ -210,3 +215,32 @@ async def test_rce_fleet_adds_a_recurring_task(station: Station, url: str) -> No
         code, told = await run(url, "task", "add", "--cell", "5", *wrong)
         assert (code, f"Invalid value for {value}" in told) == (2, True), told
     assert len(station.bodies) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "change", "body"),
+    [
+        ("task confirm T7", "POST tasks/T7/confirm", None),
+        ("task load T7 --cell 12", "POST tasks/T7/load", {"cell": 12}),
+        ("task load T7 --lost", "POST tasks/T7/load", {"cell": None}),
+        ("pause R1 --reason visitors", "POST robots/R1/pause", {"reason": "visitors"}),
+        ("resume R1", "POST robots/R1/resume", None),
+    ],
+)
+async def test_rce_fleet_does_what_waits_for_people(
+    station: Station, url: str, words: str, change: str, body: Any
+) -> None:
+    code, told = await run(url, *words.split())
+    assert (code, station.changes) == (0, [change]), told
+    assert station.bodies == ([] if body is None else [body])
+
+
+async def test_rce_fleet_shows_a_question_with_its_answer(url: str) -> None:
+    told = (await run(url, "task", "show", "T7"))[1]
+    assert "Where is the load that R1 has? (rce fleet task load T7 --cell CELL, or --lost)" in told
+
+
+@pytest.mark.parametrize("words", ["", "--lost --cell 3", "--cell -1"])
+async def test_rce_fleet_refuses_an_unclear_load(station: Station, url: str, words: str) -> None:
+    code, told = await run(url, "task", "load", "T7", *words.split())
+    assert (code, "Invalid value" in told, station.changes) == (2, True, []), told
