@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 _RING = ((-1, -1), (-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1))
 _LOOK_AT_MOST = 2000
 """Cells that are looked at for a place to wait."""
+_SEARCHES = 4
+"""Robots for which such a place is searched in one step: where there is none, each takes milliseconds."""
+_SEARCH_AGAIN_S = 10.0
+"""After so long it is searched again for a robot that found none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +58,8 @@ class Parking:
         self._after = after
         self.cells: dict[str, int] = {}
         self._idle_since: dict[str, float] = {}
+        self._search_at: dict[str, float] = {}
+        """When a place is searched again for a robot that found none."""
 
     def update(
         self,
@@ -73,6 +79,7 @@ class Parking:
             cells: Where they can wait, and where they are in the way.
         """
         self._idle_since = {name: self._idle_since.get(name, now) for name in idle}
+        self._search_at = {name: at for name, at in self._search_at.items() if name in idle and now < at}
         self.cells = {
             name: cell
             for name, cell in self.cells.items()
@@ -96,10 +103,15 @@ class Parking:
         avoided.update(self.cells.values(), cells.taken)
         free = [cell for cell in cells.parking if cell not in avoided]
         avoided |= cells.used
+        searches = 0
         for robot in moves:
             place = self._ways.nearest(robot, free) if free else None
-            if place is None and robot.cell is not None and robot.cell in cells.used:
+            may_search = searches < _SEARCHES and robot.id not in self._search_at
+            if place is None and may_search and robot.cell is not None and robot.cell in cells.used:
+                searches += 1
                 place = place_to_wait(facts.grid, facts.shut, robot.cell, avoided)
+                if place is None:
+                    self._search_at[robot.id] = now + _SEARCH_AGAIN_S
             if place is None:
                 continue
             self.cells[robot.id] = place

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from rce_fleet.planning.grid import GridMap
+from rce_fleet.tasks import parking as parking_module
 from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot
 from rce_fleet.tasks.dispatch import TaskRules
 from rce_fleet.tasks.energy import BatteryLevels, effort_of, share_needed
@@ -249,6 +250,41 @@ def test_an_idle_robot_leaves_the_cell_of_a_task(floor: Floor) -> None:
     floor.go(20, earliest_start=floor.now + 1e6)
     floor.run(20)
     assert robot.cell != 20
+
+
+def test_robots_without_a_place_to_wait_hold_no_step_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In aisles one cell wide there is none: the search for 300 robots took two seconds of each step."""
+    walls = frozenset(cell for cell in range(200) if cell // 20 % 2 and cell % 20 not in (0, 19))
+    floor = Floor(grid=GridMap(10, 20, blocked=walls))
+    cells = [cell for cell in range(1, 200, 2) if cell not in walls and cell // 20 % 2 == 0][:40]
+    for number, cell in enumerate(cells):
+        floor.add(f"Robot{number}", cell)
+        floor.go(cell, earliest_start=floor.now + 1e6)
+    searched: list[int] = []
+    search = parking_module.place_to_wait
+
+    def noted(grid: GridMap, shut: Any, start: int, avoided: Any) -> int | None:
+        searched.append(start)
+        return search(grid, shut, start, avoided)
+
+    monkeypatch.setattr(parking_module, "place_to_wait", noted)
+    counts = []
+    for _ in range(30):
+        before = len(searched)
+        floor.run(1)
+        counts.append(len(searched) - before)
+    assert 0 < max(counts) <= 4
+    assert set(searched) == set(cells), "for some robots no place was searched"
+
+
+def test_many_robots_leave_the_cells_of_tasks(floor: Floor) -> None:
+    """A few in each step."""
+    cells = range(0, 64, 3)
+    robots = [floor.add(f"Robot{cell}", cell) for cell in cells]
+    for cell in cells:
+        floor.go(cell, earliest_start=floor.now + 1e6)
+    floor.run(30)
+    assert sum(robot.cell in cells for robot in robots) == 0
 
 
 def test_idle_robots_wait_at_parking_places(floor: Floor) -> None:
