@@ -144,7 +144,7 @@ class Ros1Graph:
 
     async def _identify(self, client: RpcClient, name: str, listener: NodeListener) -> None:
         """Ask a node with an unknown name for its process."""
-        uri = self._core.graph.nodes.get(name)
+        uri = self._core.graph.node(name)
         if uri is None or name == f"/{OWN_NODE}":
             return
         try:

@@ -131,7 +131,7 @@ class MasterApi:
         return self._unregister(Kind.SERVICE, service, caller, _uri("service_api", service_uri))
 
     def _unregister(self, kind: Kind, name: str, caller: str, uri: str) -> Answer:
-        if caller not in self._graph.nodes:
+        if self._graph.node(caller) is None:
             return SUCCESS, f"[{caller}] is not a registered node", 0
         was_there, outcome = self._graph.unregister(kind, name, caller, uri)
         self._perform(outcome)
@@ -145,7 +145,7 @@ class MasterApi:
 
     def _lookup_node(self, caller: str, node: Any) -> Answer:
         node = graph_name("node", node, caller)
-        uri = self._graph.nodes.get(node)
+        uri = self._graph.node(node)
         return (SUCCESS, "node api", uri) if uri else (ERROR, f"unknown node [{node}]", "")
 
     def _lookup_service(self, caller: str, service: Any) -> Answer:

@@ -42,6 +42,11 @@ class Graph:
         """Known nodes and their slave APIs."""
         return {name: entry.uri for name, entry in self._registrations.nodes.items()}
 
+    def node(self, name: str) -> str | None:
+        """Return the slave API of a node; None if it is not known."""
+        entry = self._registrations.nodes.get(name)
+        return None if entry is None else entry.uri
+
     @property
     def topic_types(self) -> dict[str, str]:
         """Topics in use with known types, and ``*`` for those whose publishers did not give one."""

@@ -152,7 +152,7 @@ class Core:
 
     def forget_node(self, name: str) -> bool:
         """Unregister everything of a node that died; return whether anything was registered."""
-        known = name in self.graph.nodes
+        known = self.graph.node(name) is not None
         self._perform(self.graph.forget_node(name))
         return known
 

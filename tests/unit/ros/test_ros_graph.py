@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import pytest
@@ -66,6 +67,26 @@ def test_the_displaced_node_cannot_unregister_the_newer() -> None:
     was_there, _ = graph.unregister(Kind.PUBLISHER, "/t", "/n", "http://old:1/")
     assert not was_there
     assert graph.publishers("/t") == {"/n": "http://new:1/"}
+
+
+def test_looking_up_a_node_costs_the_same_in_a_large_graph() -> None:
+    """Discoveries look up all nodes every second; a fleet's core has thousands."""
+
+    def seconds(nodes: int) -> float:
+        graph = Graph()
+        api = MasterApi(graph, lambda: "", lambda _: None)
+        lookup = api.methods()["lookupNode"]
+        for number in range(nodes):
+            graph.register_publisher(f"/t{number}", "a/B", f"/n{number}", uri(f"/n{number}"))
+        spent = []
+        for _ in range(20):
+            begin = time.perf_counter()
+            for _ in range(100):
+                assert lookup("/asker", "/n7")[0] == 1
+            spent.append(time.perf_counter() - begin)
+        return min(spent)
+
+    assert seconds(10_000) < 20 * seconds(10)
 
 
 def test_a_service_has_one_provider() -> None:
