@@ -84,7 +84,8 @@ class Notifier:
                 if repeats > MAX_REPEATS:
                     _log.warning("%s has not answered %d calls: it is not called any more", uri, repeats)
                     return
-                queue.setdefault(call.key, call)  # a newer one carries the whole state too
+                if call.key not in queue:  # a newer one carries the whole state too
+                    _put_first(queue, call)
                 await asyncio.sleep(pauses.next())
         finally:
             del self._waiting[uri]
@@ -125,6 +126,14 @@ class Notifier:
             if _is_error(answer):
                 self._on_unwanted(call)
         return True
+
+
+def _put_first(queue: dict[object, Call], call: Call) -> None:
+    """Keep the order: the update of a namespace must not come after that of a parameter in it."""
+    later = queue.copy()
+    queue.clear()
+    queue[call.key] = call
+    queue.update(later)
 
 
 def _is_error(answer: Any) -> bool:

@@ -218,6 +218,19 @@ async def test_unknown_methods_are_faults(core: Core) -> None:
         assert "registerPublisher" in await rpc.call(core.uri, "system.listMethods", ())
 
 
+async def test_a_repeated_update_comes_before_later_ones(core: Core) -> None:
+    """The update of a namespace must not undo that of a parameter in it, which was set later."""
+    calls: asyncio.Queue[bytes] = asyncio.Queue()
+    async with answering_second_call(calls, loses=True) as uri, RpcClient() as rpc:
+        await rpc.call(core.uri, "subscribeParam", ("/n", uri, "/a"))
+        core.set_param("/a", {"b": 1})
+        core.set_param("/a/b", 2)
+        await _until(lambda: calls.qsize() == 2)
+        first, second = calls.get_nowait(), calls.get_nowait()
+        assert b"<string>/a/</string>" in first
+        assert second == first
+
+
 async def test_node_without_subscription_is_left_alone(core: Core) -> None:
     """A node that knows nothing of a subscription is left alone."""
     calls: list[str] = []
