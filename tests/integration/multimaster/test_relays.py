@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import struct
 import sys
 from collections.abc import AsyncIterator
@@ -26,6 +27,7 @@ from rce.ros.multimaster.relay.topic import TopicRelay
 from rce.ros.multimaster.sync import MasterSync, SyncSettings
 from rce.ros.node import Message, Publisher, Subscriber
 from rce.ros.node.master import MasterClient
+from rce.ros.xmlrpc import RpcClient
 
 
 @pytest.fixture
@@ -345,6 +347,25 @@ async def test_topic_of_both_sides_is_not_sent_back() -> None:
             async with asyncio.timeout(60):
                 assert (await anext(aiter(at_robot))).data == word
                 assert (await anext(aiter(at_cloud))).data == word
+
+
+async def test_silent_host_delays_no_relay_of_others() -> None:
+    """Its topics and services cannot be learned: each takes seconds until that is known."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # takes connections and says nothing
+        port = silent.getsockname()[1]
+        async with (
+            linked() as (cloud, robot, _, _),
+            node("planner", cloud.uri) as planner,
+            node("base", robot.uri) as base,
+            RpcClient() as rpc,
+        ):
+            api, address = f"http://127.0.0.1:{port}/", f"rosrpc://127.0.0.1:{port}"
+            for number in range(6):
+                await rpc.call(robot.uri, "registerPublisher", ("/away", f"/away{number}", STRING, api))
+                await rpc.call(robot.uri, "registerService", ("/away", f"/ask{number}", address, api))
+            said, heard = await base.advertise("said", STRING), await planner.subscribe("said", STRING)
+            async with asyncio.timeout(20):
+                assert (await published_until_heard(said, heard, data="here")).data == "here"
 
 
 async def test_a_broken_link_takes_back_and_comes_back() -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Generic, TypeVar
 
 from rce.aio.tasks import TaskScope, finish
@@ -16,6 +18,7 @@ from rce.ros.multimaster.errors import NothingToRelayError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.relay.frames import NO_SOURCE, Answer, Call, Data, Frame, Offer, Sources, Want
 from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind, learn_service, learn_topic
+from rce.ros.multimaster.relay.learning import Learning, Question
 from rce.ros.multimaster.source import RpcSource, Snapshot
 from rce.ros.node import Node, ServiceClient, Subscriber
 from rce.ros.node.master import MasterClient
@@ -69,7 +72,7 @@ class Exporter:
             master: The node's master.
             chosen: The filter, by the names that topics and services are offered under.
             send: Takes frames for the other end.
-            tasks: Owns the calls.
+            tasks: Owns the calls, and the questions for types.
             rename: Gives the names to offer.
             foreign: Returns the nodes that a synchronization registered; their topics and services are not
                 offered.
@@ -84,6 +87,8 @@ class Exporter:
         self._source = RpcSource(master)
         self._topics: dict[str, _Offered[TopicKind]] = {}
         self._services: dict[str, _Offered[ServiceKind]] = {}
+        self._topic_kinds = Learning[TopicKind](tasks)
+        self._service_kinds = Learning[ServiceKind](tasks)
         self._names: dict[int, str] = {}
         self._offered = Offer()
         self._next = 0
@@ -98,23 +103,11 @@ class Exporter:
 
     async def run(self) -> None:
         """Offer topics and services, and send the wanted messages, until cancelled."""
-        loop = asyncio.get_running_loop()
-        next_look = loop.time()
         try:
-            while True:
-                try:
-                    if loop.time() >= next_look:
-                        next_look = loop.time() + PERIOD
-                        await self._look()
-                    await self._serve_wants()
-                except RosError as error:
-                    _log.info("%s", error)
-                try:
-                    async with asyncio.timeout_at(next_look):
-                        await self._changed.wait()
-                except TimeoutError:
-                    continue
-                self._changed.clear()
+            async with asyncio.TaskGroup() as group:
+                # Apart: a master that answers slowly delays only what is new, not what is wanted.
+                group.create_task(self._keep_looking())
+                group.create_task(self._keep_serving())
         finally:
             await finish(self._close())
 
@@ -132,6 +125,16 @@ class Exporter:
 
     # The offer
 
+    async def _keep_looking(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            next_look = loop.time() + PERIOD
+            try:
+                await self._look()
+            except RosError as error:
+                _log.info("%s", error)
+            await asyncio.sleep(next_look - loop.time())
+
     async def _look(self) -> None:
         snapshot = await self._source.read()
         foreign = {self._node.name, *self._foreign()}
@@ -143,6 +146,7 @@ class Exporter:
         )
         if offer != self._offered:
             self._offered = offer
+            self._changed.set()
             self._send(offer)
 
     async def _update_topics(self, snapshot: Snapshot, foreign: set[str]) -> None:
@@ -160,17 +164,15 @@ class Exporter:
             if uris:
                 found[topic] = uris
         self._forget(self._topics, found)
+        questions: dict[str, Question[TopicKind]] = {}
         for topic, uris in found.items():
             known, type_name = self._topics.get(topic), snapshot.topic_types.get(topic, "")
-            if known is not None and known.origins <= set(uris) and known.type_name == type_name:
-                continue
-            try:
-                learned = await learn_topic(self._master.rpc, self._node.name, topic, uris)
-            except NothingToRelayError as error:
-                _log.debug("%s", error)
-                continue
-            number = self._number(topic, learned, known)
-            self._topics[topic] = _Offered(number, learned, frozenset(uris), type_name)
+            if known is None or not known.origins <= set(uris) or known.type_name != type_name:
+                ask = partial(learn_topic, self._master.rpc, self._node.name, topic, uris)
+                questions[topic] = Question(frozenset(uris), ask, type_name)
+        for topic, (question, learned) in (await self._topic_kinds.learn(questions)).items():
+            number = self._number(topic, learned, self._topics.get(topic))
+            self._topics[topic] = _Offered(number, learned, question.origins, question.type_name)
 
     async def _update_services(self, snapshot: Snapshot, foreign: set[str]) -> None:
         found: dict[str, str] = {}
@@ -181,17 +183,15 @@ class Exporter:
             if all(self._chosen.takes_service(node, name) for node in nodes):
                 found[service] = address
         self._forget(self._services, found)
+        questions: dict[str, Question[ServiceKind]] = {}
         for service, address in found.items():
             known = self._services.get(service)
-            if known is not None and address in known.origins:
-                continue
-            try:
-                learned = await learn_service(self._node.name, service, address)
-            except NothingToRelayError as error:
-                _log.debug("%s", error)
-                continue
-            number = self._number(service, learned, known)
-            self._services[service] = _Offered(number, learned, frozenset((address,)))
+            if known is None or address not in known.origins:
+                ask = partial(learn_service, self._node.name, service, address)
+                questions[service] = Question(frozenset((address,)), ask)
+        for service, (question, learned) in (await self._service_kinds.learn(questions)).items():
+            number = self._number(service, learned, self._services.get(service))
+            self._services[service] = _Offered(number, learned, question.origins)
 
     def _forget(self, known: dict[str, _Offered[K]], found: Mapping[str, object]) -> None:
         for name in known.keys() - found.keys():
@@ -215,6 +215,17 @@ class Exporter:
         return self._rename(name) or name
 
     # Wanted messages and calls
+
+    async def _keep_serving(self) -> None:
+        while True:
+            self._changed.clear()
+            try:
+                await self._serve_wants()
+            except RosError as error:
+                _log.info("%s", error)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(PERIOD):
+                    await self._changed.wait()
 
     async def _serve_wants(self) -> None:
         unwanted = self._subscribers.keys() - (self._wanted & self._names.keys())
@@ -255,6 +266,8 @@ class Exporter:
         return client
 
     async def _close(self) -> None:
+        self._topic_kinds.close()
+        self._service_kinds.close()
         for client in self._clients.values():
             await client.close()
         await release_all(self._subscribers.values())
