@@ -232,7 +232,8 @@ class MasterSync:
     def _take(self, master: Neighbour) -> None:
         remote = self._remotes.get(master.uri)
         if remote is not None:
-            remote.update(master)
+            if self._is_wanted(master):  # one that was left for a relay link stays left
+                remote.update(master)
         elif self._is_wanted(master):
             remote = self._remotes[master.uri] = self._make_remote(master)
             self._tasks.spawn(self._run(remote), name=f"synchronize with {master.name}")

@@ -368,6 +368,26 @@ async def test_silent_host_delays_no_relay_of_others() -> None:
                 assert (await published_until_heard(said, heard, data="here")).data == "here"
 
 
+async def test_side_that_dials_again_stays_linked() -> None:
+    """Its former link may be noticed to be dead only after the new one was made."""
+    async with linked() as (_, robot, one, other), AsyncExitStack() as stack:
+        again = SyncSettings(
+            robot.uri,
+            node_name="again",
+            relay_to=(("127.0.0.1", one.relay_port),),
+            relay_token="t",
+            relay_name="robot",
+        )
+        await stack.enter_async_context(MasterSync(again))
+        async with asyncio.timeout(60):
+            while len(one._links._running) < 2:
+                await asyncio.sleep(0.02)
+            await other.__aexit__(None, None, None)
+            while len(one._links._running) > 1:
+                await asyncio.sleep(0.02)
+        assert one._links.connected == {"robot"}
+
+
 async def test_a_broken_link_takes_back_and_comes_back() -> None:
     async with (
         linked() as (cloud, robot, one, _),

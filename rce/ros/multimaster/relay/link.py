@@ -78,16 +78,20 @@ class RelayLinks:
     """All links of one synchronization: dialed and accepted ones."""
 
     def __init__(self, identity: LinkIdentity, make_ends: MakeEnds) -> None:
-        self.connected: set[str] = set()
-        """Names of the sides that are linked now."""
         self._identity = identity
         self._make_ends = make_ends
-        self._running: set[RelayConnection] = set()
+        self._running: dict[RelayConnection, str] = {}
+        """The links and the names of their other sides: a side that dials again may have two for a while."""
         self._guests: asyncio.Queue[RelayConnection] = asyncio.Queue(MAX_NEW)
         self._lobby = Lobby("relay links", per_address=UNAUTHENTICATED_PER_ADDRESS, in_all=UNAUTHENTICATED)
         self._throttle = LogThrottle()
         self._dialing: set[str] = set()
         """Nonces of the attempts to dial that are not over."""
+
+    @property
+    def connected(self) -> set[str]:
+        """Names of the sides that are linked now."""
+        return set(self._running.values())
 
     async def dial(self, host: str, port: int) -> None:
         """Keep a link to another side, until cancelled."""
@@ -190,8 +194,7 @@ class RelayLinks:
 
     async def _run(self, link: RelayConnection, name: str) -> None:
         _log.info("relay link with %s", name)
-        self.connected.add(name)
-        self._running.add(link)
+        self._running[link] = name
         try:
             async with TaskScope() as tasks:
                 exporter, importer = self._make_ends(link.send, tasks, name)
@@ -206,5 +209,4 @@ class RelayLinks:
         except ExceptionGroup as group:
             raise broken_by(group) from group
         finally:
-            self.connected.discard(name)
-            self._running.discard(link)
+            del self._running[link]
