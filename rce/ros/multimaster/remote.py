@@ -36,8 +36,8 @@ class Remote(ABC):
 
     def update(self, master: Neighbour) -> None:
         """Take the master's present state from the discovery."""
-        self._is_gone = False
-        if master != self.master:
+        was_gone, self._is_gone = self._is_gone, False
+        if was_gone or master != self.master:
             self.master = master
             self._wake.set()
 
