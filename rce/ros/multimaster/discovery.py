@@ -216,8 +216,8 @@ class Discovery:
             try:
                 changed = await self._monitor.poll(time.time())
                 if failures >= DEAD_AFTER_POLLS or self._monitor.restarts != restarts:
-                    restarts = self._monitor.restarts
                     await self._return_to_graph()
+                    restarts = self._monitor.restarts
                 failures = 0
             except MasterError as error:
                 failures += 1

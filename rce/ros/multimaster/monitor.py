@@ -63,7 +63,7 @@ class MasterMonitor:
         snapshot = await self._source.read()
         if snapshot == self._last:
             return False
-        if self._last is not None and self._last.pid != snapshot.pid:
+        if self._last is not None and self._last.run != snapshot.run:
             self.restarts += 1
         origins = await self._ask(snapshot)
         self._last = snapshot

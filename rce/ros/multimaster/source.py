@@ -18,8 +18,15 @@ from rce.ros.xmlrpc.dispatch import SUCCESS
 SETTLE = 0.05
 """Seconds in which changes of a watched core are gathered."""
 
+RUN_ID = "/run_id"
+"""Parameter to which each run of ``roscore`` or a core gives another value; a bare ``rosmaster`` has none."""
+
 MAX_CALLS = 2000
 """How many calls go into one ``system.multicall``."""
+
+
+Run = tuple[int, str]
+"""Identifies a process of a master: its number, which in a container may always be the same, and its run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +39,8 @@ class Snapshot:
     topic_types: Mapping[str, str] = field(default_factory=dict)
     node_uris: Mapping[str, str] = field(default_factory=dict)
     service_uris: Mapping[str, str] = field(default_factory=dict)
-    pid: int = 0
-    """The master's process: a new one means that the master was restarted."""
+    run: Run = (0, "")
+    """The master's process: another one means that the master was restarted."""
 
 
 class MasterSource(Protocol):
@@ -62,7 +69,7 @@ class RpcSource:
         Raises:
             MasterError: The master does not answer as it should.
         """
-        state, types, pid = await self._many([("getSystemState",), ("getTopicTypes",), ("getPid",)])
+        state, types, *run = await self._many([("getSystemState",), ("getTopicTypes",), *_ASK_RUN])
         try:
             publishers, subscribers, services = (read_names(part) for part in state)
             topic_types = {
@@ -87,7 +94,7 @@ class RpcSource:
             topic_types,
             _known(nodes, node_uris),
             _known(list(services), service_uris),
-            pid if isinstance(pid, int) else 0,
+            _run(*run),
         )
 
     async def wait(self, longest: float) -> None:
@@ -96,6 +103,15 @@ class RpcSource:
 
     async def _many(self, calls: Sequence[tuple[str, ...]]) -> list[Any]:
         return await multicall(self._master, calls)
+
+
+async def ask_run(master: MasterClient) -> Run:
+    """Ask which process the master is.
+
+    Raises:
+        MasterUnreachableError: The master does not answer as it should.
+    """
+    return _run(*await multicall(master, _ASK_RUN))
 
 
 async def multicall(master: MasterClient, calls: Sequence[tuple[Any, ...]]) -> list[Any]:
@@ -175,7 +191,7 @@ class CoreSource:
             graph.topic_types,
             graph.nodes,
             {name: uri for name, uri in addresses.items() if uri},
-            os.getpid(),
+            (os.getpid(), ""),
         )
 
     async def wait(self, longest: float) -> None:
@@ -202,6 +218,13 @@ async def open_source(master: MasterClient, core: Core | None) -> AsyncIterator[
         return
     with core.watch() as watch:
         yield CoreSource(core, watch)
+
+
+_ASK_RUN: Sequence[tuple[str, ...]] = (("getPid",), ("getParam", RUN_ID))
+
+
+def _run(pid: Any, run_id: Any) -> Run:
+    return pid if isinstance(pid, int) else 0, run_id if isinstance(run_id, str) else ""
 
 
 def _known(names: Sequence[str], uris: Sequence[Any]) -> dict[str, str]:

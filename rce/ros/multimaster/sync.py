@@ -25,6 +25,7 @@ from rce.ros.multimaster.relay.link import LinkIdentity, RelayLinks, check_liste
 from rce.ros.multimaster.relay.namespace import NamespaceRemote, add_namespace
 from rce.ros.multimaster.remote import DirectRemote, Remote
 from rce.ros.multimaster.settings import local_master
+from rce.ros.multimaster.source import Run, ask_run
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
 from rce.ros.node.runtime import TypeName
@@ -312,14 +313,14 @@ class MasterSync:
 
     async def _watch_master(self) -> None:
         """Register everything again when another process has replaced the master."""
-        known = None
+        known: Run | None = None
         while True:
             try:
-                pid = await self._master.call("getPid")
-                if known not in (None, pid):
+                run = await ask_run(self._master)
+                if known not in (None, run):
                     _log.warning("the master at %s was restarted", self._master_uri)
                     await self.registrar.restore()
-                known = pid
+                known = run
             except MasterError as error:
                 _log.debug("%s", error)
             await asyncio.sleep(WATCH_MASTER)

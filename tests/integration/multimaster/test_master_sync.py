@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import AsyncExitStack
 
 import pytest
 from support.multimaster import STRING, DiscoveryNetwork, node
+from support.ports import free_port
 from support.ros_busy_node import answering_second_call
 
 from rce.aio.tasks import TaskScope
@@ -142,6 +144,23 @@ async def test_a_restarted_node_is_registered_anew(network: DiscoveryNetwork) ->
                 publisher.publish(data=word)
                 async with asyncio.timeout(60):
                     assert (await anext(aiter(heard))).data == word
+
+
+async def test_a_restarted_master_is_known_by_its_run(network: DiscoveryNetwork) -> None:
+    """In a container, the next master may have the number of the process of the one before."""
+    port = free_port()
+    uri = f"http://127.0.0.1:{port}/"
+    async with network.machine() as a, node("talker", a.uri) as talker, AsyncExitStack() as stack:
+        await talker.advertise("chatter", STRING)
+        async with Core(port=port) as first:
+            await stack.enter_async_context(network.machine(uri))
+            await first.wait_until(lambda graph: bool(graph.publishers("/chatter")), timeout=20)
+        async with Core(port=port) as second:
+            await second.wait_until(lambda graph: bool(graph.publishers("/chatter")), timeout=30)
+            await second.wait_until(
+                lambda graph: graph.parameters.has("/master_discovery/masteruri"), timeout=30
+            )
+            await stack.aclose()
 
 
 async def test_next_synchronization_cleans_up_after_killed_one(
