@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from rce.printable import one_line
@@ -68,7 +69,10 @@ async def ask_state(rpc: RpcClient, monitor_uri: str, chosen: SyncFilter) -> Mas
 
 
 class OriginsReader:
-    """Asks the synchronizations at a master where what they registered came from."""
+    """Asks the synchronizations at a master where what they registered came from.
+
+    What one answered last counts while it does not answer: else its nodes would be told as this master's own.
+    """
 
     def __init__(self, node: Node, hosts: Callable[[], frozenset[str]]) -> None:
         """Prepare to ask.
@@ -81,17 +85,23 @@ class OriginsReader:
         self._node = node
         self._hosts = hosts
         self._clients: dict[str, ServiceClient] = {}
+        self._answers: dict[str, list[Any]] = {}
+        """By the service; what was answered last."""
+        self._silent: set[str] = set()
+        """The services that did not answer when they were asked last."""
 
     async def read(self, snapshot: Snapshot) -> Origins:
         """Ask all synchronizations among the registrations in ``snapshot``."""
         hosts = self._hosts()
         for service in self._clients.keys() - snapshot.service_uris.keys():
             await self._clients.pop(service).close()
+            self._answers.pop(service, None)
+            self._silent.discard(service)
         found: list[Any] = []
         for service, uri in snapshot.service_uris.items():
             if service.endswith(SYNC_INFO) and host_of(uri) in hosts:
                 found += await self._ask(service)
-        return messages.read_origins(found)
+        return replace(messages.read_origins(found), is_complete=not self._silent)
 
     async def _ask(self, service: str) -> list[Any]:
         client = self._clients.get(service)
@@ -101,6 +111,10 @@ class OriginsReader:
         try:
             answer = await client.call({}, timeout=ORIGINS_TIMEOUT)
         except (RosError, SerializationError) as error:
-            _log.warning("what is registered by others is not known: %s", error)
-            return []
-        return list(answer.hosts)
+            if service not in self._silent:
+                _log.warning("what is registered by others is not known: %s", error)
+            self._silent.add(service)
+        else:
+            self._silent.discard(service)
+            self._answers[service] = list(answer.hosts)
+        return self._answers.get(service, [])

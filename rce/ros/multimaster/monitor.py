@@ -16,6 +16,8 @@ class Origins:
 
     nodes: Mapping[tuple[str, str], str] = field(default_factory=dict)
     services: Mapping[tuple[str, str], str] = field(default_factory=dict)
+    is_complete: bool = True
+    """Whether every synchronization answered."""
 
 
 AskOrigins = Callable[[Snapshot], Awaitable[Origins]]
@@ -50,6 +52,7 @@ class MasterMonitor:
         self._hosts = hosts
         self._ask = ask
         self._last: Snapshot | None = None
+        self._knows_origins = False
 
     async def poll(self, now: float) -> bool:
         """Read the master; return whether it changed.
@@ -61,14 +64,17 @@ class MasterMonitor:
             MasterError: It does not answer.
         """
         snapshot = await self._source.read()
-        if snapshot == self._last:
+        if snapshot == self._last and self._knows_origins:
             return False
         if self._last is not None and self._last.run != snapshot.run:
             self.restarts += 1
         origins = await self._ask(snapshot)
-        self._last = snapshot
-        self._take(describe(snapshot, self._uri, self._name, self._hosts(), origins), now)
-        return True
+        new = describe(snapshot, self._uri, self._name, self._hosts(), origins)
+        is_known = snapshot == self._last and self.info is not None and new.same_graph(self.info)
+        self._last, self._knows_origins = snapshot, origins.is_complete
+        if not is_known:
+            self._take(new, now)
+        return not is_known
 
     def _take(self, new: MasterInfo, now: float) -> None:
         old = self.info

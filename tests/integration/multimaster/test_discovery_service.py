@@ -6,6 +6,7 @@ import asyncio
 import gc
 import shutil
 import sys
+from contextlib import AsyncExitStack
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from support.multimaster import STRING, DiscoveryNetwork, node
 from support.ports import free_ports
 
 from rce.ros.core import Core
-from rce.ros.errors import MasterUnreachableError, RemoteFaultError
+from rce.ros.errors import MasterUnreachableError, RemoteFaultError, ServiceFaultError
 from rce.ros.multimaster import messages
 from rce.ros.multimaster.discovery import Discovery
 from rce.ros.multimaster.errors import NoDiscoveryError
@@ -115,6 +116,39 @@ async def test_checksums_are_answered_from_definitions_read_before(
         many = [f"no/Such{number}" for number in range(MAX_TYPES + 1)]
         with pytest.raises(RemoteFaultError, match="at most 1000 message types"):
             await rpc.call(discovery.monitor_uri, "getTopicsMd5sum", (many,))
+
+
+async def test_origins_of_nodes_outlive_a_busy_synchronization(network: DiscoveryNetwork) -> None:
+    """Nodes of other masters are not told as this master's own while a synchronization does not answer."""
+    far, api = "http://far:11311/", "http://127.0.0.1:1/"
+    topic = {"topic": "/t", "node": "/far", "nodeuri": api}
+    info = {"masteruri": far, "nodes": ["/far"], "publisher": [topic], "subscriber": [], "services": []}
+    is_busy = True
+
+    def answer(_request: object) -> dict[str, object]:
+        if is_busy:
+            raise ServiceFaultError("/sync/get_sync_info", "busy")
+        return {"hosts": [info]}
+
+    async with Core(port=0) as core, RpcClient() as rpc, AsyncExitStack() as stack:
+        sync = await stack.enter_async_context(node("sync", core.uri, types=messages.registry()))
+        await sync.advertise_service("~get_sync_info", messages.GET_SYNC_INFO, answer)
+        await rpc.call(core.uri, "registerPublisher", ("/far", "/t", STRING, api))
+        discovery = await stack.enter_async_context(Discovery(network.settings(core.uri, name="a")))
+
+        async def until(origin: str, topic: str = "/t") -> None:
+            async with asyncio.timeout(60):
+                while discovery.info is None or topic not in discovery.info.publishers:
+                    await asyncio.sleep(0.02)
+                while discovery.info.nodes["/far"].master_uri != origin:
+                    await asyncio.sleep(0.02)
+
+        await until(core.uri)
+        is_busy = False
+        await until(far)
+        is_busy = True
+        await rpc.call(core.uri, "registerPublisher", ("/near", "/u", STRING, "http://127.0.0.1:2/"))
+        await until(far, "/u")
 
 
 async def test_installed_messages_of_fkie_win(
