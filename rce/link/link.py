@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from typing import TYPE_CHECKING
 
 from rce.link.exceptions import ProtocolError
 from rce.link.frames import Frame, FrameType
 from rce.link.handshake import TAKEOVER
+from rce.link.pacing import Bucket
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -19,6 +21,10 @@ if TYPE_CHECKING:
     from rce.link.settings import LinkLimits
 
 _log = logging.getLogger(__name__)
+
+OPENINGS_AT_ONCE = 8
+OPENINGS_PER_S = 1.0
+"""How often a peer may open one channel on a connection; it does when its interface was made anew."""
 
 
 class Link:
@@ -50,6 +56,8 @@ class Link:
         self._on_growth = on_growth
         self._channels: dict[int, Channel] = {}
         self._pacer: Pacer | None = None
+        self._openings: dict[int, Bucket] = {}
+        """How often the peer may open each channel again on this carrier."""
         self._traffic = (0, 0)
         """Of former carriers."""
 
@@ -167,6 +175,7 @@ class Link:
                 raise ProtocolError("too many open channels")
             self.peer_open.add(number)
             if channel is not None:
+                self._count_opening(number)
                 channel.peer_opened()
         elif frame.type is FrameType.CLOSE:
             self.peer_open.discard(number)
@@ -180,6 +189,20 @@ class Link:
             channel.frame_received(frame)
         elif frame.type < FrameType.DATA:
             raise ProtocolError(f"{frame.type.name} after the handshake")
+
+    def _count_opening(self, number: int) -> None:
+        """Count an OPEN: it brings the peer all latched messages, and costs it 24 bytes.
+
+        Raises:
+            ProtocolError: The peer opens the channel again and again.
+        """
+        now = asyncio.get_running_loop().time()
+        openings = self._openings.get(number)
+        if openings is None:
+            openings = self._openings[number] = Bucket(OPENINGS_PER_S, OPENINGS_AT_ONCE, now)
+        if openings.pause(now) > 0:
+            raise ProtocolError(f"channel {number} is opened again and again")
+        openings.spend(1, now)
 
     def _peer_moved(self, news: FrameType) -> None:
         if news is FrameType.TAKE:
@@ -197,6 +220,7 @@ class Link:
         self._traffic = self.traffic
         self.carrier = None
         self.peer_open.clear()
+        self._openings.clear()
         for channel in list(self._channels.values()):
             channel.peer_closed()
 

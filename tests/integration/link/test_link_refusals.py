@@ -111,8 +111,16 @@ async def test_silent_connection_is_dropped(rig: Rig) -> None:
         encode(Frame(FrameType.OPEN, 1)) + encode(Frame(FrameType.HELLO, 1)),
         b"".join(encode(Frame(FrameType.OPEN, n)) for n in range(1, 40)),
         encode(Frame(FrameType.OPEN, 2)) + 2 * encode(Frame(FrameType.CALL, 2, 7)),
+        50 * (encode(Frame(FrameType.OPEN, 1)) + encode(Frame(FrameType.CLOSE, 1))),
     ],
-    ids=["unknown type", "second hello", "hello on a channel", "too many channels", "same call twice"],
+    ids=[
+        "unknown type",
+        "second hello",
+        "hello on a channel",
+        "too many channels",
+        "same call twice",
+        "opens one channel again and again",
+    ],
 )
 async def test_rule_breaking_peer_loses_its_link(rig: Rig, rule_breaker: bytes) -> None:
     hub = await rig.hub(limits=LinkLimits(max_channels=30))
