@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import deque
 from typing import TYPE_CHECKING
 
 from rce.aio.tasks import BackgroundTasks
@@ -94,7 +93,7 @@ class CallServer:
         self._name = name
         self._scope = BackgroundTasks()
         self._serving: dict[tuple[Channel, int], asyncio.Task[None]] = {}
-        self._waiting: deque[tuple[Channel, int, bytes]] = deque()
+        self._waiting: dict[tuple[Channel, int], bytes] = {}
         self._holdings = Holdings() if holdings is None else holdings
         self._held: dict[tuple[Channel, int], Holding] = {}
         self._closed = False
@@ -111,7 +110,7 @@ class CallServer:
         if len(self._scope) < self._limits.serving:
             self._begin(channel, call_id, payload)
         elif len(self._waiting) < self._limits.waiting:
-            self._waiting.append((channel, call_id, payload))
+            self._waiting[channel, call_id] = payload
         else:
             raise OverloadedError(f"{len(self._waiting)} requests wait to be served")
         key = channel, call_id
@@ -123,27 +122,20 @@ class CallServer:
 
     def has(self, channel: Channel, call_id: int) -> bool:
         """Return whether a request is being served or waits."""
-        return (channel, call_id) in self._serving or any(
-            waiting[:2] == (channel, call_id) for waiting in self._waiting
-        )
+        return (channel, call_id) in self._serving or (channel, call_id) in self._waiting
 
     def serves(self, channel: Channel) -> bool:
         """Return whether a request of a channel is being served or waits."""
-        return any(key[0] is channel for key in self._serving) or any(
-            waiting[0] is channel for waiting in self._waiting
-        )
+        return any(key[0] is channel for keys in (self._serving, self._waiting) for key in keys)
 
     def cancel(self, channel: Channel, call_id: int | None = None) -> None:
         """Stop working on a request, or on all requests of a channel; they get no answer."""
-        for key in [key for key in self._held if key[0] is channel and call_id in (None, key[1])]:
-            self._held.pop(key).release()
-        self._waiting = deque(
-            request
-            for request in self._waiting
-            if not (request[0] is channel and call_id in (None, request[1]))
-        )
-        for key in [key for key in self._serving if key[0] is channel and call_id in (None, key[1])]:
-            self._serving.pop(key).cancel()
+        if call_id is not None:
+            self._drop((channel, call_id))
+            return
+        for key in {*self._held, *self._waiting, *self._serving}:
+            if key[0] is channel:
+                self._drop(key)
 
     async def close(self) -> None:
         """Stop working and wait until that has happened."""
@@ -181,6 +173,14 @@ class CallServer:
             holding.release()
         return True
 
+    def _drop(self, key: tuple[Channel, int]) -> None:
+        """Stop working on a request, if it is known."""
+        self._waiting.pop(key, None)
+        if (holding := self._held.pop(key, None)) is not None:
+            holding.release()
+        if (task := self._serving.pop(key, None)) is not None:
+            task.cancel()
+
     def _give_up(self, channel: Channel, call_id: int) -> None:
         """Answer a request with a fault, because memory is short."""
         if self.has(channel, call_id):
@@ -189,4 +189,5 @@ class CallServer:
 
     def _next(self, _ended: asyncio.Task[None]) -> None:
         while self._waiting and len(self._scope) < self._limits.serving and not self._closed:
-            self._begin(*self._waiting.popleft())
+            key = next(iter(self._waiting))
+            self._begin(*key, self._waiting.pop(key))

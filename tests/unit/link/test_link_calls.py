@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import TYPE_CHECKING, cast
 
 import pytest
@@ -62,6 +63,32 @@ async def test_pending_calls_have_their_own_ids_and_answers() -> None:
         await third
     assert not calls.drop(c)
     assert len(calls) == 0
+
+
+async def test_a_request_costs_the_same_while_many_wait() -> None:
+    """A peer may let many wait, and send and cancel others: each costs it a few bytes."""
+
+    async def seconds(waiting: int) -> float:
+        channel = FakeChannel().as_channel()
+        server = CallServer(never, LinkLimits(serving=1, waiting=waiting + 2), "ask")
+        for call_id in range(waiting + 1):
+            server.accept(channel, call_id, b"")
+        spent = []
+        for _ in range(20):
+            begin = time.perf_counter()
+            for call_id in range(waiting + 1, waiting + 51):
+                assert not server.has(channel, call_id)
+                server.accept(channel, call_id, b"")
+                server.cancel(channel, call_id)
+            spent.append(time.perf_counter() - begin)
+        await server.close()
+        return min(spent)
+
+    async def never(payload: bytes) -> bytes:
+        await asyncio.get_running_loop().create_future()
+        return payload
+
+    assert await seconds(10_000) < 20 * await seconds(10)
 
 
 async def test_server_serves_few_at_a_time_and_refuses_too_many() -> None:
