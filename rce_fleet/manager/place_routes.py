@@ -106,7 +106,7 @@ async def set_zone(call: Call) -> FleetAnswer:
         model.reason,
         call.request.user,
         model.until,
-        (known.revision if known else 0) + 1,
+        book.next_revision(known),
         unsent=True,
     )
     made = checked(asked, book.grid, call.now)

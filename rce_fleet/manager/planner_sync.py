@@ -266,7 +266,7 @@ class PlannerSync:
                 gone = replace(known, is_removed=True, revision=known.revision + 1, unsent=False)
                 book.emit(gone, "zone removed", now, text=f"zone {key} is gone")
             return
-        made = replace(self._facts.zones[key], revision=(known.revision if known else 0) + 1)
+        made = replace(self._facts.zones[key], revision=book.next_revision(known))
         book.emit(made, "zone", now, user=made.user, text=f"zone {key}: {made.kind}")
 
     def _adopt_cells(self, changes: dict[int, bool | None], now: float) -> None:

@@ -168,6 +168,13 @@ class FleetTables:
         """Return what people decided about a robot."""
         return self.robots.get(robot) or RobotEntry(robot, revision=0)
 
+    def next_revision(self, zone: Zone | None) -> int:
+        """Return the revision of a zone's next change; None: of a new zone.
+
+        A new zone begins above those of a removed one with its name, so that none of their ETags fits.
+        """
+        return self.number + 1 if zone is None else zone.revision + 1
+
     def at(self, task_id: str, revision: int | None) -> Task:
         """Return a task at a revision; None: any.
 

@@ -117,6 +117,20 @@ async def test_an_old_etag_is_refused(client: ManagerClient) -> None:
     assert (await client.ask("PUT", "/chargers", {"chargers": []}, revision='"0"'))[0] == 412
 
 
+async def test_the_etag_of_a_removed_zone_fits_no_new_one(client: ManagerClient, tmp_path: Path) -> None:
+    """Another person removed the zone and made one of the same name: their zone was replaced."""
+    zone = {"kind": "slow", "cells": [3], "value": 0.3}
+    _, _, seen = await client.ask("PUT", "/zones/gate", zone)
+    await client.ask("DELETE", "/zones/gate")
+    await client.manager.close()
+    following = ManagerClient(tmp_path / "j.sqlite")
+    client.manager = following.manager
+    _, _, newer = await following.ask("PUT", "/zones/gate", {"kind": "blocked", "cells": [4]}, revision='"0"')
+    assert (await following.ask("PUT", "/zones/gate", zone, revision=seen))[0] == 412
+    assert (await following.ask("DELETE", "/zones/gate", revision=seen))[0] == 412
+    assert (await following.ask("PUT", "/zones/gate", zone, revision=newer))[0] == 200
+
+
 async def test_a_viewer_changes_nothing(client: ManagerClient) -> None:
     assert (await client.ask("POST", "/tasks", GO, role="viewer"))[0] == 403
     assert (await client.ask("GET", "/tasks", role="viewer"))[:2] == (200, {"tasks": [], "next": None})
