@@ -178,10 +178,12 @@ def _show_robot(call: Call, name: str, queues: dict[str, list[str]]) -> FleetRob
 
 
 async def fleet_map(call: Call) -> FleetAnswer:
-    """Return the grid."""
-    grid = call.manager.facts.grid
+    """Return the grid; a cell that was just blocked or freed is shown so before the planner tells it."""
+    grid, kept = call.manager.facts.grid, call.manager.book.blocked
     if grid is None:
         return problem(503, "the planner has not told its map yet; try again later")
+    blocked = [cell for cell in kept.cells if cell in grid]
+    freed = {*kept.unsent}.difference(kept.cells)
     return shown(
         FleetMapModel(
             rows=grid.rows,
@@ -190,7 +192,7 @@ async def fleet_map(call: Call) -> FleetAnswer:
             origin=list(grid.origin),
             yaw=grid.yaw,
             walls=sorted(grid.blocked),
-            blocked=sorted(call.manager.facts.shut - grid.blocked),
+            blocked=sorted(({*call.manager.facts.shut, *blocked} - grid.blocked).difference(freed)),
         )
     )
 

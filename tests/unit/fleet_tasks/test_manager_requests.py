@@ -131,6 +131,16 @@ async def test_the_etag_of_a_removed_zone_fits_no_new_one(client: ManagerClient,
     assert (await following.ask("PUT", "/zones/gate", zone, revision=newer))[0] == 200
 
 
+async def test_the_map_shows_a_cell_as_it_was_just_set(client: ManagerClient) -> None:
+    """The planner's change comes later; whoever blocked the cell looks at once."""
+    assert (await client.ask("PUT", "/cells/5", {"blocked": True}))[0] == 200
+    assert (await client.ask("GET", "/map"))[1]["blocked"] == [5]
+    client.manager.facts.shut = frozenset({5, 9})
+    assert (await client.ask("PUT", "/cells/5", {"blocked": False}))[0] == 200
+    shown = (await client.ask("GET", "/map"))[1]
+    assert (shown["blocked"], shown["walls"]) == ([], [9])
+
+
 async def test_a_viewer_changes_nothing(client: ManagerClient) -> None:
     assert (await client.ask("POST", "/tasks", GO, role="viewer"))[0] == 403
     assert (await client.ask("GET", "/tasks", role="viewer"))[:2] == (200, {"tasks": [], "next": None})
