@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+_MAX_EARLY = 4
+"""Frames of a dialing end beside its HELLO, which waits for the answer; others would fill the memory."""
+
 
 class LinkHub:
     """Listens for links, dials them, and joins endpoints of the same process without a socket.
@@ -293,6 +296,7 @@ class LinkHub:
                 self.limits,
                 self.timeouts,
                 received=received,
+                max_early=_MAX_EARLY,
                 on_open=self._admit,
                 on_closed=self._carriers.discard,
             )

@@ -40,6 +40,15 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
     Until :meth:`start` only small frames are accepted, and kept; :meth:`handshake_frame` returns the first of
     them.
 
+    Args:
+        limits: Of links.
+        timeouts: Of links.
+        received: What was read of the connection already.
+        max_early: How many frames may come after the first until :meth:`start`; None: as many as a link may
+            have channels, which an accepting end opens right after its answer.
+        on_open: Called when the connection is there.
+        on_closed: Called when it has ended.
+
     Attributes:
         sent: Bytes that went out, with headers and the handshake.
         received: Bytes that came in, likewise.
@@ -51,12 +60,14 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
         timeouts: LinkTimeouts,
         *,
         received: bytes = b"",
+        max_early: int | None = None,
         on_open: Callable[[SocketCarrier], None] = lambda _: None,
         on_closed: Callable[[SocketCarrier], None] = lambda _: None,
     ) -> None:
         self._limits = limits
         self._timeouts = timeouts
         self._received = received
+        self._max_early = limits.max_channels if max_early is None else max_early
         self._on_open = on_open
         self._on_closed = on_closed
         self._loop = asyncio.get_running_loop()
@@ -319,7 +330,7 @@ class SocketCarrier(asyncio.BufferedProtocol, Carrier):
             self._check_flow()
 
     def _keep(self, frame: Frame) -> None:
-        if len(self._early) > self._limits.max_channels:
+        if len(self._early) > self._max_early:
             self.abort(ProtocolError("too many frames before the handshake is done"))
             return
         self._early.append(frame)

@@ -96,6 +96,18 @@ async def test_garbage_ends_its_own_connection_only(rig: Rig, way: str, garbage:
     assert await b.fakes["i1"].received.get() == (b"unhurt", False)
 
 
+async def test_stranger_cannot_send_on_while_its_link_is_looked_for(rig: Rig) -> None:
+    """What comes before the answer to HELLO is kept in memory, and counts for no user."""
+    _, b = await rig.pair("tcp", handshake=60.0, unknown_link=50.0)
+    reader, writer = await hello(b.address, encode_hello("unknown", ""))
+    frame = encode(Frame(FrameType.PING, payload=bytes(4_000)))
+    writer.write(100 * frame)
+    async with asyncio.timeout(20):
+        while await read_on(reader):
+            pass
+    writer.close()
+
+
 async def test_silent_connection_is_dropped(rig: Rig) -> None:
     _, b = await rig.pair("tcp", handshake=0.05)
     reader, writer = await hello(b.address, b"")
