@@ -47,6 +47,11 @@ _WIRE_ORDER = (
 )
 _NONE = Patterns()
 
+MAX_EXPRESSION = 64 * 2**10
+"""Characters of one list that a peer may send."""
+MAX_PATTERNS = 1000
+"""Patterns of all its lists: each name of the graph is compared with them."""
+
 
 @dataclass(frozen=True, slots=True)
 class SyncFilter:
@@ -97,12 +102,17 @@ class SyncFilter:
     def from_wire(cls, values: Sequence[Any]) -> Self:
         """Read a filter that a peer sent; later lists may be missing.
 
-        A list that is not understood lets everything pass.
+        A list that is not understood, or is too long, lets everything pass.
         """
         read: dict[str, Patterns] = {}
+        left = MAX_PATTERNS
         for name, expression in zip(_WIRE_ORDER, values[1:], strict=False):
-            patterns = Patterns.from_wire(expression) if isinstance(expression, str) else _NONE
-            read[name] = patterns if patterns is not None else _everything(name)
+            text = expression if isinstance(expression, str) else ""
+            patterns = Patterns.from_wire(text) if len(text) <= MAX_EXPRESSION else None
+            if patterns is None or len(patterns) > left:
+                patterns = _everything(name)
+            left -= len(patterns)
+            read[name] = patterns
         return cls(bool(values[0]) if values else False, **read)
 
 

@@ -7,9 +7,11 @@ busy for hours. A filter of another form lets everything pass; the peer filters 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 
 _BEGIN, _END = r"\A", r"\Z"
+_STARS = re.compile(r"\*+")
 _SPECIAL = frozenset("[](){}+?|^$\\")
 
 
@@ -18,10 +20,13 @@ class Patterns:
 
     def __init__(self, patterns: Iterable[str] = ()) -> None:
         self._patterns = tuple(dict.fromkeys(stripped for text in patterns if (stripped := text.strip())))
-        self._parts = [pattern.lower().split("*") for pattern in self._patterns]
+        self._parts = [_STARS.sub("*", pattern.lower()).split("*") for pattern in self._patterns]
 
     def __bool__(self) -> bool:
         return bool(self._patterns)
+
+    def __len__(self) -> int:
+        return len(self._patterns)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._patterns)

@@ -118,6 +118,21 @@ async def test_checksums_are_answered_from_definitions_read_before(
             await rpc.call(discovery.monitor_uri, "getTopicsMd5sum", (many,))
 
 
+async def test_an_endless_filter_does_not_keep_a_discovery_busy(network: DiscoveryNetwork) -> None:
+    """Any host may send one: comparing all names with it would stop the heartbeats meanwhile."""
+    stars = rf"\A/t{'.*' * 200_000}x\Z"
+    many = "|".join(rf"\A/a{number}.*b\Z" for number in range(40_000))
+    async with Core(port=0) as core, RpcClient() as rpc:
+        for number in range(100):
+            api = f"http://127.0.0.1:1/{number}"
+            await rpc.call(core.uri, "registerPublisher", (f"/n{number}", f"/t{number}", STRING, api))
+        async with Discovery(network.settings(core.uri)) as discovery:
+            for expression in (many, stars):
+                lists = [False, *[expression] * 10]
+                answer = await rpc.call(discovery.monitor_uri, "masterInfoFiltered", (lists,), timeout=5)
+                assert {f"/t{number}" for number in range(100)} <= {name for name, _ in answer[4]}
+
+
 async def test_origins_of_nodes_outlive_a_busy_synchronization(network: DiscoveryNetwork) -> None:
     """Nodes of other masters are not told as this master's own while a synchronization does not answer."""
     far, api = "http://far:11311/", "http://127.0.0.1:1/"
