@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 _SPARE_TASKS = 50
 """So many tasks more than robots, and twice as many as robots, are looked at, the most urgent ones."""
+_PRICED = 20_000
+"""So many pairs of a task and a profile are looked at in a step, or one profile: each takes some ten
+microseconds. Robots of the other profiles have their turn in the steps after it."""
 _ATTEMPTS = 4
 """A step assigns at most so often, if robots turn out to have too little energy for tasks."""
 
@@ -77,6 +80,8 @@ class Assigner:
         self._travel = travel
         self._rules = rules
         self._levels = levels
+        self._next_group = 0
+        """Counts the groups of robots that had their turn."""
 
     def urgency(self, task: Task, now: float, seconds: float = 0.0) -> float:
         """Return what it is worth to begin with a task now, in seconds of way.
@@ -135,6 +140,8 @@ class Assigner:
     ) -> list[Choice]:
         """Return which robots begin with which tasks, with the smallest sum of costs.
 
+        If the robots have very many profiles, some of them are looked at, and the next ones in the next call.
+
         Args:
             tasks: Tasks that can begin now.
             robots: Robots that can.
@@ -145,6 +152,7 @@ class Assigner:
         """
         if not tasks or not robots:
             return []
+        robots = self._in_turn(robots, len(tasks))
         robots = sorted(robots, key=lambda robot: robot.cell)  # Distances are read in the order of cells.
         groups = [
             _Group(columns, [robots[column] for column in columns]) for columns in _columns_by_profile(robots)
@@ -173,10 +181,25 @@ class Assigner:
             costs[row, later] = inf
         return self._pairs(costs, urgent, robots, groups, chargers)
 
+    def _in_turn(self, robots: Sequence[FreeRobot], tasks: int) -> Sequence[FreeRobot]:
+        """Return all robots, or those whose turn it is if they have very many profiles."""
+        groups = _columns_by_profile(robots)
+        if len(groups) * min(tasks, _most_tasks(len(robots))) <= _PRICED:
+            return robots
+        chosen: list[FreeRobot] = []
+        begin = self._next_group % len(groups)
+        for number, columns in enumerate(groups[begin:] + groups[:begin], 1):
+            more = [*chosen, *(robots[column] for column in columns)]
+            if chosen and number * min(tasks, _most_tasks(len(more))) > _PRICED:
+                break
+            chosen = more
+            self._next_group = begin + number
+        return chosen
+
     def _most_urgent(self, tasks: Sequence[Task], groups: Sequence[_Group], now: float) -> list[Task]:
         """Return the most urgent of the tasks that one of the robots may do."""
         robots = sum(len(group.names) for group in groups)
-        most = max(2 * robots, robots + _SPARE_TASKS)
+        most = _most_tasks(robots)
         names = {name: group for group in groups for name in group.names}
         urgent = []
         for task in sorted(tasks, key=lambda task: (-self.urgency(task, now), task.number)):
@@ -332,6 +355,11 @@ class _Group:
             [nan if robot.battery is None else robot.battery for robot in robots], np.float64
         )
         self.tails: dict[int, Effort] = {}
+
+
+def _most_tasks(robots: int) -> int:
+    """Return how many tasks are looked at for some robots."""
+    return max(2 * robots, robots + _SPARE_TASKS)
 
 
 def _joined(

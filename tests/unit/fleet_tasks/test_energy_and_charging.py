@@ -389,6 +389,31 @@ def test_hundreds_of_robots_get_tasks_in_one_call() -> None:
     assert len({choice.robot for choice in chosen}) == len({choice.task.number for choice in chosen}) == 600
 
 
+def test_robots_with_profiles_of_their_own_have_their_turns() -> None:
+    """Each was compared with each task in one step: with 1000 robots that took half a minute."""
+    travel, grid = TravelCosts(), GridMap(20, 60)
+    travel.set_map(grid, frozenset(), {}, 0)
+    assigner = Assigner(travel, AssignmentRules(), BatteryLevels())
+    robots = {
+        f"R{n}": FreeRobot(f"R{n}", 2 * n, RobotProfile(capacity=60 + n, payload=n % 3), None)
+        for n in range(400)
+    }
+    tasks = {
+        n: Task(n, Order((Stop(Action.GO, (n % 100 * 12,)),), payload=1.0), "", "", 0.0, 0.0)
+        for n in range(500)
+    }
+    turns = 0
+    for turns in range(1, 20):  # noqa: B007 - their number counts
+        chosen = assigner.choose([*tasks.values()], [*robots.values()], 0.0)
+        assert len(chosen) <= 100
+        for choice in chosen:
+            del robots[choice.robot], tasks[choice.task.number]
+        if all(robot.profile.payload < 1 for robot in robots.values()):
+            break
+    assert len(robots) == 134, "some robots that can do tasks got none"
+    assert turns > 2
+
+
 def test_a_changed_map_is_measured_in_slices() -> None:
     """After a cell is blocked, distances follow a few at a time; to a blocked cell no way leads at once."""
     travel, grid = TravelCosts(), GridMap(3, 40)
