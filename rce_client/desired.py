@@ -172,6 +172,24 @@ class Desired:
                 del self.connections[pair]
 
 
+def merge_removals(requests: Iterable[Request]) -> list[Request]:
+    """Return requests that :meth:`Desired.unrestored` returned as few requests, in their order."""
+    merged: list[Request] = []
+    for request in requests:
+        match merged[-1] if merged else None, request:
+            case ConfigureComponents() as last, ConfigureComponents():
+                merged[-1] = ConfigureComponents(
+                    remove_nodes=last.remove_nodes + request.remove_nodes,
+                    remove_interfaces=last.remove_interfaces + request.remove_interfaces,
+                    delete_param=last.delete_param + request.delete_param,
+                )
+            case ConfigureConnections() as last, ConfigureConnections():
+                merged[-1] = ConfigureConnections(disconnect=last.disconnect + request.disconnect)
+            case _:
+                merged.append(request)
+    return merged
+
+
 def _discard_of(items: dict[tuple[str, str], Item], endpoint: str) -> None:
     for key in [key for key in items if key[0] == endpoint]:
         del items[key]

@@ -14,6 +14,7 @@ from rce.model import (
     ConfigureConnections,
     CreateContainer,
     DestroyContainer,
+    FaultCode,
     RemoveInterface,
     Request,
     ResizeContainer,
@@ -31,7 +32,7 @@ from rce.protocol import (
     LatchedSources,
     encode,
 )
-from rce_client.desired import Desired
+from rce_client.desired import Desired, merge_removals
 from rce_client.engine_transport import EngineTransport, Target, Timing
 from rce_client.exceptions import (
     ClientError,
@@ -45,6 +46,7 @@ from rce_client.interface_table import InterfaceTable
 from rce_client.life import CONNECTION_LIFE, ConnectionEvent, State
 from rce_client.parts import parts_of
 from rce_client.reminder import Reminder
+from rce_client.repetition import Repetition
 from rce_client.sendqueue import QueueLimits
 
 if TYPE_CHECKING:
@@ -57,6 +59,9 @@ _log = logging.getLogger(__name__)
 
 CONNECTING = "looking for the engine"
 """The words of the first report of an attempt; the reports of failures tell what went wrong."""
+
+KEPT_REMOVALS = 256
+"""As many of the newest removals that the engine received are repeated too: it may have dropped them."""
 
 
 def _take_note(sent: asyncio.Future[None]) -> None:
@@ -107,6 +112,9 @@ class Session:
         self._unconfirmed: dict[object, Request] = {}
         """Removals, and others that :attr:`desired` does not restore, which the engine may not have received;
         oldest first."""
+        self._received: deque[Request] = deque(maxlen=KEPT_REMOVALS)
+        """The newest of them that the engine received, which it may have dropped; oldest first."""
+        self._repetition = Repetition(self.spawn, self._repeat_all, self._received.clear)
         self._was_connected = False
         self._refusal: RefusedError | None = None
         self._reminder = Reminder()
@@ -273,7 +281,7 @@ class Session:
     def on_connected(self) -> None:
         """Remove again what the engine may not have removed, and ask again for everything that was made."""
         for key, request in self._unconfirmed.items():
-            self.transport.post_request(encode(request), partial(self._unconfirmed.pop, key, None))
+            self.transport.post_request(encode(request), partial(self._confirm, key))
         for request in self.desired.restore():
             for part in parts_of(request):
                 self.transport.post_request(encode(part))
@@ -329,7 +337,21 @@ class Session:
             return None
         key = object()
         self._unconfirmed[key] = unrestored
-        return partial(self._unconfirmed.pop, key, None)
+        return partial(self._confirm, key)
+
+    def _confirm(self, key: object) -> None:
+        """Learn that the engine received a request that no restoring repeats."""
+        if (request := self._unconfirmed.pop(key, None)) is not None:
+            self._received.append(request)
+
+    async def _repeat_all(self) -> None:
+        """Send all requests again that the engine may have dropped; after a reconnect, what is desired."""
+        if self._refusal is not None:
+            return
+        for request in merge_removals(self._received):
+            for part in parts_of(request):
+                self.transport.deliver(encode(part)).add_done_callback(_take_note)
+        await self.repeat()
 
     def _take_fault(self, fault: Fault) -> None:
         """Report what came and cannot be read; fail the service call that it was part of."""
@@ -341,6 +363,8 @@ class Session:
         call = self.interfaces.call_of(report)
         if call is None:
             self._take_error(report.text)
+            if report.code is FaultCode.BUSY:
+                self._repetition.note_drop()
         else:
             self.interfaces.fail(call.i_tag, call.msg_id, report.text.removeprefix(f"{call}: "))
 

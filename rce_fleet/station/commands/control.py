@@ -250,9 +250,11 @@ class RobotControl:
         async def prepare(robot: str) -> None:
             async with slots:
                 try:
+                    is_new = robot not in self._stops
                     sender = await self._stop_sender(robot)
-                    async with asyncio.timeout(OPEN_S):
-                        await sender.repair()
+                    if not is_new:
+                        async with asyncio.timeout(OPEN_S):
+                            await sender.repair()
                 except (CommandError, TimeoutError) as error:
                     self._refused_at[robot] = asyncio.get_running_loop().time()
                     _log.debug("no emergency stop for %s: %s", robot, error)

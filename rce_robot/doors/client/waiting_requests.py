@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from rce.model import ConfigureComponents, ConfigureConnections, Request
+from rce.model import ConfigureComponents, ConfigureConnections, FaultCode, Request
 from rce.protocol import ErrorReport, type_of
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class WaitingRequests:
         waiting = self.bytes + size
         if self._queue.qsize() >= self._settings.max_requests or waiting > self._settings.max_request_bytes:
             problem = f"{type_of(request)}: too many requests wait; this one was dropped"
-            self._send(ErrorReport(problem=problem))
+            self._send(ErrorReport(problem=problem, code=FaultCode.BUSY))
         else:
             self.bytes = waiting
             self._queue.put_nowait((request, size))

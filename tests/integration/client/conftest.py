@@ -95,6 +95,12 @@ class Engine:
             socket.abort()
         await self.master.changed.until(lambda: len(self.master.left) > before)
 
+    async def wait_errors(self, conn: Connection, text: str) -> None:
+        """Wait until the engine has told the client of an error."""
+        async with asyncio.timeout(60):
+            while not any(text in error for error in conn.errors):
+                await asyncio.sleep(0.01)
+
     def stop_reading(self) -> None:
         """Take nothing more from the robot's connection, until that is broken."""
         for socket in _server_sockets():

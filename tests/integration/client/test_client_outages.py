@@ -7,12 +7,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-from integration.client.conftest import TIMING
+from integration.client.conftest import TIMING, Engine
 from support.client_types import ECHO, STRING, ros_string
-from support.cloud import PASSWORD
+from support.cloud import PASSWORD, content_of, running_cloud
 from support.slow_link import SlowLink
 
-from rce.model import ConfigureConnections
+from rce.model import ConfigureComponents, ConfigureConnections
 from rce.model import Connection as ConnectionSpec
 from rce.protocol import MAX_ITEMS
 from rce_client.connection import Connection, State
@@ -22,15 +22,49 @@ from rce_client.exceptions import (
     RefusedError,
 )
 from rce_client.reminder import Reminder
+from rce_robot.settings import SessionSettings
 
 if TYPE_CHECKING:
-    from integration.client.conftest import Door, Engine
+    from integration.client.conftest import Door
+
+    from rce.control.messages import ClientRequest
 
 
 async def test_the_password_itself_is_not_sent(engine: Engine) -> None:
     async with engine.connection():
         pass
     assert engine.door.targets == ["/?userID=testUser&version=20130902&auth=bearer"]
+
+
+async def test_requests_that_a_busy_engine_drops_are_repeated(door: Door) -> None:
+    """All interfaces of a program exist at last, and those that it removed do not."""
+    async with running_cloud(SessionSettings(max_requests=4)) as cloud:
+        engine = Engine(cloud, door)
+        made: set[str] = set()
+        gate = asyncio.Event()
+
+        async def answer(request: ClientRequest) -> tuple[str, ...]:
+            await gate.wait()
+            content = content_of(request)
+            assert isinstance(content, ConfigureComponents)
+            made.difference_update(item.tag for item in content.remove_interfaces)
+            made.update(item.interface.tag for item in content.add_interfaces)
+            engine.master.changed.set()
+            return ()
+
+        engine.master.answer = answer
+        async with engine.connection() as conn:
+            tags = [f"say{number}" for number in range(20)]
+            say = await asyncio.gather(*(conn.publisher(tag, STRING) for tag in tags))
+            await engine.wait_errors(conn, "too many requests wait")
+            gate.set()
+            await engine.master.changed.until(lambda: made == set(tags))
+            gate.clear()
+            conn.errors.clear()
+            await asyncio.gather(*(one.close() for one in say[:15]))
+            await engine.wait_errors(conn, "too many requests wait")
+            gate.set()
+            await engine.master.changed.until(lambda: made == set(tags[15:]))
 
 
 @pytest.mark.parametrize("status", [400, 401, 410, 501])

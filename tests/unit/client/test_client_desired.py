@@ -21,7 +21,7 @@ from rce.model.requests import (
     SetParameter,
 )
 from rce.model.specs import InterfaceSpec, NodeSpec, ParameterSpec, ResourceChanges
-from rce_client.desired import Desired
+from rce_client.desired import Desired, merge_removals
 
 TAGS = st.sampled_from(["a", "b", "robot"])
 NAMES = st.sampled_from(["x", "y"])
@@ -149,3 +149,15 @@ def test_a_container_is_made_again_as_it_was_and_then_resized() -> None:
         desired.apply(ResizeContainer(tag="a", changes=data))
     resized = ResizeContainer(tag="a", changes=ResourceChanges(cpu=0.5, memory=1 << 30))
     assert desired.restore() == [made, resized]
+
+
+def test_removals_are_merged_in_their_order() -> None:
+    cut = [ConfigureConnections(disconnect=(Connection(tag_a=f"a/{name}", tag_b="b/x"),)) for name in "xy"]
+    gone = [components(remove_interfaces=RemoveInterface(endpoint="robot", tag=name)) for name in "xy"]
+    destroyed = DestroyContainer(tag="a")
+    first, second, third, last = merge_removals([*cut, *gone, destroyed, gone[0]])
+    assert first == ConfigureConnections(disconnect=cut[0].disconnect + cut[1].disconnect)
+    assert second == ConfigureComponents(
+        remove_interfaces=gone[0].remove_interfaces + gone[1].remove_interfaces
+    )
+    assert (third, last) == (destroyed, gone[0])

@@ -1,0 +1,57 @@
+"""Sends again what a busy engine dropped."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from rce.aio.backoff import Backoff
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Coroutine
+
+PAUSES = Backoff(first=0.5, longest=30.0, jitter=0.5)
+"""Pauses until the requests are sent again."""
+
+CALM_S = 2.0
+"""After so long without a drop, the engine has taken all that was repeated."""
+
+
+class Repetition:
+    """Repeats requests until the engine drops none of them.
+
+    An engine drops requests of a client that sends them faster than the master carries them out. It names
+    their type only, so all are repeated; the engine takes what is there already silently.
+
+    Args:
+        spawn: Runs a coroutine as long as the connection is used.
+        repeat: Sends all requests again.
+        on_taken: Called when the engine has taken all of them.
+    """
+
+    def __init__(
+        self,
+        spawn: Callable[[Coroutine[object, object, None]], asyncio.Task[None]],
+        repeat: Callable[[], Awaitable[None]],
+        on_taken: Callable[[], None],
+    ) -> None:
+        self._spawn = spawn
+        self._repeat = repeat
+        self._on_taken = on_taken
+        self._task: asyncio.Task[None] | None = None
+        self._has_dropped = False
+
+    def note_drop(self) -> None:
+        """Learn that the engine dropped a request."""
+        self._has_dropped = True
+        if self._task is None or self._task.done():
+            self._task = self._spawn(self._run())
+
+    async def _run(self) -> None:
+        pauses = PAUSES.start()
+        while self._has_dropped:
+            await asyncio.sleep(pauses.next())
+            self._has_dropped = False
+            await self._repeat()
+            await asyncio.sleep(CALM_S)
+        self._on_taken()
