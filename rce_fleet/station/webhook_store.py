@@ -105,6 +105,10 @@ class WebhookStore:
         """Remove a webhook; return whether it was there."""
         return self._webhooks.pop(id_, None) is not None
 
+    def put_back(self, webhook: Webhook) -> None:
+        """Have a webhook again that was removed."""
+        self._webhooks[webhook.id] = webhook
+
     def save(self) -> None:
         """Write the file, whole or not at all. Blocks.
 

@@ -73,10 +73,16 @@ class Webhooks:
         id_ = request.match_info["webhook"]
         if (refusal := self._refusal(request, "remove_webhook")) is not None:
             return refusal
-        if not self._store.remove(id_):
+        webhook = self._store.get(id_)
+        if webhook is None or not self._store.remove(id_):
             return problem(404, f"there is no webhook {id_[:40]!r}")
         await self._sender.stop(id_)
-        await self._sender.save()
+        try:
+            await self._sender.save()
+        except OSError as error:  # a station that is started again would send to it
+            self._store.put_back(webhook)
+            self._sender.start(webhook)
+            return problem(507, f"the webhook cannot be removed: {error.strerror}; check --state-dir")
         self._access.audit(request, "remove_webhook", id_)
         return web.Response(status=204)
 

@@ -268,6 +268,18 @@ async def check_webhooks(fleet: ManagedFleet, tmp_path: Path) -> None:
         known = len(receiver.numbers)
         async with fleet_station(fleet.core.uri, file) as url, FleetClient(url) as client:
             await until(lambda: len(receiver.numbers) > known, "the delivery after a restart")
+            kept = file.read_bytes()
+            file.unlink()
+            (file / "in the way").mkdir(parents=True)
+            with pytest.raises(ApiError, match=r"cannot be removed: .*check --state-dir") as refused:
+                await client.remove_webhook(hook.id)
+            assert (refused.value.status, [one.id for one in await client.webhooks()]) == (507, [hook.id])
+            known = len(receiver.numbers)
+            await client.create_task(TaskRequest(stops=[StopModel(cell=3)]))
+            await until(lambda: len(receiver.numbers) > known, "a delivery to the webhook that stayed")
+            (file / "in the way").rmdir()
+            file.rmdir()
+            file.write_bytes(kept)
             await client.remove_webhook(hook.id)
             assert await client.webhooks() == []
     assert receiver.forged == 0
