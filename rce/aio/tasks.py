@@ -132,6 +132,27 @@ def errors_in(group: BaseExceptionGroup[E]) -> Iterator[E]:
             yield error
 
 
+def pass_cancellation(error: BaseException) -> None:
+    """Raise ``error`` again if it is the cancellation of the present task; do nothing for any other error.
+
+    What a task waits for may raise ``CancelledError`` too: because another task was cancelled that it waits
+    for. That is an error like others, and does not ask this task to end.
+
+    Raises:
+        asyncio.CancelledError: The present task is being cancelled.
+
+    Example:
+        >>> try:
+        ...     await callback()
+        ... except (Exception, asyncio.CancelledError) as error:
+        ...     pass_cancellation(error)
+        ...     log.exception("the callback failed")
+    """
+    task = asyncio.current_task()
+    if isinstance(error, asyncio.CancelledError) and task is not None and task.cancelling():
+        raise error
+
+
 async def cancel_and_wait(*tasks: asyncio.Future[Any]) -> None:
     """Cancel tasks and wait until they have ended; their results and exceptions are dropped.
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 import logging
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from rce.aio.tasks import pass_cancellation
 from rce.ros.errors import ServiceFaultError
 from rce.ros.node.runtime import Runtime
 from rce.ros.tcpros.connection import Connection
@@ -127,14 +129,16 @@ class Service:
     async def _finish(self, response: Awaitable[bytes]) -> Chunks:
         try:
             return answer_frame(await response, ok=True)
-        except Exception as error:  # noqa: BLE001 - the caller gets every failure
+        except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - the caller gets every failure
+            pass_cancellation(error)
             return self._failure(error)
 
-    def _failure(self, error: Exception) -> Chunks:
+    def _failure(self, error: BaseException) -> Chunks:
         if isinstance(error, ServiceFaultError):
             return answer_frame(error.text.encode(), ok=False)
         _log.error("service %s failed", self.name, exc_info=error)
-        return answer_frame(f"error processing request: {error}".encode(), ok=False)
+        text = f"error processing request: {str(error) or type(error).__name__}"
+        return answer_frame(text.encode(), ok=False)
 
 
 class Session:

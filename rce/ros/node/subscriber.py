@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rce.aio.queues import BoundedQueue
-from rce.aio.tasks import TaskScope
+from rce.aio.tasks import TaskScope, pass_cancellation
 from rce.ros.errors import NodeClosedError
 from rce.ros.node.local import LocalMessage
 from rce.ros.node.runtime import TypeName
@@ -175,7 +175,8 @@ async def call_in_order(
             return
         try:
             await callback(payload, latched)
-        except Exception:  # noqa: BLE001 - as above
+        except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - as above
+            pass_cancellation(error)
             _log.exception("the callback of %s failed", topic)
 
 

@@ -8,7 +8,7 @@ import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import NamedTuple
 
-from rce.aio.tasks import TaskScope
+from rce.aio.tasks import TaskScope, pass_cancellation
 from rce.ros.node.clock import NANOSECONDS, Clock
 
 _log = logging.getLogger(__name__)
@@ -121,5 +121,6 @@ class Timer:
             result = self._callback(event)
             if inspect.isawaitable(result):
                 await result
-        except Exception:  # noqa: BLE001 - the program's own fault, which must not stop the timer
+        except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - the program's own
+            pass_cancellation(error)
             _log.exception("the callback of a timer failed")

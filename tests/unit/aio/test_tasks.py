@@ -6,7 +6,14 @@ import asyncio
 
 import pytest
 
-from rce.aio.tasks import BackgroundTasks, TaskScope, cancel_and_wait, finish, run_until_first
+from rce.aio.tasks import (
+    BackgroundTasks,
+    TaskScope,
+    cancel_and_wait,
+    finish,
+    pass_cancellation,
+    run_until_first,
+)
 
 Reported = list[BaseException]
 
@@ -255,3 +262,20 @@ async def test_finish_raises_the_error_of_its_work() -> None:
 
     with pytest.raises(ValueError, match="no room"):
         await finish(fail())
+
+
+async def test_pass_cancellation_raises_only_that_of_the_present_task() -> None:
+    pass_cancellation(OSError())
+    pass_cancellation(asyncio.CancelledError())  # of a task that this one waited for
+
+    async def wait() -> None:
+        try:
+            await asyncio.sleep(3600)
+        except asyncio.CancelledError as error:
+            pass_cancellation(error)
+
+    waiting = asyncio.create_task(wait())
+    await asyncio.sleep(0)
+    waiting.cancel()
+    await asyncio.wait((waiting,))
+    assert waiting.cancelled()

@@ -1,0 +1,74 @@
+"""Faults of a node's program, and of other nodes' messages, end nothing but what they belong to."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+from support.ros_nodes import MakeNode
+
+from rce.ros.errors import ServiceFaultError
+from rce.ros.node import TimerEvent
+from rce.ros.types import Message
+
+STRING = "std_msgs/String"
+TRIGGER = "std_srvs/Trigger"
+
+
+async def cancelled_task() -> None:
+    """Wait for a task that was cancelled, as a program does that replaces its work."""
+    work = asyncio.create_task(asyncio.sleep(3600))
+    work.cancel()
+    await work
+
+
+async def test_callback_awaiting_a_cancelled_task_gets_later_messages(
+    make_node: MakeNode, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        got: asyncio.Queue[str] = asyncio.Queue()
+
+        async def take(message: Message) -> None:
+            if message.data == "bad":
+                await cancelled_task()
+            got.put_nowait(message.data)
+
+        await b.subscribe("t", STRING, take)
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        publisher.publish(data="bad")
+        publisher.publish(data="good")
+        assert await asyncio.wait_for(got.get(), 10) == "good"
+    assert "the callback of /t failed" in caplog.text
+
+
+async def test_handler_awaiting_a_cancelled_task_answers_with_an_error(make_node: MakeNode) -> None:
+    async with make_node("a") as a, make_node("b") as b:
+        calls: list[Message] = []
+
+        async def trigger(request: Message) -> dict[str, Any]:
+            calls.append(request)
+            if len(calls) == 1:
+                await cancelled_task()
+            return {"success": True}
+
+        await a.advertise_service("go", TRIGGER, trigger)
+        client = b.service_client("go", TRIGGER)
+        with pytest.raises(ServiceFaultError, match="CancelledError"):
+            await client.call({}, timeout=10)
+        assert (await client.call({}, timeout=10)).success
+
+
+async def test_timer_awaiting_a_cancelled_task_calls_again(make_node: MakeNode) -> None:
+    async with make_node("a") as a:
+        calls: asyncio.Queue[TimerEvent] = asyncio.Queue()
+
+        async def call(event: TimerEvent) -> None:
+            calls.put_nowait(event)
+            await cancelled_task()
+
+        a.timer(0.01, call)
+        async with asyncio.timeout(10):
+            await calls.get()
+            await calls.get()
