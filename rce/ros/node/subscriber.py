@@ -271,18 +271,22 @@ class Subscriber:
         return self
 
     async def __anext__(self) -> Message:
-        """Wait for the next message.
+        """Wait for the next message. What a publisher sends that is not one is logged and left out.
 
         Raises:
             NodeClosedError: The subscriber has a callback, which takes the messages.
         """
         if not isinstance(self.sink, QueueSink) or self._message_type is None:
             raise NodeClosedError(f"the messages of {self.topic} go to a callback")
-        try:
-            payload, _ = await self.sink.take()
-        except EOFError:
-            raise StopAsyncIteration from None
-        return decode(self._message_type, payload)
+        while True:
+            try:
+                payload, _ = await self.sink.take()
+            except EOFError:
+                raise StopAsyncIteration from None
+            try:
+                return decode(self._message_type, payload)
+            except ValueError as error:  # a SerializationError; the types may not be imported yet
+                _log.warning("a message of %s is left out: %s", self.topic, error)
 
     async def close(self) -> None:
         """Stop taking messages; the last subscriber of a topic unregisters it."""

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from typing import Any
 
 import pytest
 from support.ros_nodes import MakeNode
 
+from rce.ros.core import Core
 from rce.ros.errors import ServiceFaultError
-from rce.ros.node import TimerEvent
+from rce.ros.node import Node, TimerEvent
 from rce.ros.types import Message
 
 STRING = "std_msgs/String"
@@ -72,3 +74,18 @@ async def test_timer_awaiting_a_cancelled_task_calls_again(make_node: MakeNode) 
         async with asyncio.timeout(10):
             await calls.get()
             await calls.get()
+
+
+@pytest.mark.parametrize("intra_process", [False, True])
+async def test_iteration_leaves_out_what_is_not_a_message(
+    core: Core, intra_process: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    make = partial(Node, argv=[], master_uri=core.uri, intra_process=intra_process)
+    async with make("a") as a, make("b") as b:
+        subscriber = await b.subscribe("t", STRING)
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        publisher.publish_serialized(b"\xff\xff\0\0x")
+        publisher.publish(data="good")
+        assert (await asyncio.wait_for(anext(subscriber), 10)).data == "good"
+    assert "a message of /t is left out: data: the message ends after" in caplog.text
