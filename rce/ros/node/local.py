@@ -112,6 +112,8 @@ class LocalLink:
         self._loop = loop
         self._listener = listener
         self._queue: BoundedQueue[tuple[LocalMessage, bool]] = BoundedQueue(queue_size, MAX_QUEUED_BYTES)
+        self._is_due = False
+        """Whether the event loop will call :meth:`_deliver`."""
 
     @property
     def bytes_out(self) -> int:
@@ -130,17 +132,31 @@ class LocalLink:
 
     def send(self, local_message: LocalMessage, *, latched: bool) -> None:
         """Queue a message; it is delivered as soon as the event loop is free."""
-        if not self._queue:
-            self._loop.call_soon(self._deliver)
         self._queue.put((local_message, latched), len(local_message))
+        self._deliver_soon()
 
     def end(self) -> None:
         """End the link from the publisher's side; waiting messages are still delivered."""
         if not self.ended.done():
             self.ended.set_result(None)
 
+    def _deliver_soon(self) -> None:
+        if self._queue and not self._is_due:
+            self._is_due = True
+            self._loop.call_soon(self._deliver)
+
     def _deliver(self) -> None:
-        while self._queue:
+        self._is_due = False
+        try:
+            self._deliver_waiting(len(self._queue))
+        finally:
+            self._deliver_soon()
+
+    def _deliver_waiting(self, count: int) -> None:
+        """Deliver what waits now; what callbacks publish meanwhile comes when others had their turn."""
+        for _ in range(count):
+            if not self._queue:
+                return
             local_message, latched = self._queue.take()
             self.messages += 1
             self.bytes_in += len(local_message)

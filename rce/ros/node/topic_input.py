@@ -108,9 +108,19 @@ class TopicInput:
         own = uri == self._own_uri
         for subscriber in self.subscribers:
             if subscriber.hears_own or not own:
-                subscriber.sink.deliver(
-                    local_message if subscriber.decodes else local_message.payload(), latched, uri
-                )
+                self._hand_over(subscriber, local_message, latched, uri)
+
+    def _hand_over(
+        self, subscriber: Subscriber, local_message: LocalMessage, latched: bool, uri: str
+    ) -> None:
+        item: LocalMessage | bytes = local_message
+        if not subscriber.decodes:
+            try:
+                item = local_message.payload()
+            except ValueError as error:  # a SerializationError; the types may not be imported yet
+                _log.warning("a message of %s cannot be written: %s", self.topic, error)
+                return
+        subscriber.sink.deliver(item, latched, uri)
 
     def lose(self, uri: str) -> None:
         """Tell all subscribers that the connection to a publisher ended."""
@@ -123,8 +133,8 @@ class TopicInput:
         for link in self.links:
             if link.uri == self._own_uri and not subscriber.hears_own:
                 continue
-            if isinstance(link.kept, LocalMessage) and not subscriber.decodes:
-                subscriber.sink.deliver(link.kept.payload(), True, link.uri)
+            if isinstance(link.kept, LocalMessage):
+                self._hand_over(subscriber, link.kept, True, link.uri)
             elif link.kept is not None:
                 subscriber.sink.deliver(link.kept, True, link.uri)
 

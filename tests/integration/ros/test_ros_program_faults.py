@@ -12,7 +12,7 @@ from support.ros_nodes import MakeNode
 from rce.ros.core import Core
 from rce.ros.errors import ServiceFaultError
 from rce.ros.node import Node, TimerEvent
-from rce.ros.types import Message
+from rce.ros.types import Message, TypeRegistry
 
 STRING = "std_msgs/String"
 TRIGGER = "std_srvs/Trigger"
@@ -89,3 +89,43 @@ async def test_iteration_leaves_out_what_is_not_a_message(
         publisher.publish(data="good")
         assert (await asyncio.wait_for(anext(subscriber), 10)).data == "good"
     assert "a message of /t is left out: data: the message ends after" in caplog.text
+
+
+async def test_bad_object_keeps_no_other_from_local_subscribers(
+    core: Core, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Objects are written only for those who take bytes, long after the call that published them."""
+    make = partial(Node, argv=[], master_uri=core.uri, types=TypeRegistry())
+    async with make("a") as a, make("b") as b:
+        raw: asyncio.Queue[bytes] = asyncio.Queue()
+        objects: asyncio.Queue[Message] = asyncio.Queue()
+        await b.subscribe_serialized("t", STRING, lambda payload, _: raw.put_nowait(payload))
+        await b.subscribe("t", STRING, objects.put_nowait)
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        for data in (5, "one", "two"):
+            publisher.publish(publisher.type.new(data=data))
+        async with asyncio.timeout(10):
+            assert [await raw.get(), await raw.get()] == [b"\x03\0\0\0one", b"\x03\0\0\0two"]
+            assert [(await objects.get()).data for _ in range(3)] == [5, "one", "two"]
+    assert "a message of /t cannot be written: data: 5 is not a string" in caplog.text
+
+
+async def test_local_echo_leaves_time_for_others(core: Core) -> None:
+    async with Node("a", argv=[], master_uri=core.uri) as a:
+        publisher = await a.advertise("t", STRING)
+        turns = 0
+
+        def echo(message: Message) -> None:
+            nonlocal turns
+            turns += 1
+            if turns < 100_000:  # so that a failure ends
+                publisher.publish(message)
+
+        subscriber = await a.subscribe("t", STRING, echo)
+        await publisher.wait_for_subscribers(timeout=10)
+        publisher.publish(publisher.type.new(data="again"))
+        while not turns:
+            await asyncio.sleep(0)
+        await subscriber.close()
+        assert turns < 1000
