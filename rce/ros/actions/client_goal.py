@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator, Callable
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,8 @@ from rce.ros.node.settings import MAX_QUEUED_BYTES
 
 if TYPE_CHECKING:
     from rce.ros.types import Message, Time
+
+_log = logging.getLogger(__name__)
 
 FEEDBACK_QUEUE = 100
 """How many feedbacks wait for an iteration before the oldest is dropped."""
@@ -133,7 +136,7 @@ class ClientGoal:
         if self.is_done:
             return
         if self._on_feedback is not None:
-            self._on_feedback(feedback)
+            self._call(self._on_feedback, feedback)
         else:
             self._feedback.put(feedback, 0)
             self._arrived.set()
@@ -147,4 +150,10 @@ class ClientGoal:
             self._done.set()
             self._arrived.set()
         if self._on_change is not None:
-            self._on_change(self)
+            self._call(self._on_change, self)
+
+    def _call(self, callback: Callable[[Any], None], argument: object) -> None:
+        try:
+            callback(argument)
+        except Exception:  # noqa: BLE001 - the program's own fault, which must not stop the client
+            _log.exception("a callback of goal %s failed", self.id)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
 from rce.ros import names
 from rce.ros.errors import MasterRefusedError, ParameterMissingError
 from rce.ros.node.master import MasterClient
+
+_log = logging.getLogger(__name__)
 
 ParameterCallback = Callable[[str, Any], None]
 
@@ -163,7 +166,14 @@ class Parameters:
         for watched, callbacks in self._watchers.items():
             if name == watched or name.startswith(watched.rstrip(names.SEPARATOR) + names.SEPARATOR):
                 for callback in callbacks:
-                    callback(name, value)
+                    _call(callback, name, value)
+
+
+def _call(callback: ParameterCallback, name: str, value: Any) -> None:
+    try:
+        callback(name, value)
+    except Exception:  # noqa: BLE001 - the program's own fault: others hear of the change, and the node goes on
+        _log.exception("the callback of parameter %s failed", name)
 
 
 def _replaced(tree: Any, path: list[str], value: Any) -> Any:

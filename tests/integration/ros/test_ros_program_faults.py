@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from functools import partial
 from typing import Any
 
@@ -129,3 +130,21 @@ async def test_local_echo_leaves_time_for_others(core: Core) -> None:
             await asyncio.sleep(0)
         await subscriber.close()
         assert turns < 1000
+
+
+async def test_failing_parameter_callback_keeps_the_node_registered(
+    make_node: MakeNode, core: Core, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(name: str, value: object) -> None:
+        raise RuntimeError(f"{name} is {value}")
+
+    core.set_param("/p", 1)
+    async with make_node("a") as a:
+        told: asyncio.Queue[object] = asyncio.Queue()
+        await a.watch_param("/p", fail)
+        await a.watch_param("/p", lambda _, value: told.put_nowait(value))
+        async with make_node("b") as b:
+            await b.set_param("/p", 2)
+        assert await asyncio.wait_for(told.get(), 10) == 2
+    assert "the callback of parameter /p failed" in caplog.text
+    assert not [record for record in caplog.records if record.levelno >= logging.CRITICAL]

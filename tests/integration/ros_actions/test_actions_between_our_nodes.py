@@ -290,6 +290,28 @@ async def test_a_silent_server_loses_the_goal(make_node: MakeNode) -> None:
             await goal.result(20)
 
 
+async def test_callbacks_of_a_goal_that_fail_do_not_end_the_client(
+    make_node: MakeNode, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The client itself reports the loss, from the task that looks after its goals."""
+
+    def fail(_: object) -> None:
+        raise RuntimeError("broken callback")
+
+    async with (
+        make_node("server") as a,
+        make_node("client") as b,
+        ActionServer(a, "job", FIBONACCI, until_cancelled),
+        ActionClient(b, "job", FIBONACCI, silence_timeout=0.01) as client,
+    ):
+        async with asyncio.timeout(30):
+            for _ in range(2):
+                goal = await client.send(order=1, on_change=fail, on_feedback=fail)
+                with pytest.raises(GoalFailedError, match="the server is silent"):
+                    await goal.result()
+    assert "broken callback" in caplog.text
+
+
 async def test_a_goal_that_got_lost_on_the_way_is_sent_again(
     make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
