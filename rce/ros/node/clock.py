@@ -1,7 +1,7 @@
 """ROS time: the machine's clock or, if the parameter ``/use_sim_time`` is true, the topic ``/clock``.
 
-Simulated time is zero until the first tick, may run at any speed, stand still, and jump back when a
-simulation or a bag begins again.
+Simulated time is zero until the first tick: what sleeps until then sleeps from that tick on. It may run at
+any speed, stand still, and jump back when a simulation or a bag begins again.
 """
 
 from __future__ import annotations
@@ -30,10 +30,12 @@ class Clock:
 
     Attributes:
         simulated: Whether time comes from ``/clock``.
+        begun: Nanoseconds by which what was planned at time zero is later: the time of the first tick.
     """
 
     def __init__(self) -> None:
         self.simulated = False
+        self.begun = 0
         self._now = 0  # simulated time in nanoseconds
         self._sleepers: list[tuple[int, int, asyncio.Future[None]]] = []
         self._order = count()
@@ -50,9 +52,16 @@ class Clock:
             return
         secs, nsecs = _STAMP.unpack(payload)
         now = secs * NANOSECONDS + nsecs
+        if not self._now:
+            self._begin(now)
         went_back, self._now = now < self._now, now
         while self._sleepers and (went_back or self._sleepers[0][0] <= now):
             _wake(heapq.heappop(self._sleepers)[2])
+
+    def _begin(self, now: int) -> None:
+        """Postpone what was planned at time zero, as roscpp and rospy do."""
+        self.begun += now
+        self._sleepers = [(deadline + now, order, woken) for deadline, order, woken in self._sleepers]
 
     def end(self) -> None:
         """Wake all sleepers, now and later: the node stops."""

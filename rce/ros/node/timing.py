@@ -29,10 +29,12 @@ class Rate:
         self._clock = clock
         self._step = round(NANOSECONDS / hz)
         self._last = clock.nanoseconds()
+        self._begun = clock.begun
 
     @property
     def due(self) -> int:
         """When the next beat is, in nanoseconds of ROS time."""
+        self._postpone()
         return self._last + self._step
 
     @property
@@ -46,13 +48,20 @@ class Rate:
         Returns:
             Whether the node continues.
         """
+        self._postpone()
         self._last = min(self._last, self._clock.nanoseconds())  # time may have jumped back
         goes_on = await self._clock.sleep_until(self._last + self._step)
+        self._postpone()
         self._last += self._step
         now = self._clock.nanoseconds()
         if not self._last <= now <= self._last + self._step:
             self._last = now
         return goes_on
+
+    def _postpone(self) -> None:
+        """Count from the first tick of simulated time if the beat was planned before it."""
+        self._last += self._clock.begun - self._begun
+        self._begun = self._clock.begun
 
     async def __aiter__(self) -> AsyncIterator[int]:
         """Count the beats, the first at once."""
@@ -104,8 +113,9 @@ class Timer:
 
     async def _run(self) -> None:
         last: float | None = None
-        due = self._rate.due
+        due, begun = self._rate.due, self._clock.begun
         while await self._rate.sleep():
+            due += self._clock.begun - begun
             jumped_back = self._clock.simulated and self._clock.nanoseconds() < due
             if not jumped_back:
                 now = self._clock.nanoseconds() / NANOSECONDS
@@ -113,7 +123,7 @@ class Timer:
                 if self._oneshot:
                     return
                 last = now
-            due = self._rate.due
+            due, begun = self._rate.due, self._clock.begun
 
     async def _call(self, event: TimerEvent) -> None:
         self.calls += 1

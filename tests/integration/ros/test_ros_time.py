@@ -148,3 +148,34 @@ async def test_real_time(make_node: MakeNode) -> None:
         a.shutdown()
         assert not await asyncio.wait_for(asleep, 10)
         assert not await rate.sleep()
+
+
+async def test_what_begins_at_time_zero_counts_from_the_first_tick(core: Core, make_node: MakeNode) -> None:
+    """As in roscpp and rospy: time zero means that the simulation has not begun."""
+    core.set_param("/use_sim_time", True)
+    async with make_node("sim") as sim, make_node("a") as a:
+        publisher = await sim.advertise("/clock", "rosgraph_msgs/Clock")
+        await publisher.wait_for_subscribers(2, timeout=10)
+        calls: list[TimerEvent] = []
+        a.timer(2.0, calls.append)
+        once = a.timer(5.0, lambda event: None, oneshot=True)
+        sleeper = asyncio.create_task(a.sleep(3.0))
+        beats: list[float] = []
+
+        async def beat() -> None:
+            async for _ in a.rate(1.0):
+                beats.append(a.time())  # noqa: PERF401 - one by one, as they come
+
+        beating = asyncio.create_task(beat())
+        await asyncio.sleep(0)
+        for second in range(1000, 1005):
+            await tick(publisher, a, float(second))
+            for _ in range(4):
+                await asyncio.sleep(0)
+            assert sleeper.done() == (second >= 1003)
+        assert beats == [0.0, 1001.0, 1002.0, 1003.0, 1004.0]
+        assert [(call.now, call.expected) for call in calls] == [(1002.0, 1002.0), (1004.0, 1004.0)]
+        assert not once.calls
+        assert await sleeper
+        beating.cancel()
+        await asyncio.gather(beating, return_exceptions=True)
