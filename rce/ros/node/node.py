@@ -14,7 +14,7 @@ from rce.ros.node.publisher import Publisher
 from rce.ros.node.runtime import TypeName
 from rce.ros.node.service import Handler, SerializedHandler, Service, coding
 from rce.ros.node.service_client import ServiceClient, answers
-from rce.ros.node.settings import NodeSettings
+from rce.ros.node.settings import NodeSettings, queue_items
 from rce.ros.node.subscriber import (
     ListenerSink,
     MessageCallback,
@@ -129,7 +129,8 @@ class Node(GraphMember):
             topic: The topic.
             message_type: Its type.
             latch: Give the last message to later subscribers.
-            queue_size: How many messages wait for a slow subscriber before its oldest is dropped.
+            queue_size: How many messages wait for a slow subscriber before its oldest is dropped; 0: as many
+                as 64 MiB hold.
 
         Raises:
             TypeMismatchError: This node publishes the topic with another type.
@@ -139,7 +140,7 @@ class Node(GraphMember):
         runtime = self._running
         known = runtime.types.message(message_type)
         return await self._topics.advertise(
-            runtime, self.resolve(topic), known, latch=latch, queue_size=queue_size
+            runtime, self.resolve(topic), known, latch=latch, queue_size=queue_items(queue_size)
         )
 
     async def subscribe(
@@ -158,7 +159,8 @@ class Node(GraphMember):
             callback: Called with each message, in order. A plain function is called as soon as a message is
                 there and must not block; a coroutine function is awaited before the next message. Without
                 a callback, iterate over the subscriber.
-            queue_size: How many messages wait for a coroutine or an iteration before the oldest is dropped.
+            queue_size: How many messages wait for a coroutine or an iteration before the oldest is dropped;
+                0: as many as 64 MiB hold.
 
         Raises:
             TypeMismatchError: This node subscribes to the topic with another type.
@@ -166,11 +168,11 @@ class Node(GraphMember):
             MasterError: The registration at the master failed.
         """
         runtime = self._running
-        name = self.resolve(topic)
+        name, items = self.resolve(topic), queue_items(queue_size)
         known = runtime.types.message(message_type)
         if callback is None:
-            return await self._topics.subscribe(runtime, name, known, QueueSink(queue_size), decodes=True)
-        sink = sink_for(decoding(known, callback), queue_size, name, runtime.tasks)
+            return await self._topics.subscribe(runtime, name, known, QueueSink(items), decodes=True)
+        sink = sink_for(decoding(known, callback), items, name, runtime.tasks)
         return await self._topics.subscribe(runtime, name, known, sink, decodes=True)
 
     async def subscribe_serialized(
@@ -196,7 +198,7 @@ class Node(GraphMember):
             MasterError: The registration at the master failed.
         """
         name = self.resolve(topic)
-        sink = sink_for(callback, queue_size, name, self._running.tasks)
+        sink = sink_for(callback, queue_items(queue_size), name, self._running.tasks)
         return await self._subscribe_raw(name, message_type, sink)
 
     async def _subscribe_raw(

@@ -22,6 +22,8 @@ DEFAULT_MASTER_URI = "http://127.0.0.1:11311/"
 LOOPBACK = "127.0.0.1"
 MAX_QUEUED_BYTES = 64 * 2**20
 """Most bytes that one queue of messages holds, unless a single message is longer."""
+MAX_QUEUED_ITEMS = 2**20
+"""Most messages in a queue for which no number is given."""
 _DISCARD = 9
 """The port of the discard service (RFC 863)."""
 SHOW_WARNINGS = "RCE_SHOW_WARNINGS"
@@ -101,6 +103,19 @@ class NodeSettings:
     async def placed(self) -> NodeSettings:
         """Return these settings with a host. The master's name may be looked up for it."""
         return self if self.host else dataclasses.replace(self, host=await address_towards(self.master_uri))
+
+
+def queue_items(queue_size: int) -> int:
+    """Return how many messages a queue holds: as given; for 0, as many as its bytes allow.
+
+    Raises:
+        ValueError: It is negative.
+    """
+    if queue_size < 0:
+        raise ValueError(
+            f"queue_size is {queue_size}, must be 0 (as many as {MAX_QUEUED_BYTES} bytes) or more"
+        )
+    return queue_size or MAX_QUEUED_ITEMS
 
 
 def anonymous_name(name: str) -> str:

@@ -301,6 +301,21 @@ async def test_a_slow_program_loses_its_oldest_messages(make_node: MakeNode) -> 
         assert kept.dropped == 8
 
 
+async def test_queue_size_zero_drops_nothing(make_node: MakeNode) -> None:
+    """As in roscpp and rospy, 0 asks for a queue without a bound in messages."""
+    async with make_node("a") as a, make_node("b") as b:
+        subscriber = await b.subscribe("t", STRING, queue_size=0)
+        publisher = await a.advertise("t", STRING, queue_size=0)
+        await publisher.wait_for_subscribers(timeout=10)
+        text = "x" * 1000
+        for _ in range(500):
+            publisher.publish(data=text)
+        assert await collect(subscriber, 500) == [text] * 500
+        assert publisher.dropped == subscriber.dropped == 0
+        with pytest.raises(ValueError, match="queue_size is -1"):
+            await a.advertise("other", STRING, queue_size=-1)
+
+
 async def test_subscribers_follow_a_publisher_that_comes_back(make_node: MakeNode) -> None:
     async with make_node("b") as b:
         subscriber = await b.subscribe("t", STRING)
