@@ -7,6 +7,7 @@ Source of the grammar and of the md5 sums: ROS's genmsg. Names of message types 
 from __future__ import annotations
 
 import hashlib
+import io
 import re
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -81,7 +82,7 @@ def parse_message(name: str, text: str, source: str = "", first_line: int = 1) -
     fields: list[RawField] = []
     constants: list[Constant] = []
     package = name.partition("/")[0]
-    for number, line in enumerate(text.splitlines(), first_line):
+    for number, line in enumerate(_lines(text), first_line):
         code = line.partition("#")[0].strip()
         if not code:
             continue
@@ -103,7 +104,7 @@ def parse_service(name: str, text: str, source: str = "") -> tuple[Definition, D
         BadDefinitionError: The text cannot be read, or has not exactly one ``---`` line.
     """
     parts: list[list[str]] = [[]]
-    for line in text.splitlines(keepends=True):
+    for line in _lines(text):
         if line.strip() == "---":
             parts.append([])
         else:
@@ -157,6 +158,11 @@ def checksum_text(definition: Definition, md5_of: Callable[[str], str]) -> str:
 def md5(*texts: str) -> str:
     """Return the checksum of the texts, one after another, as hex digits."""
     return hashlib.md5("".join(texts).encode(), usedforsecurity=False).hexdigest()
+
+
+def _lines(text: str) -> io.StringIO:
+    """Return a text's lines with their ends: those of files, not the others of Unicode, as a form feed."""
+    return io.StringIO(text, newline="")
 
 
 def _parse_field(code: str, package: str, line: int) -> RawField:

@@ -23,6 +23,15 @@ def test_fields_know_their_type_and_array() -> None:
     ]
 
 
+@pytest.mark.parametrize("separator", ["\x0b", "\x0c", "\x1c", "\x85", "\u2028", "\u2029"])
+def test_only_line_ends_of_files_end_a_comment(separator: str) -> None:
+    """Text from web pages and old editors has others; ROS's genmsg reads them as part of the line."""
+    text = f"# the{separator} robot place\r\nint32 x\r\n"
+    assert [field.name for field in parse_message("p/T", text).fields] == ["x"]
+    request, response = parse_service("p/S", f"{text}---\n{text}")
+    assert [[field.name for field in part.fields] for part in (request, response)] == [["x"], ["x"]]
+
+
 def test_constants_have_values_of_their_type() -> None:
     constants = parse_message(
         "p/C",
