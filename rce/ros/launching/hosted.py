@@ -11,6 +11,7 @@ import importlib
 import logging
 from typing import TYPE_CHECKING
 
+from rce.aio.tasks import pass_cancellation
 from rce.ros.launching.launched import LaunchedNode, StopTimeouts, describe_end
 from rce.ros.node.hosting import HostedProgram
 
@@ -79,7 +80,8 @@ class HostedNode(LaunchedNode):
             result = await getattr(importlib.import_module(self._command.module), MAIN)()
         except SystemExit as error:  # as of argparse
             result = error.code
-        except Exception:  # noqa: BLE001 - the others live on, as if it were a process of its own
+        except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 - the others run on
+            pass_cancellation(error)
             _log.exception("%s failed", self.plan.name)
             return FAILED
         return result if isinstance(result, int) else 0

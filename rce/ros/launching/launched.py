@@ -82,5 +82,8 @@ class LaunchedNode(ABC):
 def describe_end(code: int) -> str:
     """Return how a process ended, in words."""
     if code < 0:
-        return f"was ended by {signal.Signals(-code).name}"
+        try:
+            return f"was ended by {signal.Signals(-code).name}"
+        except ValueError:  # a real-time signal has no name
+            return f"was ended by signal {-code}"
     return f"ended with exit code {code}" if code else "ended"

@@ -15,6 +15,7 @@ from rce.ros.launch.plan import NodePlan
 from rce.ros.launching import StopTimeouts
 from rce.ros.launching.command import NodeCommand, node_command
 from rce.ros.launching.hosted import HostedNode, can_host
+from rce.ros.launching.launched import describe_end
 from rce.ros.node import Node
 from rce.ros.node.hosting import HostedProgram, program_arguments, program_environ
 from rce.ros.node.running import stop_signals
@@ -33,7 +34,7 @@ def command(module: str, *words: str) -> NodeCommand:
 
 @pytest.fixture
 def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A module with a node's ``main``: ends, fails or waits, as its first argument says."""
+    """A module with a node's ``main``: does as its first argument says."""
     (tmp_path / "hosted_tool.py").write_text(
         "import asyncio\n"
         "from rce.ros.node.hosting import program_arguments\n"
@@ -44,6 +45,10 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
         "    if word == 'wait': await asyncio.Event().wait()\n"
         "    if word == 'fail': raise ValueError(word)\n"
         "    if word == 'exit': raise SystemExit(3)\n"
+        "    if word == 'lose':\n"
+        "        work = asyncio.create_task(asyncio.sleep(3600))\n"
+        "        work.cancel()\n"
+        "        await work\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "hosted_tool", raising=False)
@@ -83,13 +88,17 @@ async def test_signals_are_for_the_process_not_for_a_hosted_node() -> None:
     assert await HostedProgram([], {}).start(main())
 
 
-@pytest.mark.parametrize(("word", "code"), [("end", 0), ("fail", 1), ("exit", 3)])
+@pytest.mark.parametrize(("word", "code"), [("end", 0), ("fail", 1), ("exit", 3), ("lose", 1)])
 async def test_end_of_a_hosted_node_has_the_code_of_a_process(module: str, word: str, code: int) -> None:
     lines: list[str] = []
     node = HostedNode(plan(), command(module, word), lines.append, StopTimeouts())
     assert await node.run() == code
     assert lines[0] == "/robot/tool: started in this process"
     assert lines[1] == ("/robot/tool: ended" if code == 0 else f"/robot/tool: ended with exit code {code}")
+
+
+def test_end_by_a_signal_without_a_name_is_described() -> None:
+    assert describe_end(-signal.SIGRTMIN - 1) == f"was ended by signal {signal.SIGRTMIN + 1}"
 
 
 async def test_hosted_node_starts_again_until_it_is_told_to_end(module: str) -> None:
