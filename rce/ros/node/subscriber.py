@@ -6,7 +6,7 @@ import asyncio
 import inspect
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from rce.aio.queues import BoundedQueue
 from rce.aio.tasks import TaskScope, pass_cancellation
@@ -64,7 +64,13 @@ class CallbackSink:
         """Call."""
         del source
         try:
-            self._callback(payload, latched)
+            result = self._callback(payload, latched)
+            if inspect.iscoroutine(result):
+                result.close()
+                raise TypeError(  # noqa: TRY301 - logged below, as what the callback raises
+                    "the callback is a plain function, but returned a coroutine, which is not awaited;"
+                    " give the coroutine function itself, or a functools.partial of it"
+                )
         except Exception:  # noqa: BLE001 - the program's own fault, which must not stop the next message
             _log.exception("the callback of %s failed", self._topic)
 
@@ -180,12 +186,18 @@ async def call_in_order(
             _log.exception("the callback of %s failed", topic)
 
 
+def _is_async(callback: Callable[..., Any]) -> bool:
+    """Return whether a callback is a coroutine function, or an object that is called like one."""
+    return inspect.iscoroutinefunction(callback) or inspect.iscoroutinefunction(type(callback).__call__)
+
+
 def sink_for(callback: ItemCallback, queue_size: int, topic: str, tasks: TaskScope) -> Sink:
     """Make a sink that gives messages to ``callback``, a function or coroutine function."""
-    if not inspect.iscoroutinefunction(callback):
+    if not _is_async(callback):
         return CallbackSink(callback, topic)
     sink = QueueSink(queue_size)
-    tasks.spawn(call_in_order(sink, callback, topic), name=f"callback of {topic}")
+    asynchronous = cast("Callable[[Any, bool], Awaitable[None]]", callback)
+    tasks.spawn(call_in_order(sink, asynchronous, topic), name=f"callback of {topic}")
     return sink
 
 
@@ -198,17 +210,18 @@ def decode(message_type: MessageType, payload: Item) -> Message:
 
 def decoding(message_type: MessageType, callback: MessageCallback) -> ItemCallback:
     """Turn a callback that takes messages into one that takes their bytes."""
-    if inspect.iscoroutinefunction(callback):
+    if _is_async(callback):
+        asynchronous = cast("Callable[[Any], Awaitable[None]]", callback)
 
         async def decode_and_wait(payload: Item, latched: bool) -> None:
             del latched
-            await callback(decode(message_type, payload))
+            await asynchronous(decode(message_type, payload))
 
         return decode_and_wait
 
-    def decode_and_call(payload: Item, latched: bool) -> None:
+    def decode_and_call(payload: Item, latched: bool) -> Awaitable[None] | None:
         del latched
-        callback(decode(message_type, payload))
+        return callback(decode(message_type, payload))
 
     return decode_and_call
 

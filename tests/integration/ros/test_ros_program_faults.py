@@ -148,3 +148,36 @@ async def test_failing_parameter_callback_keeps_the_node_registered(
         assert await asyncio.wait_for(told.get(), 10) == 2
     assert "the callback of parameter /p failed" in caplog.text
     assert not [record for record in caplog.records if record.levelno >= logging.CRITICAL]
+
+
+async def test_callable_object_with_a_coroutine_is_awaited(make_node: MakeNode) -> None:
+    class Taker:
+        def __init__(self) -> None:
+            self.got: asyncio.Queue[str] = asyncio.Queue()
+
+        async def __call__(self, message: Message) -> None:
+            self.got.put_nowait(message.data)
+
+    async with make_node("a") as a, make_node("b") as b:
+        taker = Taker()
+        await b.subscribe("t", STRING, taker)
+        publisher = await a.advertise("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        publisher.publish(data="hello")
+        assert await asyncio.wait_for(taker.got.get(), 10) == "hello"
+
+
+async def test_function_that_returns_a_coroutine_is_reported(
+    make_node: MakeNode, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def take(_: Message) -> None:
+        raise AssertionError("nothing awaits it")
+
+    async with make_node("a") as a, make_node("b") as b:
+        await b.subscribe("t", STRING, lambda message: take(message))  # noqa: PLW0108 - the mistake
+        publisher = await a.advertise("t", STRING)
+        after = await b.subscribe("t", STRING)
+        await publisher.wait_for_subscribers(timeout=10)
+        publisher.publish(data="hello")
+        await asyncio.wait_for(anext(after), 10)
+    assert "give the coroutine function itself" in caplog.text
