@@ -17,6 +17,7 @@ import yaml
 from rce.cli.program_files import from_file
 from rce.config import start_logging
 from rce.ros.errors import RosError
+from rce.ros.multimaster.addresses import split_host
 from rce.ros.multimaster.errors import MultimasterError
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.relay.link import DEFAULT_PORT as RELAY_PORT
@@ -132,10 +133,10 @@ def _namespaces(texts: list[str]) -> dict[str, str]:
 
 
 def _address(text: str) -> tuple[str, int]:
-    host, _, port = text.partition(":")
-    if not host or not (port or "0").isdigit():
-        raise MultimasterError(f"{text!r} is not HOST or HOST:PORT")
-    return host, int(port) if port else RELAY_PORT
+    try:
+        return split_host(text, RELAY_PORT)
+    except ValueError as error:
+        raise MultimasterError(str(error)) from error
 
 
 def read_lists(file: Path | None, options: Mapping[str, list[Any]]) -> SyncLists:

@@ -19,12 +19,30 @@ RPC_PORT_OFFSET = 300
 """A discovery's RPC server has its master's port plus this."""
 
 DEFAULT_MASTER_PORT = 11311
+_MAX_PORT = 65535
+_LONGEST_PORT = 6
+"""Digits that tell a port, or that a number is too large for one."""
 
 
 def split_group(text: str) -> tuple[str, str]:
     """Split ``group@interface``; either part may be missing."""
     group, _, interface = text.partition("@")
     return group or DEFAULT_GROUP, interface
+
+
+def split_host(text: str, default: int) -> tuple[str, int]:
+    """Split ``HOST`` or ``HOST:PORT``; without a port it is ``default``.
+
+    Raises:
+        ValueError: The text has another form, or the port is not one of 1 to 65535.
+    """
+    host, colon, port = text.partition(":")
+    if not host or host.strip() != host or (colon and not (port.isascii() and port.isdigit())):
+        raise ValueError(f"{text!r} is not HOST or HOST:PORT")
+    number = int(port[:_LONGEST_PORT]) if colon else default
+    if not 0 < number <= _MAX_PORT:
+        raise ValueError(f"{text!r}: a port is a number of 1 to {_MAX_PORT}")
+    return host, number
 
 
 async def address_of(interface: str) -> str:

@@ -11,6 +11,7 @@ from rce.ros.multimaster.addresses import (
     DEFAULT_MASTER_PORT,
     DEFAULT_PORT,
     RPC_PORT_OFFSET,
+    split_host,
 )
 from rce.ros.multimaster.heartbeat import MAX_RATE
 from rce.ros.multimaster.peer_table import LivenessSettings
@@ -59,6 +60,8 @@ class DiscoverySettings:
             )
         if not self.rosmaster_hz > 0:
             raise ValueError(f"rosmaster_hz must be above 0, not {self.rosmaster_hz:g}")
+        for host in self.robot_hosts:
+            split_host(host, self.mcast_port)
 
     @property
     def liveness(self) -> LivenessSettings:
@@ -74,8 +77,7 @@ class DiscoverySettings:
     @property
     def robot_addresses(self) -> list[tuple[str, int]]:
         """The robot hosts with their ports."""
-        parts = (host.rpartition(":") for host in self.robot_hosts)
-        return [(name, int(port)) if name else (port, self.mcast_port) for name, _, port in parts]
+        return [split_host(host, self.mcast_port) for host in self.robot_hosts]
 
     def rpc_port_for(self, master_uri: str) -> int:
         """Return the RPC server's port for a master."""

@@ -55,6 +55,14 @@ def test_robot_hosts_may_have_ports() -> None:
     assert settings.robot_addresses == [("robot1", 11511), ("robot2", 5000)]
 
 
+@pytest.mark.parametrize(
+    "host", ["", ":5", "robot:", "robot:x", "robot:0", "robot:65536", "r:1:2", " r", "r:²"]
+)
+def test_robot_hosts_of_another_form_are_refused(host: str) -> None:
+    with pytest.raises(ValueError, match=r"is not HOST or HOST:PORT|a port is a number of 1 to 65535"):
+        DiscoverySettings(robot_hosts=(host,))
+
+
 @pytest.mark.parametrize("hertz", [0, -1, 26, float("nan")])
 def test_rates_must_fit_a_heartbeat(hertz: float) -> None:
     with pytest.raises(ValueError, match="heartbeat_hz"):
