@@ -5,6 +5,8 @@ Keys are those of the RoboEarth Cloud Engine's files (``docs/protocol.md``).
 
 from __future__ import annotations
 
+import contextlib
+import ipaddress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
@@ -50,12 +52,19 @@ def _check_urls(given: Any) -> Any:
 def _check_url(url: str) -> str:
     try:
         parts = urlsplit(url)
-        valid = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+        valid = parts.scheme in ("http", "https") and _is_host(parts.hostname or "") and parts.port != 0
+        valid = valid and url.isprintable() and " " not in url
     except ValueError:
         valid = False
     if not valid:
         raise ValueError("must be the master's address such as http://master:9000/")
     return url
+
+
+def _is_host(host: str) -> bool:
+    with contextlib.suppress(ValueError):
+        return bool(ipaddress.ip_address(host))
+    return all(character.isalnum() or character in "-._" for character in host) and host.strip(".") != ""
 
 
 def _check_authority(text: str) -> str:

@@ -460,6 +460,29 @@ def test_urls_must_be_a_list_of_addresses(urls: object) -> None:
     assert "urls must be a list" in fault
 
 
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://a b:9000/",
+        "http://master:9000/a b",
+        "http://mas\tter:9000/",
+        "http://m,:9000/",
+        "http://.:9000/",
+    ],
+)
+def test_addresses_that_no_master_can_have_are_refused(url: str) -> None:
+    """The client would try them again and again, as if the master were away."""
+    (fault,) = faults(good() | {"url": url})
+    assert fault.startswith("url: must be the master's address")
+
+
+@pytest.mark.parametrize(
+    "url", ["http://[fe80::1]:9000/", "https://köln.example/", "http://my_robot-1.local"]
+)
+def test_unusual_addresses_are_taken(url: str) -> None:
+    assert loads(json.dumps(good() | {"url": url})).url == url
+
+
 @pytest.mark.parametrize("urls", [["ftp://two"], ["http://"], [""]])
 def test_urls_are_checked_like_url(urls: list[str]) -> None:
     (fault,) = faults(good() | {"urls": urls})
