@@ -8,15 +8,20 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from typing import Any
+from xmlrpc.client import MAXINT, MININT
 
 from rce.ros import names
 from rce.ros.core.events import Outcome
 from rce.ros.core.graph import ANY_TYPE, Graph
 from rce.ros.core.registrations import Kind
 from rce.ros.xmlrpc.arguments import graph_name
+from rce.ros.xmlrpc.codec import MAX_DEPTH
 from rce.ros.xmlrpc.dispatch import ERROR, FAILURE, SUCCESS, BadArgumentError, Method
 
 Answer = tuple[int, str, Any]
+
+MAX_NESTING = MAX_DEPTH // 4 - 2
+"""Levels of namespaces, dictionaries and lists: the answer with all parameters must be readable too."""
 
 NOTHING: dict[str, Any] = {
     "getUri": "",
@@ -170,8 +175,7 @@ class MasterApi:
 
     def _set_param(self, caller: str, key: Any, value: Any) -> Answer:
         name = _key(key, caller)
-        if _holds_none(value):
-            raise BadArgumentError("parameter [value] must be specified, and hold no nil")
+        _check_value(value, len(names.segments(name)))
         self._perform(self._graph.set_parameter(name, value, by=caller))
         return SUCCESS, f"parameter {name} set", 0
 
@@ -241,11 +245,25 @@ def _uri(role: str, value: Any) -> str:
     return value
 
 
-def _holds_none(value: Any) -> bool:
-    """Return whether a value is or holds XML-RPC's extension ``nil``, which not all clients can read."""
-    if isinstance(value, dict):
-        return any(map(_holds_none, value.values()))
-    return any(map(_holds_none, value)) if isinstance(value, list) else value is None
+def _check_value(value: Any, depth: int) -> None:
+    """Check that all clients can read a value, alone and with its namespaces.
+
+    Args:
+        value: Of a parameter, or a part of one.
+        depth: In how many namespaces and values it is.
+
+    Raises:
+        BadArgumentError: It is or holds XML-RPC's extensions ``nil`` or ``i8``, or is nested too deep.
+    """
+    if depth > MAX_NESTING:
+        raise BadArgumentError(f"parameter [value] is nested deeper than {MAX_NESTING} levels")
+    if isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            _check_value(part, depth + 1)
+    elif value is None:
+        raise BadArgumentError("parameter [value] must be specified, and hold no nil")
+    elif isinstance(value, int) and not MININT <= value <= MAXINT:
+        raise BadArgumentError("parameter [value] must not hold integers beyond 32 bits")
 
 
 def roslaunch_methods() -> dict[str, Method]:

@@ -218,6 +218,29 @@ async def test_unknown_methods_are_faults(core: Core) -> None:
         assert "registerPublisher" in await rpc.call(core.uri, "system.listMethods", ())
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "problem"),
+    [
+        ("/big", b"<i8>1099511627776</i8>", "beyond 32 bits"),
+        ("/big", b"<array><data><value><i8>-2147483649</i8></value></data></array>", "beyond 32 bits"),
+        ("/deep" * 60, b"<int>1</int>", "nested deeper"),
+        ("/deep" * 3000, b"<int>1</int>", "nested deeper"),
+    ],
+    ids=["integer", "integer in a list", "name", "very long name"],
+)
+async def test_a_parameter_that_cannot_be_answered_is_refused(
+    core: Core, name: str, value: bytes, problem: str
+) -> None:
+    """Else no client could read all parameters, or their names, any more."""
+    document = encode_call("setParam", ("/x", name, "VALUE")).replace(b"<string>VALUE</string>", value)
+    async with RpcClient() as rpc:
+        status, text, _ = await rpc.send(core.uri, "setParam", document)
+        assert (status, problem in text) == (-1, True), text
+        await rpc.call(core.uri, "setParam", ("/x", "/deep" * 40, [2**31 - 1, {"a": -(2**31)}]))
+        assert (await rpc.call(core.uri, "getParam", ("/x", "/")))[0] == 1
+        assert (await rpc.call(core.uri, "getParamNames", ("/x",)))[0] == 1
+
+
 async def test_a_repeated_update_comes_before_later_ones(core: Core) -> None:
     """The update of a namespace must not undo that of a parameter in it, which was set later."""
     calls: asyncio.Queue[bytes] = asyncio.Queue()
