@@ -244,9 +244,13 @@ def interpreter_paths() -> list[Path]:
 
 @cache
 def _compile() -> None:
-    """Compile the modules here, once: inside they are read-only, and each container would do it again."""
+    """Compile the modules here, once: inside they are read-only, and each container would do it again.
+
+    In folders of another user nothing could be kept: all would be compiled in vain, at each start.
+    """
     for folder in _python_packages():
-        compileall.compile_dir(folder, quiet=2)
+        if os.access(folder, os.W_OK):
+            compileall.compile_dir(folder, quiet=2)
 
 
 def _python_packages() -> list[Path]:

@@ -19,6 +19,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 USER = "rce-test"
 SYSTEM_PYTHON = "/usr/bin/python3"
+_IMPORTED = ("rce", "rce_container", "rce_fleet")
 SECRET = "what-only-the-engine-of-the-tests-may-know"
 
 
@@ -104,6 +105,10 @@ def _copy_engine(folder: Path) -> str:
     if subprocess.run(["cp", "-al", source, site], capture_output=True, check=False).returncode:
         shutil.rmtree(site, ignore_errors=True)
         subprocess.run(["cp", "-a", source, site], check=True)
-    for name in ("rce", "rce_container", "rce_fleet", "examples", "configs", "tests/support"):
-        shutil.copytree(ROOT / name, folder / "source" / name, ignore=shutil.ignore_patterns("__pycache__"))
-    return str(folder / "venv" / "bin" / "python")
+    for name in (*_IMPORTED, "examples", "configs", "tests/support"):
+        shutil.copytree(ROOT / name, folder / "source" / name)  # with bytecode
+    python = str(folder / "venv" / "bin" / "python")
+    # They cannot keep bytecode there: what has none now would be compiled by each of their programs.
+    imported = [folder / "source" / name for name in _IMPORTED]
+    subprocess.run([python, "-m", "compileall", "-q", *imported], check=True)
+    return python
