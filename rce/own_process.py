@@ -45,7 +45,7 @@ def open_missing_streams() -> None:
 
 
 def raise_file_limit() -> int:
-    """Raise the limit of open files to the most that the system allows, also for child processes.
+    """Raise the limit of open files to the most that the system allows this user, also for child processes.
 
     The usual soft limit of 1024 is there for old programs; a server needs a socket for each of its clients.
 
@@ -53,6 +53,10 @@ def raise_file_limit() -> int:
         The new limit.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < _ENOUGH:
+        with contextlib.suppress(OSError, ValueError):  # only root may raise it
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, _ENOUGH))
+            hard = _ENOUGH
     wanted = _ENOUGH if hard == resource.RLIM_INFINITY else min(hard, _ENOUGH)
     if soft == resource.RLIM_INFINITY or soft >= wanted:
         return soft

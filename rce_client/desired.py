@@ -176,17 +176,17 @@ def merge_removals(requests: Iterable[Request]) -> list[Request]:
     """Return requests that :meth:`Desired.unrestored` returned as few requests, in their order."""
     merged: list[Request] = []
     for request in requests:
-        match merged[-1] if merged else None, request:
-            case ConfigureComponents() as last, ConfigureComponents():
-                merged[-1] = ConfigureComponents(
-                    remove_nodes=last.remove_nodes + request.remove_nodes,
-                    remove_interfaces=last.remove_interfaces + request.remove_interfaces,
-                    delete_param=last.delete_param + request.delete_param,
-                )
-            case ConfigureConnections() as last, ConfigureConnections():
-                merged[-1] = ConfigureConnections(disconnect=last.disconnect + request.disconnect)
-            case _:
-                merged.append(request)
+        last = merged[-1] if merged else None
+        if isinstance(last, ConfigureComponents) and isinstance(request, ConfigureComponents):
+            merged[-1] = ConfigureComponents(
+                remove_nodes=last.remove_nodes + request.remove_nodes,
+                remove_interfaces=last.remove_interfaces + request.remove_interfaces,
+                delete_param=last.delete_param + request.delete_param,
+            )
+        elif isinstance(last, ConfigureConnections) and isinstance(request, ConfigureConnections):
+            merged[-1] = ConfigureConnections(disconnect=last.disconnect + request.disconnect)
+        else:
+            merged.append(request)
     return merged
 
 

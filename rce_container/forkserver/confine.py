@@ -37,7 +37,7 @@ for each user of the machine.
 
 Numbers are those of ``setrlimit(2)``.
 """
-_FILES = 4096
+_FILES = 16384
 """The soft limit of open files; a process may raise it."""
 _NO_CORE = 1
 """The only size at which the kernel writes a core neither to a file nor to a program of the machine."""

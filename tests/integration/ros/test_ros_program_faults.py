@@ -151,7 +151,7 @@ async def test_failing_parameter_callback_keeps_the_node_registered(
 
 
 async def test_callable_object_with_a_coroutine_is_awaited(make_node: MakeNode) -> None:
-    class Taker:
+    class Listener:
         def __init__(self) -> None:
             self.got: asyncio.Queue[str] = asyncio.Queue()
 
@@ -159,12 +159,12 @@ async def test_callable_object_with_a_coroutine_is_awaited(make_node: MakeNode) 
             self.got.put_nowait(message.data)
 
     async with make_node("a") as a, make_node("b") as b:
-        taker = Taker()
-        await b.subscribe("t", STRING, taker)
+        listener = Listener()
+        await b.subscribe("t", STRING, listener)
         publisher = await a.advertise("t", STRING)
         await publisher.wait_for_subscribers(timeout=10)
         publisher.publish(data="hello")
-        assert await asyncio.wait_for(taker.got.get(), 10) == "hello"
+        assert await asyncio.wait_for(listener.got.get(), 10) == "hello"
 
 
 async def test_function_that_returns_a_coroutine_is_reported(
