@@ -104,6 +104,7 @@ class EngineCommandSource(CommandSource):
         self._offers: dict[str, set[str]] = {}
         """Endpoints with an interface, by its tag."""
         self._read_at = float("-inf")
+        self._reading: asyncio.Task[None] | None = None
 
     async def open(self, robot: str, command: RobotCommand) -> CommandSender:
         """Connect the station's interface to the robot's."""
@@ -146,17 +147,38 @@ class EngineCommandSource(CommandSource):
         return set() if connection is None else {connection.robot_id}
 
     async def _read_offers(self) -> dict[str, set[str]]:
-        now = asyncio.get_running_loop().time()
-        if now - self._read_at > KEEP_S:
-            try:
-                items = await self._read_items("interfaces")
-            except Exception as error:
-                raise CommandError(f"the engine does not say what robots offer: {error}") from error
-            self._read_at = now
+        """Return the endpoints with an interface, by its tag. All who ask meanwhile share one answer.
+
+        With a thousand robots it has more than ten thousand interfaces: reading them for each robot takes the
+        master so long that few robots are ever reached.
+        """
+        loop = asyncio.get_running_loop()
+        if self._reading is None and loop.time() - self._read_at > KEEP_S:
+            self._reading = asyncio.create_task(self._read())
+            self._reading.add_done_callback(_take_note)
+        if self._reading is not None:
+            await asyncio.wait([reading := self._reading])
+            reading.result()
+        return self._offers
+
+    async def _read(self) -> None:
+        try:
+            items = await self._read_items("interfaces")
+        except Exception as error:
+            raise CommandError(f"the engine does not say what robots offer: {error}") from error
+        else:
             self._offers = {}
             for item in items:
                 self._offers.setdefault(item["tag"], set()).add(str(item["endpoint"]))
-        return self._offers
+            self._read_at = asyncio.get_running_loop().time()
+        finally:
+            self._reading = None
+
+
+def _take_note(reading: asyncio.Task[None]) -> None:
+    """Retrieve the error of a reading: those who still wait for it raise it."""
+    if not reading.cancelled():
+        reading.exception()
 
 
 class _EngineSender(CommandSender):
