@@ -47,6 +47,13 @@ def attribute(name: str) -> str:
     return f"{name}_" if keyword.iskeyword(name) else name
 
 
+def repetitions(field: Field) -> int:
+    """Return how many elements the shortest value has: 0 for a variable array, 1 if it is no array."""
+    if not field.is_array:
+        return 1
+    return field.length or 0
+
+
 def min_size(field: Field) -> int:
     """Return the bytes of the shortest value of a field on the wire."""
     if field.is_array and field.length is None:

@@ -15,13 +15,19 @@ from rce.ros.types.definition import (
     checksum_text,
     md5,
 )
-from rce.ros.types.exceptions import UnknownTypeError
-from rce.ros.types.fields import Buffer, Field, min_size
+from rce.ros.types.exceptions import BadDefinitionError, UnknownTypeError
+from rce.ros.types.fields import Buffer, Field, min_size, repetitions
 from rce.ros.types.objects import make_class, make_codec, make_message
 from rce.ros.types.values import BUILTINS, Message
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
+MAX_ELEMENTS = 1 << 21
+"""Most values in a message of defaults: arrays of arrays multiply what each may ask for."""
+
+MAX_HOLLOW_ELEMENTS = 16
+"""Most messages without content in one message, beside those in variable arrays."""
 
 
 class MessageType:
@@ -39,6 +45,7 @@ class MessageType:
         self.own_text = definition.text
         self.constants: tuple[Constant, ...] = definition.constants
         self.fields = tuple(_field(raw, definition, resolve) for raw in definition.fields)
+        self._check_elements(definition)
         nested = {field.message.name: field.message for field in self.fields if field.message is not None}
         self.checksum_text = checksum_text(definition, lambda name: nested[name].md5sum)
         self.md5sum = md5(self.checksum_text)
@@ -68,6 +75,41 @@ class MessageType:
     def min_size(self) -> int:
         """Bytes of the shortest message on the wire."""
         return sum(min_size(field) for field in self.fields)
+
+    @cached_property
+    def elements(self) -> int:
+        """Values in a message of defaults, nested messages included: what fixed arrays ask for."""
+        return sum(
+            repetitions(field) * (1 + (field.message.elements if field.message is not None else 0))
+            for field in self.fields
+        )
+
+    @cached_property
+    def hollow_elements(self) -> int:
+        """Messages in one of this type that take no byte on the wire: its length does not bound them."""
+        return sum(
+            repetitions(field) * (field.message.hollow_elements + (field.message.min_size == 0))
+            for field in self.fields
+            if field.message is not None
+        )
+
+    def _check_elements(self, definition: Definition) -> None:
+        """Refuse a type whose fixed arrays would fill the memory, or whose messages read for seconds.
+
+        Raises:
+            BadDefinitionError: It holds too many elements.
+        """
+        if self.elements > MAX_ELEMENTS:
+            problem = (
+                f"its fixed arrays have {self.elements} elements in all, at most {MAX_ELEMENTS} are allowed"
+            )
+            raise BadDefinitionError(definition.source, 0, problem)
+        if self.hollow_elements > MAX_HOLLOW_ELEMENTS:
+            problem = (
+                f"it holds {self.hollow_elements} messages without content,"
+                f" at most {MAX_HOLLOW_ELEMENTS} are allowed"
+            )
+            raise BadDefinitionError(definition.source, 0, problem)
 
     @cached_property
     def cls(self) -> type[Message]:

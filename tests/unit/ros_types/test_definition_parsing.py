@@ -104,6 +104,30 @@ def test_a_type_that_holds_itself_is_refused() -> None:
         TypeRegistry().from_definition("a/A", f"B b\n{separator}\nMSG: a/B\nA[] a\n")
 
 
+@pytest.mark.parametrize(
+    ("outer", "inner", "part"),
+    [
+        ("B[1000] b", "C[1000] c\nfloat64 x", "1001002000 elements in all"),
+        ("uint8 x\nB[4] b", "C[5] c", "24 messages without content"),
+        ("B[600] b", "C[600] c", "messages without content"),
+        ("B b", "float64[1048576] x\nfloat64[1048576] y", "2097153 elements in all"),
+    ],
+)
+def test_fixed_arrays_are_bounded_together(outer: str, inner: str, part: str) -> None:
+    """What they multiply to takes memory and time that no length of a message bounds."""
+    separator = "=" * 80
+    innermost = "float64[1000] x" if "x" in inner else "# nothing"
+    text = f"{outer}\n{separator}\nMSG: a/B\n{inner}\n{separator}\nMSG: a/C\n{innermost}\n"
+    with pytest.raises(BadDefinitionError, match=part):
+        TypeRegistry().from_definition("a/A", text)
+
+
+def test_usual_fixed_arrays_are_allowed() -> None:
+    separator = "=" * 80
+    text = f"B[2] b\nuint8[1048576] image\nC[] many\n{separator}\nMSG: a/B\nC[5] c\n{separator}\nMSG: a/C\n"
+    assert len(TypeRegistry().from_definition("a/A", text).new().image) == 1 << 20
+
+
 def test_an_unknown_type_is_told_with_the_place_that_needs_it(tmp_path: Path) -> None:
     messages = tmp_path / "mine" / "msg"
     messages.mkdir(parents=True)
