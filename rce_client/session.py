@@ -60,8 +60,11 @@ _log = logging.getLogger(__name__)
 CONNECTING = "looking for the engine"
 """The words of the first report of an attempt; the reports of failures tell what went wrong."""
 
-KEPT_REMOVALS = 256
-"""As many of the newest removals that the engine received are repeated too: it may have dropped them."""
+MAX_RECEIVED = 256
+"""Most removals that are kept until it is sure that the engine did not drop them."""
+
+REPORTED_WITHIN_S = 10.0
+"""In this time after the engine received a request, it reports that it dropped it."""
 
 
 def _take_note(sent: asyncio.Future[None]) -> None:
@@ -112,9 +115,11 @@ class Session:
         self._unconfirmed: dict[object, Request] = {}
         """Removals, and others that :attr:`desired` does not restore, which the engine may not have received;
         oldest first."""
-        self._received: deque[Request] = deque(maxlen=KEPT_REMOVALS)
-        """The newest of them that the engine received, which it may have dropped; oldest first."""
-        self._repetition = Repetition(self.spawn, self._repeat_all, self._received.clear)
+        self._received: deque[tuple[float, Request]] = deque(maxlen=MAX_RECEIVED)
+        """Those that the engine received lately, and when; oldest first."""
+        self._maybe_dropped: deque[Request] = deque(maxlen=MAX_RECEIVED)
+        """Those that it may have dropped, until it has taken all requests; oldest first."""
+        self._repetition = Repetition(self.spawn, self._repeat_all, self._maybe_dropped.clear)
         self._was_connected = False
         self._refusal: RefusedError | None = None
         self._reminder = Reminder()
@@ -342,13 +347,24 @@ class Session:
     def _confirm(self, key: object) -> None:
         """Learn that the engine received a request that no restoring repeats."""
         if (request := self._unconfirmed.pop(key, None)) is not None:
-            self._received.append(request)
+            self._received.append((asyncio.get_running_loop().time(), request))
+
+    def _take_drop(self) -> None:
+        """Learn that the engine dropped a request: repeat all, with the removals that it may have been.
+
+        No older removal is repeated: another program may have made a thing of that name since.
+        """
+        since = asyncio.get_running_loop().time() - REPORTED_WITHIN_S
+        self._maybe_dropped.extend(request for at, request in self._received if at >= since)
+        self._received.clear()
+        self._maybe_dropped.extend(self._unconfirmed.values())
+        self._repetition.note_drop()
 
     async def _repeat_all(self) -> None:
         """Send all requests again that the engine may have dropped; after a reconnect, what is desired."""
         if self._refusal is not None:
             return
-        for request in merge_removals(self._received):
+        for request in merge_removals(self._maybe_dropped):
             for part in parts_of(request):
                 self.transport.deliver(encode(part)).add_done_callback(_take_note)
         await self.repeat()
@@ -364,7 +380,7 @@ class Session:
         if call is None:
             self._take_error(report.text)
             if report.code is FaultCode.BUSY:
-                self._repetition.note_drop()
+                self._take_drop()
         else:
             self.interfaces.fail(call.i_tag, call.msg_id, report.text.removeprefix(f"{call}: "))
 
