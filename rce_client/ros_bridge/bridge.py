@@ -35,6 +35,9 @@ MASTER_TIMEOUT = 2.0
 REMINDER = 5.0
 """Seconds between two messages about interfaces that are not connected yet."""
 
+SHOWN_NAMES = 10
+"""Most interfaces that such a message names: a file of many robots has hundreds."""
+
 RETRY = Backoff(first=0.5, longest=10.0, jitter=0.5)
 """Pauses between attempts to register a topic or service at the robot's ROS master."""
 
@@ -233,6 +236,12 @@ class Downlink:
             self._publisher.unlatch(source)
 
 
+def listed(names: Sequence[str]) -> str:
+    """Return names for a line of a log: the first few, and how many more there are."""
+    shown = ", ".join(names[:SHOWN_NAMES])
+    return shown if len(names) <= SHOWN_NAMES else f"{shown} and {len(names) - SHOWN_NAMES} more"
+
+
 async def wait_ready(plan: Plan, conn: Connection, say: Callable[[str], None]) -> None:
     """Wait until every interface that the config connects has its peer; log the missing ones.
 
@@ -246,5 +255,5 @@ async def wait_ready(plan: Plan, conn: Connection, say: Callable[[str], None]) -
                     await conn.wait_active(tag)
         missing = sorted(tag for tag in plan.awaited if not conn.active.get(tag, False))
         if missing:
-            say(f"waiting for interfaces: {', '.join(missing)}")
+            say(f"waiting for interfaces: {listed(missing)}")
             await conn.repeat_requests()

@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from rce_client import Serialized
-from rce_client.ros_bridge.bridge import Downlink, Uplink
+from rce_client.ros_bridge.bridge import SHOWN_NAMES, Downlink, Uplink, listed
 from rce_client.topics import Publisher
 
 if TYPE_CHECKING:
@@ -121,3 +121,10 @@ def test_what_the_cloud_latches_is_latched_at_the_robot() -> None:
     assert topic.published == [b"pose", b"5.1", b"5.2"]
     link.keep_latched(("5.2", "5.3"))
     assert topic.latched == {"5.2": b"5.2"}
+
+
+def test_a_message_names_some_of_many_interfaces() -> None:
+    names = [f"pose{number}" for number in range(SHOWN_NAMES + 2)]
+    assert listed(names[:2]) == "pose0, pose1"
+    assert listed(names[:SHOWN_NAMES]).endswith(f", pose{SHOWN_NAMES - 1}")
+    assert listed(names).endswith(f", pose{SHOWN_NAMES - 1} and 2 more")
