@@ -72,8 +72,13 @@ async def main(authority, password, url):
     tls = ssl.create_default_context(cafile=authority)
     async with aiohttp.ClientSession() as session:
         body = {"userID": "alice", "password": password}
-        async with session.post(url + "api/v1/login", json=body, ssl=tls) as reply:
-            headers = {"Authorization": "Bearer " + (await reply.json())["token"]}
+        while True:  # 503: it does not know the new leader yet
+            async with session.post(url + "api/v1/login", json=body, ssl=tls) as reply:
+                login = await reply.json()
+                if reply.status != 503:
+                    break
+            await asyncio.sleep(0.2)
+        headers = {"Authorization": "Bearer " + login["token"]}
         async with session.get(url + "api/v1/robot-tokens", headers=headers, ssl=tls) as reply:
             print(json.dumps([token["robot"] for token in (await reply.json())["tokens"]]))
 
