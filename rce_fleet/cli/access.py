@@ -138,7 +138,7 @@ async def _do(station: str, work: Work, token: str, *, sends_login: bool) -> Non
 
 
 def why_not_sent(login: str, station: str) -> str:
-    """Return why the token of a login is not for a station: whoever gets it may do all that its user may.
+    """Return why a login's token is not for a station: one that gets it may do all that its user may.
 
     Args:
         login: URLs of the engine's masters, separated by commas.

@@ -48,7 +48,7 @@ def attribute(name: str) -> str:
 
 
 def repetitions(field: Field) -> int:
-    """Return how many elements the shortest value has: 0 for a variable array, 1 if it is no array."""
+    """Return how many elements the shortest value has: 0 for a variable array, 1 without an array."""
     if not field.is_array:
         return 1
     return field.length or 0

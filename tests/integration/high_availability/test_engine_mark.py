@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-import pytest_asyncio
 from support.engine import until
-from support.etcd import Cluster, cluster
 
 from rce.config.secret import Secret, new_secret, read_secret, retire_secrets, rotate_secret
 from rce_master.exceptions import StoreError
@@ -22,18 +19,6 @@ from rce_master.store.etcd.wire import Put
 pytestmark = [pytest.mark.needs("etcd"), pytest.mark.asyncio(loop_scope="module")]
 
 PREFIX = "/rce"
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def etcd(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Cluster]:
-    async with cluster(tmp_path_factory.mktemp("etcd")) as made:
-        yield made
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def client(etcd: Cluster) -> AsyncIterator[EtcdClient]:
-    async with EtcdClient(etcd.endpoints, attempt=20.0) as made:
-        yield made
 
 
 async def test_another_engine_is_refused(client: EtcdClient) -> None:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import aiohttp
 import pytest
-import pytest_asyncio
-from support.etcd import Cluster, CuttingProxy, cluster
+from support.etcd import Cluster, CuttingProxy
 from support.master_program import rce
 from support.store_laws import check_round_trip, check_snapshot, check_terms
 
@@ -24,18 +22,6 @@ from rce_master.store.etcd.wire import Put
 pytestmark = [pytest.mark.needs("etcd"), pytest.mark.asyncio(loop_scope="module")]
 
 _numbers = itertools.count(1)
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def etcd(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Cluster]:
-    async with cluster(tmp_path_factory.mktemp("etcd")) as made:
-        yield made
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def client(etcd: Cluster) -> AsyncIterator[EtcdClient]:
-    async with EtcdClient(etcd.endpoints, attempt=20.0) as made:
-        yield made
 
 
 @pytest.fixture

@@ -8,9 +8,8 @@ from collections.abc import AsyncIterator
 from itertools import count
 
 import pytest
-import pytest_asyncio
 from support.engine import until
-from support.etcd import Cluster, cluster
+from support.etcd import Cluster
 from support.go_between import GoBetween
 
 from rce.control.messages import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
@@ -30,18 +29,6 @@ from rce_master.store.etcd.wire import Delete, as_it_is
 pytestmark = [pytest.mark.needs("etcd"), pytest.mark.asyncio(loop_scope="module")]
 
 _prefixes = (f"/engine{number}" for number in count())
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def etcd(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Cluster]:
-    async with cluster(tmp_path_factory.mktemp("etcd")) as made:
-        yield made
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def client(etcd: Cluster) -> AsyncIterator[EtcdClient]:
-    async with EtcdClient(etcd.endpoints, attempt=20.0) as made:
-        yield made
 
 
 class Leader:

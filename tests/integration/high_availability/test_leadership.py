@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
 
 import pytest
-import pytest_asyncio
 from support.engine import until
-from support.etcd import Cluster, cluster
 
 from rce_master.exceptions import FencedError
 from rce_master.leadership import LeaseSettings, Role
@@ -20,18 +17,6 @@ pytestmark = [pytest.mark.needs("etcd"), pytest.mark.asyncio(loop_scope="module"
 
 PATIENT = LeaseSettings(ttl=30.0)
 PREFIX = "/rce"
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def etcd(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Cluster]:
-    async with cluster(tmp_path_factory.mktemp("etcd")) as made:
-        yield made
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def client(etcd: Cluster) -> AsyncIterator[EtcdClient]:
-    async with EtcdClient(etcd.endpoints, attempt=20.0) as made:
-        yield made
 
 
 async def test_one_keeper_leads_and_hands_over_at_once(client: EtcdClient) -> None:

@@ -8,9 +8,8 @@ from collections.abc import AsyncIterator
 from itertools import count
 
 import pytest
-import pytest_asyncio
 from support.engine import until
-from support.etcd import Cluster, cluster
+from support.etcd import Cluster
 from support.go_between import GoBetween
 
 from rce_master.follower import StateFollower
@@ -79,18 +78,6 @@ class Pipe(GoBetween):
         async with self.to_server() as (there, to), asyncio.TaskGroup() as group:
             group.create_task(to_member())
             group.create_task(from_member())
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def etcd(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Cluster]:
-    async with cluster(tmp_path_factory.mktemp("etcd")) as made:
-        yield made
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def client(etcd: Cluster) -> AsyncIterator[EtcdClient]:
-    async with EtcdClient(etcd.endpoints, attempt=20.0) as made:
-        yield made
 
 
 @contextlib.asynccontextmanager

@@ -124,7 +124,7 @@ def test_a_pose_of_no_numbers_is_only_a_sign_of_life(x: float) -> None:
     assert signs.sign(8.0, is_driving=False) == RobotSign(0.0)
 
 
-def test_the_heartbeat_is_of_whoever_was_silent_longer() -> None:
+def test_the_heartbeat_is_of_the_one_that_was_silent_longer() -> None:
     """A robot that stands is as old as what its move client heard of it, and as the report about it."""
     client = ClientOnly()
     client.planner.handle(PoseSeen("Robot1", 2.5, 3.5, 0.0), client.now)

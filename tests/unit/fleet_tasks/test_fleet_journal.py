@@ -71,7 +71,7 @@ def test_events_are_found_by_number_time_and_id(tmp_path: Path) -> None:
 
 
 def test_events_of_one_task_are_found_without_looking_at_all(tmp_path: Path) -> None:
-    """The journal has 200 000 events, and whoever waits for it to be written waits for the search, too."""
+    """The journal has 200 000 events, and those who wait for it to be written wait for the search, too."""
     book, journal = filled(), Journal(tmp_path / "j.sqlite")
     for _ in range(2000):
         book.create(ORDER, 9.0)

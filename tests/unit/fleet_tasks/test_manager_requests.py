@@ -132,7 +132,7 @@ async def test_the_etag_of_a_removed_zone_fits_no_new_one(client: ManagerClient,
 
 
 async def test_the_map_shows_a_cell_as_it_was_just_set(client: ManagerClient) -> None:
-    """The planner's change comes later; whoever blocked the cell looks at once."""
+    """The planner's change comes later; the person who blocked the cell looks at once."""
     assert (await client.ask("PUT", "/cells/5", {"blocked": True}))[0] == 200
     assert (await client.ask("GET", "/map"))[1]["blocked"] == [5]
     client.manager.facts.shut = frozenset({5, 9})
