@@ -88,7 +88,11 @@ def _one_shot(map_: Path, scen: Path, robots: int, seconds: float, name: str, se
     joint = planner.plan(problem)
     found.append(time.perf_counter())
     if not joint.complete:
-        raise PlanningError(f"no plan was found in {found[-1] - began:.1f} s; try another --seed")
+        if joint.impossible:
+            raise PlanningError("no plan exists: all moves were tried, and the robots cannot pass each other")
+        raise PlanningError(
+            f"no plan was found in {found[-1] - began:.1f} s; try more --seconds or another --seed"
+        )
     return {
         "robots": robots,
         "compile_s": round(compile_s, 4),

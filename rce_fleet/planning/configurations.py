@@ -85,6 +85,8 @@ class ConfigurationSearch:
         self._urgency = np.zeros((_CHUNK + 1, len(goals)), np.int32)
         self._facing = np.zeros((_CHUNK + 1, len(goals)), np.int32)
         self._fewest, self._since = len(goals) + 1, 0
+        self.exhausted = False
+        """Whether everything was tried: no plan exists."""
 
     def run(self, starts: Ints, rounds: int, urgency: Ints | None = None) -> tuple[Ints, bool]:
         """Return the configurations, shape (steps + 1, robots), and whether they end with the goals.
@@ -127,6 +129,7 @@ class ConfigurationSearch:
                 stack.append(reached)
                 if rests[row - 1] < best_rest:
                     best, best_rest = reached, int(rests[row - 1])
+        self.exhausted = not stack
         return _trace(best), np.array_equal(best.cells, self._goals)
 
     def _away(self, rows: Ints) -> NDArray[np.int64]:

@@ -12,7 +12,7 @@ improved by large-neighbourhood search.
 from __future__ import annotations
 
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -53,7 +53,20 @@ _RESTARTS = 0.15
 """Share of the time in which first plans are made from other seeds, before the best of them is improved."""
 _SMOOTHING = 1000
 """States of searches by robot, with which a plan is made straighter."""
+_NEXT_SEED = 7919
+"""Added to the seed for another search."""
 KERNELS = (*FIELD_KERNELS, roll_out, improve, enter_all, straighten, smooth, execute)
+
+
+class _Found(NamedTuple):
+    """What a search ended with."""
+
+    cells: Ints
+    """The configurations, shape (steps + 1, robots)."""
+    complete: bool
+    """Whether they end with the goals."""
+    impossible: bool
+    """Whether everything was tried."""
 
 
 class LacamPlanner:
@@ -81,18 +94,18 @@ class LacamPlanner:
             guide = part.compact(guided(problem.graph))
         if problem.motion is not None:
             return self._plan_in_motion(part, problem, problem.motion, guide, began + problem.seconds)
-        cells, complete = _search(part, problem, guide, problem.seed)
+        deadline = began + problem.seconds
+        cells, complete, impossible = _first(part, problem, guide, deadline)
         if not problem.rotations and cells.size * len(part.graph) < _MAX_IMPROVED * 16:
             straighten(cells, len(part.graph), ends_of(cells, part.goals, lifelong=problem.lifelong))
-        joint = JointPlan(part.original(cells), complete)
+        joint = JointPlan(part.original(cells), complete, impossible=impossible)
         if self._on_first is not None and complete:
             self._on_first(joint)
-        deadline = began + problem.seconds
         if not complete or perf_counter() >= deadline or cells.shape[1] * len(steps) > _MAX_IMPROVED:
             return joint
         seed = problem.seed
         while perf_counter() < began + _RESTARTS * problem.seconds:
-            seed += 7919
+            seed += _NEXT_SEED
             cells = _another(part, problem, guide, cells, seed)
         distances = _table(part, steps).astype(np.int32, copy=False)
         improver = Improver(
@@ -120,7 +133,7 @@ class LacamPlanner:
         effort = min(problem.effort, _SMOOTHING * len(part.starts))
         while True:
             for choice in (guided_turning, None):
-                cells, complete = _search(part, problem, guide, seed, choice)
+                cells, complete, _ = _search(part, problem, guide, seed, choice)
                 for smooth_effort in (0, effort) if complete else (0,):
                     if smooth_effort:
                         cells = smoothed(
@@ -136,7 +149,7 @@ class LacamPlanner:
                         if self._on_first is not None and complete and not best.complete:
                             self._on_first(joint)
                         best, least = joint, took
-            seed += 7919
+            seed += _NEXT_SEED
             if perf_counter() >= deadline:
                 return best
 
@@ -173,22 +186,38 @@ def _table(part: Compaction, graph: PlanningGraph) -> Table:
     return field_table(graph, part.goals)
 
 
+def _first(part: Compaction, problem: PlanningProblem, graph: PlanningGraph, deadline: float) -> _Found:
+    """Search with the problem's effort, then with other seeds and more effort while time is left."""
+    seed, effort = problem.seed, problem.effort
+    while True:
+        began = perf_counter()
+        found = _search(part, problem, graph, seed, effort=effort)
+        now = perf_counter()
+        if found.complete or found.impossible or now >= deadline:
+            return found
+        seed += _NEXT_SEED
+        effort = int(effort * min(2.0, (deadline - now) / (now - began))) + len(part.starts)
+
+
 def _search(
     part: Compaction,
     problem: PlanningProblem,
     graph: PlanningGraph,
     seed: int,
     turning: Turning | None = None,
-) -> tuple[Ints, bool]:
+    effort: int = 0,
+) -> _Found:
     search = ConfigurationSearch(
         graph, _table(part, graph), part.goals, rotations=problem.rotations, seed=seed, turning=turning
     )
-    return search.run(part.starts, problem.effort // len(part.starts), problem.urgency)
+    rounds = (effort or problem.effort) // len(part.starts)
+    cells, complete = search.run(part.starts, rounds, problem.urgency)
+    return _Found(cells, complete, search.exhausted)
 
 
 def _another(
     part: Compaction, problem: PlanningProblem, graph: PlanningGraph, cells: Ints, seed: int
 ) -> Ints:
     """Return a plan from another seed, or ``cells`` if it is not better."""
-    other, complete = _search(part, problem, graph, seed)
+    other, complete, _ = _search(part, problem, graph, seed)
     return other if complete and JointPlan(other, complete).cost < JointPlan(cells, complete).cost else cells

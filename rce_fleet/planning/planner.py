@@ -48,7 +48,8 @@ class PlanningProblem:
         starts: Node of each robot, shape (robots,), all different.
         goals: Goal of each robot, shape (robots,), all different.
         seed: The same problem with the same seed and no ``seconds`` gives the same plan.
-        effort: Moves of single robots that are tried at most until the first plan is found.
+        effort: Moves of single robots that are tried at most until the first plan is found; more
+            while ``seconds`` are left.
         seconds: Time for the whole plan; what the first plan leaves is used to improve it.
         rotations: Whether robots may follow one another around in a circle, as in the classic model. Robots
             that enter a cell only when it has been left cannot do that.
@@ -139,12 +140,14 @@ class JointPlan:
         conflict_free: Whether no two robots are in one node or change places in one step. A planner that
             plans each robot alone cannot promise that: the code that carries out the plan keeps robots apart.
         lower_bound: Sum of the robots' shortest distances in steps; -1 if the planner does not know it.
+        impossible: Whether everything was tried: no plan exists. False if the planner does not know.
     """
 
     cells: Ints
     complete: bool
     conflict_free: bool = True
     lower_bound: int = -1
+    impossible: bool = False
 
     @classmethod
     def of(cls, steps: Sequence[Sequence[int]], *, complete: bool, conflict_free: bool = True) -> JointPlan:

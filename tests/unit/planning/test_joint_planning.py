@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from random import Random
 from typing import Any
 
@@ -85,6 +86,21 @@ def test_aisles_filled_with_robots_are_solved() -> None:
     assert joint.complete
     paths = [joint.path(robot) for robot in range(40)]
     assert check_plan(SHELVES, paths, starts=starts, goals=goals, rotations=False) == []
+
+
+def test_time_that_is_left_goes_into_the_search_for_a_first_plan() -> None:
+    class FoundError(Exception):
+        pass
+
+    def found(joint: JointPlan) -> None:
+        raise FoundError
+
+    cells = sorted(SHELVES.free)
+    problem = problem_of(SHELVES, cells, 40, 3, effort=400, rotations=True)
+    planner = LacamPlanner(compiled=False, on_first=found)
+    assert not planner.plan(problem).complete  # ten configurations are too few
+    with pytest.raises(FoundError):
+        planner.plan(replace(problem, seconds=120.0))
 
 
 def test_improvement_lowers_the_cost() -> None:

@@ -124,3 +124,12 @@ def test_too_many_lifelong_robots_are_refused(files: tuple[Path, Path], tmp_path
     code, said = run(files[0], "--lifelong", "--robots", 40, "--output", tmp_path / "plan.json")
     assert code == 1
     assert "40 robots do not fit: the map has 18 connected free cells" in said
+
+
+def test_a_scenario_without_a_plan_is_said_to_have_none(tmp_path: Path) -> None:
+    map_, scen = tmp_path / "lane.map", tmp_path / "lane.scen"
+    map_.write_text("type octile\nheight 1\nwidth 4\nmap\n....\n")
+    scen.write_text("version 1\n0\tlane.map\t4\t1\t0\t0\t3\t0\t3\n0\tlane.map\t4\t1\t3\t0\t0\t0\t3\n")
+    code, said = run(map_, "--scen", scen, "--robots", 2, "--seconds", 20, "--output", tmp_path / "o.json")
+    assert code == 1
+    assert "no plan exists" in said
