@@ -1,6 +1,7 @@
 """CARMEN logs, the text format of most published laser logs, plain or compressed with gzip.
 
-The order of the lines rules; times may go backwards. Records other than ``ODOM`` and ``FLASER`` are skipped.
+The order of the lines rules; times may go backwards. Records other than ``ODOM`` and those of the front
+laser, ``FLASER`` and in newer logs ``ROBOTLASER1``, are skipped.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rce_fleet.exceptions import LogError
+from rce_fleet.geometry.poses import Pose
 from rce_fleet.mapping.records import LaserRecord, ScanLog, no_return_range
 
 if TYPE_CHECKING:
@@ -29,6 +31,13 @@ ODOM_FIELDS = 7
 """``ODOM x y theta tv rv accel ipc_time``; what follows is not needed."""
 FLASER_TAIL = 7
 """``x y theta odom_x odom_y odom_theta ipc_time`` after the ranges of a ``FLASER``."""
+ROBOTLASER_HEAD = 8
+"""``laser_type start_angle field_of_view angular_resolution maximum_range accuracy remission_mode
+num_readings`` before the ranges of a ``ROBOTLASER1``; angles are in radians, ranges in metres."""
+ROBOTLASER_TAILS = (10, 11)
+"""``laser_x laser_y laser_theta robot_x robot_y robot_theta laser_tv laser_rv forward_safety_dist
+side_safety_dist``, then ``turn_axis`` in newer logs: fields between a ``ROBOTLASER1``'s ranges and its
+``ipc_time ipc_hostname logger_time``. Most loggers write ``num_remissions`` and remissions before them."""
 MOST_BEAMS = 100_000
 CLOSE_ODOMETRY_S = 1.0
 """Odometry is interpolated between two records that are at most this far apart, seconds."""
@@ -40,9 +49,17 @@ Odometry = tuple[float, float, float]
 class _Scan:
     time: float
     readings: NDArray[np.float64]
+    start: float
+    """Direction of the first beam, radians."""
+    step: float
+    """Angle from one beam to the next, radians."""
     odometry: Odometry
     before: int
     """Number of ODOM records that precede it."""
+    farthest: float = inf
+    """Greatest range of the laser, metres."""
+    laser: Odometry = (0.0, 0.0, 0.0)
+    """Pose of the laser on the robot."""
 
 
 @dataclass(slots=True)
@@ -57,12 +74,12 @@ def read_carmen(path: Path) -> ScanLog:
     """Read a CARMEN log.
 
     A scan's odometry is that of the ``ODOM`` record before it, interpolated where the next record is near in
-    time; in a log without ``ODOM`` records it is the odometry in the ``FLASER`` record.
+    time; in a log without ``ODOM`` records it is the odometry in the scan's own record.
 
     Lines that cannot be parsed are left out and listed in ``faults`` of the result.
 
     Raises:
-        LogError: If the file cannot be opened, is empty, or has no usable ``FLASER`` record.
+        LogError: If the file cannot be opened, is empty, or has no usable scan.
     """
     parsed = _Parsed()
     number = 0
@@ -97,7 +114,9 @@ def _parse(line: str, place: str, into: _Parsed) -> None:
                 into.odometry.append(_odom(rest.split()))
             case "FLASER":
                 into.scans.append(_flaser(rest.split(), len(into.odometry)))
-            case "" | "PARAM" | "NEFF":
+            case "ROBOTLASER1":
+                into.scans.append(_robotlaser(rest.split(), len(into.odometry)))
+            case "" | "PARAM" | "NEFF" | "SYNC":
                 pass
             case other if other.startswith("#"):
                 pass
@@ -114,18 +133,54 @@ def _odom(fields: list[str]) -> tuple[float, Odometry]:
 
 
 def _flaser(fields: list[str], before: int) -> _Scan:
-    count = int(fields[0]) if fields and fields[0].isdecimal() else -1
-    if not 0 <= count <= MOST_BEAMS:
-        raise ValueError(
-            f"expected a number of ranges up to {MOST_BEAMS}, found {fields[0] if fields else 'nothing'}"
-        )
+    count = _count(fields[0] if fields else "")
     if len(fields) < 1 + count + FLASER_TAIL:
         raise ValueError(
             f"expected {count} ranges and {FLASER_TAIL} more fields, found {len(fields) - 1} in all"
         )
     readings = np.array(fields[1 : 1 + count], np.float64)
     tail = fields[1 + count :]
-    return _Scan(_number(tail[6], "ipc_time"), readings, _pose(tail[3:6]), before)
+    step = pi / (count - 1 if count in {181, 361} else max(count, 1))
+    return _Scan(_number(tail[6], "ipc_time"), readings, -pi / 2, step, _pose(tail[3:6]), before)
+
+
+def _robotlaser(fields: list[str], before: int) -> _Scan:
+    if len(fields) < ROBOTLASER_HEAD:
+        raise ValueError(f"expected at least {ROBOTLASER_HEAD} fields, found {len(fields)}")
+    count = _count(fields[ROBOTLASER_HEAD - 1])
+    body, end = fields[ROBOTLASER_HEAD + count : -3], fields[-3:]
+    if body and body[0].isdecimal() and len(body) - 1 - int(body[0]) in ROBOTLASER_TAILS:
+        body = body[1 + int(body[0]) :]
+    if len(body) not in ROBOTLASER_TAILS:
+        raise ValueError(
+            f"expected {count} ranges, remissions and {ROBOTLASER_TAILS[0]} more fields before ipc_time, "
+            f"found {len(fields) - ROBOTLASER_HEAD - len(end)} in all"
+        )
+    start, step, farthest = (
+        _number(fields[place], name)
+        for place, name in ((1, "start_angle"), (3, "angular_resolution"), (4, "maximum_range"))
+    )
+    if step <= 0:
+        raise ValueError(f"angular_resolution: expected more than 0, found {fields[3]}")
+    laser, robot = Pose(*_pose(body[:3])), Pose(*_pose(body[3:6]))
+    place = laser.relative_to(robot)
+    return _Scan(
+        time=_number(end[0], "ipc_time"),
+        readings=np.array(fields[ROBOTLASER_HEAD : ROBOTLASER_HEAD + count], np.float64),
+        start=start,
+        step=step,
+        odometry=(robot.x, robot.y, robot.yaw),
+        before=before,
+        farthest=farthest if farthest > 0 else inf,
+        laser=(place.x, place.y, place.yaw),
+    )
+
+
+def _count(text: str) -> int:
+    count = int(text) if text.isdecimal() else -1
+    if not 0 <= count <= MOST_BEAMS:
+        raise ValueError(f"expected a number of ranges up to {MOST_BEAMS}, found {text or 'nothing'}")
+    return count
 
 
 def _pose(fields: list[str]) -> Odometry:
@@ -142,9 +197,9 @@ def _number(text: str, name: str) -> float:
 
 def _without_scans(path: Path, lines: int, parsed: _Parsed) -> str:
     if lines == 0:
-        return f"{path}: the log is empty; expected a CARMEN log with FLASER records"
+        return f"{path}: the log is empty; expected a CARMEN log with FLASER or ROBOTLASER1 records"
     found = ", ".join(f"{count} {kind}" for kind, count in parsed.unknown.most_common(5))
-    reason = f"{path}: no laser scan in {lines} lines; expected FLASER records"
+    reason = f"{path}: no laser scan in {lines} lines; expected FLASER or ROBOTLASER1 records"
     if parsed.odometry:
         reason += f", found {len(parsed.odometry)} ODOM"
     if found:
@@ -157,18 +212,19 @@ def _without_scans(path: Path, lines: int, parsed: _Parsed) -> str:
 def _records(parsed: _Parsed, farthest: float) -> list[LaserRecord]:
     records = []
     for index, scan in enumerate(parsed.scans):
-        count = len(scan.readings)
+        limit = min(farthest, scan.farthest)
         with np.errstate(invalid="ignore"):
-            usable = (scan.readings > 0) & (scan.readings < farthest)
+            usable = (scan.readings > 0) & (scan.readings < limit)
         records.append(
             LaserRecord(
                 index=index,
                 time=scan.time,
                 ranges=np.where(usable, scan.readings, inf),
-                angle_min=-pi / 2,
-                angle_increment=pi / (count - 1 if count in {181, 361} else max(count, 1)),
-                range_max=farthest,
+                angle_min=scan.start,
+                angle_increment=scan.step,
+                range_max=limit,
                 odometry=_odometry_of(scan, parsed.odometry),
+                laser=scan.laser,
             )
         )
     return records

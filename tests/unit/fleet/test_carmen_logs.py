@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gzip
-from math import inf, isclose, pi
+from math import cos, inf, isclose, pi, sin
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +59,43 @@ def test_odometry_comes_from_the_odom_before(tmp_path: Path) -> None:
     assert found == [(1, 0, 0), (1.25, 0, 0.25), (9, 0, 0)]
 
 
+ROBOT = "3.0 1.2 0.5 3.0 1.0 0.5 0 0 0.2 0.3"
+"""Of a robot whose laser is 0.2 m in the map's direction of y from its base."""
+
+
+@pytest.mark.parametrize(
+    ("remissions", "axis"),
+    [("", ""), ("0 ", ""), ("0 ", " 1e6"), ("3 10 20 30 ", ""), ("3 10 20 30 ", " 1e6")],
+)
+def test_a_robotlaser_has_its_own_angles_range_and_laser(tmp_path: Path, remissions: str, axis: str) -> None:
+    line = f"ROBOTLASER1 5 -2.0 4.0 0.5 20.0 0.01 0 3 1.0 19.9 20.0 {remissions}{ROBOT}{axis} 7.5 host 0.1\n"
+    (record,) = read_carmen(write(tmp_path, "SYNC start\n" + line + line.replace("LASER1", "LASER2"))).records
+    assert (record.time, record.odometry) == (7.5, (3.0, 1.0, 0.5))
+    assert (record.angle_min, record.angle_increment) == (-2.0, 0.5)
+    assert record.ranges.tolist() == [1.0, inf, inf]  # 19.9 is within half a percent of the greatest reading
+    assert record.laser == pytest.approx((0.2 * sin(0.5), 0.2 * cos(0.5), 0.0))
+
+
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        ("ROBOTLASER1 0 0 3\n", "expected at least 8 fields"),
+        ("ROBOTLASER1 0 0 3 0.1 20 0 0 x 1\n", "expected a number of ranges"),
+        (f"ROBOTLASER1 0 0 3 0.1 20 0 0 9 1.0 {ROBOT} 1 host 1\n", "expected 9 ranges"),
+        (
+            f"ROBOTLASER1 0 0 3 0 20 0 0 1 1.0 0 {ROBOT} 1 host 1\n",
+            "angular_resolution: expected more than 0",
+        ),
+        (f"ROBOTLASER1 0 nan 3 1 20 0 0 1 1.0 0 {ROBOT} 1 host 1\n", "start_angle: expected a finite number"),
+    ],
+)
+def test_a_faulty_robotlaser_is_reported_and_left_out(tmp_path: Path, line: str, fault: str) -> None:
+    log = read_carmen(write(tmp_path, flaser(1.0, 2.0) + line))
+    assert len(log.records) == 1
+    assert "run.log:2: ROBOTLASER1 left out" in log.faults[0]
+    assert fault in log.faults[0]
+
+
 def test_faulty_lines_are_reported_and_left_out(tmp_path: Path) -> None:
     faulty = [
         "FLASER 3 1.0 2.0\n",
@@ -95,8 +132,8 @@ def test_a_damaged_gzip_keeps_what_was_read(tmp_path: Path) -> None:
     ("text", "reason"),
     [
         ("", "empty"),
-        ("ODOM 0 0 0 0 0 0 1 host 1\n", "expected FLASER records, found 1 ODOM"),
-        ("ROBOTLASER1 0 1 2\n", "found 1 ROBOTLASER1"),
+        ("ODOM 0 0 0 0 0 0 1 host 1\n", "expected FLASER or ROBOTLASER1 records, found 1 ODOM"),
+        ("RAWLASER1 0 1 2\n", "found 1 RAWLASER1"),
         ("FLASER 9\n", "first of 1 faults"),
     ],
 )
