@@ -164,6 +164,8 @@ def is_private(address: str) -> bool:
         carried = found.ipv4_mapped or found.sixtofour
         if any(found in network for network in _CARRIERS):
             carried = ipaddress.IPv4Address(int(found) & 0xFFFF_FFFF)
-        if found in _LOCAL_NAT64 or (carried is not None and not carried.is_global):
+        if found in _LOCAL_NAT64:
             return True
+        if carried is not None:  # newer Pythons take no 6to4 address for a public one
+            return not carried.is_global
     return not found.is_global

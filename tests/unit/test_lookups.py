@@ -136,6 +136,6 @@ async def test_any_exception_of_a_lookup_is_an_answer() -> None:
     """A port beyond all limits ends neither the thread nor the wait for it."""
     lookups = Lookups(1)
     async with asyncio.timeout(60):
-        with pytest.raises(socket.gaierror, match="too large"):
+        with pytest.raises(socket.gaierror):
             await lookups.addresses("localhost", 10**40)
         assert await lookups.addresses("127.0.0.1", 80)

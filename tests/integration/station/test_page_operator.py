@@ -102,6 +102,7 @@ async def site() -> AsyncIterator[Site]:
             yield made
         finally:
             await browser.close()
+            recorder.records.close()
     assert made.problems == []
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +31,16 @@ class Manager:
 
 async def test_robots_are_counted_with_and_without_a_manager() -> None:
     view, manager = FleetView(), Manager()
-    recorder = FigureRecorder(view, Records(), manager.ask)
-    assert await recorder.sample() == {}
-    view.on_state(state(robot("Robot1", state="driving"), robot("Robot2", state="waiting")))
-    counted = {"moving": 1, "waiting": 1}
-    assert await recorder.sample() == counted
-    manager.is_away = True
-    assert await recorder.sample() == counted
-    manager.is_away, manager.answer = False, STATISTICS
-    assert await recorder.sample() == {**counted, "battery": 0.8, "done": 60.0, "open": 3, "late": 0}
+    with closing(Records()) as records:
+        recorder = FigureRecorder(view, records, manager.ask)
+        assert await recorder.sample() == {}
+        view.on_state(state(robot("Robot1", state="driving"), robot("Robot2", state="waiting")))
+        counted = {"moving": 1, "waiting": 1}
+        assert await recorder.sample() == counted
+        manager.is_away = True
+        assert await recorder.sample() == counted
+        manager.is_away, manager.answer = False, STATISTICS
+        assert await recorder.sample() == {**counted, "battery": 0.8, "done": 60.0, "open": 3, "late": 0}
 
 
 def test_figures_outlive_the_station_for_a_day(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -21,6 +23,12 @@ def view() -> FleetView:
     return made
 
 
+@pytest.fixture
+def records() -> Iterator[Records]:
+    with closing(Records()) as kept:
+        yield kept
+
+
 def record(recorder: Recorder, now: float) -> bool:
     """Record a moment; return whether there was something."""
     made = recorder.take(now)
@@ -29,8 +37,8 @@ def record(recorder: Recorder, now: float) -> bool:
     return made is not None
 
 
-def test_the_state_of_any_moment_is_known(view: FleetView) -> None:
-    recorder = Recorder(view, Records())
+def test_the_state_of_any_moment_is_known(view: FleetView, records: Records) -> None:
+    recorder = Recorder(view, records)
     for second in range(100):
         view.on_pose("Robot1", pose(0.1 * second, 0.5, 0.0))
         if second == 50:
@@ -47,14 +55,14 @@ def test_the_state_of_any_moment_is_known(view: FleetView) -> None:
     assert recorder.records.read(START + 70, 0.0)[0]["blocked"] == [6]
 
 
-def test_nothing_is_written_while_nothing_changes(view: FleetView) -> None:
-    recorder = Recorder(view, Records())
+def test_nothing_is_written_while_nothing_changes(view: FleetView, records: Records) -> None:
+    recorder = Recorder(view, records)
     assert [record(recorder, START + second) for second in range(5)] == [True, False, False, False, False]
     assert record(recorder, START + WHOLE_EVERY_S), "but a whole record, now and then"
 
 
-def test_a_removed_robot_is_gone_in_the_replay(view: FleetView) -> None:
-    recorder = Recorder(view, Records())
+def test_a_removed_robot_is_gone_in_the_replay(view: FleetView, records: Records) -> None:
+    recorder = Recorder(view, records)
     record(recorder, START)
     view.on_changes(changes(removed=["Robot2"]))
     record(recorder, START + 1)
@@ -79,8 +87,8 @@ def test_a_file_stays_within_its_bound(view: FleetView, tmp_path: Path) -> None:
     again.close()
 
 
-def test_nothing_is_recorded_before_the_first_state() -> None:
-    recorder = Recorder(FleetView(), Records())
+def test_nothing_is_recorded_before_the_first_state(records: Records) -> None:
+    recorder = Recorder(FleetView(), records)
     assert recorder.take(START) is None
     assert recorder.records.range() is None
     assert recorder.records.read(START, 10.0) == []

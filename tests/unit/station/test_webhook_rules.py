@@ -82,6 +82,7 @@ def test_private_urls_need_to_be_allowed() -> None:
         "https://erp.example.com/fleet?x=1",
         "http://[64:ff9b::8.8.8.8]/",
         "http://[2002:808:808::1]/",
+        "http://[::ffff:8.8.8.8]/",
     ):
         check_url(url, allow_private=False)
 
