@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import subprocess
 from collections.abc import Sequence
 from typing import Self
 
@@ -14,14 +16,15 @@ _SHELL = 'trap "" HUP INT TERM; read -r word; [ "$word" = done ] || exec "$@"'
 class FinalCommand:
     """Waits in a separate process for the end of this one, then runs a command.
 
-    Signals for this process, from a terminal or at its end, do not reach the other one.
+    Signals for this process, from a terminal or at its end, do not reach the other one. asyncio does not own
+    it either, because that kills its child processes when an interrupted program is torn down.
 
     Example:
         >>> final = await FinalCommand.arm(["rm", "-rf", folder])
         >>> await final.disarm()
     """
 
-    def __init__(self, argv: Sequence[str], process: asyncio.subprocess.Process) -> None:
+    def __init__(self, argv: Sequence[str], process: subprocess.Popen[bytes]) -> None:
         self._argv = argv
         self._process = process
 
@@ -32,8 +35,12 @@ class FinalCommand:
         Raises:
             OSError: No shell can be started.
         """
-        process = await asyncio.create_subprocess_exec(
-            *("sh", "-c", _SHELL, "sh", *argv), stdin=asyncio.subprocess.PIPE, start_new_session=True
+        process = await asyncio.to_thread(
+            subprocess.Popen,
+            ("sh", "-c", _SHELL, "sh", *argv),
+            bufsize=0,
+            stdin=subprocess.PIPE,
+            start_new_session=True,
         )
         return cls(argv, process)
 
@@ -52,11 +59,11 @@ class FinalCommand:
     async def disarm(self) -> None:
         """Cancel the command."""
         assert self._process.stdin is not None
-        if self._process.returncode is None:
+        with contextlib.suppress(BrokenPipeError):  # its process was killed
             self._process.stdin.write(_DISARM)
         await self._close()
 
     async def _close(self) -> int:
         assert self._process.stdin is not None
         self._process.stdin.close()
-        return await self._process.wait()
+        return await asyncio.to_thread(self._process.wait)
