@@ -14,6 +14,7 @@
     |   +-- MasterUnreachableError  the master gave no answer
     |   +-- MasterRefusedError      the master answered with a status other than success
     +-- ParameterMissingError       no such parameter (also a KeyError)
+    +-- ParameterValueError         a value that a parameter cannot have (also a ValueError)
     +-- TcprosError                 a TCPROS connection cannot continue
     |   +-- MalformedFrameError     a header or length that breaks the protocol
     |   +-- HandshakeRefusedError   the two ends do not agree on type or name
@@ -125,6 +126,23 @@ class MasterRefusedError(MasterError):
 
     def __str__(self) -> str:
         return f"{self.method}: {self.text}"
+
+
+class ParameterValueError(RosError, ValueError):
+    """A value that a parameter cannot have, because XML-RPC has no form for it.
+
+    Attributes:
+        name: The parameter's resolved name; of a namespace, the place in it.
+        reason: Why it cannot be sent.
+    """
+
+    def __init__(self, name: str, reason: str) -> None:
+        super().__init__(name, reason)
+        self.name = name
+        self.reason = reason
+
+    def __str__(self) -> str:
+        return f"parameter {self.name}: {self.reason}"
 
 
 class ParameterMissingError(RosError, KeyError):

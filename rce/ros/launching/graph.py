@@ -16,7 +16,7 @@ import yaml
 
 from rce.ros.core import Core
 from rce.ros.core.server import DEFAULT_PORT
-from rce.ros.errors import MasterError, MasterRefusedError, MasterUnreachableError
+from rce.ros.errors import MalformedDocumentError, MasterRefusedError, MasterUnreachableError
 from rce.ros.launch.exceptions import LaunchError
 from rce.ros.node.master import MasterClient
 from rce.ros.node.settings import LOOPBACK, is_loopback
@@ -46,12 +46,16 @@ class LaunchGraph:
         self._master = MasterClient(uri, CALLER, "", rpc)
 
     async def run_id(self) -> str:
-        """Return the run's id; a master that has none gets one."""
+        """Return the run's id; a master that has none gets one.
+
+        Raises:
+            LaunchError: The master does not answer.
+        """
         try:
-            return str(await self._master.call("getParam", "/run_id"))
+            return str(await self._call("getParam", "/run_id"))
         except MasterRefusedError:
             run_id = str(uuid.uuid1())
-            await self._master.call("setParam", "/run_id", run_id)
+            await self._call("setParam", "/run_id", run_id)
             return run_id
 
     async def apply(self, plan: LaunchPlan) -> None:
@@ -66,8 +70,8 @@ class LaunchGraph:
             await self._delete(name)
         for name, value in plan.parameters.items():
             try:
-                await self._master.call("setParam", name, value)
-            except MasterError as error:
+                await self._call("setParam", name, value)
+            except (MasterRefusedError, MalformedDocumentError) as error:
                 raise LaunchError(f"parameter {name} cannot be set: {error}") from error
 
     async def _carry_out(self, command: ParameterCommand) -> None:
@@ -75,7 +79,7 @@ class LaunchGraph:
             await self._delete(command.name)
             return
         try:
-            value = await self._master.call("getParam", command.name)
+            value = await self._call("getParam", command.name)
         except MasterRefusedError as error:
             raise LaunchError(f"parameter {command.name} cannot be dumped: {error}") from error
         try:
@@ -84,8 +88,14 @@ class LaunchGraph:
             raise LaunchError(f"{command.file} cannot be written: {error.strerror}") from error
 
     async def _delete(self, name: str) -> None:
-        if await self._master.call("hasParam", name):
-            await self._master.call("deleteParam", name)
+        if await self._call("hasParam", name):
+            await self._call("deleteParam", name)
+
+    async def _call(self, method: str, *arguments: Any) -> Any:
+        try:
+            return await self._master.call(method, *arguments)
+        except MasterUnreachableError as error:
+            raise LaunchError(f"{error}; was asked for {method} {arguments[0]}") from error
 
 
 @asynccontextmanager

@@ -7,12 +7,13 @@ from typing import Any
 
 from rce.ros.errors import MasterRefusedError, MasterUnreachableError, XmlRpcError
 from rce.ros.xmlrpc import RpcClient
+from rce.ros.xmlrpc.codec import encode_call
 from rce.ros.xmlrpc.dispatch import SUCCESS
 
 
 @dataclass(slots=True)
 class MasterClient:
-    """Calls the master in the name of one node. Every method raises MasterError."""
+    """Calls the master in the name of one node. Every method raises MasterError, as :meth:`call` does."""
 
     uri: str
     caller: str
@@ -30,11 +31,13 @@ class MasterClient:
             The value of the answer.
 
         Raises:
+            MalformedDocumentError: An argument has no XML-RPC form; the master was not asked.
             MasterUnreachableError: No usable answer.
             MasterRefusedError: The status is not success.
         """
+        document = encode_call(method, (self.caller, *arguments))
         try:
-            answer = await self.rpc.call(self.uri, method, (self.caller, *arguments), timeout=self.timeout)
+            answer = await self.rpc.send(self.uri, method, document, timeout=self.timeout)
             status, text, value = answer
         except XmlRpcError as error:
             raise MasterUnreachableError(self.uri, str(error)) from error

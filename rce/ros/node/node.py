@@ -348,7 +348,12 @@ class Node(GraphMember):
         return await self._parameters.get_cached(self.resolve(name), default)
 
     async def set_param(self, name: str, value: Any) -> None:
-        """Set a parameter, or a whole namespace from a dictionary."""
+        """Set a parameter, or a whole namespace from a dictionary.
+
+        Raises:
+            ParameterValueError: XML-RPC has no form for the value, or for one in it; nothing was set.
+            MasterUnreachableError: The master does not answer.
+        """
         await self._parameters.set(self.resolve(name), value)
 
     async def has_param(self, name: str) -> bool:

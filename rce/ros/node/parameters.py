@@ -7,8 +7,14 @@ from collections.abc import Callable
 from typing import Any
 
 from rce.ros import names
-from rce.ros.errors import MasterRefusedError, ParameterMissingError
+from rce.ros.errors import (
+    MalformedDocumentError,
+    MasterRefusedError,
+    ParameterMissingError,
+    ParameterValueError,
+)
 from rce.ros.node.master import MasterClient
+from rce.ros.xmlrpc.codec import encode_response
 
 _log = logging.getLogger(__name__)
 
@@ -70,8 +76,16 @@ class Parameters:
         return default
 
     async def set(self, name: str, value: Any) -> None:
-        """Set a parameter, or a whole namespace from a dictionary."""
-        await self._master.call("setParam", name, value)
+        """Set a parameter, or a whole namespace from a dictionary.
+
+        Raises:
+            ParameterValueError: XML-RPC has no form for the value, or for one in it; nothing was set.
+            MasterUnreachableError: The master does not answer.
+        """
+        try:
+            await self._master.call("setParam", name, value)
+        except MalformedDocumentError as error:
+            raise ParameterValueError(*_unsendable(name, value, str(error))) from error
         self._note(name, value)  # the master reports a change to all nodes except the one that made it
 
     async def has(self, name: str) -> bool:
@@ -198,3 +212,18 @@ def _within(tree: Any, path: list[str]) -> Any:
             return UNSET
         tree = tree[segment]
     return tree
+
+
+def _unsendable(name: str, value: Any, reason: str) -> tuple[str, str]:
+    """Return the innermost place of a value that cannot be sent, and the reason."""
+    inner: list[tuple[str, Any]] = []
+    if isinstance(value, dict):
+        inner = [(f"{name}/{key}", each) for key, each in value.items() if isinstance(key, str)]
+    elif isinstance(value, list | tuple):
+        inner = [(f"{name}[{index}]", each) for index, each in enumerate(value)]
+    for place, each in inner:
+        try:
+            encode_response(each)
+        except MalformedDocumentError as error:
+            return _unsendable(place, each, str(error))
+    return name, reason

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
+import re
 import signal
 import sys
+import xmlrpc.client
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -232,6 +235,36 @@ async def test_a_master_elsewhere_is_not_started(folder: Path) -> None:
     async with launched(folder, "", uri="http://192.0.2.1:1/") as running:
         assert await running.code() == 1
     assert "192.0.2.1 is not an address of this machine" in running.lines[-2]
+
+
+@asynccontextmanager
+async def leaving_master(last: bytes) -> AsyncIterator[str]:
+    """A master that answers every call with success, until it drops the connection of a method."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
+            while True:
+                head = await reader.readuntil(b"\r\n\r\n")
+                (size,) = re.findall(rb"(?i)content-length: *(\d+)", head)
+                if last in await reader.readexactly(int(size)):
+                    break
+                body = xmlrpc.client.dumps(((1, "", 1),), methodresponse=True).encode()
+                writer.write(b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\n")
+                writer.write(b"Content-Length: %d\r\n\r\n%b" % (len(body), body))
+        writer.close()
+
+    async with await asyncio.start_server(serve, "127.0.0.1") as server:
+        yield f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/"
+
+
+@pytest.mark.parametrize("method", ["getParam", "setParam", "hasParam"])
+async def test_a_master_that_goes_away_is_one_line(folder: Path, method: str) -> None:
+    text = '<rosparam command="delete" param="/old"/><param name="x" value="1"/>'
+    text += '<node name="a" pkg="tools" type="sleeper"/>'
+    async with leaving_master(method.encode()) as uri, launched(folder, text, uri=uri) as run:
+        assert await run.code() == 1
+        assert not [line for line in run.lines if "Traceback" in line]
+        assert [line for line in run.lines if f"{uri} does not answer" in line and method in line]
 
 
 async def test_launch_waits_for_a_master(folder: Path) -> None:

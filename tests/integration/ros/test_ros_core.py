@@ -15,7 +15,12 @@ from support.ros_nodes import MakeNode
 
 from rce.ros.core import Change, Core, GraphEvent, notifier
 from rce.ros.core.notifier import CALL_TIMEOUT
-from rce.ros.errors import MasterRefusedError, ParameterMissingError, RemoteFaultError
+from rce.ros.errors import (
+    MasterRefusedError,
+    ParameterMissingError,
+    ParameterValueError,
+    RemoteFaultError,
+)
 from rce.ros.node import Node
 from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer
 from rce.ros.xmlrpc.codec import encode_call
@@ -49,6 +54,23 @@ async def test_parameters(core: Core, make_node: MakeNode) -> None:
         assert not core.delete_param("/host")
         with pytest.raises(ParameterMissingError):
             core.get_param("/host")
+
+
+@pytest.mark.parametrize(
+    ("value", "place"),
+    [
+        (None, "/odd"),
+        ({"deep": [1, {"wide": 2**40}]}, "/odd/deep[1]/wide"),
+        ({"text": "\x00"}, "/odd/text"),
+        ({"keys": {1: 2}}, "/odd/keys"),
+    ],
+)
+async def test_a_value_that_cannot_be_sent_is_named(make_node: MakeNode, value: object, place: str) -> None:
+    async with make_node("a") as node:
+        with pytest.raises(ParameterValueError) as raised:
+            await node.set_param("/odd", value)
+        assert raised.value.name == place
+        assert not await node.has_param("/odd")
 
 
 async def test_parameter_changes_are_told(make_node: MakeNode) -> None:
