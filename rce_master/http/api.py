@@ -39,7 +39,7 @@ from rce_master.http.models import Error
 from rce_master.http.routes import Call, Route, Services, body_of
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
     Answer = Callable[[web.Request, Mapping[str, str]], Awaitable[web.StreamResponse]]
 
@@ -58,6 +58,10 @@ ROUTES: list[Route] = [
     *api_stream.routes,
     *api_exec.routes,
 ]
+
+
+_SHOWN = 40
+"""Characters of a wrong name that are shown."""
 
 
 class Api:
@@ -93,6 +97,8 @@ class Api:
 
 
 def _adapt(route: Route, services: Services) -> Answer:
+    known = frozenset(query.name for query in route.operation.query)
+
     async def answer(request: web.Request, parts: Mapping[str, str]) -> web.StreamResponse:
         token, user = bearer(request, services, stations=route.stations)
         if user is not None:
@@ -100,6 +106,7 @@ def _adapt(route: Route, services: Services) -> Answer:
         call = Call(request, services, user, token, None, parts)
         try:
             admit(route, user)
+            check_query(request.query, known)
             text = b""
             if route.body:
                 text = await read_whole(request)
@@ -142,6 +149,18 @@ def _text() -> str:
 
 async def _document(_: web.Request, __: Mapping[str, str]) -> web.Response:
     return web.Response(text=_text(), content_type="application/json")
+
+
+def check_query(given: Iterable[str], known: Collection[str]) -> None:
+    """Check the names of query parameters: one that is ignored would answer another question.
+
+    Raises:
+        InvalidRequestError: The route does not have one of them.
+    """
+    unknown = next((name for name in given if name not in known), None)
+    if unknown is not None:
+        names = ", ".join(sorted(known)) or "none"
+        raise InvalidRequestError(f"query parameter {unknown[:_SHOWN]!r} is unknown here; known are: {names}")
 
 
 def read_body(model: type[BaseModel], text: bytes) -> BaseModel:

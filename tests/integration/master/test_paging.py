@@ -129,3 +129,14 @@ async def test_commands_follow_pages(filled: Site, monkeypatch: pytest.MonkeyPat
         first, used = await client.pages("/usage", "containers")
         assert len(used) == 3 * len(TAGS)
         assert "machines" in first
+
+
+async def test_a_query_parameter_that_a_route_does_not_have_is_named(site: Site) -> None:
+    for method, path, known in (
+        ("GET", "/containers?machine=m1", "cursor, limit, user"),
+        ("DELETE", "/containers/c1?force=1&user=testUser", "user"),
+        ("GET", "/users?user=testUser", "cursor, limit"),
+    ):
+        answer = await site.api(method, path, status=422)
+        assert "is unknown here" in answer["error"]
+        assert answer["error"].endswith(f"known are: {known}")
