@@ -10,6 +10,7 @@ import logging
 import os
 import re
 from collections import OrderedDict, deque
+from errno import ENOSPC
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
@@ -236,14 +237,18 @@ class AuditLog:
                 self._open()
             elif self._size + len(line) > self._max_bytes:
                 self._turn()
-            os.write(self._descriptor, line)
-            self._size += len(line)
+            self._append(line)
             self._failed = False
         except OSError as error:
             if not self._failed:
                 _log.error("the audit log %s cannot be written: %s", self._file, error)
             self._failed = True
             self._close()
+
+    def _append(self, line: bytes) -> None:
+        if os.write(self._descriptor, line) < len(line):  # what follows a part must begin a new line
+            raise OSError(ENOSPC, os.strerror(ENOSPC))
+        self._size += len(line)
 
     def _open(self) -> None:
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)

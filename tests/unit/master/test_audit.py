@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import json
+import resource
 import stat
 from typing import TYPE_CHECKING
 
@@ -33,6 +35,27 @@ def test_records_survive_restart_and_ids_grow(tmp_path: Path) -> None:
     second.close()
     third = AuditLog(tmp_path / "audit", Clock())
     assert [r.user for r in third.since(-1, 10)] == ["bob"], "the half line cost no other one"
+
+
+def test_disk_that_gets_full_within_a_record_costs_no_later_one(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A limit of the file's size stands for the disk: both let a part of the record be written."""
+    log = AuditLog(tmp_path, Clock())
+    log.add("anna", "log_in")
+    file = tmp_path / "audit.jsonl"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (file.stat().st_size + 10, hard))
+    try:
+        log.add("bob", "log_in")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "No space left on device" in caplog.text
+    log.add("carol", "log_in")
+    log.close()
+    first, half, last = file.read_bytes().splitlines()
+    assert len(half) == 10
+    assert [json.loads(line)["user"] for line in (first, last)] == ["anna", "carol"]
 
 
 def test_files_take_turns_and_their_number_is_bounded(tmp_path: Path) -> None:
