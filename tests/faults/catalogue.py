@@ -27,6 +27,7 @@ class Scenario:
 SCENARIOS = (
     Scenario("kill", kill.kill, short=True),
     Scenario("stop", kill.stop, short=True),
+    Scenario("terminate", kill.terminate, short=True),
     Scenario("cut", network.cut),
     Scenario("cut-from-task-sets", network.cut_from_task_sets),
     Scenario("cut-etcd-apart", network.cut_etcd_apart, short=True),
@@ -38,5 +39,5 @@ SCENARIOS = (
     Scenario("full-disk", etcd.full_disk, robot=False),
     Scenario("full-database", etcd.full_database, robot=False, short=True),
     Scenario("replace-member", etcd.replace_member, robot=False),
-    Scenario("upgrade", kill.terminate),
+    Scenario("upgrade", kill.upgrade),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Iterable
@@ -69,6 +70,11 @@ class History:
     def first_write_after(self, at: float) -> float | None:
         """Return when the first write was acknowledged that was asked for after a time."""
         return min((end for start, end in self.acknowledged if start >= at), default=None)
+
+    def longest_pause(self, start: float, end: float) -> float:
+        """Return the longest time without an acknowledged write between two moments, seconds."""
+        within = sorted(at for _, at in self.acknowledged if start < at < end)
+        return max(after - before for before, after in itertools.pairwise([start, *within, end]))
 
     def violations(self, stored: Iterable[str], initial: int) -> list[str]:
         """Return what went wrong; nothing may.

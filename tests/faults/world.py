@@ -46,6 +46,17 @@ class World:
         self.times.add(what, end - since)
         return end
 
+    async def until_handed_over(self, former: Machine, since: float) -> None:
+        """Wait until another master leads, and note the longest time without an acknowledged write.
+
+        The former leader may still acknowledge what is asked for after the signal: the first write after it
+        would not tell how long the others waited.
+        """
+        await self.cluster.leader(but=former)
+        await self.clients.wait_for_writes()
+        pause = self.history.longest_pause(since, time.monotonic())
+        self.times.add("SIGTERM of the leading master", pause)
+
     async def until_task_sets_are_back(self, since: float) -> None:
         """Note how long it took until all task sets are connected to the leading master."""
         if self.robot is None:

@@ -74,13 +74,25 @@ async def stop(world: World) -> None:
 
 
 async def terminate(world: World) -> None:
+    """End the leading master with SIGTERM, so that it hands over, at any moment of a save."""
+    for _ in range(1 if world.scale == 1 else max(1, round(LONG_ROUNDS * world.scale / 100))):
+        await asyncio.sleep(world.rng.uniform(0, 0.5))
+        leader = await world.cluster.leader()
+        since = time.monotonic()
+        assert await leader.master.stop() == 0
+        await world.until_handed_over(leader, since)
+        await world.until_task_sets_are_back(since)
+        await world.whole()
+
+
+async def upgrade(world: World) -> None:
     """End masters and members of etcd in order, one after the other, as an upgrade does."""
     for machine in world.cluster.machines:
         leads = machine is await world.cluster.leader()
         since = time.monotonic()
         assert await machine.master.stop() == 0
         if leads:
-            await world.until_written("SIGTERM of the leading master", since)
+            await world.until_handed_over(machine, since)
         await machine.member.stop()
         await world.clients.wait_for_writes()
         await world.whole()

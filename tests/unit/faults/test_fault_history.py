@@ -7,6 +7,8 @@ import math
 from dataclasses import replace
 
 import pytest
+from faults.catalogue import SCENARIOS
+from faults.goals import GOALS, Times
 from faults.history import Fate, Heard, History
 from faults.linearizability import Operation, is_linearizable, unexplained
 from hypothesis import given
@@ -152,3 +154,31 @@ def test_the_first_write_after_a_fault_is_one_that_was_asked_for_after_it() -> N
     history.wrote("x", 2.2, 3, 3, Fate.UNKNOWN)
     assert history.first_write_after(2) == 4
     assert history.first_write_after(5) is None
+
+
+def test_longest_pause_of_writes_begins_at_the_fault_and_ends_at_the_look() -> None:
+    history = History()
+    for start, end in ((0, 1), (1.5, 2.25), (2, 5), (4, 5.5)):
+        history.wrote("x", start, end, 1, Fate.DONE)
+    history.wrote("x", 3, 4, 2, Fate.UNKNOWN)
+    assert history.longest_pause(2, 6) == 2.75
+    assert history.longest_pause(2, 9) == 3.5
+    assert history.longest_pause(0.5, 2.5) == 1.25
+    assert History().longest_pause(1, 4) == 3
+
+
+def test_each_time_is_told_beside_its_goal() -> None:
+    times = Times()
+    for value in (0.5, 0.25, 1.5):
+        times.add("SIGTERM of the leading master", value)
+    times.add("another fault", 3)
+    _, of_goal, without = times.table()
+    assert of_goal.split()[-6:] == ["master", "3", "0.50", "1.50", "<", "1"]
+    assert without.split() == ["another", "fault", "1", "3.00", "3.00"]
+    assert set(GOALS) >= {"SIGTERM of the leading master"}
+
+
+def test_scenarios_have_names_of_their_own() -> None:
+    names = [each.name for each in SCENARIOS]
+    assert len(set(names)) == len(names)
+    assert {"kill", "terminate", "upgrade"} <= set(names)
