@@ -285,12 +285,33 @@ def _read(file: Path) -> bytes:
 
 
 def _write_private(file: Path, content: bytes) -> None:
-    """Write a file atomically that only its owner may read."""
+    """Write a file atomically that only its owner may read.
+
+    A file that is replaced keeps its owner: services run as a user of their own, and root renews for them.
+    """
     aside = file.with_name(f".{file.name}.{os.getpid()}")
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+    aside.unlink(missing_ok=True)
     try:
-        descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+        descriptor = os.open(aside, flags, 0o600)
         with os.fdopen(descriptor, "wb") as output:
             output.write(content)
+            if os.geteuid() == 0 and (owner := _owner_of(file)) is not None:
+                os.fchown(descriptor, *owner)
         aside.replace(file)
     finally:
         aside.unlink(missing_ok=True)
+
+
+def _owner_of(file: Path) -> tuple[int, int] | None:
+    """Return the user and group of a file; for a new list of revoked ones, those who read it, of the folder.
+
+    Other new files are keys of other machines, or the authority's, and stay those of this process.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        was = file.lstat()
+        return was.st_uid, was.st_gid
+    if file.stem != REVOKED:
+        return None
+    folder = file.parent.stat()
+    return folder.st_uid, folder.st_gid

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import ssl
 import stat
 from pathlib import Path
@@ -209,3 +210,22 @@ def test_new_authority_begins_with_nothing_revoked(folder: CertificateFolder) ->
     folder.make_authority()
     assert folder.revocations() == []
     assert folder.owners() == {}
+
+
+@pytest.mark.needs("root")
+def test_root_leaves_renewed_files_to_their_owner(folder: CertificateFolder) -> None:
+    """Services run as a user of their own; the authority's key and those of other machines stay root's."""
+    folder.issue("engine", ("10.0.0.1",))
+    services = 12345
+    for path in (folder.path, folder.authority, folder.certificate("engine"), folder.key("engine")):
+        os.chown(path, services, services)
+    folder.issue("engine")
+    folder.issue("m2", ("10.0.0.2",))
+    folder.revoke("m2")
+    owners = {path.name: (path.stat().st_uid, path.stat().st_gid) for path in folder.path.iterdir()}
+    of_services = {"authority.pem", "engine.pem", "engine.key", "revoked.pem"}
+    assert {name for name, owner in owners.items() if owner == (services, services)} == of_services
+    assert {owners[name] for name in ("authority.key", "m2.key", "m2.pem")} == {(0, 0)}
+    assert {stat.S_IMODE(folder.path.joinpath(name).stat().st_mode) for name in owners} == {0o600}
+    folder.revoke("engine")
+    assert folder.revoked.stat().st_uid == services
