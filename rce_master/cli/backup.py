@@ -16,7 +16,7 @@ from rce.model import about
 from rce.tls.choice import TlsChoice
 from rce_master.backup import CERTIFICATES, MASTER, Copy, back_up, restore
 from rce_master.cli.exceptions import CliError
-from rce_master.cli.offline import find_folder, find_state, read_etcd
+from rce_master.cli.offline import find_folder, find_state, give_to_owner, read_etcd
 from rce_master.etcd_backup import exported, restore_to_etcd
 from rce_master.exceptions import StoreError
 
@@ -75,6 +75,7 @@ def restore_(
         else:
             target = place.etcd
             found = restore_to_etcd(file, place.folders[MASTER], place.etcd, place.tls)
+            give_to_owner(place.folders[MASTER])
     except StoreError as error:
         typer.echo(f"rce restore: {error}", err=True)
         raise typer.Exit(1) from None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pwd
+import stat
 import time
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
@@ -171,6 +172,7 @@ async def open_state(place: Path | EtcdAddress, state_dir: Path | None = None) -
         raise CliError(str(error)) from error
     folder = find_state(place) if isinstance(place, Path) else settings.master_state
     async with AsyncExitStack() as stack:
+        stack.callback(give_to_owner, folder)
         try:
             store = await stack.enter_async_context(
                 open_store(folder if isinstance(place, Path) else place, TlsChoice.of(settings))
@@ -215,6 +217,17 @@ async def _etcd_store(address: EtcdAddress, tls: TlsChoice) -> AsyncIterator[Sto
     async with EtcdClient(address.endpoints, tls=contexts, attempt=_ETCD_S) as client:
         await prepare(client, address.prefix)
         yield EtcdStore(client, address.prefix)
+
+
+def give_to_owner(folder: Path) -> None:
+    """Give the owner of a state folder what root made in it, so that a master of another user can use it."""
+    if os.geteuid() != 0 or not folder.is_dir() or (owner := folder.stat()).st_uid == 0:
+        return
+    for _, folders, files, place in os.fwalk(folder):  # follows no link that the owner made
+        for name in (*folders, *files):
+            found = os.stat(name, dir_fd=place, follow_symlinks=False)
+            if found.st_uid == 0 and (stat.S_ISDIR(found.st_mode) or found.st_nlink == 1):
+                os.chown(name, owner.st_uid, owner.st_gid, dir_fd=place, follow_symlinks=False)
 
 
 def _caller() -> str:

@@ -19,7 +19,7 @@ from rce.config import (
 from rce.tls.choice import TlsChoice
 from rce_master.cli.client import run
 from rce_master.cli.exceptions import CliError
-from rce_master.cli.offline import find_folder, find_state, open_store
+from rce_master.cli.offline import find_folder, find_state, give_to_owner, open_store
 from rce_master.exceptions import StoreBusyError
 from rce_master.packages.carrying import carry, packages_of, states_of
 from rce_master.packages.contents import ARCHIVES
@@ -65,6 +65,7 @@ async def _copy(source: str, target: str, state_dir: Path | None) -> None:
     beside_etcd = settings.master_state if state_dir is None else state_dir
     folder, new_folder = (beside_etcd if isinstance(one, EtcdAddress) else one for one in (here, there))
     async with AsyncExitStack() as stack:
+        stack.callback(give_to_owner, new_folder)
         try:
             old = await stack.enter_async_context(open_store(here, tls))
             term = await old.begin_term()
