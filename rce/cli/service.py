@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pwd
+import shlex
 import shutil
 import stat
 import subprocess
@@ -76,8 +77,15 @@ def uninstall_service(
     typer.echo(f"removed {path}")
 
 
-def install(service: Service) -> None:
+def install(service: Service, *, start: bool = True) -> None:
     """Write the unit of a service, and start it; without systemd, print the commands for that.
+
+    A master that runs by another unit is restarted; of other programs, the command for that is printed,
+    since it interrupts containers or robots.
+
+    Args:
+        service: The service.
+        start: Start it now, and not only with the machine.
 
     Raises:
         typer.Exit: What the service needs is missing, or it cannot be started.
@@ -85,12 +93,39 @@ def install(service: Service) -> None:
     check(service)
     if service.user:
         make_user(service.user)
+        _open_state_folder(service)
     folder = _units(system=service.system)
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / service.name
-    path.write_text(unit(service), encoding="utf-8")
+    path, text = folder / service.name, unit(service)
+    is_changed = path.exists() and path.read_text(encoding="utf-8") != text
+    was_active = is_changed and _is_active(service)
+    path.write_text(text, encoding="utf-8")
     typer.echo(f"made {path}")
-    _systemctl(service.system, ["daemon-reload"], ["enable", "--now", service.name])
+    _systemctl(service.system, ["daemon-reload"], ["enable", *(["--now"] if start else []), service.name])
+    if not was_active:
+        return
+    if service.role is Role.MASTER and start:
+        _systemctl(service.system, ["restart", service.name])
+    else:
+        words = shlex.join(_systemctl_words(service.system, ["restart", service.name]))
+        typer.echo(f"{service.name} runs as it was started; to use the new unit: {words}")
+
+
+def _open_state_folder(service: Service) -> None:
+    """Let the service's user pass through the state folder, also if root's umask closed it."""
+    if service.state is None or not service.state.is_relative_to(SYSTEM_STATE):
+        return
+    SYSTEM_STATE.mkdir(parents=True, exist_ok=True)
+    mode = stat.S_IMODE(SYSTEM_STATE.stat().st_mode)
+    if not mode & stat.S_IXOTH:
+        SYSTEM_STATE.chmod(mode | stat.S_IXGRP | stat.S_IXOTH)
+
+
+def _is_active(service: Service) -> bool:
+    if not systemd_runs():
+        return False
+    argv = _systemctl_words(service.system, ["is-active", "--quiet", service.name])
+    return subprocess.run(argv, check=False).returncode == 0  # noqa: S603 - fixed words and a unit's name
 
 
 def make_service(
@@ -217,14 +252,17 @@ def systemd_runs() -> bool:
 
 def _systemctl(system: bool, *commands: list[str]) -> None:
     """Run systemctl, or print the command if systemd does not run."""
-    scope = [] if system else ["--user"]
     runs = systemd_runs()
     for command in commands:
-        argv = ["systemctl", *scope, *command]
+        argv = _systemctl_words(system, command)
         if not runs:
             typer.echo(f"systemd does not run here; on the machine, run: {' '.join(argv)}")
         elif subprocess.run(argv, check=False).returncode:  # noqa: S603 - fixed words and a unit's name
             _fail(f"{' '.join(argv)} failed")
+
+
+def _systemctl_words(system: bool, command: list[str]) -> list[str]:
+    return ["systemctl", *([] if system else ["--user"]), *command]
 
 
 def _fail(text: str) -> None:

@@ -104,6 +104,8 @@ def unit(service: Service) -> str:
         f"# Made by `rce install-service {service.role}`.\n",
         f"[Unit]\nDescription={_TITLES[service.role]}\n",
         "Wants=network-online.target\nAfter=network-online.target\n" if service.system else "",
+        # At the end of the machine, the master hands over before its etcd stops.
+        f"After=rce-{Role.ETCD}.service\n" if service.role is Role.MASTER else "",
         f"\n[Service]\nType=exec\nExecStart={command}\n",
         _reload(service, bare) if service.role is Role.CONTAINER else "",
         "Environment=PYTHONUNBUFFERED=1\nRestart=always\nRestartSec=2\nTimeoutStopSec=60\nKillMode=mixed\n",

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 import typer
 
-from rce.cli.service import USER, install, is_system, make_service, make_user, systemd_runs
+from rce.cli.service import USER, check, install, is_system, make_service, make_user, systemd_runs
 from rce.config import default_state_dir
 from rce.config.store_address import DEFAULT_PREFIX
 from rce.masters import split_addresses
@@ -43,6 +43,7 @@ from rce_master.cluster.recovery import read_machine
 from rce_master.cluster.recovery import recover as recover_alone
 from rce_master.cluster.report import make_report
 from rce_master.settings import HTTP_PORT
+from rce_master.store.etcd.layout import Keys
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
@@ -215,6 +216,15 @@ class _Local:
         """
         return _contexts(self.machine.certificates) if self.machine.tls else None
 
+    async def has_users(self) -> bool:
+        """Return whether the cluster's state has a user.
+
+        Raises:
+            EtcdError: etcd does not answer.
+        """
+        async with await cluster_client([self.machine.client], self.contexts) as client:
+            return bool((await client.range(Keys(DEFAULT_PREFIX).row("users", ""), limit=1)).records)
+
     def begins(self) -> bool:
         """Check the machine; return whether it has no member yet.
 
@@ -222,6 +232,8 @@ class _Local:
             ClusterError: It cannot have one.
         """
         find_etcd()
+        if not self.foreground:  # before others know of this machine
+            check(make_service(Role.MASTER, (), system=self.system, config=None, run_as=self.run_as))
         machine = self.machine
         if machine.config.exists() and machine.data.exists():
             found = read_config(machine.config)
@@ -243,10 +255,15 @@ class _Local:
             return
         members = await steps()
         arguments = self.machine.master_arguments(_clients(members))
+        has_users = await self.has_users()
         install(
-            make_service(Role.MASTER, tuple(arguments), system=self.system, config=None, run_as=self.run_as)
+            make_service(Role.MASTER, tuple(arguments), system=self.system, config=None, run_as=self.run_as),
+            start=has_users,
         )
         self._say_state(members)
+        if not has_users:  # none can be added over the API, and no state be copied here, once a master leads
+            scope = "" if self.system else "--user "
+            typer.echo(f"when there is a user, start the master: systemctl {scope}start rce-master")
 
     async def _run_etcd(self, steps: Callable[[], Awaitable[Sequence[Member]]]) -> None:
         process = await asyncio.create_subprocess_exec(
@@ -316,10 +333,11 @@ async def _init(local: _Local) -> None:
 
     async def steps() -> Sequence[Member]:
         members = await wait_for_vote([machine.client], machine, contexts)
-        typer.echo(
-            f"next, add the first user: rce user add NAME --admin --state-dir {machine.folder} --store"
-            f" {machine.store((machine.client,))}"
-        )
+        if not await local.has_users():
+            typer.echo(
+                f"next, add the first user: rce user add NAME --admin --state-dir {machine.folder} --store"
+                f" {machine.store((machine.client,))}"
+            )
         if machine.tls:
             typer.echo(
                 f"for each further machine: rce certificate issue NAME --host ADDRESS --certificates"
@@ -351,6 +369,11 @@ async def _join(local: _Local, endpoints: list[str]) -> None:
         return await wait_for_vote(endpoints, machine, contexts)
 
     await local.start(steps)
+    if not local.foreground:
+        typer.echo(
+            "on the machines that were there before, when it suits, run the command again that made each of"
+            " them a member: their masters then use this member of etcd too"
+        )
 
 
 def _check_certificate(machine: Machine) -> None:

@@ -141,6 +141,7 @@ class Machine:
         try:
             self.folder.mkdir(parents=True, exist_ok=True, mode=0o755)
             self.config.write_text(f"# Made by `rce cluster`.\n{text}", encoding="utf-8")
+            self.config.chmod(0o644)  # etcd's user reads it, whatever the umask is; it has no secrets
         except OSError as error:
             raise ClusterError(f"cannot write {self.config}: {error}") from error
 

@@ -128,6 +128,7 @@ async def _run_alone(machine: Machine, data: Path, tls: Context | None) -> None:
     }
     config = machine.folder / "etcd.alone.yaml"
     config.write_text(yaml.safe_dump(read_config(machine.config) | own), encoding="utf-8")
+    config.chmod(0o644)  # etcd's user reads it, whatever the umask is
     user, group = _owner(data)
     process = await asyncio.create_subprocess_exec(
         *(find_etcd(), "--config-file", str(config)),

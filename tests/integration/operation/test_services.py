@@ -50,6 +50,7 @@ def test_systemd_accepts_every_unit(role: Role, scope: str, tmp_path: Path) -> N
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
     assert ("Delegate=yes" in text) == (role in (Role.CONTAINER, Role.ENGINE))
     assert ("ExecReload=/bin/kill -USR1 $MAINPID" in text) == (role is Role.CONTAINER)
+    assert ("After=rce-etcd.service" in text) == (role is Role.MASTER)
 
 
 @pytest.mark.needs("systemd")

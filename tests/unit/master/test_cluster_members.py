@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -156,3 +159,17 @@ def test_names_that_etcd_cannot_have(tmp_path: Path) -> None:
     for name in ("", "a=b", "a,b", "x" * 64):
         with pytest.raises(ClusterError, match="cannot be a machine's name"):
             machine(tmp_path, name=name)
+
+
+@pytest.fixture
+def strict_umask() -> Iterator[None]:
+    before = os.umask(0o077)
+    yield
+    os.umask(before)
+
+
+@pytest.mark.usefixtures("strict_umask")
+def test_user_of_etcd_can_read_its_configuration_whatever_the_umask_is(tmp_path: Path) -> None:
+    first = machine(tmp_path / "state", tls=False)
+    first.write({"m1": first.peer_url}, new=True)
+    assert stat.S_IMODE(first.config.stat().st_mode) == 0o644
