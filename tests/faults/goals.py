@@ -15,7 +15,7 @@ GOALS = {
     "machine cut off": 8.0,
     "task sets are back": 10.0,
 }
-"""The longest time until the next write, or until the event, in seconds."""
+"""The longest time until the next write, without one during a hand-over, or until the event, in seconds."""
 
 
 class Times:
