@@ -21,7 +21,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="faults", description="Make faults, and check what the masters do.")
     parser.add_argument("--only", action="append", choices=names, help="Run this scenario only; repeatable.")
     parser.add_argument("--seed", type=int, default=secrets.randbelow(10**6), help="Repeat a run's choices.")
-    parser.add_argument("--rounds", type=int, default=100, help="Kills, or four times the SIGTERMs; 1: as short as in the tests.")
+    parser.add_argument("--rounds", type=int, default=100, help="Kills, 4 for a SIGTERM; 1: as in the tests.")
     parser.add_argument("--keep", action="store_true", help="Keep the folder with all logs.")
     options = parser.parse_args()
     print(f"seed {options.seed}", flush=True)
