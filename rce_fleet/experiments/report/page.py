@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import PurePath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rce_fleet.experiments.report import drawing
 from rce_fleet.experiments.report.break_even import break_even_table
@@ -13,7 +13,15 @@ from rce_fleet.experiments.report.claims import judge_all
 from rce_fleet.experiments.report.claims_part import cases, verdicts
 from rce_fleet.experiments.report.figures import figures_of
 from rce_fleet.experiments.report.measurements import Measurements
-from rce_fleet.experiments.report.parts import environment_table, environments_of, read_parts, rows_of
+from rce_fleet.experiments.report.parts import (
+    differences_table,
+    environment_table,
+    environments_of,
+    read_environments,
+    read_parts,
+    rows_of,
+    write_environments,
+)
 from rce_fleet.experiments.report.repeat import compare
 from rce_fleet.experiments.report.repeat_part import comparison_text
 from rce_fleet.experiments.report.schematics import schematics
@@ -28,10 +36,20 @@ if TYPE_CHECKING:
     from rce_fleet.experiments.report.drawing import Drawing
 
 SUMMARY = "summary.csv"
+ENVIRONMENTS = "environments.json"
+"""What the summary's raw data depend on, beside it."""
 NOT_MEASURED = "Not measured."
 _LINK = "link"
 _ANALYSES = {"scaling": breaking_table, "offload": break_even_table}
 """Tables that say what follows from an experiment's medians."""
+
+
+class OtherRun(NamedTuple):
+    """Another full run, which the page compares with its own."""
+
+    summary: list[Summary]
+    environments: dict[str, Mapping[str, Any]]
+    """What it depends on, by experiments; empty if that was not kept."""
 
 
 def make_report(folders: Sequence[Path], *, page: Path, figures: Path, second: Sequence[Path] = ()) -> None:
@@ -55,17 +73,19 @@ def make_report(folders: Sequence[Path], *, page: Path, figures: Path, second: S
     again = read_second(second) if second else None
     figures.mkdir(parents=True, exist_ok=True)
     write_summary(figures / SUMMARY, summarize(measurements))
+    environments = environments_of(parts)
+    write_environments(figures / ENVIRONMENTS, environments)
     drawings = figures_of(measurements)
     if drawing.can_draw():
         for one in (*schematics(), *(one for found in drawings.values() for one in found)):
             drawing.save(one, figures)
     where = PurePath(os.path.relpath(figures, page.parent)).as_posix()
     page.parent.mkdir(parents=True, exist_ok=True)
-    page.write_text(page_text(measurements, environments_of(parts), drawings, where, again), encoding="utf-8")
+    page.write_text(page_text(measurements, environments, drawings, where, again), encoding="utf-8")
 
 
-def read_second(paths: Sequence[Path]) -> list[Summary]:
-    """Return the summary of another run, of folders with its raw data or of files that were kept of it.
+def read_second(paths: Sequence[Path]) -> OtherRun:
+    """Return another run, of folders with its raw data or of summaries that were kept of it.
 
     Raises:
         OSError: A file cannot be read.
@@ -74,7 +94,10 @@ def read_second(paths: Sequence[Path]) -> list[Summary]:
     files = [path for path in paths if path.is_file()]
     kept = [one for path in files for one in read_summary(path)]
     parts = read_parts([path for path in paths if path not in files])
-    return kept + summarize(Measurements.of(rows_of(parts)))
+    environments = environments_of(parts)
+    for path in files:
+        environments |= read_environments(path.parent / ENVIRONMENTS)
+    return OtherRun(kept + summarize(Measurements.of(rows_of(parts))), environments)
 
 
 def page_text(
@@ -82,7 +105,7 @@ def page_text(
     environments: Mapping[str, Mapping[str, Any]],
     drawings: Mapping[str, Sequence[Drawing]],
     figures: str,
-    again: Sequence[Summary] | None = None,
+    again: OtherRun | None = None,
 ) -> str:
     """Return the page.
 
@@ -91,7 +114,7 @@ def page_text(
         environments: What they depend on, by the heads of the table's columns.
         drawings: Figures by experiment.
         figures: Folder of the figures as the page links to it.
-        again: The summary of another full run.
+        again: Another full run.
     """
     judgements = judge_all(measurements)
     parts = [
@@ -111,7 +134,7 @@ def page_text(
         parts += [f"## {section.title}", f"Experiment `{section.experiment}`. {section.text}"]
         parts += _section(measurements, section.experiment, drawings.get(section.experiment, ()), figures)
     parts += ["## Other data", _other(measurements)]
-    parts += ["## Another full run", _repeated(measurements, again)]
+    parts += ["## Another full run", _repeated(measurements, environments, again)]
     parts += ["## Limits", LIMITS]
     return "\n\n".join(part.strip("\n") for part in parts if part) + "\n"
 
@@ -180,7 +203,18 @@ def _other(measurements: Measurements) -> str:
     return "\n\n".join(filter(None, parts)) or "None."
 
 
-def _repeated(measurements: Measurements, again: Sequence[Summary] | None) -> str:
+def _repeated(
+    measurements: Measurements, environments: Mapping[str, Mapping[str, Any]], again: OtherRun | None
+) -> str:
     if again is None:
         return NOT_MEASURED
-    return comparison_text(compare(summarize(measurements), again))
+    compared = comparison_text(compare(summarize(measurements), again.summary))
+    return "\n\n".join(filter(None, (_differences(environments, again.environments), compared)))
+
+
+def _differences(first: Mapping[str, Mapping[str, Any]], second: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return what differs between the runs, if each was made in one go."""
+    if len(first) != 1 or len(second) != 1:
+        return ""
+    (one,), (other,) = first.values(), second.values()
+    return differences_table(one, other)

@@ -110,6 +110,40 @@ def environment_table(environments: Mapping[str, Mapping[str, Any]]) -> str:
     return markdown(("what", *environments), rows)
 
 
+def differences_table(first: Mapping[str, Any], second: Mapping[str, Any]) -> str:
+    """Return the table of what differs between what two runs depend on; empty if nothing is known to."""
+    if not first or not second:
+        return ""
+    rows = [
+        [name, *(_value(name, one.get(name, MISSING)) for one in (first, second))]
+        for name in dict.fromkeys((*first, *second))
+        if first.get(name) != second.get(name)
+    ]
+    return markdown(("what differs", "first run", "second run"), rows) if rows else ""
+
+
+def write_environments(path: Path, environments: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write what rows depend on, to be kept with their summary.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    path.write_text(json.dumps(environments, indent=2) + "\n", encoding="utf-8")
+
+
+def read_environments(path: Path) -> dict[str, Mapping[str, Any]]:
+    """Read what :func:`write_environments` wrote; nothing if there is no file.
+
+    Raises:
+        OSError: The file cannot be read.
+        ExperimentError: It is not such a file.
+    """
+    found = _environment(path)
+    if not all(isinstance(one, dict) for one in found.values()):
+        raise ExperimentError(f"{path} is not what a page kept beside its summary")
+    return found
+
+
 def _environment(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))

@@ -15,7 +15,7 @@ from support.experiment_rows import CRS, SMS, example_rows, in_three_systems, ro
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.report import drawing, make_report
 from rce_fleet.experiments.report.measurements import Measurements
-from rce_fleet.experiments.report.page import page_text
+from rce_fleet.experiments.report.page import OtherRun, page_text
 from rce_fleet.experiments.report.schematics import schematics
 from rce_fleet.experiments.report.sections import SECTIONS
 from rce_fleet.experiments.report.summary import summarize
@@ -299,7 +299,7 @@ def test_second_run_is_compared(rows: list[Row]) -> None:
     ]
     same = [row for row in rows if row.metric != "rain"]
     again = summarize(Measurements.of([*same, *changed]))
-    text = page_text(Measurements.of(rows), {}, {}, "images", again)
+    text = page_text(Measurements.of(rows), {}, {}, "images", OtherRun(again, {}))
     assert "| weather | 1 | 0 % | 0 % |" in text
     assert "| weather | CRS | RCE | sky=blue | `rain` | 3.00 [2.70, 3.30] | 6.00 | mm | +100.0 % |" in text
     assert "the goal of 90 % is reached" in text
@@ -341,6 +341,13 @@ def test_report_is_page_figures_and_summary(folder: Path, tmp_path: Path) -> Non
     assert "| options | quick no |" in text
     make_report([folder], page=page, figures=figures, second=[figures / "summary.csv"])
     assert page.read_text(encoding="utf-8") == text, "the summary is enough to compare with a run"
+    assert "what differs" not in page.read_text()
+    (figures / "environments.json").write_text('{"value": {"cores": 4}}')
+    make_report([folder], page=page, figures=figures, second=[figures / "summary.csv"])
+    assert "| what differs | first run | second run |\n| --- | --- | --- |\n| cores | " in page.read_text()
+    (figures / "environments.json").write_text('{"value": 4}')
+    with pytest.raises(ExperimentError, match=r"environments\.json is not what a page kept"):
+        make_report([folder], page=page, figures=figures, second=[figures / "summary.csv"])
 
 
 def test_page_without_matplotlib_says_what_to_install(
@@ -351,7 +358,9 @@ def test_page_without_matplotlib_says_what_to_install(
     text = (tmp_path / "page.md").read_text(encoding="utf-8")
     assert "Figures are missing: matplotlib is not installed: pip install 'rce[figures]'." in text
     assert "| SMS | ROS | core_killed | 100 [99.0, 101] |" in text
-    assert [path.name for path in (tmp_path / "figures").iterdir()] == ["summary.csv"]
+    assert [path.name for path in (tmp_path / "figures").iterdir() if path.suffix != ".json"] == [
+        "summary.csv"
+    ]
 
 
 @pytest.mark.parametrize("text", ["{", "[]"])
