@@ -34,16 +34,11 @@ master_host: 127.0.0.1
 NODE = {"tag": "echo", "pkg": "Test", "exe": "stringEcho.py", "name": "echo"}
 
 
-def folders_to(*places: str) -> set[str]:
-    """Folders that the service's user must be able to enter, wherever this Python is installed."""
-    return {str(folder) for place in places for folder in Path(place).parents}
-
-
 async def install(machine: Booted) -> None:
     machine.run(
         f"mkdir /etc/rce; cat >/etc/rce/engine.yaml; {BIN}/rce secret new /etc/rce/secret", stdin=SETTINGS
     )
-    machine.run(f"chmod o+x {shlex.join(folders_to(sys.base_prefix, str(BIN)))}")
+    machine.let_enter(sys.base_prefix, str(BIN))
     machine.run(
         f"{BIN}/rce user add alice --admin --password-stdin --state-dir /var/lib/rce/master",
         stdin="wonderland\n",

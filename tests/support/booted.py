@@ -1,6 +1,6 @@
 """A machine that systemd runs: this one's files under an overlay, in namespaces and cgroups of their own.
 
-Nothing that happens in it changes this machine. Its network is a loopback interface.
+Nothing that happens in it changes this machine. Its network is a loopback interface, or one that was made.
 """
 
 from __future__ import annotations
@@ -33,14 +33,15 @@ for folder in "$@"; do
     done
     echo $$ >"$folder/$name/cgroup.procs"
 done
-exec unshare --fork --pid --mount --net --ipc --uts --cgroup --mount-proc --kill-child=SIGKILL \
+if [ -n "$NETWORK" ]; then enter="nsenter --net=$NETWORK"; else enter="unshare --net"; fi
+exec $enter unshare --fork --pid --mount --ipc --uts --cgroup --mount-proc --kill-child=SIGKILL \
     sh -ec "$INSIDE"
 """
 
 _INSIDE = r"""
 mount --make-rprivate /
-mount -t tmpfs tmpfs /mnt
-mkdir /mnt/upper /mnt/work /mnt/root
+if [ -n "$DISK" ]; then mount --bind "$DISK" /mnt; else mount -t tmpfs tmpfs /mnt; fi
+mkdir -p /mnt/upper /mnt/work /mnt/root
 mount -t overlay overlay -o lowerdir=/,upperdir=/mnt/upper,workdir=/mnt/work /mnt/root
 cd /mnt/root
 mount -t proc proc proc
@@ -68,6 +69,7 @@ if grep -qv '^0:' /proc/self/cgroup; then
 else
     mount -t cgroup2 cgroup2 sys/fs/cgroup
 fi
+if [ ! -e /mnt/begun ]; then
 rm -rf etc/systemd/system var/log/journal etc/rce var/lib/rce
 mkdir etc/systemd/system
 : >etc/fstab
@@ -76,8 +78,10 @@ for unit in systemd-udevd.service systemd-logind.service systemd-networkd.servic
     systemd-timesyncd.service getty.target console-getty.service proc-sys-fs-binfmt_misc.automount; do
     ln -s /dev/null etc/systemd/system/$unit
 done
+touch /mnt/begun
+fi
 ip link set lo up
-mkdir .former
+mkdir -p .former
 pivot_root . .former
 umount -l /.former
 mount --make-rshared /
@@ -88,7 +92,8 @@ exec env -i container=other PATH=$PATH /lib/systemd/systemd --system --unit=mult
 class Booted:
     """The machine, while it runs."""
 
-    def __init__(self, init: int) -> None:
+    def __init__(self, init: int, process: asyncio.subprocess.Process) -> None:
+        self._process = process
         self._enter = ["nsenter", f"--target={init}", "--all", "--root", "--wd", "--", "env", "-i"]
 
     def run(self, command: str, *, code: int | None = 0, stdin: str = "") -> str:
@@ -114,22 +119,39 @@ class Booted:
         """As :meth:`run`, in a thread."""
         return await asyncio.to_thread(self.run, command, code=code, stdin=stdin)
 
+    async def reboot(self) -> None:
+        """Reboot it; it ends then, and the next machine with its disk is the same one."""
+        await self.run_soon("systemctl reboot", code=None)
+        await self._process.wait()
+
+    def let_enter(self, *places: str) -> None:
+        """Let all users enter the folders of these places, wherever they are installed."""
+        folders = {str(folder) for place in places for folder in Path(place).parents}
+        self.run(f"chmod o+x {shlex.join(folders)}")
+
     def journal(self, unit: str) -> str:
         """The unit's log."""
         return self.run(f"journalctl --no-pager -o cat -u {shlex.quote(unit)}")
 
 
 @contextlib.asynccontextmanager
-async def booted() -> AsyncIterator[Booted]:
-    """Boot the machine, and take it away again."""
-    name = f"rce-booted-{os.getpid()}"
+async def booted(number: int = 0, *, network: str = "", disk: Path | None = None) -> AsyncIterator[Booted]:
+    """Boot the machine, and take it away again, as by a loss of power if it runs.
+
+    Args:
+        number: One for each machine that runs at the same time.
+        network: The network namespace that it is in; empty for one of its own.
+        disk: Folder that keeps its files, on a file system that overlays can be on; None: they end with it.
+    """
+    name = f"rce-booted-{os.getpid()}-{number}"
+    place = {"NETWORK": f"/run/netns/{network}" if network else "", "DISK": str(disk or "")}
     with tempfile.TemporaryFile() as console:
         process = await asyncio.create_subprocess_exec(
             *("sh", "-c", _BOOT, "sh", name, *map(str, _hierarchies())),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=console,
             stderr=console,
-            env={"PATH": _PATH, "INSIDE": _INSIDE},
+            env={"PATH": _PATH, "INSIDE": _INSIDE, **place},
             start_new_session=True,
         )
         try:
@@ -142,13 +164,14 @@ async def booted() -> AsyncIterator[Booted]:
                         return int(children[0])
                 return 0
 
-            machine = Booted(await until(init, what="systemd starts"))
+            machine = Booted(await until(init, what="systemd starts"), process)
             state = "systemctl is-system-running --wait"
             await until(lambda: "running" in machine.run(state, code=None), what="systemd has booted")
             try:
                 yield machine
             except BaseException:
-                print(machine.run("journalctl --no-pager -o cat | tail -n 80", code=None))  # noqa: T201
+                if process.returncode is None:
+                    print(machine.run("journalctl --no-pager -o cat | tail -n 80", code=None))  # noqa: T201
                 raise
         finally:
             with contextlib.suppress(ProcessLookupError):
