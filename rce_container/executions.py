@@ -38,12 +38,39 @@ class Executions:
     def __init__(self, dialer: RunDialer, start: Start) -> None:
         self._dialer = dialer
         self._start = start
+        self._leadership = ("", 0)
+        """Name and term of the master that gives the orders."""
+        self._running: dict[ClientConnection, tuple[str, int]] = {}
+        """The leadership that ordered the run of each connection."""
+
+    def welcomed(self, master: str, term: int) -> None:
+        """End the runs that another leadership ordered.
+
+        Its master ends their connections itself, unless it hangs or its machine is lost; then their users
+        cannot end them.
+
+        Args:
+            master: The name of the master that leads now.
+            term: Of its leadership.
+        """
+        self._leadership = (master, term)
+        for connection, ordered_by in self._running.items():
+            if ordered_by != self._leadership:
+                _log.info("a command that master %s ordered is ended: %s leads", ordered_by[0], master)
+                connection.transport.abort()
 
     async def execute(self, message: Execute) -> None:
         """Run a command to its end."""
+        ordered_by = self._leadership
         try:
             async with self._dialer.dial(message.run) as master:
-                await self._join(message, master)
+                if ordered_by != self._leadership:
+                    return
+                self._running[master] = ordered_by
+                try:
+                    await self._join(message, master)
+                finally:
+                    del self._running[master]
         except (OSError, TimeoutError, WebSocketException) as error:
             _log.warning("a command in %s is ended: %s", message.id, error)
 

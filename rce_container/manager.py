@@ -206,11 +206,8 @@ class Manager:
     async def handle(self, message: ToTaskSet) -> None:
         """Handle a message of the master."""
         match message:
-            case Welcome(features=features):
-                self._master_features = frozenset(features)
-                if self._snapshots is not None:
-                    self._snapshots.is_wanted = SNAPSHOTS in features
-                self._node_states.learn(features)
+            case Welcome():
+                self._learn(message)
             case Put() | PatchSpec() | StatusWanted() | Drop() | Sync():
                 self._feed(_event_of(message))
             case ReadLog():
@@ -236,6 +233,15 @@ class Manager:
                 _log.debug("not for a container task set: %s", type(message).__name__)
             case _:
                 assert_never(message)
+
+    def _learn(self, welcome: Welcome) -> None:
+        """Take note of the master that leads, and of what it can do."""
+        features = self._master_features = frozenset(welcome.features)
+        if self._executions is not None:
+            self._executions.welcomed(welcome.master, welcome.term)
+        if self._snapshots is not None:
+            self._snapshots.is_wanted = SNAPSHOTS in features
+        self._node_states.learn(features)
 
     def _begin(self, order: SaveState | Execute) -> None:
         """Begin to do what takes a while."""
