@@ -253,7 +253,8 @@ async def test_without_cgroups_each_process_is_limited(
     async with machine.engine():
         await machine.put(BOX, resources=Resources(memory=128 * MB), nodes=(greedy("hog", "300"),))
         died = await machine.node_is(BOX, "hog", NodeState.FAILED)
-        assert "MemoryError" in died.detail
+        # From Python 3.13 on there may be no memory left for the traceback.
+        assert "MemoryError" in died.detail or "lost sys.stderr" in died.detail
         assert "has 60" in await machine.log(BOX, "hog")
         await until(lambda: machine.usage and BOX in machine.usage[-1].endpoints)
         seen = usage(machine, BOX)
