@@ -73,7 +73,7 @@ class ClusterClient(EtcdClient):
             EtcdError: No member answers, or etcd refused.
         """
         message = {"action": "GET"}
-        return await self._call("v3/maintenance/alarm", message, read_alarms, CHANGE_S)
+        return await self._call("v3/maintenance/alarm", message, read_alarms)
 
     async def status(self) -> MemberStatus:
         """Return what the member that answers tells of itself.

@@ -12,6 +12,7 @@ import aiohttp
 from rce.link.address import in_url
 from rce_master.cluster.client import ANSWER_S, ClusterClient, answering, ask_all, healthy
 from rce_master.cluster.members import Member, MemberStatus, advice, no_quorum
+from rce_master.store.etcd.exceptions import EtcdAwayError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -106,8 +107,13 @@ async def make_report(client: ClusterClient, tls: Context | None, http_port: int
     """
     members = sorted(await client.members(), key=lambda member: member.name)
     answers = await ask_all(members, tls)
+    alarms: dict[int, tuple[str, ...]] = {}
+    if healthy(answers):
+        try:
+            alarms = await client.alarms()
+        except EtcdAwayError:  # a leader that has just lost the others says for a while that it leads
+            answers = await ask_all(members, tls)
     is_led = bool(healthy(answers))
-    alarms = await client.alarms() if is_led else {}
     lines = tuple(_member_line(member, answers[member.id], alarms.get(member.id, ())) for member in members)
     masters = await _ask_masters(members, tls, http_port)
     advised = list(_advice(members, lines, masters)) if is_led else [no_quorum(members, answering(answers))]
