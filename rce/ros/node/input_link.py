@@ -7,11 +7,12 @@ import logging
 from typing import TYPE_CHECKING
 
 from rce.ros.errors import TcprosError
-from rce.ros.tcpros.header import check_type, decode_header, raise_error_field
+from rce.ros.tcpros.header import ANY, check_type, decode_header, raise_error_field
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from rce.ros.errors import HandshakeRefusedError
     from rce.ros.node.topic_input import TopicInput
     from rce.ros.tcpros.connection import Connection
 
@@ -71,7 +72,10 @@ class InputLink:
         """Done when the connection is gone; failed if the publisher refused."""
         self.publisher = ""
         """The publishing node's name, once it said so."""
+        self.md5sum = ANY
+        """Checksum of the published type, once the publisher said so."""
         self._target = target
+        self._connection: Connection | None = None
         self.is_greeted = False
         """Whether the publisher has answered."""
         self.kept: bytes | None = None
@@ -82,7 +86,8 @@ class InputLink:
         self._waiting: list[bytes] | None = None
 
     def connection_made(self, connection: Connection) -> None:
-        """Do nothing: the connecting side sends the header."""
+        """Keep it, to end it: the connecting side sends the header."""
+        self._connection = connection
 
     def frame_received(self, connection: Connection, payload: bytes) -> None:
         """Take the publisher's header, then messages."""
@@ -114,6 +119,15 @@ class InputLink:
             self._deliver(payload)
         connection.resume_reading()
 
+    def refuse(self, error: HandshakeRefusedError) -> None:
+        """End the connection from this side: nothing more is delivered."""
+        self.kept = None
+        if self._waiting:
+            self._waiting = []
+        self._end(error)
+        if self._connection is not None:
+            self._connection.abort()
+
     def _take_first(self, connection: Connection) -> None:
         """Hold the first message if it may be latched although the publisher's header did not say so."""
         in_doubt = not self._latched and self._target.tells_latched
@@ -142,6 +156,7 @@ class InputLink:
             fields, md5sum=target.md5sum, type_name=target.message_type_name, subject=f"topic {target.topic}"
         )
         self.publisher = fields.get("callerid", "")
+        self.md5sum = fields.get("md5sum", ANY)
         self._latched = says_latching(fields)
 
     def _end(self, error: Exception | None) -> None:

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Protocol
 
 from rce.aio.queues import BoundedQueue
 from rce.ros.node.settings import MAX_QUEUED_BYTES
+from rce.ros.tcpros.header import ANY
 
 if TYPE_CHECKING:
+    from rce.ros.errors import HandshakeRefusedError
     from rce.ros.node.topics import Topics
     from rce.ros.types import Message, MessageType
 
@@ -45,7 +47,7 @@ def find_neighbour(uri: str) -> Topics | None:
 class LocalMessage:
     """A published message, as an object, as bytes, or both; each is made from the other when needed."""
 
-    __slots__ = ("_message", "_message_type", "_payload")
+    __slots__ = ("_message", "_message_type", "_payload", "_size")
 
     def __init__(
         self, message_type: MessageType | None, message: Message | None = None, payload: bytes | None = None
@@ -54,10 +56,15 @@ class LocalMessage:
         self._message_type = message_type
         self._message = message
         self._payload = payload
+        self._size = -1 if payload is None else len(payload)
 
     def __len__(self) -> int:
-        """Bytes that the message has on the wire, 0 while it was not written."""
-        return 0 if self._payload is None else len(self._payload)
+        """Bytes that the message has on the wire; text counts as a byte a character until it is written."""
+        if self._size < 0:
+            assert self._message_type is not None
+            assert self._message is not None
+            self._size = self._message_type.size(self._message)
+        return self._size
 
     def payload(self) -> bytes:
         """Return the serialized message."""
@@ -65,6 +72,7 @@ class LocalMessage:
             assert self._message_type is not None
             assert self._message is not None
             self._payload = bytes(self._message_type.serialize(self._message))
+            self._size = len(self._payload)
         return self._payload
 
     def message(self, message_type: MessageType) -> Message:
@@ -89,10 +97,11 @@ class LocalLink:
         publisher: The publishing node's name.
         subscriber: The subscribing node's name.
         messages: How many messages were delivered.
-        bytes_in: Bytes of those that were serialized for some reason.
+        bytes_in: Bytes that these would have on the wire.
         bytes_out: The same.
+        md5sum: Checksum of the published type.
         kept: The newest message of a latching publisher.
-        ended: Done when the publisher's topic is closed.
+        ended: Done when the publisher's topic is closed; failed if the subscriber refused its type.
     """
 
     is_greeted = True
@@ -106,6 +115,7 @@ class LocalLink:
         self.subscriber = subscriber
         self.messages = 0
         self.bytes_in = 0
+        self.md5sum = ANY
         self.kept: LocalMessage | None = None
         loop = asyncio.get_running_loop()
         self.ended: asyncio.Future[None] = loop.create_future()
@@ -132,6 +142,8 @@ class LocalLink:
 
     def send(self, local_message: LocalMessage, *, latched: bool) -> None:
         """Queue a message; it is delivered as soon as the event loop is free."""
+        if self.ended.done():
+            return
         self._queue.put((local_message, latched), len(local_message))
         self._deliver_soon()
 
@@ -139,6 +151,13 @@ class LocalLink:
         """End the link from the publisher's side; waiting messages are still delivered."""
         if not self.ended.done():
             self.ended.set_result(None)
+
+    def refuse(self, error: HandshakeRefusedError) -> None:
+        """End the link from the subscriber's side: nothing more is delivered."""
+        self._queue.clear()
+        self.kept = None
+        if not self.ended.done():
+            self.ended.set_exception(error)
 
     def _deliver_soon(self) -> None:
         if self._queue and not self._is_due:

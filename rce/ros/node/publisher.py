@@ -146,6 +146,7 @@ class TopicOutput:
                 f"{self.topic} is of type {self.message_type.name} there, "
                 f"which does not have md5 sum {md5sum}"
             )
+        link.md5sum = self.message_type.md5sum
         for chunks in self._latched():
             link.send(LocalMessage(self.message_type, payload=payload_of(chunks)), latched=True)
         self.local_links.append(link)

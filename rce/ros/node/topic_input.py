@@ -81,6 +81,8 @@ class TopicInput:
     def check(self, message_type_name: str, md5sum: str) -> None:
         """Check that another subscriber of the node expects the same type; the first concrete one counts.
 
+        Publishers of another type end, which were taken while any type was expected.
+
         Raises:
             TypeMismatchError: It does not.
         """
@@ -91,10 +93,18 @@ class TopicInput:
                 f"{self.topic} is subscribed to as {self.message_type_name} already, not {message_type_name}"
             )
         self.message_type_name, self.md5sum = message_type_name, md5sum
+        for link in self.links:
+            if link.md5sum not in (ANY, md5sum):
+                link.refuse(
+                    HandshakeRefusedError(
+                        f"topic {self.topic} is of type {message_type_name} with md5 sum {md5sum} here,"
+                        f" of a type with md5 sum {link.md5sum} there"
+                    )
+                )
 
     def connected(self) -> int:
         """Return how many publishers have accepted the subscription."""
-        return sum(link.is_greeted for link in self.links)
+        return sum(link.is_greeted and not link.ended.done() for link in self.links)
 
     def deliver(self, payload: bytes, latched: bool, uri: str) -> None:
         """Give a message of a publisher's to all subscribers."""

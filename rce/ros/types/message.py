@@ -18,6 +18,7 @@ from rce.ros.types.definition import (
 from rce.ros.types.exceptions import BadDefinitionError, UnknownTypeError
 from rce.ros.types.fields import Buffer, Field, min_size, repetitions
 from rce.ros.types.objects import make_class, make_codec, make_message
+from rce.ros.types.sizes import make_size
 from rce.ros.types.values import BUILTINS, Message
 
 if TYPE_CHECKING:
@@ -123,6 +124,15 @@ class MessageType:
     @cached_property
     def _codec(self) -> tuple[Callable[[Message], bytes], Callable[[Buffer], Message]]:
         return make_codec(self)
+
+    @cached_property
+    def size(self) -> Callable[[Message], int]:
+        """Returns the bytes that a message of :attr:`cls` has on the wire, without writing it.
+
+        Text counts as one byte a character. It does not fail: of a message that cannot be written, it returns
+        :attr:`min_size`.
+        """
+        return make_size(self)
 
     def new(self, /, **values: Any) -> Message:
         """Make a message; nested messages may be given as dicts, arrays as any sequence.

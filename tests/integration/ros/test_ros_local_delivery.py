@@ -86,6 +86,25 @@ async def test_too_many_at_once_lose_the_oldest(near: MakeNode) -> None:
         assert publisher.dropped == 7
 
 
+async def test_objects_count_in_the_bytes_of_queues(near: MakeNode, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that takes nothing must not fill the memory, although its messages are never written."""
+    monkeypatch.setattr("rce.ros.node.subscriber.MAX_QUEUED_BYTES", 10_000)
+    monkeypatch.setattr("rce.ros.node.local.MAX_QUEUED_BYTES", 10_000)
+    async with near("a") as a, near("b") as b:
+        publisher = await a.advertise("t", "std_msgs/UInt8MultiArray", queue_size=1000)
+        slow = await b.subscribe("t", "std_msgs/UInt8MultiArray", queue_size=1000)
+        await publisher.wait_for_subscribers(timeout=10)
+        for _ in range(20):
+            publisher.publish(publisher.type.new(data=bytes(3000)))
+        assert publisher.dropped == 17, "three wait for the event loop"
+        for _ in range(20):
+            publisher.publish(publisher.type.new(data=bytes(3000)))
+            await asyncio.sleep(0)
+        async with asyncio.timeout(20):
+            while slow.dropped < 19:  # of 22 that were handed over; three wait for the program
+                await asyncio.sleep(0)
+
+
 async def test_types_must_agree(near: MakeNode, caplog: pytest.LogCaptureFixture) -> None:
     async with near("a") as a, near("b") as b:
         publisher = await a.advertise("t", STRING)

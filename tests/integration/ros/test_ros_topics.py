@@ -357,6 +357,36 @@ async def test_types_must_agree(core: Core, make_node: MakeNode, caplog: pytest.
             publisher.publish(TypeRegistry().message("std_msgs/Bool").new(data=True))
 
 
+@pytest.mark.parametrize("near", [True, False])
+async def test_concrete_type_after_any_ends_other_publishers(
+    make_node: MakeNode, caplog: pytest.LogCaptureFixture, near: bool
+) -> None:
+    """A subscriber of any type takes all publishers; one of a type must not get the others' messages."""
+    async with make_node("a", intra_process=near) as a, make_node("b", intra_process=near) as b:
+        publisher = await a.advertise("t", STRING, latch=True)
+        publisher.publish(data="text")
+        raw: asyncio.Queue[bytes] = asyncio.Queue()
+        relayed = await b.subscribe_serialized("t", "*", lambda payload, latched: raw.put_nowait(payload))
+        assert await asyncio.wait_for(raw.get(), 20) == b"\x04\0\0\0text"
+        numbers: list[object] = []
+        other = await b.subscribe("t", "std_msgs/UInt64", numbers.append)
+        assert (relayed.connections, other.connections) == (0, 0)
+        async with asyncio.timeout(20):
+            while publisher.connections:
+                publisher.publish(data="four")  # as many bytes as a UInt64 has
+                await asyncio.sleep(0)
+            while "md5 sum" not in caplog.text:
+                await asyncio.sleep(0.01)
+        assert numbers == []
+        right = await b.advertise("t", "std_msgs/UInt64")
+        await right.wait_for_subscribers(timeout=20)
+        right.publish(data=7)
+        async with asyncio.timeout(20):
+            while not numbers:
+                await asyncio.sleep(0.01)
+        assert [getattr(number, "data", None) for number in numbers] == [7]
+
+
 async def test_handles_share_a_topic_until_the_last_is_closed(core: Core, make_node: MakeNode) -> None:
     async with make_node("a") as a, make_node("b") as b:
         first, second = await a.advertise("t", STRING), await a.advertise("t", STRING)

@@ -68,6 +68,25 @@ def test_every_field_type_survives_the_wire(message: Any) -> None:
     assert EVERYTHING.deserialize(memoryview(bytearray(data))) == message
 
 
+@given(message_values(EVERYTHING))
+def test_size_is_that_of_the_written_message(message: Any) -> None:
+    written = EVERYTHING.serialize(message)
+    texts = [message.f_string, *message.f_strings, *message.three_f_string]
+    texts += [inner.b for inner in (message.f_Inner, *message.f_Inners, *message.three_f_Inner)]
+    surplus = sum(len(text.encode()) - len(text) for text in texts)  # a character counts as one byte
+    assert EVERYTHING.size(message) == len(written) - surplus
+
+
+def test_size_of_other_sequences() -> None:
+    everything = EVERYTHING.new()
+    before = EVERYTHING.size(everything)
+    everything.f_uint8s = np.zeros((3, 4), np.uint8)
+    everything.f_float64s = np.zeros(5)
+    assert EVERYTHING.size(everything) == before + 12 + 40 == len(EVERYTHING.serialize(everything))
+    everything.f_string = None
+    assert EVERYTHING.size(everything) == EVERYTHING.min_size
+
+
 @given(st.data())
 def test_the_bytes_are_those_that_rosbags_reads_and_writes(data: st.DataObject) -> None:
     store = get_typestore(Stores.ROS1_NOETIC)
