@@ -9,6 +9,7 @@
         +-- NoSuchInterfaceError     an interface or address to discover on that is not there
         +-- NoDiscoveryError         no discovery runs at a master
         +-- NothingToRelayError      the type of a topic or service cannot be learned: no node offers it
+        +-- LinkFullError            too much waits to be sent on a relay link
         +-- LinkBrokenError          the other end of a relay link breaks its protocol or refuses
 """
 
@@ -39,6 +40,26 @@ class NoDiscoveryError(MultimasterError):
 
 class NothingToRelayError(MultimasterError):
     """The type of a topic or service cannot be learned."""
+
+
+class LinkFullError(MultimasterError):
+    """A call or an answer was not sent over a relay link, because too much waits to be sent.
+
+    Attributes:
+        waiting: Bytes that wait.
+        size: Bytes of what was not sent.
+    """
+
+    def __init__(self, waiting: int, size: int) -> None:
+        super().__init__(waiting, size)
+        self.waiting = waiting
+        self.size = size
+
+    def __str__(self) -> str:
+        return (
+            f"the relay's connection is too slow: {self.waiting} bytes wait to be sent,"
+            f" {self.size} more do not fit"
+        )
 
 
 class LinkBrokenError(MultimasterError):

@@ -9,12 +9,14 @@ import struct
 import sys
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
 from support.multimaster import STRING, DiscoveryNetwork, node
+from support.slow_link import SlowLink
 
 from rce.ros.core import Core, Graph
 from rce.ros.errors import ServiceError, ServiceFaultError
@@ -287,6 +289,59 @@ async def test_one_connection_carries_topics_and_services_both_ways() -> None:
         assert (await base.service_client("add", "roscpp/GetLoggers").call({}, timeout=20)).loggers == []
         with pytest.raises(ServiceFaultError, match="not today"):
             await base.service_client("refuse", "roscpp/Empty").call({}, timeout=20)
+
+
+@pytest.mark.parametrize("large", ["calls", "answers"])
+async def test_calls_that_a_slow_link_cannot_hold_fail(large: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What waits for a connection is in memory; the caller learns that there is too much of it."""
+    monkeypatch.setattr("rce.ros.multimaster.relay.connection.MAX_WAITING", 2**23)
+    text = "x" * 2**22
+    count = 8
+    settings = SyncSettings(relay_listen=0, relay_addr="127.0.0.1", relay_token="t", relay_name="cloud")
+    async with AsyncExitStack() as stack:
+        cloud, robot = [await stack.enter_async_context(Core(port=0)) for _ in range(2)]
+        one = await stack.enter_async_context(MasterSync(replace(settings, master_uri=cloud.uri)))
+        slow = await stack.enter_async_context(SlowLink(f"ws://127.0.0.1:{one.relay_port}").running())
+        host, _, port = slow.endpoint.partition(":")
+        dialing = SyncSettings(robot.uri, relay_to=((host, int(port)),), relay_token="t", relay_name="robot")
+        await stack.enter_async_context(MasterSync(dialing))
+        provider = await stack.enter_async_context(node("provider", cloud.uri))
+        caller = await stack.enter_async_context(node("caller", robot.uri))
+        came = 0
+        all_came = asyncio.Event()
+
+        async def answer(_: object) -> dict[str, object]:
+            nonlocal came
+            came += 1
+            if came == count:
+                slow.hangs = True
+                all_came.set()
+            await all_came.wait()
+            return {"loggers": [{"name": text, "level": ""}]}
+
+        await provider.advertise_service("small", "roscpp/SetLoggerLevel", lambda _: {})
+        await provider.advertise_service("large", "roscpp/GetLoggers", answer)
+        await robot.wait_until(
+            lambda graph: None not in (graph.service("/small"), graph.service("/large")), timeout=20
+        )
+        if large == "calls":
+            slow.hangs = True
+            client = caller.service_client("small", "roscpp/SetLoggerLevel")
+            calls = [client.call({"logger": text}, timeout=30) for _ in range(count)]
+        else:
+            client = caller.service_client("large", "roscpp/GetLoggers")
+            calls = [client.call({}, timeout=30) for _ in range(count)]
+        working = [asyncio.ensure_future(call) for call in calls]
+        if large == "calls":
+            await asyncio.wait(working, return_when=asyncio.FIRST_COMPLETED, timeout=20)
+        else:
+            await asyncio.wait_for(all_came.wait(), 20)
+        slow.hangs = False
+        results = await asyncio.gather(*working, return_exceptions=True)
+        failures = [result for result in results if isinstance(result, ServiceFaultError)]
+        assert 1 <= len(failures) < count, results
+        assert all("connection is too slow" in failure.text for failure in failures)
+        assert not [result for result in results if isinstance(result, Exception) and result not in failures]
 
 
 async def test_a_link_brings_messages_only_while_there_is_a_subscriber() -> None:

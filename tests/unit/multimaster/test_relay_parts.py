@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce.ros.multimaster.errors import LinkBrokenError
-from rce.ros.multimaster.relay.connection import QUEUE, RelayConnection
+from rce.ros.multimaster.errors import LinkBrokenError, LinkFullError
+from rce.ros.multimaster.relay import connection as relay_connection
+from rce.ros.multimaster.relay.connection import QUEUE, SHORT, RelayConnection
 from rce.ros.multimaster.relay.frames import (
     NO_SOURCE,
     Answer,
@@ -107,6 +108,27 @@ async def test_full_connection_keeps_the_newest_of_each_source() -> None:
     found = await sent_by_a_full_connection(*frames, Sources(1, frozenset({2})))
     assert found[-3:] == [*frames[-2:], Sources(1, frozenset({2}))]
     assert len(found) <= QUEUE + 3
+
+
+async def test_side_that_does_not_read_answers_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Short answers are taken by a full connection, but not without an end."""
+    monkeypatch.setattr(relay_connection, "MAX_WAITING", 2**21)
+    loop = asyncio.get_running_loop()
+    ours, theirs = socket.socketpair()
+    with theirs:
+        _, connection = await loop.create_connection(RelayConnection, sock=ours)
+        calls = (Call(1, number, bytes(2**19)) for number in range(100))
+        with pytest.raises(LinkFullError, match="too slow"):
+            list(map(connection.send, calls))
+        connection.send(Answer(1, ok=False, payload=b"too slow"))
+        assert not connection.ended.done()
+        with pytest.raises(LinkFullError):
+            connection.send(Answer(1, ok=True, payload=bytes(2**20)))
+        for number in range(2**13):
+            connection.send(Answer(number, ok=False, payload=bytes(SHORT)))
+        with pytest.raises(LinkBrokenError, match="does not read the answers"):
+            await connection.ended
+        await connection.gone.wait()
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,12 @@ from typing import cast
 
 from rce.aio.queues import BoundedQueue
 from rce.guard import Guest, Lobby, address_of
-from rce.ros.multimaster.errors import LinkBrokenError
+from rce.ros.multimaster.errors import LinkBrokenError, LinkFullError
 from rce.ros.multimaster.relay.frames import (
     MAX_FRAME_SIZE,
     MAX_GREETING,
+    Answer,
+    Call,
     Challenge,
     Data,
     Decoder,
@@ -33,6 +35,15 @@ WRITE_HIGH = 2**20
 """Bytes waiting to be sent from which on messages wait, the newest :data:`QUEUE` besides the latched ones."""
 
 QUEUE = 100
+MAX_WAITING = MAX_QUEUED_BYTES
+"""Bytes waiting to be sent beyond which a full connection takes no calls and answers."""
+
+SHORT = 1024
+"""Bytes of an answer that a full connection takes nevertheless: such as say why another one was not sent."""
+
+MAX_SHORT = 2**20
+"""Bytes that such answers may add; a side that calls on without reading them is left."""
+
 MAX_BACKLOG = 16
 """How many frames may come before this side has read the hello."""
 
@@ -76,14 +87,34 @@ class RelayConnection(asyncio.Protocol):
         """Send a frame; while the connection is full, a message waits, and may be dropped for newer ones.
 
         A latched message is dropped only for a newer one of its source.
+
+        Raises:
+            LinkFullError: A call or an answer does not fit beside what waits to be sent; it was not sent.
         """
         if self._full and isinstance(frame, Data | Sources):
             self._waiting.put(frame, len(frame.payload) if isinstance(frame, Data) else 0, frame.key)
-        elif self._transport is not None and not self._transport.is_closing():
+            return
+        if self._full and isinstance(frame, Call | Answer) and not self._has_room(frame):
+            return
+        if self._transport is not None and not self._transport.is_closing():
             for piece in encode(frame):
                 self._transport.write(piece)
         elif self._transport is None and not self.gone.is_set():
             self._early.append(frame)
+
+    def _has_room(self, frame: Call | Answer) -> bool:
+        """Return whether a full connection takes a call or an answer; one that is too slow for both ends."""
+        if self._transport is None:
+            return True
+        waiting, size = self._transport.get_write_buffer_size(), len(frame.payload)
+        if waiting + size <= MAX_WAITING:
+            return True
+        if isinstance(frame, Call) or size > SHORT:
+            raise LinkFullError(waiting, size)
+        if waiting + size <= MAX_WAITING + MAX_SHORT:
+            return True
+        self._fail(LinkBrokenError("the other side does not read the answers to its calls"))
+        return False
 
     async def greeting(self) -> Greeting:
         """Wait for the next frame of the handshake.

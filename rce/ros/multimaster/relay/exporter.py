@@ -14,8 +14,9 @@ from typing import Generic, TypeVar
 from rce.aio.tasks import TaskScope, finish
 from rce.ros.closing import release_all
 from rce.ros.errors import InvalidNameError, RosError, ServiceError, TypeMismatchError
-from rce.ros.multimaster.errors import NothingToRelayError
+from rce.ros.multimaster.errors import LinkFullError, NothingToRelayError
 from rce.ros.multimaster.filters import SyncFilter
+from rce.ros.multimaster.relay.connection import SHORT
 from rce.ros.multimaster.relay.frames import NO_SOURCE, Answer, Call, Data, Frame, Offer, Sources, Want
 from rce.ros.multimaster.relay.kinds import ServiceKind, TopicKind, learn_service, learn_topic
 from rce.ros.multimaster.relay.learning import Learning, Question
@@ -71,7 +72,7 @@ class Exporter:
             node: Subscribes and calls.
             master: The node's master.
             chosen: The filter, by the names that topics and services are offered under.
-            send: Takes frames for the other end.
+            send: Takes frames for the other end; raises LinkFullError for an answer that does not fit.
             tasks: Owns the calls, and the questions for types.
             rename: Gives the names to offer.
             foreign: Returns the nodes that a synchronization registered; their topics and services are not
@@ -246,13 +247,20 @@ class Exporter:
 
     async def _call(self, call: Call) -> None:
         try:
+            # A response that does not fit into a connection that is full is an error, too.
             response = await self._client(call.service).call_serialized(call.payload, timeout=CALL_TIMEOUT)
             self._send(Answer(call.call, ok=True, payload=response))
         except RosError as error:
-            text = error.text if isinstance(error, ServiceError) else str(error)
-            self._send(Answer(call.call, ok=False, payload=text.encode()))
+            self._refuse(call, error.text if isinstance(error, ServiceError) else str(error))
         finally:
             self._calls -= 1
+
+    def _refuse(self, call: Call, reason: str) -> None:
+        text = reason.encode()
+        try:
+            self._send(Answer(call.call, ok=False, payload=text))
+        except LinkFullError:
+            self._send(Answer(call.call, ok=False, payload=text[:SHORT]))
 
     def _client(self, number: int) -> ServiceClient:
         client = self._clients.get(number)

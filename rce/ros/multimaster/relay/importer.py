@@ -10,6 +10,7 @@ from collections.abc import Callable
 from rce.aio.tasks import finish
 from rce.ros.closing import release_all
 from rce.ros.errors import MasterError, RosError, ServiceFaultError
+from rce.ros.multimaster.errors import LinkFullError
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.relay.exporter import CALL_TIMEOUT, Rename
 from rce.ros.multimaster.relay.frames import NO_SOURCE, Answer, Call, Data, Frame, Offer, Sources, Want
@@ -44,7 +45,7 @@ class Importer:
             node: Publishes and provides.
             master: The node's master.
             chosen: The filter of the offer, by the names in it.
-            send: Takes frames for the other end.
+            send: Takes frames for the other end; raises LinkFullError for a call that does not fit.
             rename: Gives the names of this graph.
         """
         self._node = node
@@ -190,6 +191,8 @@ class Importer:
             raise ServiceFaultError(name, "no answer came over the relay") from error
         except ServiceFaultError as error:
             raise ServiceFaultError(name, error.text) from error
+        except LinkFullError as error:
+            raise ServiceFaultError(name, str(error)) from error
         finally:
             del self._calls[number]
 
