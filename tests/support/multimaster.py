@@ -80,6 +80,12 @@ class Machine:
         assert self.core is not None
         return self.core.graph
 
+    async def until_known(self, name: str, *, online: bool, timeout: float = 30) -> None:
+        """Wait until the discovery has a master as online, or as offline."""
+        async with asyncio.timeout(timeout):
+            while (name, online) not in [(master.name, master.online) for master in self.discovery.masters]:
+                await asyncio.sleep(0.02)
+
     async def until(self, condition: Callable[[Graph], bool], timeout: float = 20) -> None:
         assert self.core is not None
         await self.core.wait_until(condition, timeout=timeout)

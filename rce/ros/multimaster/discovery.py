@@ -43,7 +43,8 @@ from rce.ros.xmlrpc import RpcClient, RpcServer
 _log = logging.getLogger(__name__)
 
 DEAD_AFTER_POLLS = 3
-"""After so many requests without an answer, others are told that this master is gone."""
+"""After so many requests without an answer, no heartbeats are sent until the master answers: others then have
+it as offline after their time for silence. It does not leave, because its nodes may work on."""
 
 FIRST_REQUESTS = 3
 """How often, at the start, all masters are asked for their state."""
@@ -253,10 +254,11 @@ class Discovery:
 
     def _announce(self, only_to: tuple[str, int] | None = None) -> None:
         info = self._monitor.info
-        if info is None:
+        if info is None or not self._is_master_up:
             return
-        kind = Kind.STATE if self._is_master_up else Kind.LEAVING
-        beat = Heartbeat(kind, self._own.rpc_port, self.settings.heartbeat_hz, info.stamp, info.stamp_local)
+        beat = Heartbeat(
+            Kind.STATE, self._own.rpc_port, self.settings.heartbeat_hz, info.stamp, info.stamp_local
+        )
         if only_to is not None:
             self._socket.send_to(beat.encode(), only_to)
             return

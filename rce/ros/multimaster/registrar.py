@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import hashlib
 import json
 import logging
 from collections.abc import Iterable, Mapping
+from collections.abc import Set as AbstractSet
 from typing import Any
 
 from rce.aio.backoff import Backoff
@@ -25,7 +28,11 @@ from rce.ros.node.master import MasterClient
 _log = logging.getLogger(__name__)
 
 RECORD = "~registrations"
-"""Parameter that records the registrations, so that a successor can remove them after a kill."""
+"""Namespace of parameters that record the registrations, so that a successor can remove them after a kill.
+
+One parameter for each remote master: what changes at one of many costs what that one has. Former releases
+wrote one for all, without a namespace.
+"""
 
 UPDATE_TIMEOUT = 5.0
 UPDATE_ATTEMPTS = 10
@@ -68,11 +75,18 @@ class Registrar:
         self._master = master
         self._tasks = tasks
         self._lock = asyncio.Lock()
-        self._recorded = ""
+        self._recorded: dict[str, str] = {}
+        """By the remote master: the parameter as it was written last."""
         self._told: set[str] = set()
 
     async def hold(
-        self, origin: str, wanted: set[Registration], publishers: Mapping[str, Iterable[str]]
+        self,
+        origin: str,
+        wanted: set[Registration],
+        publishers: Mapping[str, Iterable[str]],
+        *,
+        stale: AbstractSet[str] = frozenset(),
+        again: bool = False,
     ) -> list[Clash]:
         """Make exactly the registrations ``wanted`` for a remote master.
 
@@ -80,6 +94,8 @@ class Registrar:
             origin: The remote master's URI.
             wanted: Its registrations.
             publishers: Topic -> URIs of its publishers at the remote master; its subscribers keep them.
+            stale: The URIs of masters that are offline: their registrations give way to these.
+            again: Make also those again that were made before; subscribers are then told of all publishers.
 
         Returns:
             The entries that could not be registered, because the local graph has one of that name.
@@ -90,8 +106,9 @@ class Registrar:
         async with self._lock:
             held = self.held.get(origin, set())
             await self._unregister(origin, held - wanted)
+            await self._give_way(origin, wanted - held, stale)
             fine, clashes = await self._without_clashes(origin, wanted - held)
-            await self._register(origin, fine, publishers)
+            await self._register(origin, fine | (wanted & held if again else set()), publishers)
         for clash in clashes:
             self._tell_once(str(clash))
         return clashes
@@ -113,7 +130,7 @@ class Registrar:
         """
         async with self._lock:
             everything, self.held = self.held, {}
-            self._recorded = ""
+            self._recorded.clear()
             for origin, entries in everything.items():
                 fine, _ = await self._without_clashes(origin, entries)
                 await self._register(origin, fine, {})
@@ -125,18 +142,34 @@ class Registrar:
             MasterError: The local master does not answer.
         """
         try:
-            entries = json.loads(await self._node.get_param(RECORD))
-            left = [Registration(RegistrationKind(kind), *rest) for kind, *rest in entries]
+            record = await self._node.get_param(RECORD)
         except ParameterMissingError:
             return
-        except (TypeError, ValueError) as error:
-            _log.warning("the record of a former synchronization cannot be read: %s", error)
-            return
+        left: list[Registration] = []
+        for text in record.values() if isinstance(record, dict) else [record]:
+            try:
+                left += [Registration(RegistrationKind(kind), *rest) for kind, *rest in json.loads(text)]
+            except (TypeError, ValueError) as error:
+                _log.warning("the record of a former synchronization cannot be read: %s", error)
         if left:
             _log.info("%d registrations of a former synchronization are taken back", len(left))
             await multicall_as(self._master, [_unregistering(entry) for entry in left])
+        await self._delete(RECORD)
 
     # Inside
+
+    async def _give_way(self, origin: str, candidates: set[Registration], stale: AbstractSet[str]) -> None:
+        """Take back what offline masters have by the names of ``candidates``: it may have moved."""
+        nodes = {entry.node: entry.uri for entry in candidates}
+        services = {entry.name for entry in candidates if entry.kind is RegistrationKind.SERVICE}
+        for other in stale & self.held.keys() - {origin}:
+            taken = {
+                entry
+                for entry in self.held[other]
+                if nodes.get(entry.node, entry.uri) != entry.uri
+                or (entry.kind is RegistrationKind.SERVICE and entry.name in services)
+            }
+            await self._unregister(other, taken)
 
     async def _without_clashes(
         self, origin: str, candidates: set[Registration]
@@ -159,12 +192,13 @@ class Registrar:
             return
         ordered = sorted(entries, key=lambda entry: (_ORDER.index(entry.kind), entry.name, entry.node))
         # Recorded before it is registered: questions for a node's origin get the right answer meanwhile.
+        before = set(self.held.get(origin, ()))
         self.held.setdefault(origin, set()).update(entries)
         try:
-            await self._record()
+            await self._record(origin)
             answers = await multicall_as(self._master, [_registering(entry) for entry in ordered])
         except MasterError:
-            self.held[origin] -= entries
+            self.held[origin] = before
             raise
         for entry, answer in zip(ordered, answers, strict=True):
             _log.info("%s %s of %s is registered", entry.kind.value, entry.name, entry.node)
@@ -181,18 +215,26 @@ class Registrar:
         self.held[origin] -= entries
         if not self.held[origin]:
             del self.held[origin]
-        await self._record()
+        await self._record(origin)
 
-    async def _record(self) -> None:
+    async def _record(self, origin: str) -> None:
         rows = [
             [entry.kind.value, entry.name, entry.node, entry.uri, entry.detail]
-            for entries in self.held.values()
-            for entry in entries
+            for entry in self.held.get(origin, ())
         ]
-        text = json.dumps(sorted(rows))
-        if text != self._recorded:
-            await self._node.set_param(RECORD, text)
-            self._recorded = text
+        text = json.dumps(sorted(rows)) if rows else ""
+        if text == self._recorded.get(origin, ""):
+            return
+        if text:
+            await self._node.set_param(_record_of(origin), text)
+            self._recorded[origin] = text
+        else:
+            await self._delete(_record_of(origin))
+            del self._recorded[origin]
+
+    async def _delete(self, name: str) -> None:
+        with contextlib.suppress(ParameterMissingError):  # as after a restart of the master
+            await self._node.delete_param(name)
 
     async def _tell_subscriber(self, entry: Registration, uris: list[str]) -> None:
         """Send a remote subscriber its publishers, which the master only gave in its answer to this node."""
@@ -216,6 +258,11 @@ class Registrar:
         if text not in self._told:
             self._told.add(text)
             _log.warning("%s", text)
+
+
+def _record_of(origin: str) -> str:
+    """Return the parameter that records the registrations of a remote master."""
+    return f"{RECORD}/m{hashlib.sha256(origin.encode()).hexdigest()[:16]}"
 
 
 def _registering(entry: Registration) -> tuple[str, str, tuple[Any, ...]]:

@@ -6,8 +6,10 @@ import asyncio
 import contextlib
 import logging
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from collections.abc import Set as AbstractSet
 
-from rce.ros.errors import RosError
+from rce.ros.errors import RosError, XmlRpcError
 from rce.ros.multimaster.contacts import ask_state
 from rce.ros.multimaster.filters import SyncFilter
 from rce.ros.multimaster.peer_table import Neighbour
@@ -25,11 +27,16 @@ LOOK_AGAIN = 10.0
 """Seconds between checks of a master's state without an announcement: a clash may have ended."""
 
 
+REACH_TIMEOUT = 3.0
+"""Seconds that the discovery of a master that is offline has to answer."""
+
+
 class Remote(ABC):
     """Synchronizes with one master, for as long as it is there."""
 
-    def __init__(self, master: Neighbour) -> None:
+    def __init__(self, master: Neighbour, rpc: RpcClient) -> None:
         self.master = master
+        self.rpc = rpc
         self._is_gone = False
         self._wake = asyncio.Event()
         self._wake.set()
@@ -56,28 +63,52 @@ class Remote(ABC):
         return self.master.online and not self._is_gone
 
     async def run(self) -> None:
-        """Synchronize until the master is gone and all its registrations are removed."""
+        """Synchronize until the master is gone and all its registrations are removed.
+
+        While it is offline, they stay: its nodes may work on, and a subscriber of roscpp closes the
+        connection to a publisher that its master ceases to name. When it is back, all are made again, so that
+        the subscribers are told of the publishers again: rospy makes a lost connection anew only then. If its
+        discovery could not be reached meanwhile, connections may hang, until TCP tries again after a time as
+        long as the outage was; so all are taken back first, which has them made anew.
+        """
         timeout = 0.0
+        was_offline = was_away = False
         while True:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(timeout):
                     await self._wake.wait()
             self._wake.clear()
+            timeout = LOOK_AGAIN
             try:
-                if self.is_online:
-                    await self.synchronize()
-                else:
+                was_gone = self._is_gone
+                if was_gone or (was_away and self.master.online):
                     await self.release()
-                    if self._is_gone:
+                    was_offline = was_away = False
+                    if was_gone and self._is_gone:  # and not back meanwhile
                         return
-                timeout = LOOK_AGAIN
+                if self.master.online:
+                    await self.synchronize(again=was_offline)
+                    was_offline = False
+                else:
+                    was_offline = True
+                    was_away = was_away or not await self._is_reachable()
             except (RosError, OSError) as error:
                 _log.warning("master %s: %s", self.master.name, error)
                 timeout = RETRY
 
+    async def _is_reachable(self) -> bool:
+        try:
+            await self.rpc.call(self.master.monitor_uri, "masterContacts", (), timeout=REACH_TIMEOUT)
+        except XmlRpcError:
+            return False
+        return True
+
     @abstractmethod
-    async def synchronize(self) -> None:
+    async def synchronize(self, *, again: bool = False) -> None:
         """Bring the local graph in step with the master.
+
+        Args:
+            again: The master was offline: what is registered already is registered again.
 
         Raises:
             RosError: It does not work now; it is tried again.
@@ -104,6 +135,7 @@ class DirectRemote(Remote):
         registrar: Registrar,
         rpc: RpcClient,
         distinct_names: bool,
+        offline: Callable[[], AbstractSet[str]],
     ) -> None:
         """Begin.
 
@@ -114,21 +146,24 @@ class DirectRemote(Remote):
             registrar: Registers at the local master.
             rpc: Asks the remote discovery.
             distinct_names: Register nodes as ``NODE_at_MASTER``.
+            offline: Returns the URIs of the masters that are offline.
         """
-        super().__init__(master)
+        super().__init__(master, rpc)
         self._own_uri = own_uri
         self._chosen = chosen
         self._registrar = registrar
-        self._rpc = rpc
         self._distinct_names = distinct_names
+        self._offline = offline
         self._warned: set[str] = set()
 
-    async def synchronize(self) -> None:
+    async def synchronize(self, *, again: bool = False) -> None:
         """Register what the master has."""
-        info = await ask_state(self._rpc, self.master.monitor_uri, self._chosen)
+        info = await ask_state(self.rpc, self.master.monitor_uri, self._chosen)
         entries = wanted(info, self._own_uri, self._chosen, distinct_names=self._distinct_names)
         self._warn_of_unreachable(info)
-        await self._registrar.hold(self.master.uri, entries, publisher_uris(info))
+        await self._registrar.hold(
+            self.master.uri, entries, publisher_uris(info), stale=self._offline(), again=again
+        )
 
     async def release(self) -> None:
         """Take everything back."""

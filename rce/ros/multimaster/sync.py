@@ -264,7 +264,11 @@ class MasterSync:
             registrar=self.registrar,
             rpc=self._rpc,
             distinct_names=self.settings.distinct_names,
+            offline=self._offline_masters,
         )
+
+    def _offline_masters(self) -> set[str]:
+        return {uri for uri, remote in self._remotes.items() if not remote.is_online}
 
     async def _run(self, remote: Remote) -> None:
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from contextlib import AsyncExitStack
 
 import pytest
@@ -16,6 +17,7 @@ from rce.ros.multimaster import registrar
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.plan import Registration, RegistrationKind
 from rce.ros.multimaster.registrar import Registrar
+from rce.ros.multimaster.remote import Remote
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import RpcClient
 
@@ -81,16 +83,109 @@ async def test_three_masters_do_not_pass_things_on_in_a_circle(network: Discover
 
 
 async def test_what_a_vanished_master_had_is_taken_back(network: DiscoveryNetwork) -> None:
+    """Not while it is offline, as it may be back: subscribers of roscpp would close their connections."""
     async with (
-        network.machine() as b,
-        network.machine() as a,
+        network.machine(remove_after=3.0) as b,
+        network.machine(name="a") as a,
         node("talker", a.uri) as talker,
     ):
         await talker.advertise("chatter", STRING)
         await b.until(lambda graph: "/chatter" in graph.topic_types)
         a.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign]  # no good-bye either
+        await b.until_known("a", online=False)
+        assert b.graph.publishers("/chatter") == {"/talker": talker.uri}
         await b.until(lambda graph: "/chatter" not in graph.topic_types)
-        assert [master.online for master in b.discovery.masters if master.uri == a.uri] == [False]
+
+
+@pytest.mark.parametrize("reachable", [True, False])
+async def test_registrations_are_made_anew_after_an_outage(
+    network: DiscoveryNetwork, monkeypatch: pytest.MonkeyPatch, reachable: bool
+) -> None:
+    """Connections may hang then. If only heartbeats were lost, they work: roscpp must not close them."""
+    async with (
+        network.machine() as b,
+        network.machine(name="a") as a,
+        node("talker", a.uri) as talker,
+    ):
+        await talker.advertise("chatter", STRING)
+        await b.until(lambda graph: "/chatter" in graph.topic_types)
+        assert b.core is not None
+        with b.core.watch() as events:
+            asked = asyncio.Event()
+
+            async def is_reachable(_: Remote) -> bool:
+                asked.set()
+                return reachable
+
+            monkeypatch.setattr(Remote, "_is_reachable", is_reachable)
+            send = a.discovery._socket.send_to
+            a.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign]  # the network is gone
+            await asyncio.wait_for(asked.wait(), 20)
+            a.discovery._socket.send_to = send  # type: ignore[method-assign]  # and back
+            await b.until_known("a", online=True)
+            await talker.advertise("later", STRING)
+            changes: list[str] = []
+            async with asyncio.timeout(20):
+                async for event in events:
+                    if event.name == "/later":
+                        break
+                    if event.name == "/chatter":
+                        changes.append(event.change.value)
+        assert changes == ([] if reachable else ["publisher removed", "publisher added"])
+
+
+async def test_offline_master_gives_way_to_one_that_replaces_it(network: DiscoveryNetwork) -> None:
+    """A machine that comes back at other ports is another master, with nodes of the same names."""
+    async with network.machine() as b, AsyncExitStack() as former:
+        a = await former.enter_async_context(network.machine(name="a"))
+        talker = await former.enter_async_context(node("talker", a.uri))
+        await talker.advertise("chatter", STRING)
+        await talker.advertise_service("ask", "roscpp/Empty", lambda _: {})
+        await b.until(lambda graph: graph.service("/ask") is not None)
+        a.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign]  # no good-bye either
+        await b.until_known("a", online=False)
+        async with network.machine(name="next") as other, node("talker", other.uri) as second:
+            await second.advertise("chatter", STRING)
+            await second.advertise_service("ask", "roscpp/Empty", lambda _: {})
+            await b.until(lambda graph: graph.publishers("/chatter") == {"/talker": second.uri})
+            await b.until(lambda graph: graph.service("/ask") == second.service_uri)
+            assert not second.is_shutdown
+
+
+async def test_record_of_registrations_is_in_parts(network: DiscoveryNetwork) -> None:
+    """With a thousand masters, a change at one must not write what all have."""
+    async with (
+        Core(port=0) as core,
+        node("sync", core.uri) as sync,
+        RpcClient() as rpc,
+        TaskScope() as tasks,
+    ):
+        master = MasterClient(core.uri, sync.name, sync.uri, rpc)
+        registrations = Registrar(sync, master, tasks)
+        origins = [f"http://10.0.0.{number}:11311/" for number in range(5)]
+        for number, origin in enumerate(origins):
+            entries = {Registration(RegistrationKind.PUBLISHER, f"/t{number}", f"/n{number}", origin, STRING)}
+            await registrations.hold(origin, entries, {})
+        record = core.graph.parameters.get("/sync/registrations")
+        assert isinstance(record, dict)
+        assert sorted(json.loads(text)[0][2] for text in record.values()) == [
+            "/n0",
+            "/n1",
+            "/n2",
+            "/n3",
+            "/n4",
+        ]
+        await registrations.release(origins[0])
+        record = core.graph.parameters.get("/sync/registrations")
+        assert sorted(json.loads(text)[0][2] for text in record.values()) == ["/n1", "/n2", "/n3", "/n4"]
+
+        former = Registration(RegistrationKind.PUBLISHER, "/old", "/old", origins[0], STRING)
+        for text in ("nonsense", json.dumps([["publisher", "/old", "/old", origins[0], STRING]])):
+            await master.call("setParam", "/sync/registrations", text)  # as a former release
+            core.graph.register_publisher("/old", STRING, former.node, former.uri)
+            await Registrar(sync, master, tasks).take_back_leftovers()
+            assert not core.graph.parameters.has("/sync/registrations")
+        assert not core.graph.publishers("/old")
 
 
 async def test_nodes_of_one_name_do_not_kill_each_other(

@@ -61,17 +61,17 @@ class NamespaceRemote(Remote):
             rpc: Makes calls.
             tasks: Owns the relay.
         """
-        super().__init__(master)
+        super().__init__(master, rpc)
         self._namespace = canonical(SEPARATOR + namespace)
         self._chosen = chosen
         self._node = node
         self._local = local
-        self._rpc = rpc
         self._tasks = tasks
         self._relay: asyncio.Task[None] | None = None
 
-    async def synchronize(self) -> None:
+    async def synchronize(self, *, again: bool = False) -> None:
         """Begin to relay, unless it is being relayed already."""
+        del again  # the relay's own node makes its connections anew
         if self._relay is None or self._relay.done():
             self._relay = self._tasks.spawn(self._run_relay(), name=f"relay of {self.master.name}")
 
@@ -86,7 +86,7 @@ class NamespaceRemote(Remote):
         _log.info("master %s is relayed as %s", self.master.name, self._namespace)
         try:
             async with self._make_node() as there, TaskScope() as tasks:
-                remote = MasterClient(self.master.uri, there.name, there.uri, self._rpc)
+                remote = MasterClient(self.master.uri, there.name, there.uri, self.rpc)
                 await self._join(there, remote, tasks)
         except Exception as error:  # noqa: BLE001 - a master's answers must not end the relays of others
             _log.warning("the relay of %s ends: %s", self.master.name, broken_by(error))
