@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -10,6 +10,9 @@ from rce.web.openapi import Operation, Query
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
+
+MAX_SHOWN = 40
+"""Characters of an unknown parameter's name that an error repeats."""
 
 H = TypeVar("H")
 """A handler of requests: a function or a method."""
@@ -59,6 +62,27 @@ class Route(Generic[H]):
     def told(self) -> dict[str, Any]:
         """Return fields of :attr:`operation` that differ from those of the route."""
         return {}
+
+
+def unknown_parameter(route: Route[Any], given: Iterable[str], also: Iterable[str] = ()) -> str:
+    """Return why a request is refused: it has a query parameter that its route does not have.
+
+    A filter that is spelled wrongly must not return, or change, what others have.
+
+    Args:
+        route: The route.
+        given: The names of the request's query parameters.
+        also: Names that every route takes.
+
+    Returns:
+        The reason, which names the parameter and those that there are; empty: all are known.
+    """
+    known = sorted(query.name for query in route.query)
+    for name in given:
+        if name not in known and name not in also:
+            shown = name[:MAX_SHOWN]
+            return f"query parameter {shown!r} is unknown here; known are: {', '.join(known) or 'none'}"
+    return ""
 
 
 R = TypeVar("R", bound=Route[Any])

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
+from typing import Any
 
 from aiohttp import hdrs, web
 
 from rce.aio.tasks import cancel_and_wait
 from rce.web.openapi import PREFIX
 from rce.web.origin import ServerNames, is_foreign
+from rce.web.routes import Route, unknown_parameter
 from rce_fleet.station.authentication import AuditedAction, AuthenticationError, Authenticator, StationUser
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -147,6 +149,21 @@ class AccessControl:
         if token:
             text = f"the token is not valid here (it may have ended, or be of another engine): {text}"
         return problem(401, text, {hdrs.WWW_AUTHENTICATE: "Bearer"})
+
+
+def with_known_query(route: Route[Any], handler: Handler) -> Handler:
+    """Return a handler that refuses query parameters which its route does not have.
+
+    An emergency stop is carried out whatever is beside it.
+    """
+    if route.path.endswith(EMERGENCY_STOP):
+        return handler
+
+    async def answer(request: web.Request) -> web.StreamResponse:
+        fault = unknown_parameter(route, request.query, also=("token",))
+        return problem(422, fault) if fault else await handler(request)
+
+    return answer
 
 
 def token_of(request: web.Request) -> str:

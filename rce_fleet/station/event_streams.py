@@ -57,6 +57,10 @@ class EventStreams:
         """Return events after a number; with ``Accept: text/event-stream``, follow them."""
         if EVENT_STREAM not in request.headers.get(hdrs.ACCEPT, ""):
             return await self._requests.handle(request, "")
+        if ignored := {"id", "limit"} & request.query.keys():
+            return problem(
+                422, f"a stream of events takes no {min(ignored)!r}: it sends all, from 'after' on"
+            )
         last = request.headers.get("Last-Event-ID") or request.query.get("after", "")
         found = _ID.fullmatch(last)
         if last and found is None:

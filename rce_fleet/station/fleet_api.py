@@ -15,6 +15,7 @@ from rce.web.openapi import PREFIX, Operation, Query
 from rce.web.routes import Route
 from rce_fleet.api.fleet import EventPage
 from rce_fleet.api.webhooks import NewWebhookModel, WebhookList, WebhookRequest
+from rce_fleet.station.access import with_known_query
 from rce_fleet.station.event_streams import CSV, EVENT_STREAM, EventStreams, Work
 from rce_fleet.station.events import EventBatch, EventFeed
 from rce_fleet.station.figures import STATISTICS_PATH
@@ -114,9 +115,11 @@ class FleetApi:
         """Add the routes to an application."""
         for passed_on in ROUTES:
             handler = partial(self._requests.handle, action=passed_on.handler)
-            app.router.add_route(passed_on.method, PREFIX + passed_on.path, handler)
+            app.router.add_route(
+                passed_on.method, PREFIX + passed_on.path, with_known_query(passed_on, handler)
+            )
         for route in self._routes:
-            app.router.add_route(route.method, PREFIX + route.path, route.handler)
+            app.router.add_route(route.method, PREFIX + route.path, with_known_query(route, route.handler))
 
     async def set_goal(self, robot: str, cell: int | None, *, user: StationUser) -> str:
         """Send a robot to a cell, or stop it (None); return the answer for people.

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from aiohttp import web
 from pydantic import BaseModel, Field
 
+from rce.web.openapi import Query
 from rce.web.routes import Route, RouteTable
 from rce_fleet.station.access import problem
 from rce_fleet.station.figures import columns_of
@@ -75,8 +76,9 @@ class ReplayRoutes:
     @ROUTES.route(
         "GET",
         "/replay/{at}",
-        "What happened from a time on (seconds since 1970), for ?seconds=30",
+        "What happened from a time on (seconds since 1970)",
         reply=ReplayModel,
+        query=(Query(name="seconds", description="So many seconds. Default: 30.", type="number"),),
         errors=_ERRORS,
     )
     async def get_frames(self, request: web.Request) -> web.StreamResponse:
@@ -91,7 +93,14 @@ class ReplayRoutes:
         frames = [] if self._records is None else await asyncio.to_thread(self._records.read, at, seconds)
         return _reply(ReplayModel(frames=frames))
 
-    @ROUTES.route("GET", "/figures", "Figures of the last ?seconds=3600", reply=FigureHistory, errors=_ERRORS)
+    @ROUTES.route(
+        "GET",
+        "/figures",
+        "Figures of the last time",
+        reply=FigureHistory,
+        query=(Query(name="seconds", description="The last so many seconds. Default: 3600.", type="number"),),
+        errors=_ERRORS,
+    )
     async def get_figures(self, request: web.Request) -> web.StreamResponse:
         """Return figures over time."""
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,15 @@ from rce.web.origin import ServerNames
 from rce.web.routes import Route, RouteTable
 from rce_fleet.exceptions import EventsRestartedError, RequestRefusedError
 from rce_fleet.station import masters_watch, replay_routes, world_link
-from rce_fleet.station.access import USER, AccessControl, delete_cookie, problem, set_cookie, token_of
+from rce_fleet.station.access import (
+    USER,
+    AccessControl,
+    delete_cookie,
+    problem,
+    set_cookie,
+    token_of,
+    with_known_query,
+)
 from rce_fleet.station.api import (
     MAX_CELL,
     Answer,
@@ -132,30 +141,22 @@ class Station:
         """Build the application."""
         app = web.Application(middlewares=[_problems, self._access.check], client_max_size=MAX_BODY)
         app.on_response_prepare.append(_set_headers)
-        for route in ROUTES:
-            app.router.add_route(route.method, PREFIX + route.path, partial(route.handler, self))
-        for control_route in control_routes.ROUTES:
-            handler = partial(control_route.handler, self._control)
-            app.router.add_route(control_route.method, PREFIX + control_route.path, handler)
-        for world_route in world_link.ROUTES:
-            handler = partial(world_route.handler, self._world)
-            app.router.add_route(world_route.method, PREFIX + world_route.path, handler)
-        for masters_route in masters_watch.ROUTES:
-            handler = partial(masters_route.handler, self._masters)
-            app.router.add_route(masters_route.method, PREFIX + masters_route.path, handler)
-        for replay_route in replay_routes.ROUTES:
-            handler = partial(replay_route.handler, self._replay)
-            app.router.add_route(replay_route.method, PREFIX + replay_route.path, handler)
-        self.fleet_api.add_to(app)
-        routes = (
-            *ROUTES,
-            *control_routes.ROUTES,
-            *replay_routes.ROUTES,
-            *world_link.ROUTES,
-            *masters_watch.ROUTES,
+        tables: tuple[tuple[RouteTable[Any], object], ...] = (
+            (ROUTES, self),
+            (control_routes.ROUTES, self._control),
+            (world_link.ROUTES, self._world),
+            (masters_watch.ROUTES, self._masters),
+            (replay_routes.ROUTES, self._replay),
         )
+        for table, owner in tables:
+            for route in table:
+                handler = with_known_query(route, partial(route.handler, owner))
+                app.router.add_route(route.method, PREFIX + route.path, handler)
+        self.fleet_api.add_to(app)
+        routes = (route for table, _ in tables for route in table)
+        operations = [*(route.operation for route in routes), *self.fleet_api.operations]
         document = build_document(
-            [*(route.operation for route in routes), *self.fleet_api.operations],
+            [replace(each, errors=tuple({*each.errors, 422})) for each in operations],
             title="RCE operator station",
             description="Control a fleet of robots: tasks, goals, zones, events. For the page and an ERP.",
             error=Problem,

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, build_document
+from rce.web.routes import unknown_parameter
 from rce_master.answers import PendingAnswer
 from rce_master.exceptions import InvalidRequestError, MasterError
 from rce_master.http import (
@@ -39,7 +40,7 @@ from rce_master.http.models import Error
 from rce_master.http.routes import Call, Route, Services, body_of
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
+    from collections.abc import Awaitable, Callable, Mapping
 
     Answer = Callable[[web.Request, Mapping[str, str]], Awaitable[web.StreamResponse]]
 
@@ -58,10 +59,6 @@ ROUTES: list[Route] = [
     *api_stream.routes,
     *api_exec.routes,
 ]
-
-
-_SHOWN = 40
-"""Characters of a wrong name that are shown."""
 
 
 class Api:
@@ -97,8 +94,6 @@ class Api:
 
 
 def _adapt(route: Route, services: Services) -> Answer:
-    known = frozenset(query.name for query in route.operation.query)
-
     async def answer(request: web.Request, parts: Mapping[str, str]) -> web.StreamResponse:
         token, user = bearer(request, services, stations=route.stations)
         if user is not None:
@@ -106,7 +101,7 @@ def _adapt(route: Route, services: Services) -> Answer:
         call = Call(request, services, user, token, None, parts)
         try:
             admit(route, user)
-            check_query(request.query, known)
+            _check_parameters(route, request)
             text = b""
             if route.body:
                 text = await read_whole(request)
@@ -136,6 +131,11 @@ def _adapt(route: Route, services: Services) -> Answer:
     return answer
 
 
+def _check_parameters(route: Route, request: web.Request) -> None:
+    if fault := unknown_parameter(route, request.query):
+        raise InvalidRequestError(fault)
+
+
 @cache
 def _text() -> str:
     document = build_document(
@@ -149,18 +149,6 @@ def _text() -> str:
 
 async def _document(_: web.Request, __: Mapping[str, str]) -> web.Response:
     return web.Response(text=_text(), content_type="application/json")
-
-
-def check_query(given: Iterable[str], known: Collection[str]) -> None:
-    """Check the names of query parameters: one that is ignored would answer another question.
-
-    Raises:
-        InvalidRequestError: The route does not have one of them.
-    """
-    unknown = next((name for name in given if name not in known), None)
-    if unknown is not None:
-        names = ", ".join(sorted(known)) or "none"
-        raise InvalidRequestError(f"query parameter {unknown[:_SHOWN]!r} is unknown here; known are: {names}")
 
 
 def read_body(model: type[BaseModel], text: bytes) -> BaseModel:

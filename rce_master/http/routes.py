@@ -250,13 +250,11 @@ class Route(routes.Route[Handler]):
 
     def _errors(self) -> Iterator[int]:
         """Return the statuses of its possible errors."""
-        yield from (401, 403, 421, 429)
+        yield from (401, 403, 421, 422, 429)
         if "{" in self.path or OF_USER in self.query:
             yield 404
         if self.body is not None or self.upload:
             yield from (408, 413)
-        if self.body is not None or self.query:
-            yield 422
         if self.keyed:
             yield 400
         if self.method != "GET":

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from support.ports import free_port
 
 from rce.config.secret import Secret
 from rce.control.exceptions import ContentError
@@ -22,6 +23,7 @@ from rce.masters import Masters
 from rce.packages.folder import look_into
 from rce.packages.signing import SigningKey, key_id, statement
 from rce_master.cli import packages, signing_key
+from rce_master.cli.client import ApiClient
 from rce_master.cli.credentials import FILE_VARIABLE, Credentials, save
 from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.state.settings import StateSettings
@@ -295,3 +297,11 @@ async def test_removing_a_user_removes_their_packages(shop: Site, tmp_path: Path
     await until(lambda: not stored(tmp_path))
     with contextlib.suppress(ApiError):
         await packages._list("")
+
+
+async def test_upload_finds_the_master_that_answers(shop: Site) -> None:
+    """A file is sent once, so the client looks first which of its masters answers."""
+    async with ApiClient(f"http://127.0.0.1:{free_port()},{shop.url}", shop.token) as client:
+        with pytest.raises(ApiError) as refused:
+            await client.upload("/packages/p/1.0", io.BytesIO(b"no archive"), {"key": "k", "signature": "s"})
+    assert refused.value.status == 403, "the key is not known: the file reached the master"

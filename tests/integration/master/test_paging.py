@@ -136,7 +136,10 @@ async def test_a_query_parameter_that_a_route_does_not_have_is_named(site: Site)
         ("GET", "/containers?machine=m1", "cursor, limit, user"),
         ("DELETE", "/containers/c1?force=1&user=testUser", "user"),
         ("GET", "/users?user=testUser", "cursor, limit"),
+        ("GET", "/masters?limit=1", "none"),
     ):
         answer = await site.api(method, path, status=422)
         assert "is unknown here" in answer["error"]
         assert answer["error"].endswith(f"known are: {known}")
+    described = (await site.api("GET", "/openapi.json"))["paths"]
+    assert "422" in described["/api/v1/masters"]["get"]["responses"]

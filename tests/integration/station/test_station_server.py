@@ -114,6 +114,48 @@ async def test_reads_the_fleet(running: RunningStation) -> None:
     assert "Robot1" in (await missing.json())["error"]
 
 
+@pytest.mark.parametrize(
+    ("path", "accept", "fault"),
+    [
+        ("webhooks?limit=3", "", "query parameter 'limit' is unknown here; known are: none"),
+        ("figures?second=60", "", "query parameter 'second' is unknown here; known are: seconds"),
+        ("fleet?robot=Robot1", "", "query parameter 'robot' is unknown here; known are: none"),
+        ("tasks?states=open", "", "known are: cursor, limit, order, requester, robot, state"),
+        ("events?task=7", "text/event-stream", "known are: after, id, limit"),
+        ("events?id=7", "text/event-stream", "a stream of events takes no 'id'"),
+        ("history?format=csv&robot=Robot1", "", "query parameter 'robot' is unknown here"),
+    ],
+)
+async def test_unknown_parameters_are_refused(
+    running: RunningStation, path: str, accept: str, fault: str
+) -> None:
+    """A filter that is ignored shows what others did as if it passed."""
+    await running.start("secret")
+    # The token counts as known everywhere.
+    answer = await running.client.get(f"/api/v1/{path}&token=secret", headers={"Accept": accept})
+    assert (answer.status, fault in (await answer.json())["error"]) == (422, True)
+    document = await (await running.client.get("/api/v1/openapi.json")).json()
+    assert "422" in document["paths"][f"/api/v1/{path.partition('?')[0]}"]["get"]["responses"]
+
+
+async def test_known_parameters_are_described(running: RunningStation) -> None:
+    await running.start()
+    document = await (await running.client.get("/api/v1/openapi.json")).json()
+    for path in ("figures", "replay/{at}"):
+        (query,) = [
+            one for one in document["paths"][f"/api/v1/{path}"]["get"]["parameters"] if one["in"] == "query"
+        ]
+        assert query["name"] == "seconds"
+    assert (await running.client.get("/api/v1/figures?seconds=60")).status == 200
+
+
+async def test_emergency_stops_are_not_refused_for_parameters(running: RunningStation) -> None:
+    await running.start()
+    plain = await running.client.post("/api/v1/robots/Robot1/emergency-stop", json={"stopped": True})
+    other = await running.client.post("/api/v1/robots/Robot1/emergency-stop?x=1", json={"stopped": True})
+    assert (other.status, await other.text()) == (plain.status, await plain.text())
+
+
 async def test_sets_goals_and_blocks_cells(running: RunningStation) -> None:
     await running.start()
     assert (await running.client.put("/api/v1/robots/Robot1/goal", json={"cell": 5})).status == 200

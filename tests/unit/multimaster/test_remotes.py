@@ -7,6 +7,7 @@ import asyncio
 from rce.ros.multimaster.heartbeat import ZERO
 from rce.ros.multimaster.peer_table import Neighbour
 from rce.ros.multimaster.remote import LOOK_AGAIN, Remote
+from rce.ros.xmlrpc import RpcClient
 
 MASTER = Neighbour("far", "http://far:11311/", "http://far:11611/", "/master_discovery", True, ZERO, ZERO)
 
@@ -15,12 +16,13 @@ class SlowRemote(Remote):
     """Takes back slowly, as a busy master lets it."""
 
     def __init__(self) -> None:
-        super().__init__(MASTER)
+        super().__init__(MASTER, RpcClient())
         self.synchronized: asyncio.Queue[None] = asyncio.Queue()
         self.releasing = asyncio.Event()
         self.released = asyncio.Event()
 
-    async def synchronize(self) -> None:
+    async def synchronize(self, *, again: bool = False) -> None:
+        del again
         self.synchronized.put_nowait(None)
 
     async def release(self) -> None:
