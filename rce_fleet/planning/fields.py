@@ -59,8 +59,12 @@ def distance_fields(
     """
     table = np.empty((len(goals), len(graph)), dtype=np.int32)
     fill_fields(graph, np.asarray(goals, np.int32), table)
+    alike: dict[frozenset[int], list[int]] = {}
     for index, closed in (forbidden or {}).items():
-        table[index] = _field_around(graph, int(goals[index]), closed)
+        alike.setdefault(closed, []).append(index)
+    for closed, indices in alike.items():
+        table[indices] = _fields_around(graph, np.asarray(goals, np.int32)[indices], closed)
+    for index, closed in (forbidden or {}).items():
         kept = [node for node in closed if index >= len(starts) or node != starts[index]]
         table[index, kept] = UNREACHABLE
     return table
@@ -113,16 +117,16 @@ def fill_fields(graph: PlanningGraph, goals: Ints, table: Table) -> None:
         other.result()
 
 
-def _field_around(graph: PlanningGraph, goal: int, closed: frozenset[int]) -> Ints:
-    """Return a field in which ``closed`` nodes are not entered; they have distances for a robot in them."""
+def _fields_around(graph: PlanningGraph, goals: Ints, closed: frozenset[int]) -> Ints:
+    """Return fields in which ``closed`` nodes are not entered; they have distances for a robot in them."""
     kept = ~np.isin(graph.neighbours, list(closed))
     counts = np.add.reduceat(np.append(kept, False), graph.indptr[:-1])
     counts[np.diff(graph.indptr) == 0] = 0
     indptr = np.concatenate(([0], np.cumsum(counts))).astype(np.int32)
     part = type(graph)(indptr, graph.neighbours[kept], graph.costs[kept], graph.columns)
-    field = np.empty((1, len(graph)), np.int32)
-    fill_fields(part, np.array([goal], np.int32), field)
-    return field.reshape(-1)
+    fields = np.empty((len(goals), len(graph)), np.int32)
+    fill_fields(part, goals, fields)
+    return fields
 
 
 def _spread_numpy(indptr: Ints, neighbours: Ints, goals: Ints, far: int, table: Table) -> None:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 _SPARE_TASKS = 50
 """So many tasks more than robots, and twice as many as robots, are looked at, the most urgent ones."""
-_PRICED = 20_000
-"""So many pairs of a task and a profile are looked at in a step, or one profile: each takes some ten
+_PRICED = 6_000
+"""So many pairs of a task and a profile are looked at in a step, or one profile: each takes some twenty
 microseconds. Robots of the other profiles have their turn in the steps after it."""
 _ATTEMPTS = 4
 """A step assigns at most so often, if robots turn out to have too little energy for tasks."""
@@ -318,11 +318,13 @@ class Assigner:
         stop = task.next_stop
         cells = stop.cells if stop is not None else ()
         if len(cells) == 1:
-            self._travel.field(cells[0], zones).take(group.cells, out=ways, mode="clip")
+            self._travel.write_metres(group.cells, cells[0], zones, ways)
         else:
             ways[:] = inf if cells else 0.0
+            each = np.empty_like(ways)
             for cell in cells:
-                np.minimum(ways, self._travel.field(cell, zones)[group.cells], out=ways)
+                self._travel.write_metres(group.cells, cell, zones, each)
+                np.minimum(ways, each, out=ways)
         if task.order.robot:
             place = group.places.get(task.order.robot)
             way = inf if place is None else ways[place]

@@ -17,7 +17,7 @@ from rce_fleet.tasks.progress import ProgressRules, TaskProgress
 from rce_fleet.tasks.queueing import Queues, RobotQueue
 from rce_fleet.tasks.records import AUTOMATIC, RobotProfile
 from rce_fleet.tasks.task import Task, TaskCause, TaskState
-from rce_fleet.tasks.travel import TravelCosts
+from rce_fleet.tasks.travel import MOST_GRAPHS, TravelCosts
 from rce_fleet.tasks.zone_costs import zone_profiles
 
 if TYPE_CHECKING:
@@ -113,7 +113,11 @@ class Dispatcher:
             return False
         self._profiles = zone_profiles(book, facts, self.rules.profile)
         costs = [self.profile(name).zone_cost for name in facts.robots]
-        zone_costs = {str(cost): cost for each in costs for cost in (each, driven(each))}
+        each_once = {id(cost): cost for cost in costs}.values()
+        zone_costs = {str(cost): cost for each in each_once for cost in (each, driven(each))}
+        stops = self._stops(open_tasks) if len(zone_costs) > 1 else ()
+        if len(zone_costs) > MOST_GRAPHS or len(zone_costs) * len(stops) > travel.capacity:
+            zone_costs = {"": {}}  # The distances of each robot's own zones follow in the steps.
         missing: dict[str, set[int]] = {name: set() for name in zone_costs}
         tasks.sort(key=lambda task: (-task.order.priority, task.number))
         for task in tasks:
@@ -130,6 +134,10 @@ class Dispatcher:
         for name, cost in zone_costs.items():
             travel.measure(sorted(missing[name]), cost)
         return bool(tasks) and len(self._measured) < travel.capacity
+
+    @staticmethod
+    def _stops(tasks: Iterable[Task]) -> set[int]:
+        return {cell for task in tasks for cell in task.order.cells()}
 
     def update(self, now: float, facts: FleetFacts) -> None:
         """Take one step.
@@ -170,7 +178,7 @@ class Dispatcher:
             self._queues_due = now + QUEUES_EVERY
             self._fill_queues(now, facts)
             self._explain(facts, now)
-        used = {*book.places.chargers}.union(*(task.order.cells() for task in book.open_tasks()))
+        used = {*book.places.chargers}.union(self._stops(book.open_tasks()))
         cells = ParkingCells(frozenset(book.places.parking), used, taken.keys())
         self._parking.update(now, idle, self.chargers.charging, facts, cells)
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rce_fleet.tasks.records import Zone
 
     Floats = NDArray[np.float32]
+    Cells = NDArray[np.bool_]
     Costs = tuple[tuple[str, float], ...]
     """How much a metre in zones counts, by zone's name."""
     Graph = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]
@@ -30,6 +31,11 @@ MOST_BYTES = 128_000_000
 REFRESHED = 16
 """After a change of the map so many distances are computed anew in each step, and those from before count
 until then: they differ by a detour. Computing all at once would stop the manager for a second."""
+CELLS_PER_STEP = 160_000
+"""Robots with zones of their own have distances of their own. In each step those to some cells are computed,
+so many numbers in all, and at least :data:`REFRESHED` fields; the others are estimated until a later step."""
+MOST_GRAPHS = 16
+"""Graphs that are kept, those used last: one takes twelve times the memory of a field."""
 _AT_ONCE = 64
 """So many distances are measured in one go by the compiled loop ..."""
 _AT_ONCE_PLAIN = 16
@@ -41,6 +47,11 @@ class TravelCosts:
 
     A robot may leave a cell that is shut, and may not enter one.
 
+    With many sets of zones, the distances of all sets would take longer than a step and more memory than is
+    kept. Those that are not computed yet are estimated: the distance without the zones that are the robot's
+    own, and ``inf`` exactly where the cells that are shut to this robot leave no way. So an estimate lacks a
+    detour at most, and never leads a robot to a cell that it cannot reach.
+
     Attributes:
         epoch: Grows when all distances are forgotten: with each new grid.
     """
@@ -51,14 +62,17 @@ class TravelCosts:
         self._revision: object = None
         self._zones: dict[str, tuple[int, ...]] = {}
         self.epoch = 0
-        self._graphs: dict[Costs, Graph] = {}
+        self._graphs: OrderedDict[Costs, Graph] = OrderedDict()
+        self._parts: dict[Costs, _Parts] = {}
         self._fields: OrderedDict[tuple[int, Costs], Floats] = OrderedDict()
         self._stale: dict[tuple[int, Costs], Floats] = {}
         self._budget = REFRESHED
+        self._own_budget = REFRESHED
 
     def begin_step(self) -> None:
-        """Allow that some more distances of the map before are computed anew."""
+        """Allow that some more distances of the map before, and of robots' own zones, are computed."""
         self._budget = REFRESHED
+        self._own_budget = max(REFRESHED, CELLS_PER_STEP // max(1, len(self._grid or ())))
 
     def set_map(
         self, grid: GridMap, shut: frozenset[int], zones: Mapping[str, Zone], revision: object
@@ -78,6 +92,7 @@ class TravelCosts:
         self.epoch += grid is not self._grid
         self._grid, self._shut, self._revision, self._zones = grid, shut, revision, cells
         self._graphs.clear()
+        self._parts.clear()
         self._fields.clear()
 
     @property
@@ -87,8 +102,33 @@ class TravelCosts:
 
     def metres(self, start: int, goal: int, zone_cost: Mapping[str, float] | None = None) -> float:
         """Return the length of the way from one cell to another; ``inf`` if there is none."""
-        field = self.field(goal, zone_cost)
-        return float(field[start]) if 0 <= start < len(field) else inf
+        if self._grid is None or not 0 <= start < len(self._grid):
+            return inf
+        field, cut_off = self._look(self._grid, goal, _costs(zone_cost))
+        return inf if cut_off is not None and cut_off[start] else float(field[start])
+
+    def write_metres(
+        self,
+        cells: NDArray[np.int64],
+        goal: int,
+        zone_cost: Mapping[str, float] | None,
+        out: Floats,
+    ) -> None:
+        """Write the length of the way from each of some cells to another one.
+
+        Args:
+            cells: Where the ways begin, shape (n,).
+            goal: Where they end.
+            zone_cost: See :meth:`field`.
+            out: Lengths, shape (n,); written.
+        """
+        if self._grid is None:
+            out[:] = inf
+            return
+        field, cut_off = self._look(self._grid, goal, _costs(zone_cost))
+        field.take(cells, out=out, mode="clip")
+        if cut_off is not None:
+            out[cut_off.take(cells, mode="clip")] = inf
 
     def field(self, goal: int, zone_cost: Mapping[str, float] | None = None) -> Floats:
         """Return the length of the way to a cell from each cell, shape (cells,); ``inf`` if there is none.
@@ -99,19 +139,37 @@ class TravelCosts:
         """
         if self._grid is None:
             return np.zeros(0, np.float32)
-        costs = _costs(zone_cost)
+        field, cut_off = self._look(self._grid, goal, _costs(zone_cost))
+        return field if cut_off is None else np.where(cut_off, np.float32(inf), field)
+
+    def _look(self, grid: GridMap, goal: int, costs: Costs) -> tuple[Floats, Cells | None]:
+        """Return distances to a cell, and from which cells there is no way although a distance says so."""
         field = self._fields.get((goal, costs))
-        if field is None:
-            stale = self._stale.get((goal, costs))
-            if stale is not None and self._budget <= 0 and self._can_enter(goal, costs):
-                return stale
-            self._budget -= stale is not None
-            self._stale.pop((goal, costs), None)
-            (field,) = self._compute(self._grid, [goal], costs)
-            self._keep(goal, costs, field)
-        else:
+        if field is not None:
             self._fields.move_to_end((goal, costs))
-        return field
+            return field, None
+        stale = self._stale.get((goal, costs))
+        if stale is not None and self._budget <= 0 and self._can_enter(goal, costs):
+            return stale, None
+        if costs and stale is None:
+            if self._own_budget <= 0:
+                return self._estimate(grid, goal, costs)
+            self._own_budget -= 1
+        self._budget -= stale is not None
+        self._stale.pop((goal, costs), None)
+        (field,) = self._compute(grid, [goal], costs)
+        self._keep(goal, costs, field)
+        return field, None
+
+    def _estimate(self, grid: GridMap, goal: int, costs: Costs) -> tuple[Floats, Cells | None]:
+        """Return about what :meth:`_look` returns, from distances with fewer zones; see the class."""
+        parts = self._parts.get(costs)
+        if parts is None:
+            closed = tuple((name, factor) for name, factor in costs if factor == inf)
+            parts = self._parts[costs] = _Parts(grid, self._free(grid, ()), self._free(grid, closed))
+            # Without closed zones, what remains is the cost zones themselves: their distances are missing.
+            parts.counted = tuple((name, factor) for name, factor in costs if factor < inf) if closed else ()
+        return self._look(grid, goal, parts.counted)[0], parts.cut_off(goal)
 
     @property
     def capacity(self) -> int:
@@ -170,6 +228,15 @@ class TravelCosts:
         forbidden = (name for name, factor in costs if factor == inf)
         return goal not in self._shut and not any(goal in self._zones.get(name, ()) for name in forbidden)
 
+    def _free(self, grid: GridMap, costs: Costs) -> Cells:
+        """Return which cells a robot may enter, shape (cells,)."""
+        free = np.ones(len(grid), bool)
+        free[list(self._shut)] = False
+        for name, factor in costs:
+            if factor == inf:
+                free[[cell for cell in self._zones.get(name, ()) if cell in grid]] = False
+        return free
+
     def _compute(self, grid: GridMap, goals: Sequence[int], costs: Costs) -> list[Floats]:
         open_goals = [goal for goal in goals if goal in grid and self._can_enter(goal, costs)]
         fields: dict[int, Floats] = {}
@@ -177,6 +244,9 @@ class TravelCosts:
             graph = self._graphs.get(costs)
             if graph is None:
                 graph = self._graphs[costs] = self._graph(grid, costs)
+                if len(self._graphs) > MOST_GRAPHS:
+                    self._graphs.popitem(last=False)
+            self._graphs.move_to_end(costs)
             measured = measure_ways(*graph, np.array(open_goals, np.int32))
             # A copy of each: one that is forgotten must not be kept in memory by the others.
             fields = {goal: field.copy() for goal, field in zip(open_goals, measured, strict=True)}
@@ -188,14 +258,11 @@ class TravelCosts:
         pairs = [(cells[:, 1:], cells[:, :-1]), (cells[1:], cells[:-1])]
         heads = np.concatenate([side.ravel() for a, b in pairs for side in (a, b)])
         tails = np.concatenate([side.ravel() for a, b in pairs for side in (b, a)])
-        free = np.ones(len(grid), bool)
-        free[list(self._shut)] = False
+        free = self._free(grid, costs)
         weight = np.full(len(grid), grid.cell_size, np.float64)
         for name, factor in costs:
-            inside = [cell for cell in self._zones.get(name, ()) if cell in grid]
-            if factor == inf:
-                free[inside] = False
-            else:
+            if factor < inf:
+                inside = [cell for cell in self._zones.get(name, ()) if cell in grid]
                 weight[inside] *= max(LEAST_FACTOR, factor)  # else no way would be the shortest
         keep = free[heads]
         heads, tails = heads[keep], tails[keep]
@@ -203,6 +270,57 @@ class TravelCosts:
         heads, tails = heads[order], tails[order]
         indptr = np.concatenate(([0], np.cumsum(np.bincount(heads, minlength=len(grid)))))
         return indptr.astype(np.int32), tails, (weight[heads] + weight[tails]) / 2
+
+
+class _Parts:
+    """The connected parts of the map for robots that may not enter some more cells than others.
+
+    Args:
+        grid: The grid.
+        common: Cells that all robots may enter, shape (cells,).
+        free: Cells that these robots may enter, shape (cells,).
+
+    Attributes:
+        counted: Costs of the distances from which those of these robots are estimated.
+    """
+
+    def __init__(self, grid: GridMap, common: Cells, free: Cells) -> None:
+        shape = grid.rows, grid.columns
+        self.counted: Costs = ()
+        self._labels = _label(free.reshape(shape))
+        self._common = _label(common.reshape(shape))
+        self._all = np.ones(len(grid), bool)
+        self._cut: dict[tuple[int, int], Cells | None] = {}
+
+    def cut_off(self, goal: int) -> Cells | None:
+        """Return from which cells only these robots have no way to one, shape (cells,); None: from none."""
+        place = divmod(goal, self._labels.shape[1])
+        if not 0 <= goal < self._labels.size or not self._labels[place]:
+            return self._all
+        key = int(self._labels[place]), int(self._common[place])
+        if key not in self._cut:
+            cut = _reached(self._common == key[1]) & ~_reached(self._labels == key[0])
+            # Mostly the zones are open floor, and leave ways around them.
+            self._cut[key] = cut.ravel() if cut.any() else None
+        return self._cut[key]
+
+
+def _label(free: Cells) -> NDArray[np.int32]:
+    """Return a number for each connected part, 0 where robots cannot be, shape (rows, columns)."""
+    from scipy.ndimage import label  # long to load, needed only with zones for some robots
+
+    labels: NDArray[np.int32] = label(free)[0]
+    return labels
+
+
+def _reached(part: Cells) -> Cells:
+    """Return a part with the cells around it: a robot may leave a cell that it may not enter."""
+    wide = part.copy()
+    wide[1:] |= part[:-1]
+    wide[:-1] |= part[1:]
+    wide[:, 1:] |= part[:, :-1]
+    wide[:, :-1] |= part[:, 1:]
+    return wide
 
 
 def _costs(zone_cost: Mapping[str, float] | None) -> Costs:

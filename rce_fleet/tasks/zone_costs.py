@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rce_fleet.tasks.book import TaskBook
     from rce_fleet.tasks.facts import FleetFacts
-    from rce_fleet.tasks.records import RobotProfile
+    from rce_fleet.tasks.records import RobotProfile, Zone
 
 
 def zone_profiles(book: TaskBook, facts: FleetFacts, default: RobotProfile) -> dict[str, RobotProfile]:
@@ -31,13 +31,17 @@ def zone_profiles(book: TaskBook, facts: FleetFacts, default: RobotProfile) -> d
     ]
     if not zones:
         return {}
+    applying: dict[str, list[Zone]] = {}
+    for zone in zones:
+        for robot in zone.robots or facts.robots:
+            applying.setdefault(robot, []).append(zone)
     made: dict[tuple[int, tuple[str, ...]], RobotProfile] = {}
     found = {}
     for robot in facts.robots:
-        applied = [zone for zone in zones if zone.applies_to(robot)]
-        base = book.entry(robot).profile or default
+        applied = applying.get(robot)
         if not applied:
             continue
+        base = book.entry(robot).profile or default
         key = id(base), tuple(zone.id for zone in applied)
         if key not in made:
             costs = {zone.id: zone.value or 1.0 for zone in applied if zone.kind == "cost"}

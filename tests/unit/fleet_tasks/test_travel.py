@@ -111,3 +111,96 @@ def test_distances_are_measured_ahead_however_many_tasks_there_were(
     floor.go(299)
     floor.dispatcher.measure(floor.facts)
     assert floor.dispatcher._travel.missing([299]) == []
+
+
+def no_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(travel_module, "REFRESHED", 0)
+    monkeypatch.setattr(travel_module, "CELLS_PER_STEP", 0)
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32))
+def test_estimates_know_exactly_where_no_way_leads(seed: int) -> None:
+    """An estimate lacks a detour at most; where there is no way for a robot, it says so."""
+    rng = Random(seed)
+    grid = GridMap(5, 6)
+    cells = range(len(grid))
+    zones = {
+        name: Zone(name, kind, tuple(rng.sample(cells, 5)))
+        for name, kind in (("ice", "cost"), ("shut", "blocked"))
+    }
+    shut = frozenset(rng.sample(cells, 8))
+    for costs in ({"shut": inf}, {"ice": 2.5, "shut": inf}, {"ice": 2.5}):
+        exact, estimated = TravelCosts(), TravelCosts()
+        for travel in (exact, estimated):
+            travel.set_map(grid, shut, zones, 0)
+        with pytest.MonkeyPatch.context() as patch:
+            no_budget(patch)
+            estimated.begin_step()
+            for goal in cells:
+                found, right = estimated.field(goal, costs), exact.field(goal, costs)
+                np.testing.assert_array_equal(np.isinf(found), np.isinf(right))
+                assert np.all(found <= right)
+                assert [estimated.metres(cell, goal, costs) for cell in cells] == found.tolist()
+                out = np.empty(len(grid), np.float32)
+                estimated.write_metres(np.arange(len(grid)), goal, costs, out)
+                np.testing.assert_array_equal(out, found)
+
+
+def test_estimates_become_distances_in_later_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid = GridMap(5, 6)
+    travel = TravelCosts()
+    travel.set_map(grid, frozenset(), {"z": Zone("z", "blocked", (8, 9, 10))}, 0)
+    monkeypatch.setattr(travel_module, "CELLS_PER_STEP", 0)
+    monkeypatch.setattr(travel_module, "REFRESHED", 1)
+    travel.begin_step()
+    before = [travel.metres(3, goal, {"z": inf}) for goal in (15, 16)]
+    travel.begin_step()
+    after = [travel.metres(3, goal, {"z": inf}) for goal in (15, 16)]
+    assert before[0] == after[0]
+    assert before[1] < after[1] == travel.metres(3, 16, {"z": inf})
+
+
+def test_many_zones_for_some_robots_take_bounded_steps(floor: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hundred robots with a zone each have a hundred times as many distances; one step took 71 s for it."""
+    floor.grid = floor.facts.grid = floor.book.grid = GridMap(30, 30)
+    monkeypatch.setattr(travel_module, "CELLS_PER_STEP", 20 * 900)
+    rng = Random(2)
+    cells = rng.sample(range(900), 700)
+    for number in range(100):
+        floor.add(f"Robot{number}", cells.pop())
+        floor.book.zones[f"z{number}"] = Zone(
+            f"z{number}", "blocked", (cells.pop(), cells.pop()), robots=(f"Robot{number}",)
+        )
+    for _ in range(150):
+        floor.deliver(cells.pop(), cells.pop())
+    computed: list[tuple[int, bool]] = []
+    compute = TravelCosts._compute
+
+    def counting(self: TravelCosts, grid: GridMap, goals: Any, costs: Any) -> Any:
+        computed.append((len(goals), bool(costs)))
+        return compute(self, grid, goals, costs)
+
+    monkeypatch.setattr(TravelCosts, "_compute", counting)
+    while floor.dispatcher.measure(floor.facts):
+        assert sum(count for count, _ in computed) <= 150 * 2
+    for _ in range(8):
+        computed.clear()
+        floor.run(1)
+        assert sum(count for count, is_own in computed if is_own) <= 20
+        assert len([task for task in floor.book.active_tasks() if task.robot]) > 0
+    assert len({task.robot for task in floor.book.active_tasks()}) == 100
+
+
+def test_no_task_behind_a_cell_that_is_blocked_for_the_robot(
+    floor: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even before the distances of its own zones are computed."""
+    no_budget(monkeypatch)
+    floor.grid = floor.facts.grid = floor.book.grid = GridMap(1, 9)
+    floor.add("Near", 4)
+    floor.add("Far", 0)
+    floor.book.zones["z"] = Zone("z", "blocked", (5,), robots=("Near",))
+    task = floor.go(8)
+    floor.run(1)
+    assert floor.task(task).robot == "Far"
