@@ -1,9 +1,13 @@
 """Compares two full runs: which medians of the second one lie in the intervals of the first one.
 
 Two runs of the same thing do not agree in 95 % of the medians: an interval contains the true median in 95 of
-100 experiments, but the second run's median varies too. For large samples some 83 % lie in the interval.
+100 experiments, but the second run's median varies too. How many lie in the interval depends on the number of
+runs (:func:`~rce_fleet.experiments.statistics.repeat_share`): some 83 % of large samples, 60 % of three runs.
 Source: G. Cumming, R. Maillardet, "Confidence intervals and replication: Where will the next mean fall?",
 2006. Therefore medians that are outside by little are counted apart.
+
+Metrics that have one value only within each of the two runs, such as losses of 0, say nothing about
+intervals: they do not count.
 """
 
 from __future__ import annotations
@@ -13,6 +17,7 @@ from math import isnan
 from typing import TYPE_CHECKING
 
 from rce_fleet.experiments.report.labels import condition_order
+from rce_fleet.experiments.statistics import repeat_share
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -21,8 +26,6 @@ if TYPE_CHECKING:
 
 GOAL = 0.9
 """Share of the medians that must lie in the first run's intervals."""
-EXPECTED = 0.83
-"""Share that does if nothing has changed, for intervals of 95 %."""
 NEAR = 0.05
 """A median outside of the interval is near if it differs from the first one by this share at most."""
 
@@ -48,6 +51,11 @@ class Pair:
         return (second - first) / abs(first) if first else float("inf")
 
     @property
+    def is_constant(self) -> bool:
+        """Whether no interval has a width: neither run says how far medians vary."""
+        return all(one.estimate.low == one.estimate.high for one in (self.first, self.second))
+
+    @property
     def is_near(self) -> bool:
         """Whether the second median is outside of the interval by little."""
         return not self.is_inside and abs(self.change) <= NEAR
@@ -58,13 +66,15 @@ class Comparison:
     """Two full runs.
 
     Attributes:
-        pairs: What both measured, with an interval in the first one.
+        pairs: What both measured, with an interval in the first one, and varied in a run.
+        constant: The same of what did not vary in either run.
         without_interval: Metrics that both measured, in the first one with too few runs for an interval.
         only_first: Metrics of conditions that the second one did not measure.
         only_second: Those that the first one did not measure.
     """
 
     pairs: tuple[Pair, ...]
+    constant: tuple[Pair, ...]
     without_interval: int
     only_first: tuple[Summary, ...]
     only_second: tuple[Summary, ...]
@@ -81,6 +91,17 @@ class Comparison:
         return near / len(self.pairs) if self.pairs else float("nan")
 
     @property
+    def expected(self) -> float:
+        """Share that lies in the intervals if nothing differs but chance."""
+        runs = [(pair.first.estimate.runs, pair.second.estimate.runs) for pair in self.pairs]
+        return sum(repeat_share(*both) for both in runs) / len(runs) if runs else float("nan")
+
+    @property
+    def same(self) -> int:
+        """How many of those that did not vary have the same value in both runs."""
+        return sum(pair.is_inside for pair in self.constant)
+
+    @property
     def reaches_goal(self) -> bool:
         """Whether enough medians lie in the intervals."""
         return bool(self.pairs) and self.inside >= GOAL
@@ -88,13 +109,18 @@ class Comparison:
     @property
     def outside(self) -> list[Pair]:
         """What does not lie in the intervals, the largest change first."""
-        return sorted((pair for pair in self.pairs if not pair.is_inside), key=lambda pair: -abs(pair.change))
+        found = (pair for pair in (*self.pairs, *self.constant) if not pair.is_inside)
+        return sorted(found, key=lambda pair: -abs(pair.change))
 
     def experiments(self) -> Iterator[tuple[str, Comparison]]:
         """Yield the comparison of each experiment by itself."""
-        for name in sorted({pair.first.condition.experiment for pair in self.pairs}):
-            pairs = tuple(pair for pair in self.pairs if pair.first.condition.experiment == name)
-            yield name, Comparison(pairs, 0, (), ())
+        both = (*self.pairs, *self.constant)
+        for name in sorted({pair.first.condition.experiment for pair in both}):
+            pairs, constant = (
+                tuple(pair for pair in found if pair.first.condition.experiment == name)
+                for found in (self.pairs, self.constant)
+            )
+            yield name, Comparison(pairs, constant, 0, (), ())
 
 
 def compare(first: Iterable[Summary], second: Iterable[Summary]) -> Comparison:
@@ -106,7 +132,8 @@ def compare(first: Iterable[Summary], second: Iterable[Summary]) -> Comparison:
     both = [Pair(found, other[name]) for name, found in one.items() if name in other]
     pairs = tuple(pair for pair in both if not isnan(pair.first.estimate.low))
     return Comparison(
-        pairs,
+        tuple(pair for pair in pairs if not pair.is_constant),
+        tuple(pair for pair in pairs if pair.is_constant),
         len(both) - len(pairs),
         tuple(found for name, found in one.items() if name not in other),
         tuple(found for name, found in other.items() if name not in one),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import isfinite
+from math import isfinite, isnan
 from typing import TYPE_CHECKING
 
 from rce_fleet.experiments.report.labels import (
@@ -13,8 +13,9 @@ from rce_fleet.experiments.report.labels import (
     software_label,
     system_label,
 )
-from rce_fleet.experiments.report.repeat import EXPECTED, GOAL, NEAR
-from rce_fleet.experiments.report.tables import folded, markdown
+from rce_fleet.experiments.report.repeat import GOAL, NEAR
+from rce_fleet.experiments.report.tables import MISSING, folded, markdown
+from rce_fleet.experiments.statistics import repeat_share
 
 if TYPE_CHECKING:
     from rce_fleet.experiments.report.repeat import Comparison, Pair
@@ -22,9 +23,9 @@ if TYPE_CHECKING:
 
 def comparison_text(comparison: Comparison) -> str:
     """Return how many medians of the second run lie in the first one's intervals, and which do not."""
-    if not comparison.pairs:
+    if not (comparison.pairs or comparison.constant):
         return "Nothing can be compared: no metric has an interval in the first run and a second value."
-    parts = [_verdict(comparison), _shares(comparison)]
+    parts = [*filter(None, (_verdict(comparison), _constant(comparison))), _shares(comparison)]
     if comparison.outside:
         head = ("experiment", "system", "software", "factors", "metric", "first", "second", "unit", "change")
         rows = [_row(pair) for pair in comparison.outside]
@@ -39,22 +40,42 @@ def comparison_text(comparison: Comparison) -> str:
 
 
 def _verdict(comparison: Comparison) -> str:
+    if not comparison.pairs:
+        return ""
     reached = "reached" if comparison.reaches_goal else "not reached"
     return (
         f"Of {len(comparison.pairs)} medians of the second run, {_percent(comparison.inside)} lie in the "
         f"intervals of the first one; the goal of {_percent(GOAL)} is {reached}. With those that are "
         f"outside by {_percent(NEAR)} of the first median at most, it is "
-        f"{_percent(comparison.inside_or_near)}. If nothing differs but chance, some {_percent(EXPECTED)} "
-        "lie in the intervals, since the second medians vary too. Values over time are not counted."
+        f"{_percent(comparison.inside_or_near)}. If nothing differed but chance, some "
+        f"{_percent(comparison.expected)} would lie in the intervals, since the second medians vary too: "
+        f"{_percent(repeat_share(10, 10))} of those of ten runs, {_percent(repeat_share(3, 3))} of those of "
+        "three. Values over time are not counted."
+    )
+
+
+def _constant(comparison: Comparison) -> str:
+    if not comparison.constant:
+        return ""
+    return (
+        f"Not counted are {len(comparison.constant)} metrics that had one value only in each run, such as "
+        f"losses of 0: {comparison.same} of them have the same value in both."
     )
 
 
 def _shares(comparison: Comparison) -> str:
     rows = [
-        (name, str(len(part.pairs)), _percent(part.inside), _percent(part.inside_or_near))
+        (
+            *(name, str(len(part.pairs))),
+            *map(_percent, (part.inside, part.inside_or_near, part.expected)),
+            f"{part.same} of {len(part.constant)}" if part.constant else MISSING,
+        )
         for name, part in comparison.experiments()
     ]
-    head = ("experiment", "medians", "in the intervals", f"or outside by {_percent(NEAR)} at most")
+    head = (
+        *("experiment", "medians", "in the intervals", f"or outside by {_percent(NEAR)} at most"),
+        *("in the intervals by chance alone", "constant, and the same"),
+    )
     return markdown(head, rows)
 
 
@@ -70,4 +91,4 @@ def _row(pair: Pair) -> list[str]:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %"
+    return MISSING if isnan(share) else f"{100 * share:.0f} %"

@@ -11,6 +11,7 @@ from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.report.labels import natural, number, scale_for
 from rce_fleet.experiments.report.measurements import Measurements, Quantity
 from rce_fleet.experiments.report.repeat import compare
+from rce_fleet.experiments.report.repeat_part import comparison_text
 from rce_fleet.experiments.report.summary import read_summary, summarize, write_summary
 from rce_fleet.experiments.results import Condition, Row
 
@@ -113,9 +114,34 @@ def test_medians_of_a_second_run_are_counted() -> None:
 
 
 def test_the_same_run_twice_reaches_the_goal() -> None:
-    found = summarize(Measurements.of(rows(SMS, "rate", [7.1234567] * 3)))
+    found = summarize(Measurements.of(rows(SMS, "rate", [7.1234567, 7.2, 7.3])))
     assert compare(found, found).reaches_goal
     assert not compare([], []).reaches_goal
+
+
+def test_constant_metrics_are_counted_apart() -> None:
+    """Losses of 0 lie in an interval from 0 to 0, whatever the machines do."""
+    first, second = (
+        summarize(
+            Measurements.of(
+                [
+                    *rows(SMS, "rate", rates),
+                    *rows(SMS, "lost", [0.0, 0.0, 0.0]),
+                    *rows(SMS, "topics", [topics] * 3),
+                ]
+            )
+        )
+        for rates, topics in (([7.0, 7.5, 8.0], 5.0), ([8.9, 9.0, 9.1], 7.0))
+    )
+    found = compare(first, second)
+    assert (len(found.pairs), len(found.constant), found.same, found.inside) == (1, 2, 1, 0.0)
+    assert [pair.first.metric for pair in found.outside] == ["topics", "rate"]
+    assert found.expected == pytest.approx(0.6, abs=0.03)  # 3 of 5 orders of six values
+    text = comparison_text(found)
+    assert "2 metrics that had one value only in each run, such as losses of 0: 1 of them" in text
+    constant = compare(first[:1], first[:1])
+    assert (constant.pairs, constant.same) == ((), 1)
+    assert "| laser | 0 | - | - | - | 1 of 1 |" in comparison_text(constant)
 
 
 @pytest.mark.parametrize(
