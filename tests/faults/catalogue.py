@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from faults.scenarios import etcd, kill, network
+from faults.scenarios import disk, etcd, kill, network
 from faults.world import World
 
 
@@ -37,6 +37,8 @@ SCENARIOS = (
     Scenario("clocks", etcd.clocks, robot=False),
     Scenario("slow-disk", etcd.slow_disk, robot=False),
     Scenario("full-disk", etcd.full_disk, robot=False),
+    Scenario("slow-master-disk", disk.slow_disk, robot=False),
+    Scenario("full-master-disk", disk.full_disk, robot=False),
     Scenario("full-database", etcd.full_database, robot=False, short=True),
     Scenario("replace-member", etcd.replace_member, robot=False),
     Scenario("upgrade", kill.upgrade),

@@ -38,6 +38,8 @@ class Machine:
     Attributes:
         etcd_options: More options of the member, from its next start on.
         etcd_launcher: The program, and its arguments, that starts the member.
+        master_launcher: The program, and its arguments, that starts the master.
+        master_state: The state folder of the master, from its next start on; None: the usual one.
         master_env: More variables of the master's environment, from its next start on.
     """
 
@@ -48,6 +50,8 @@ class Machine:
         self.data.mkdir(parents=True)
         self.etcd_options: tuple[str, ...] = ()
         self.etcd_launcher: tuple[str, ...] = ()
+        self.master_launcher: tuple[str, ...] = ()
+        self.master_state: Path | None = None
         self.master_env: Mapping[str, str] = {}
         self.cluster_state = "new"
         self.env = environment(folder)
@@ -86,9 +90,18 @@ class Machine:
     async def start_master(self, store: str) -> None:
         """Start the master, and wait until it stands by."""
         self.master.argv = [
-            *(*self.place.prefix, sys.executable, "-m", "rce_master", "--dev", "--store", store),
+            *(
+                *self.place.prefix,
+                *self.master_launcher,
+                sys.executable,
+                "-m",
+                "rce_master",
+                "--dev",
+                "--store",
+                store,
+            ),
             *("--lease", str(LEASE_S), "--machine", self.name, "--bind", "0.0.0.0"),
-            *("--state-dir", str(self.data.parent / "master")),
+            *("--state-dir", str(self.master_state or self.data.parent / "master")),
         ]
         self.master.env = {**self.env, **self.master_env}
         await self.master.start(ready="rce-master stand-by: ", timeout=PATIENCE_S)

@@ -97,8 +97,7 @@ async def slow_disk(world: World) -> None:
 
     The others are more than half without a slow follower. A slow leader may delay all; it must lose nothing.
     """
-    launcher, flag = world.cluster.folder / "slow_fsync", world.cluster.folder / "slow"
-    subprocess.run(["gcc", "-O1", "-o", launcher, _SOURCE], check=True)
+    launcher, flag = build_slow_fsync(world), world.cluster.folder / "slow"
     leader = await world.cluster.etcd_leader()
     follower = world.rng.choice([each for each in world.cluster.machines if each is not leader])
     async with slowed(world, follower, launcher, flag):
@@ -110,6 +109,13 @@ async def slow_disk(world: World) -> None:
         await asyncio.sleep(SLOW_S if world.scale == 1 else LONG_SLOW_S)
         since = time.monotonic()
     await world.until_written(f"fsync of {FSYNC_S:g} s at etcd's leader, and back", since)
+
+
+def build_slow_fsync(world: World) -> Path:
+    """Compile the program that starts others with a slow fsync; return its path."""
+    launcher = world.cluster.folder / "slow_fsync"
+    subprocess.run(["gcc", "-O1", "-o", launcher, _SOURCE], check=True)
+    return launcher
 
 
 @asynccontextmanager
