@@ -254,6 +254,7 @@ class _Local:
             typer.echo("then run this command again: it waits until etcd works")
             return
         members = await steps()
+        self.machine.keep(members)
         arguments = self.machine.master_arguments(_clients(members))
         has_users = await self.has_users()
         install(
@@ -284,6 +285,7 @@ class _Local:
 
         async def become_member() -> None:
             members = await steps()
+            self.machine.keep(members)
             self._say_state(members)
             words = self.machine.master_arguments(_clients(members))
             typer.echo(
@@ -316,6 +318,7 @@ class _Local:
 
 async def _init(local: _Local) -> None:
     machine = local.machine
+    machine.check_data()
     if local.begins():
         if machine.tls:
             folder = CertificateFolder(machine.certificates)

@@ -17,7 +17,10 @@ from rce_master.store.etcd.client import MIN_VERSION
 from rce_master.store.etcd.layout import MAX_OPERATIONS
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
+
+    from rce_master.cluster.members import Member
 
 CERTIFICATE = ENGINE
 """Name of the certificate that each machine of a cluster shows; each has its own."""
@@ -25,6 +28,8 @@ _VERSION = re.compile(r"etcd Version: (\d+)\.(\d+)")
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,62}")
 _KEYS = {"name", "advertise-client-urls", "initial-advertise-peer-urls", "initial-cluster"}
 """What a configuration must have."""
+_STATE = "initial-cluster-state"
+_JOINS = "existing"
 _FIXED = {
     "enable-grpc-gateway": True,  # etcd 3.4 leaves it out if a file configures it
     "max-txn-ops": MAX_OPERATIONS,
@@ -118,7 +123,7 @@ class Machine:
             "listen-peer-urls": self.peer_url,
             "initial-advertise-peer-urls": self.peer_url,
             "initial-cluster": ",".join(f"{name}={url}" for name, url in peers.items()),
-            "initial-cluster-state": "new" if new else "existing",
+            _STATE: "new" if new else _JOINS,
             **_FIXED,
         }
         if self.tls:
@@ -144,6 +149,33 @@ class Machine:
             self.config.chmod(0o644)  # etcd's user reads it, whatever the umask is; it has no secrets
         except OSError as error:
             raise ClusterError(f"cannot write {self.config}: {error}") from error
+
+    def keep(self, members: Sequence[Member]) -> None:
+        """Write etcd's configuration once this machine is a member: with all members, and as one that joins.
+
+        If the data is lost, etcd then ends. As one that begins a cluster it would begin another one, on whose
+        empty state a master would lead.
+
+        Raises:
+            ClusterError: It cannot be written.
+        """
+        named = {each.name: f"{self.scheme}://{each.peer}" for each in members if each.name}
+        self.write(named, new=False)
+
+    def check_data(self) -> None:
+        """Check that the first machine of a cluster still has its data, once it was a member.
+
+        Raises:
+            ClusterError: It has not; etcd itself leaves an empty folder then.
+        """
+        if any(self.data.glob("member/wal/*.wal")):
+            return
+        if self.config.exists() and read_config(self.config).get(_STATE) == _JOINS:
+            raise ClusterError(
+                f"this machine is in a cluster by {self.config}, and its data is lost. To join again:"
+                f" `rce cluster remove {self.name}` on another machine, remove {self.config} here, then"
+                " `rce cluster join`. To begin another cluster, remove that file"
+            )
 
     def store(self, endpoints: tuple[str, ...]) -> str:
         """Return the address of the store for the machine's master: its own member of etcd first.

@@ -92,7 +92,7 @@ async def recover(machine: Machine, known: Iterable[Member], tls: Context | None
         raise ClusterError(f"cannot copy {machine.data}: {error}") from error
     finally:
         shutil.rmtree(copy, ignore_errors=True)
-    machine.write({machine.name: machine.peer_url}, new=True)
+    machine.write({machine.name: machine.peer_url}, new=False)
     return before
 
 

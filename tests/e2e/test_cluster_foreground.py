@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 from pathlib import Path
 
 import psutil
 import pytest
+from faults.machines import fetch
 from support.engine import Program, until
 from support.go_between import LOOPBACK
 from support.ports import free_ports
@@ -15,6 +17,7 @@ from support.processes import run_to_end
 
 pytestmark = [pytest.mark.e2e, pytest.mark.needs("etcd"), pytest.mark.timeout(300), pytest.mark.asyncio]
 
+RCE = str(Path(sys.executable).parent / "rce")
 START_S = 120.0
 
 
@@ -22,7 +25,7 @@ async def test_killed_cluster_command_ends_its_etcd(tmp_path: Path) -> None:
     client, peer = free_ports(2)
     kept = {key: value for key, value in os.environ.items() if not key.startswith("RCE_")}
     argv = [
-        *(str(Path(sys.executable).parent / "rce"), "cluster", "init", "--address", LOOPBACK, "--no-tls"),
+        *(RCE, "cluster", "init", "--address", LOOPBACK, "--no-tls"),
         *("--foreground", "--state-dir", str(tmp_path / "state")),
         *("--client-port", str(client), "--peer-port", str(peer)),
     ]
@@ -48,29 +51,65 @@ def works(process: psutil.Process) -> bool:
         return False
 
 
+class Init:
+    """``rce cluster init --foreground`` on ports of its own."""
+
+    def __init__(self, folder: Path, *options: str) -> None:
+        self.client, peer = free_ports(2)
+        kept = {key: value for key, value in os.environ.items() if not key.startswith("RCE_")}
+        self.state = folder / "state"
+        self.env = kept | {"HOME": str(folder)}
+        self.argv = [
+            *(RCE, "cluster", "init", "--address", LOOPBACK, "--foreground", *options),
+            *("--state-dir", str(self.state), "--client-port", str(self.client), "--peer-port", str(peer)),
+        ]
+        self.program = Program("cluster", self.argv, self.env, folder)
+
+    async def start(self) -> None:
+        await self.program.start(ready="etcd ready: ", timeout=START_S)
+
+    async def add_user(self, name: str) -> tuple[int, str]:
+        store = ("--state-dir", str(self.state), "--store", f"etcd://{LOOPBACK}:{self.client}")
+        words = ("user", "add", name, "--password-stdin", *store)
+        return await run_to_end(RCE, *words, env=self.env, text="a long password")
+
+
 async def test_first_user_is_asked_for_until_there_is_one(tmp_path: Path) -> None:
     """No user can be added over the API before, nor beside a master that leads."""
-    client, peer = free_ports(2)
-    kept = {key: value for key, value in os.environ.items() if not key.startswith("RCE_")}
-    env, state = kept | {"HOME": str(tmp_path)}, tmp_path / "state"
-    rce = str(Path(sys.executable).parent / "rce")
-    command = Program(
-        "cluster",
-        [
-            *(rce, "cluster", "init", "--address", LOOPBACK, "--no-tls", "--foreground"),
-            *("--state-dir", str(state), "--client-port", str(client), "--peer-port", str(peer)),
-        ],
-        env,
-        tmp_path,
-    )
+    init = Init(tmp_path, "--no-tls")
     for is_asked_for in (True, False):
-        await command.start(ready="etcd ready: ", timeout=START_S)
+        await init.start()
         try:
-            said = command.output().rpartition("warning: without TLS")[2]
+            said = init.program.output().rpartition("warning: without TLS")[2]
             assert ("next, add the first user: rce user add" in said) == is_asked_for, said
-            store = ("--state-dir", str(state), "--store", f"etcd://{LOOPBACK}:{client}")
-            words = ("user", "add", f"user{is_asked_for}", "--password-stdin", *store)
-            code, output = await run_to_end(rce, *words, env=env, text="a long password")
+            code, output = await init.add_user(f"user{is_asked_for}")
             assert code == 0, output
         finally:
-            await command.stop()
+            await init.program.stop()
+
+
+async def test_lost_data_does_not_begin_another_cluster(tmp_path: Path) -> None:
+    """A master on it would lead with an empty state, and task sets would end all containers."""
+    init = Init(tmp_path, "--no-tls")
+    await init.start()
+    await init.program.stop()
+    shutil.rmtree(init.state / "etcd")
+    etcd = Program("etcd", ["etcd", "--config-file", str(init.state / "etcd.yaml")], init.env, tmp_path)
+    await etcd.start(ready="")
+    try:
+
+        async def outcome() -> str:
+            if not etcd.running:
+                return "ended"
+            return "serves" if await fetch(f"http://{LOOPBACK}:{init.client}/health") else ""
+
+        assert await until(outcome, timeout=START_S, what="etcd serves or ends") == "ended"
+    finally:
+        if etcd.running:
+            await etcd.stop()
+    code, output = await run_to_end(*init.argv, env=init.env)
+    assert (code, "its data is lost" in output) == (1, True), output
+    (init.state / "etcd.yaml").unlink()
+    shutil.rmtree(init.state / "etcd", ignore_errors=True)
+    await init.start()
+    await init.program.stop()
