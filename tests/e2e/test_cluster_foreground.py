@@ -113,3 +113,14 @@ async def test_lost_data_does_not_begin_another_cluster(tmp_path: Path) -> None:
     shutil.rmtree(init.state / "etcd", ignore_errors=True)
     await init.start()
     await init.program.stop()
+
+
+async def test_requests_with_a_certificate_are_not_logged_by_etcd(tmp_path: Path) -> None:
+    """A master asks several times a second: each line would be one of thousands in an hour."""
+    init = Init(tmp_path)
+    await init.start()
+    try:
+        assert '"warn"' in init.program.output(), "its warnings are shown"
+        assert "ignoring common name" not in init.program.output()
+    finally:
+        await init.program.stop()

@@ -142,7 +142,10 @@ class EtcdClient:
     async def __aenter__(self) -> Self:
         # The members are named by the operator; a proxy of the environment is for other addresses.
         connector = aiohttp.TCPConnector(limit=0, keepalive_timeout=60.0)
-        self._session = aiohttp.ClientSession(connector=connector, trust_env=False)
+        # With Accept, etcd logs of each request that it ignores the name in the certificate.
+        self._session = aiohttp.ClientSession(
+            connector=connector, trust_env=False, skip_auto_headers=("Accept",)
+        )
         return self
 
     async def __aexit__(
