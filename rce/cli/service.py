@@ -24,6 +24,7 @@ SYSTEM_UNITS = Path("/etc/systemd/system")
 SYSTEM_CONFIG = Path("/etc/rce")
 USER = "rce"
 HOMES = (Path("/home"), Path("/root"))
+TEMPORARY = (Path("/tmp"), Path("/var/tmp"))  # noqa: S108 - nothing is written there
 _PROGRAMS = {
     Role.ENGINE: ("rce", "up"),
     Role.MASTER: ("rce-master",),
@@ -199,6 +200,14 @@ def check(service: Service) -> None:
         return
     if not service.program.exists():
         _fail(f"{service.program} is not installed; install RCE with the extra 'server'")
+    hidden = service.system and service.role in (Role.MASTER, Role.ROBOT)
+    if hidden and any(
+        path.is_relative_to(folder) for path in _needed(service.program) for folder in TEMPORARY
+    ):
+        _fail(
+            f"{service.program} cannot run as a service: services have a /tmp and a /var/tmp of their own;"
+            " install RCE elsewhere (/usr/bin/python3 -m venv /opt/rce)"
+        )
     closed = next(filter(None, map(_closed_folder, _needed(service.program))), None)
     if service.user and closed is not None:
         _fail(

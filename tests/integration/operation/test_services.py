@@ -7,11 +7,14 @@ import os
 import shlex
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
+import typer
 from support.engine import Program
 
+from rce.cli.service import check
 from rce.services.units import Role, Service, quoted, unit
 
 RCE = str(Path(sys.executable).parent / "rce")
@@ -93,6 +96,20 @@ def test_unit_that_could_not_start_is_refused(tmp_path: Path) -> None:
     settings.write_text("masters: {}\n")
     told = rce(tmp_path, "install-service", "engine", "--config", str(settings), code=2)
     assert "did you mean 'master'" in told
+
+
+@pytest.mark.parametrize("folder", ["/tmp", "/var/tmp"])
+def test_program_that_its_service_would_not_see_is_refused(
+    folder: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The units of master and robot have ``PrivateTmp``: systemd would only say 203/EXEC."""
+    with tempfile.TemporaryDirectory(dir=folder) as place:
+        program = Path(place, "rce-master")
+        program.touch()
+        with pytest.raises(typer.Exit):
+            check(Service(role=Role.MASTER, program=program))
+        assert f"{program} cannot run as a service" in capsys.readouterr().err
+        check(Service(role=Role.CONTAINER, program=program))
 
 
 async def test_user_unit_is_installed_and_removed(tmp_path: Path) -> None:
