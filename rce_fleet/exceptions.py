@@ -23,6 +23,7 @@
     +-- StationError        a request to the operator station was not carried out
     |   +-- StationUnavailableError    station or planner cannot be reached; try again later
     |   +-- RequestRefusedError        the station refused the request
+    |   +-- EventsForgottenError       a receiver of events is behind by more of them than are kept
     |   +-- EventsRestartedError       the fleet manager lost its journal: its events are numbered anew
     +-- ExperimentError     an experiment that cannot be done, or data of one that cannot be read
     +-- DemoError           errors of ``rce demo``, see rce_fleet.demo.exceptions
@@ -156,6 +157,26 @@ class StationUnavailableError(StationError):
 
 class RequestRefusedError(StationError):
     """The station refused a request; its text says why."""
+
+
+class EventsForgottenError(StationError):
+    """A receiver of events is behind by more of them than the fleet manager keeps.
+
+    Attributes:
+        journal: Which journal numbers the events.
+        first: Number of the first event that is not kept, of those that the receiver lacks.
+        last: Number of the last one; the receiver continues after it.
+    """
+
+    def __init__(self, journal: str, first: int, last: int) -> None:
+        self.journal, self.first, self.last = journal, first, last
+        super().__init__(journal, first, last)
+
+    def __str__(self) -> str:
+        return (
+            f"the events {self.first} .. {self.last} are not kept any more: read the tasks anew; events"
+            f" follow from {self.last + 1} on"
+        )
 
 
 class EventsRestartedError(StationError):

@@ -23,7 +23,7 @@ from rce_fleet.cli.access import (
     echo_table,
     set_token,
 )
-from rce_fleet.exceptions import EventsRestartedError
+from rce_fleet.exceptions import EventsForgottenError, EventsRestartedError
 
 if TYPE_CHECKING:
     from rce_fleet.client import FleetClient
@@ -176,6 +176,9 @@ def watch(
             except EventsRestartedError as error:
                 typer.echo(f"rce fleet: {error}", err=True)
                 number = 0
+            except EventsForgottenError as error:
+                typer.echo(f"rce fleet: {error}", err=True)
+                number = error.last
 
     do(station, work)
 

@@ -11,10 +11,11 @@ Example:
 
 from rce_fleet.client.client import FleetClient
 from rce_fleet.client.errors import ApiError, FleetApiUnavailableError, NotFoundError, OutdatedError
-from rce_fleet.exceptions import EventsRestartedError
+from rce_fleet.exceptions import EventsForgottenError, EventsRestartedError
 
 __all__ = [
     "ApiError",
+    "EventsForgottenError",
     "EventsRestartedError",
     "FleetApiUnavailableError",
     "FleetClient",

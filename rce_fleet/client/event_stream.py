@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from rce_fleet.client.errors import FleetApiUnavailableError
 from rce_fleet.client.transport import RETRY, Transport
-from rce_fleet.exceptions import EventsRestartedError
+from rce_fleet.exceptions import EventsForgottenError, EventsRestartedError
 
 
 @dataclass(slots=True)
@@ -18,7 +18,8 @@ class SentEvent:
 
     Attributes:
         id: A client that connects again sends it as ``Last-Event-ID``.
-        name: Empty for an event of the fleet; ``gap`` where numbers begin anew.
+        name: Empty for an event of the fleet; ``gap`` where numbers begin anew or events are
+            not kept any more.
         data: JSON.
     """
 
@@ -47,6 +48,7 @@ async def follow_events(transport: Transport, after: int | None) -> AsyncIterato
 
     Raises:
         ApiError: The station refused.
+        EventsForgottenError: The next events are not kept any more.
         EventsRestartedError: The numbers began anew.
         FleetApiUnavailableError: The stream could not be opened for the first time.
     """
@@ -68,7 +70,10 @@ async def follow_events(transport: Transport, after: int | None) -> AsyncIterato
                     last = whole.id or last
                     continue
                 if whole.name == "gap":
-                    raise EventsRestartedError(str(json.loads(whole.data)["journal"]))
+                    gap = json.loads(whole.data)
+                    if "to" in gap:
+                        raise EventsForgottenError(str(gap["journal"]), int(gap["from"]), int(gap["to"]))
+                    raise EventsRestartedError(str(gap["journal"]))
                 last = whole.id
                 pauses.reset()
                 yield whole.data

@@ -78,6 +78,8 @@ class HistoryRequests(ApiRequests):
 
         Raises:
             ApiError: The station refused, for example because the login has ended.
+            EventsForgottenError: The next events are not kept any more; ``events(error.last)`` follows those
+                after them.
             EventsRestartedError: The fleet manager lost its journal; ``events(0)`` follows the new one.
             FleetApiUnavailableError: The station cannot be reached, and could not be before.
 

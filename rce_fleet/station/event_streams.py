@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from aiohttp import hdrs, web
 
-from rce_fleet.exceptions import EventsRestartedError
+from rce_fleet.exceptions import EventsForgottenError, EventsRestartedError
 from rce_fleet.station.access import USER, problem
 from rce_fleet.station.events import EventCursor, EventFeed
 from rce_fleet.station.planner_client import PlannerUnavailableError
@@ -129,7 +129,10 @@ class EventStreams:
 
 
 async def _next_frames(cursor: EventCursor) -> list[str]:
-    """Wait for events; return them as server-sent events, and the event ``gap`` where numbers begin anew."""
+    """Wait for events; return them as server-sent events.
+
+    The event ``gap`` tells that numbers begin anew, or that some events are not kept any more.
+    """
     try:
         found = await cursor.next()
     except PlannerUnavailableError:
@@ -138,6 +141,11 @@ async def _next_frames(cursor: EventCursor) -> list[str]:
     except EventsRestartedError as error:
         told = json.dumps({"journal": error.journal, "text": str(error)})
         return [f"event: gap\nid: {error.journal}:0\ndata: {told}\n\n"]
+    except EventsForgottenError as error:
+        told = json.dumps(
+            {"journal": error.journal, "from": error.first, "to": error.last, "text": str(error)}
+        )
+        return [f"event: gap\nid: {_id_of(cursor, error.last)}\ndata: {told}\n\n"]
     return [f"id: {_id_of(cursor, one['number'])}\ndata: {json.dumps(one)}\n\n" for one in found]
 
 

@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from rce_fleet.exceptions import EventsRestartedError
+from rce_fleet.exceptions import EventsForgottenError, EventsRestartedError
 
 KEPT = 2000
 """Newest events that are kept here, so that clients which follow cost the manager nothing."""
@@ -157,7 +157,8 @@ class EventCursor:
 
     Args:
         feed: The feed.
-        number: The last event that the client has; None: it wants those from now on.
+        number: The last event that the client has; None: it wants those from now on; 0 without a journal:
+            all that are kept.
         journal: Which journal numbered it; empty: the client does not know.
 
     Attributes:
@@ -168,6 +169,7 @@ class EventCursor:
     def __init__(self, feed: EventFeed, number: int | None, journal: str = "") -> None:
         self._feed = feed
         self._epoch = feed.epoch
+        self._wants_kept = number == 0 and not journal
         self.number = feed.newest if number is None else number
         self.journal = feed.journal if number is None else journal
 
@@ -176,6 +178,7 @@ class EventCursor:
 
         Raises:
             PlannerUnavailableError: The manager does not answer.
+            EventsForgottenError: The next events are not kept any more; the next call begins after them.
             EventsRestartedError: The numbers began anew; the next call begins with the first event.
         """
         feed = self._feed
@@ -188,8 +191,16 @@ class EventCursor:
         if not found:
             found = await self._after(self.number, ask=not await feed.wait(self.number))
         if found:
+            self._look_for_gap(int(found[0]["number"]))
             self.number = int(found[-1]["number"])
         return found
+
+    def _look_for_gap(self, number: int) -> None:
+        """Notice that the events before the next one are not kept: events are numbered one by one."""
+        wants_kept, self._wants_kept = self._wants_kept, False
+        if self.number is not None and number > self.number + 1 and not wants_kept:
+            first, self.number = self.number + 1, number - 1
+            raise EventsForgottenError(self.journal, first, self.number)
 
     async def _after(self, number: int, *, ask: bool = False) -> Sequence[FleetEvent]:
         found = await self._feed.after(number, ask=ask)
@@ -212,4 +223,5 @@ class EventCursor:
         is_other = bool(self.journal) and self.journal != feed.journal
         if is_ahead or is_other or self._epoch != feed.epoch:
             self._epoch, self.journal, self.number = feed.epoch, feed.journal, 0
+            self._wants_kept = False
             raise EventsRestartedError(feed.journal)

@@ -21,7 +21,7 @@ from aiohttp.abc import AbstractResolver, ResolveResult
 from rce.aio.backoff import Backoff
 from rce.web.client import NameResolver
 from rce_fleet.api.webhooks import SIGNATURE, TIMESTAMP, WEBHOOK, sign
-from rce_fleet.exceptions import EventsRestartedError, RequestRefusedError
+from rce_fleet.exceptions import EventsForgottenError, EventsRestartedError, RequestRefusedError
 from rce_fleet.station.events import EventCursor, EventFeed, FleetEvent
 from rce_fleet.station.planner_client import PlannerUnavailableError
 from rce_fleet.station.webhook_store import Webhook, WebhookStore, check_url, is_private
@@ -135,6 +135,10 @@ class WebhookSender:
                 except EventsRestartedError as restarted:
                     await self._send(session, webhook, (), restarted.journal)
                     continue
+                except EventsForgottenError as forgotten:
+                    webhook.journal = cursor.journal
+                    await self._send(session, webhook, (), forgotten=forgotten)
+                    continue
                 webhook.journal = cursor.journal
                 for first in range(0, len(found), BATCH):
                     await self._send(session, webhook, found[first : first + BATCH])
@@ -145,12 +149,16 @@ class WebhookSender:
         webhook: Webhook,
         events: Sequence[FleetEvent],
         new_journal: str = "",
+        forgotten: EventsForgottenError | None = None,
     ) -> None:
-        """Send events, or that a new journal numbers them, until the receiver has taken it."""
+        """Send events, or that a new journal numbers them or some are gone, until the receiver took it."""
         wanted = [event for event in events if not webhook.kinds or event["kind"] in webhook.kinds]
         said: dict[str, Any] = {"webhook": webhook.id, "journal": new_journal or webhook.journal}
-        said |= {"gap": True, "events": []} if new_journal else {"events": wanted}
-        while (wanted or new_journal) and (error := await self._post(session, webhook, said)):
+        is_gap = bool(new_journal) or forgotten is not None
+        said |= {"gap": True, "events": []} if is_gap else {"events": wanted}
+        if forgotten is not None:
+            said |= {"from": forgotten.first, "to": forgotten.last}
+        while (wanted or is_gap) and (error := await self._post(session, webhook, said)):
             webhook.failures += 1
             pause = self._retry.pause_after(webhook.failures)
             webhook.error, webhook.next_attempt = error, self._clock() + pause
@@ -160,9 +168,11 @@ class WebhookSender:
         webhook.failures, webhook.error, webhook.next_attempt = 0, "", None
         if new_journal:
             webhook.journal, webhook.position = new_journal, 0
+        elif forgotten is not None:
+            webhook.position = forgotten.last
         else:
             webhook.position = int(events[-1]["number"])
-        if wanted or new_journal:
+        if wanted or is_gap:
             await self._keep(webhook)
 
     async def _keep(self, webhook: Webhook) -> None:

@@ -10,7 +10,7 @@ import pytest
 from aiohttp import ClientSession, web
 from aiohttp.test_utils import TestServer
 
-from rce_fleet.exceptions import EventsRestartedError
+from rce_fleet.exceptions import EventsForgottenError, EventsRestartedError
 from rce_fleet.station import events as module
 from rce_fleet.station.event_streams import COLUMNS, EventStreams, csv_rows
 from rce_fleet.station.events import EventBatch, EventCursor, EventFeed
@@ -159,3 +159,60 @@ def test_csv_has_times_and_no_formulas() -> None:
     assert row.startswith("3,1970-01-01T00:00:00.250+00:00,")
     assert "'@erp" in row
     assert '"\'=SUM(A1), ""x"""' in row
+
+
+class ShortJournal(Journal):
+    """Keeps the newest events only."""
+
+    kept = 10
+
+    async def ask(self, after: int, limit: int) -> EventBatch:
+        return await super().ask(max(after, len(self.events) - self.kept), limit)
+
+
+async def test_a_client_behind_more_than_is_kept_is_told() -> None:
+    journal = ShortJournal(50)
+    cursor = EventCursor(EventFeed(journal.ask), 20, "aa")
+    with pytest.raises(EventsForgottenError) as caught:
+        await cursor.next()
+    assert (caught.value.journal, caught.value.first, caught.value.last) == ("aa", 21, 40)
+    assert numbers(await cursor.next()) == list(range(41, 51))
+
+
+async def test_a_client_that_wants_what_is_kept_has_no_gap() -> None:
+    journal = ShortJournal(50)
+    assert numbers(await EventCursor(EventFeed(journal.ask), 0).next()) == list(range(41, 51))
+    assert numbers(await EventCursor(EventFeed(journal.ask), 40, "aa").next()) == list(range(41, 51))
+
+
+async def test_a_stream_tells_its_gap_and_resumes_after_it() -> None:
+    """Without the gap, a program that was away took the events after it for all."""
+    journal = ShortJournal(50)
+    feed = EventFeed(journal.ask)
+    streams = EventStreams(cast("Any", None), feed, cast("Any", Always()))
+    app = web.Application()
+    app.router.add_get("/events", streams.events)
+    async with TestServer(app) as server, ClientSession() as session, asyncio.timeout(60):
+
+        async def follow(last: str) -> tuple[str, str]:
+            headers = {"Accept": "text/event-stream", "Last-Event-ID": last}
+            async with session.get(server.make_url("/events"), headers=headers) as reply:
+                await reply.content.readuntil(b"\n\n")
+                gap = await reply.content.readuntil(b"\n\n")
+                return gap.decode(), (await reply.content.readuntil(b"\n\n")).decode()
+
+        gap, after = await follow("aa:20")
+        fields = dict(line.split(": ", 1) for line in gap.splitlines() if line)
+        assert (fields["event"], fields["id"]) == ("gap", "aa:40")
+        told = json.loads(fields["data"])
+        assert (told["journal"], told["from"], told["to"]) == ("aa", 21, 40)
+        assert after.startswith("id: aa:41\n")
+        resumed, _ = await follow(fields["id"])
+        assert resumed.startswith("id: aa:41\n")
+
+
+class Always:
+    """Lets each user in."""
+
+    async def is_still_allowed(self, _request: web.Request) -> bool:
+        return True

@@ -58,3 +58,36 @@ async def test_a_receiver_is_told_of_a_lost_journal() -> None:
         running.cancel()
         await asyncio.wait([running])
     assert hook.journal == "bb"
+
+
+async def test_a_receiver_behind_more_than_is_kept_is_told() -> None:
+    """The events that it lacks are gone; without a word it would take the rest for all."""
+
+    class Short(Manager):
+        async def ask(self, after: int, limit: int) -> EventBatch:
+            return await super().ask(max(after, self.count - 2), limit)
+
+    manager, said = Short(), asyncio.Queue[dict[str, Any]]()
+    manager.count = 9
+    refusals = [True, False, False]
+
+    async def take(request: web.Request) -> web.Response:
+        said.put_nowait(await request.json())
+        return web.Response(status=500 if refusals.pop(0) else 200)
+
+    app = web.Application()
+    app.router.add_post("/", take)
+    store = WebhookStore(None)
+    sender = WebhookSender(store, EventFeed(manager.ask), retry=Backoff(first=0.01, longest=0.02))
+    async with TestServer(app) as server, asyncio.timeout(60):
+        hook = store.add(WebhookRequest(url=str(server.make_url("/")), allow_private=True), "anna", 3, "aa")
+        running = asyncio.create_task(sender.run())
+        for _ in range(2):
+            gap = await said.get()
+            assert (gap["gap"], gap["journal"], gap["from"], gap["to"]) == (True, "aa", 4, 7)
+        after = await said.get()
+        assert ("gap" in after, [event["number"] for event in after["events"]]) == (False, [8, 9])
+        while hook.position != 9:
+            await asyncio.sleep(0.01)
+        running.cancel()
+        await asyncio.wait([running])
