@@ -136,6 +136,9 @@ class TaskProgress:
             if task.number in self._retry_at or not self._can_continue(task, robot):
                 return
             task = self._book.advance(task, TaskCause.CONTINUE, now, f"{robot.id} can continue")
+        if task.is_stranded:
+            task = replace(task, is_stranded=False, revision=task.revision + 1, reason="")
+            self._book.emit(task, "continued", now, text=f"{robot.id} can continue")
         task = self._end_action(task, now, robot)
         while not task.has_ended and task.action is None:
             if not self._go(task, robot, now, facts):
@@ -353,6 +356,10 @@ class TaskProgress:
             self._suspend(task, now, f"{what}: {reason}", is_away=is_away)
         elif now - task.changed_at > self._rules.load_lost_after:
             self._book.advance(task, TaskCause.FAIL, now, f"{what}; it did not come back: {reason}")
+        elif is_away and task.state is TaskState.CANCELLING and task.action is None and not task.is_stranded:
+            reason = f"{what}: {reason}"
+            stranded = replace(task, is_stranded=True, target=None, revision=task.revision + 1, reason=reason)
+            self._book.emit(stranded, "question", now, text=stranded.question)
         elif is_away and task.action is None and task.target is not None:
             waits = replace(task, target=None, revision=task.revision + 1)
             self._book.emit(waits, "waits", now, text=f"{what}: {reason}")

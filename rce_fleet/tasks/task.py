@@ -169,6 +169,7 @@ class Task:
         recurs_at: When its next occurrence is due; None: there is none.
         cancelled_by: Who cancelled it.
         asked: Digest of the first order, to recognize a second request with the same key.
+        is_stranded: Whether the robot that brings the load of a cancelled task away does not answer.
     """
 
     number: int
@@ -192,6 +193,7 @@ class Task:
     recurs_at: float | None = None
     cancelled_by: str = ""
     asked: str = ""
+    is_stranded: bool = False
 
     @property
     def id(self) -> str:
@@ -228,7 +230,8 @@ class Task:
     @property
     def question(self) -> str:
         """What people have to decide about it, in words; empty: nothing."""
-        if not self.is_loaded or self.action is not None or self.state is not TaskState.SUSPENDED:
+        waits = self.state is TaskState.SUSPENDED or (self.state is TaskState.CANCELLING and self.is_stranded)
+        if not self.is_loaded or self.action is not None or not waits:
             return ""
         return f"Where is the load that {self.robot} has? Wait for the robot, or say where the load is."
 
