@@ -45,7 +45,8 @@ class Connection(Requests, OwnInterfaces):
         robot_id: Names this robot; one connection at a time.
         token: The robot's own token (``rce robot add``), instead of the user's password.
         tls: TLS settings, or a function that returns them for each connection; the system's if None.
-        on_error: Called with the text of every ``ER`` that belongs to no service call; must not block.
+        on_error: Called with the text of every ``ER`` that belongs to no service call, and once with the
+            number of requests that a busy engine dropped; must not block.
             Without it, the texts are logged.
         on_state: Called with every new state and a short description; must not block.
         timing: Times in seconds and sizes in bytes.

@@ -26,6 +26,8 @@ class Repetition:
     Args:
         spawn: Runs a coroutine as long as the connection is used.
         repeat: Sends all requests again.
+        on_dropped: Called with the number of drops before they are repeated, not with each: a program that
+            makes a thousand interfaces would fill its log.
         on_taken: Called when the engine has taken all of them.
     """
 
@@ -33,25 +35,28 @@ class Repetition:
         self,
         spawn: Callable[[Coroutine[object, object, None]], asyncio.Task[None]],
         repeat: Callable[[], Awaitable[None]],
+        on_dropped: Callable[[int], None],
         on_taken: Callable[[], None],
     ) -> None:
         self._spawn = spawn
         self._repeat = repeat
+        self._on_dropped = on_dropped
         self._on_taken = on_taken
         self._task: asyncio.Task[None] | None = None
-        self._has_dropped = False
+        self._dropped = 0
 
     def note_drop(self) -> None:
         """Learn that the engine dropped a request."""
-        self._has_dropped = True
+        self._dropped += 1
         if self._task is None or self._task.done():
             self._task = self._spawn(self._run())
 
     async def _run(self) -> None:
         pauses = PAUSES.start()
-        while self._has_dropped:
+        while self._dropped:
             await asyncio.sleep(pauses.next())
-            self._has_dropped = False
+            dropped, self._dropped = self._dropped, 0
+            self._on_dropped(dropped)
             await self._repeat()
             await asyncio.sleep(CALM_S)
         self._on_taken()

@@ -86,7 +86,8 @@ class Session:
 
     Args:
         target: The engine, and who connects.
-        on_error: Called with the text of every ``ER`` that belongs to no service call.
+        on_error: Called with the text of every ``ER`` that belongs to no service call; requests that a busy
+            engine dropped are told together, with their number.
         on_state: Called with every new state and a few words.
         timing: Times in seconds and sizes in bytes.
         limits: How many messages and bytes may wait to be sent.
@@ -119,7 +120,9 @@ class Session:
         """Those that the engine received lately, and when; oldest first."""
         self._maybe_dropped: deque[Request] = deque(maxlen=MAX_RECEIVED)
         """Those that it may have dropped, until it has taken all requests; oldest first."""
-        self._repetition = Repetition(self.spawn, self._repeat_all, self._maybe_dropped.clear)
+        self._repetition = Repetition(
+            self.spawn, self._repeat_all, self._tell_dropped, self._maybe_dropped.clear
+        )
         self._was_connected = False
         self._refusal: RefusedError | None = None
         self._reminder = Reminder()
@@ -378,11 +381,16 @@ class Session:
     def _take_report(self, report: ErrorReport) -> None:
         call = self.interfaces.call_of(report)
         if call is None:
-            self._take_error(report.text)
             if report.code is FaultCode.BUSY:
                 self._take_drop()
+            else:
+                self._take_error(report.text)
         else:
             self.interfaces.fail(call.i_tag, call.msg_id, report.text.removeprefix(f"{call}: "))
+
+    def _tell_dropped(self, dropped: int) -> None:
+        requests = "1 request was" if dropped == 1 else f"{dropped} requests were"
+        self._take_error(f"{requests} dropped, because too many requests wait; they are sent again")
 
     def _take_error(self, text: str) -> None:
         self.errors.append(text)

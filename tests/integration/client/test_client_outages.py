@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -65,6 +66,34 @@ async def test_requests_that_a_busy_engine_drops_are_repeated(door: Door) -> Non
             await engine.wait_errors(conn, "too many requests wait")
             gate.set()
             await engine.master.changed.until(lambda: made == set(tags[15:]))
+
+
+async def test_requests_that_were_dropped_are_told_together(
+    door: Door, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A station of a thousand robots logged hundreds of lines when it started."""
+    async with running_cloud(SessionSettings(max_requests=4)) as cloud:
+        engine = Engine(cloud, door)
+        gate, made = asyncio.Event(), set[str]()
+
+        async def answer(request: ClientRequest) -> tuple[str, ...]:
+            await gate.wait()
+            content = content_of(request)
+            assert isinstance(content, ConfigureComponents)
+            made.update(item.interface.tag for item in content.add_interfaces)
+            engine.master.changed.set()
+            return ()
+
+        engine.master.answer = answer
+        async with engine.connection() as conn:
+            tags = [f"say{number}" for number in range(40)]
+            await asyncio.gather(*(conn.publisher(tag, STRING) for tag in tags))
+            await engine.wait_errors(conn, "requests were dropped")
+            told = [record.message for record in caplog.records if "dropped" in record.message]
+            assert len(told) == 1
+            assert int(re.findall(r"\d+", told[0])[0]) > 1
+            gate.set()
+            await engine.master.changed.until(lambda: made == set(tags))
 
 
 @pytest.mark.parametrize("status", [400, 401, 410, 501])
