@@ -15,9 +15,13 @@ import pytest
 from support.engine import command_line
 from support.multimaster import STRING, DiscoveryNetwork, node, process, real_master, ros_environment
 from support.ports import free_port, free_ports
+from support.ros_nodes import say_until_echoed
+from support.roscpp_programs import compiled
 
 from rce.ros.core import Graph
 from rce.ros.node import Node, Publisher
+
+ROSCPP_PEER = Path(__file__).parents[1] / "ros_real" / "programs" / "roscpp_peer.cpp"
 
 TALKER = """
 import rospy
@@ -199,6 +203,38 @@ async def test_a_connection_outlives_killed_programs(network: DiscoveryNetwork, 
         async with asyncio.timeout(10):
             assert (await anext(aiter(heard))).data == "afterwards"
         assert publisher._output.all_links == [before], "it is not made anew"
+
+
+@pytest.mark.needs("roscpp")
+async def test_roscpp_stays_connected_to_nodes_of_a_dead_core(
+    network: DiscoveryNetwork, tmp_path: Path
+) -> None:
+    """Roscpp closes a connection to a publisher that its master ceases to name."""
+    port = free_port()
+    uri = f"http://127.0.0.1:{port}/"
+    core = _program("core", "from rce.ros.cli.core import core", "--port", str(port), "--no-log")
+    discovery = _discovery_process(uri, network.port, "--name", "far", "--rosmaster-hz", "10")
+    async with (
+        network.machine(name="near") as near,
+        core as running,
+        discovery,
+        process(str(compiled(ROSCPP_PEER, "roscpp")), env=ros_environment(near.uri, tmp_path)),
+        node("listener", near.uri) as listener,
+        node("far", uri) as far,
+    ):
+        publisher, echoed = (
+            await far.advertise("peer_in", STRING),
+            await listener.subscribe("peer_out", STRING),
+        )
+        await say_until_echoed(publisher, echoed)
+        before = publisher._output.all_links
+        running.kill()
+        await near.until_known("far", online=False)
+        await asyncio.sleep(1)  # nothing may happen
+        publisher.publish(data="meanwhile")
+        async with asyncio.timeout(10):
+            assert (await anext(aiter(echoed))).data == "meanwhile"
+        assert publisher._output.all_links == before
 
 
 async def test_a_machine_that_vanished_comes_back_at_other_ports(network: DiscoveryNetwork) -> None:
