@@ -14,7 +14,6 @@ from typing import Any
 from rce.aio.backoff import Backoff
 from rce.aio.tasks import TaskScope
 from rce.ros.errors import (
-    MasterError,
     ParameterMissingError,
     RpcRefusedError,
     RpcUnreachableError,
@@ -77,6 +76,8 @@ class Registrar:
         self._lock = asyncio.Lock()
         self._recorded: dict[str, str] = {}
         """By the remote master: the parameter as it was written last."""
+        self._unsure: set[str] = set()
+        """Remote masters of which a call was not answered: what it registered may be there or not."""
         self._told: set[str] = set()
 
     async def hold(
@@ -105,10 +106,12 @@ class Registrar:
         """
         async with self._lock:
             held = self.held.get(origin, set())
+            again = again or origin in self._unsure
             await self._unregister(origin, held - wanted)
             await self._give_way(origin, wanted - held, stale)
-            fine, clashes = await self._without_clashes(origin, wanted - held)
-            await self._register(origin, fine | (wanted & held if again else set()), publishers)
+            fine, clashes = await self._without_clashes(origin, wanted if again else wanted - held)
+            held -= {clash.registration for clash in clashes}  # a node here took the name from it
+            await self._register(origin, fine, publishers)
         for clash in clashes:
             self._tell_once(str(clash))
         return clashes
@@ -121,6 +124,7 @@ class Registrar:
         """
         async with self._lock:
             await self._unregister(origin, set(self.held.get(origin, ())))
+            self._unsure.discard(origin)
 
     async def restore(self) -> None:
         """Register everything again: the local master was restarted.
@@ -192,14 +196,11 @@ class Registrar:
             return
         ordered = sorted(entries, key=lambda entry: (_ORDER.index(entry.kind), entry.name, entry.node))
         # Recorded before it is registered: questions for a node's origin get the right answer meanwhile.
-        before = set(self.held.get(origin, ()))
         self.held.setdefault(origin, set()).update(entries)
-        try:
-            await self._record(origin)
-            answers = await multicall_as(self._master, [_registering(entry) for entry in ordered])
-        except MasterError:
-            self.held[origin] = before
-            raise
+        self._unsure.add(origin)
+        await self._record(origin)
+        answers = await multicall_as(self._master, [_registering(entry) for entry in ordered])
+        self._unsure.discard(origin)
         for entry, answer in zip(ordered, answers, strict=True):
             _log.info("%s %s of %s is registered", entry.kind.value, entry.name, entry.node)
             if entry.kind is RegistrationKind.SUBSCRIBER and isinstance(answer, list) and answer:

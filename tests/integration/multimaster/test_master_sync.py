@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from contextlib import AsyncExitStack
+from typing import Any
 
 import pytest
 from support.multimaster import STRING, DiscoveryNetwork, node
@@ -13,11 +14,13 @@ from support.ros_busy_node import answering_second_call
 
 from rce.aio.tasks import TaskScope
 from rce.ros.core import Core
+from rce.ros.errors import MasterUnreachableError
 from rce.ros.multimaster import registrar
 from rce.ros.multimaster.filters import SyncLists
 from rce.ros.multimaster.plan import Registration, RegistrationKind
 from rce.ros.multimaster.registrar import Registrar
 from rce.ros.multimaster.remote import Remote
+from rce.ros.multimaster.source import multicall_as
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import RpcClient
 
@@ -150,6 +153,58 @@ async def test_offline_master_gives_way_to_one_that_replaces_it(network: Discove
             await b.until(lambda graph: graph.publishers("/chatter") == {"/talker": second.uri})
             await b.until(lambda graph: graph.service("/ask") == second.service_uri)
             assert not second.is_shutdown
+
+
+async def test_node_that_took_a_name_meanwhile_stays(network: DiscoveryNetwork) -> None:
+    """What is registered again when a master is back must not displace a node that was started here."""
+    async with (
+        network.machine() as b,
+        network.machine(name="a") as a,
+        node("talker", a.uri) as talker,
+        node("other", a.uri) as other,
+    ):
+        await talker.advertise("chatter", STRING)
+        await b.until(lambda graph: "/chatter" in graph.topic_types)
+        send = a.discovery._socket.send_to
+        a.discovery._socket.send_to = lambda *_: None  # type: ignore[method-assign]  # the network is gone
+        await b.until_known("a", online=False)
+        async with node("talker", b.uri) as here:
+            await here.advertise("own", STRING)
+            a.discovery._socket.send_to = send  # type: ignore[method-assign]  # and back
+            await b.until_known("a", online=True)
+            await other.advertise("later", STRING)
+            await b.until(lambda graph: "/later" in graph.topic_types)
+            assert b.graph.nodes["/talker"] == here.uri
+            assert not here.is_shutdown
+
+
+async def test_registration_without_answer_is_taken_back(
+    network: DiscoveryNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A master that was too busy to answer may have registered everything."""
+    entry = Registration(RegistrationKind.PUBLISHER, "/t", "/n", "http://10.0.0.1:1/", STRING)
+    origin = "http://10.0.0.1:11311/"
+    original = multicall_as
+
+    async def unanswered(*arguments: Any) -> list[Any]:
+        await original(*arguments)
+        monkeypatch.setattr(registrar, "multicall_as", original)
+        raise MasterUnreachableError(origin, "no answer")
+
+    async with (
+        Core(port=0) as core,
+        node("sync", core.uri) as sync,
+        RpcClient() as rpc,
+        TaskScope() as tasks,
+    ):
+        registrations = Registrar(sync, MasterClient(core.uri, sync.name, sync.uri, rpc), tasks)
+        monkeypatch.setattr(registrar, "multicall_as", unanswered)
+        with pytest.raises(MasterUnreachableError):
+            await registrations.hold(origin, {entry}, {})
+        assert await registrations.hold(origin, {entry}, {}) == []
+        assert registrations.held == {origin: {entry}}
+        await registrations.release(origin)
+        assert not core.graph.publishers("/t")
 
 
 async def test_record_of_registrations_is_in_parts(network: DiscoveryNetwork) -> None:
