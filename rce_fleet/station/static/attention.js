@@ -1,11 +1,12 @@
 // What needs the operator, worst first, each with the answers that fit.
 
-import { exceptionsOf, fleetConditionsOf, isPossible } from "./conditions.js";
+import { exceptionsOf, fleetConditionsOf, isPossible, rowsOf } from "./conditions.js";
 import { element } from "./engine.js";
 import { t } from "./texts.js";
 
 const DRAW_EVERY_MS = 1000;
 const MOST = 20;
+const MOST_NAMES = 100;
 
 const ANSWERS = {
   undelivered: ["stop", "release"],
@@ -19,6 +20,7 @@ const ANSWERS = {
 
 export class Attention {
   #drawn = "";
+  #open = new Set(); // kinds of groups whose robots are shown
 
   // answer: (name, robot) => does it
   constructor(fleet, answer) {
@@ -35,16 +37,18 @@ export class Attention {
     const whole = fleetConditionsOf(this.fleet);
     const found = exceptionsOf([...this.fleet.robots.values(), ...this.fleet.unknownUndelivered()]);
     this.count.textContent = whole.length + found.length || "";
-    const shown = found.slice(0, MOST);
+    const rows = rowsOf(found, this.fleet.stoppedBy !== null);
+    const shown = rows.slice(0, MOST);
+    const hidden = rows.slice(MOST).reduce((count, { robots }) => count + robots.length, 0);
     // Rebuilt only when something else is to be shown, so that a button keeps its focus.
-    const key = JSON.stringify([this.steers, this.fleet.manager, whole, found.length, shown.map(({ robot, conditions }) => [robot.id, conditions.map(({ kind }) => kind)])]);
+    const key = JSON.stringify([this.steers, this.fleet.manager, whole, hidden, shown.map(({ robots, conditions }) => [robots.map(({ id }) => id), conditions.map(({ kind }) => kind)])]);
     if (key === this.#drawn) {
       shown.forEach(({ conditions }, index) => { this.list.children[whole.length + index].querySelector(".why").textContent = conditions.map(({ text }) => text).join("; "); });
       return;
     }
     this.#drawn = key;
-    this.list.replaceChildren(...whole.map(({ text }) => this.#line([text])), ...shown.map((one) => this.#item(one)));
-    if (found.length > MOST) this.list.append(element("li", t("attention.more", { count: found.length - MOST }), "quiet"));
+    this.list.replaceChildren(...whole.map(({ text }) => this.#line([text])), ...shown.map((row) => (row.robots.length > 1 ? this.#group(row) : this.#item(row))));
+    if (hidden) this.list.append(element("li", t("attention.more", { count: hidden }), "quiet"));
     if (!whole.length && !found.length) this.list.append(element("li", t("attention.none"), "quiet"));
   }
 
@@ -56,10 +60,47 @@ export class Attention {
     return item;
   }
 
-  #item({ robot, conditions }) {
-    const name = element("button", robot.id, "link");
+  // Robots that one stop of the whole fleet concerns: one answer for all, the robots on demand.
+  #group({ robots, conditions: [{ kind, severity, text }] }) {
+    const details = element("details");
+    details.open = this.#open.has(kind);
+    const summary = element("summary", t("attention.group", { count: robots.length }));
+    summary.append(" ", element("span", text, "why"));
+    details.append(summary);
+    const fill = () => {
+      if (!details.open || details.childElementCount > 1) return;
+      for (const { id } of robots.slice(0, MOST_NAMES)) details.append(this.#name(id), " ");
+      if (robots.length > MOST_NAMES) details.append(element("span", t("attention.more", { count: robots.length - MOST_NAMES }), "quiet"));
+    };
+    details.addEventListener("toggle", () => {
+      if (details.isConnected) this.#open[details.open ? "add" : "delete"](kind);
+      fill();
+    });
+    fill();
+    const item = this.#line([details], severity > 2);
+    if (this.steers) {
+      const row = element("div", "", "answers");
+      const answers = kind === "undelivered" ? [["stopAll", "stop.all"], ["releaseAll", "stop.releaseAll"]] : [["releaseAll", "stop.releaseAll"]];
+      for (const [answer, label] of answers) {
+        const button = element("button", t(label));
+        button.type = "button";
+        button.addEventListener("click", () => this.answer(answer, null));
+        row.append(button);
+      }
+      item.append(row);
+    }
+    return item;
+  }
+
+  #name(id) {
+    const name = element("button", id, "link");
     name.type = "button";
-    name.addEventListener("click", () => this.answer("show", robot.id));
+    name.addEventListener("click", () => this.answer("show", id));
+    return name;
+  }
+
+  #item({ robots: [robot], conditions }) {
+    const name = this.#name(robot.id);
     const why = element("span", conditions.map(({ text }) => text).join("; "), "why");
     const item = this.#line([name, " ", why], conditions[0].severity > 2);
     if (this.steers) {

@@ -66,6 +66,24 @@ export function fleetConditionsOf({ plannerAwaySince }) {
   return [{ kind: "planner", severity: 4, text: t("condition.planner", { time: new Date(1000 * plannerAwaySince).toLocaleTimeString() }) }];
 }
 
+// From so many robots on, those that one stop of the whole fleet concerns, and nothing else, are one row.
+const GROUP_FROM = 5;
+const GROUPED = ["undelivered", "emergency"];
+
+// Rows of exceptions: {robots, conditions}. After STOP ALL a row for each robot would hide everything else.
+export function rowsOf(exceptions, isFleetStopped) {
+  const alike = new Map();
+  const rows = exceptions.map(({ robot, conditions }) => {
+    const [{ kind, text }] = conditions;
+    if (!isFleetStopped || conditions.length > 1 || !GROUPED.includes(kind)) return { robots: [robot], conditions };
+    const key = JSON.stringify([kind, text]);
+    if (!alike.has(key)) alike.set(key, { robots: [], conditions });
+    alike.get(key).robots.push(robot);
+    return alike.get(key);
+  });
+  return [...new Set(rows)].flatMap((row) => (row.robots.length < GROUP_FROM ? row.robots.map((robot) => ({ robots: [robot], conditions: row.conditions })) : [row]));
+}
+
 // The fleet's exceptions: {robot, conditions}, worst first.
 export function exceptionsOf(robots, now = performance.now()) {
   const found = [];

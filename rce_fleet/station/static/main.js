@@ -71,6 +71,10 @@ tools.isPast = () => replay.at !== null;
 new ZoneForm(tools, actions, work);
 const tasks = new TasksPanel(work, actions, fleet);
 
+function releaseAll() {
+  if (confirm(t("stop.confirm"))) actions.emergencyStop(null, false);
+}
+
 // An answer to an exception, or a button of a robot's card.
 function answer(name, robot) {
   const task = fleet.robots.get(robot)?.task;
@@ -83,6 +87,8 @@ function answer(name, robot) {
     },
     stop: () => actions.emergencyStop(robot, true),
     release: () => actions.emergencyStop(robot, false),
+    stopAll: () => actions.emergencyStop(null, true),
+    releaseAll,
     drive: () => drive.begin(robot),
     localize: () => {
       if (fleet.selected !== robot) fleet.select(robot);
@@ -130,7 +136,7 @@ drawTools();
 at("#fleet-pause").addEventListener("click", () => actions.setMode("paused"));
 at("#fleet-resume").addEventListener("click", () => actions.setMode("automatic"));
 at("#stop-all").addEventListener("click", () => actions.emergencyStop(null, true));
-at("#release-all").addEventListener("click", () => { if (confirm(t("stop.confirm"))) actions.emergencyStop(null, false); });
+at("#release-all").addEventListener("click", releaseAll);
 for (const type of ["state", "changes"]) fleet.addEventListener(type, () => {
   const { mode } = fleet;
   const isPaused = mode !== "automatic";

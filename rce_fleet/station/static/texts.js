@@ -40,6 +40,7 @@ const TEXTS = {
   "age.now": "now",
   "age.seconds": "{seconds} s",
   attention: "Needs attention",
+  "attention.group": "{count} robots:",
   "attention.more": "and {count} more",
   "attention.none": "nothing",
   audit: "Who did what",

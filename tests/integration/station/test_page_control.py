@@ -125,6 +125,25 @@ async def test_a_robot_that_a_stop_does_not_reach_is_shown() -> None:
         await check_missed(page)
 
 
+async def test_a_stop_of_all_robots_is_one_row() -> None:
+    """A thousand rows hid what else was wrong; one click releases all, and the robots are shown on demand."""
+    async with site(robots=12) as made, opened(made) as page:
+        await page.locator("#stop-all").click()
+        group = page.locator("#attention-list li", has_text="11 robots:")
+        await group.wait_for()
+        rows = page.locator("#attention-list li")
+        assert await rows.count() == 2
+        assert (await rows.first.inner_text()).startswith("!!Robot2")
+        assert await page.locator("#attention-count").inner_text() == "12"
+        await group.locator("summary").click()
+        await group.locator("button", has_text="Robot12").click()
+        await page.locator("#robot-card", has_text="Robot12").wait_for()
+        page.once("dialog", lambda dialog: dialog.accept())
+        await group.locator("button", has_text="Release all").click()
+        await made.until(lambda: made.stops and not made.stops[-1])
+        await group.wait_for(state="detached")
+
+
 async def test_an_operator_stops_places_and_drives_a_robot() -> None:
     async with site() as made, opened(made) as page:
         await check_stops(made, page)

@@ -101,10 +101,11 @@ class Login(TokenAuthenticator):
 
 
 @asynccontextmanager
-async def site(authenticator: Authenticator | None = None) -> AsyncIterator[Site]:
+async def site(authenticator: Authenticator | None = None, robots: int = 2) -> AsyncIterator[Site]:
+    """Run a station; all robots but Robot2 listen to emergency stops."""
     view = FleetView()
     feed = Feed(view)
-    feed.on_change(view.on_state(state(robot("Robot1"), robot("Robot2"))))
+    feed.on_change(view.on_state(state(*(robot(f"Robot{number}") for number in range(1, robots + 1)))))
     fleet = RecordingFleet()
     async with (
         Core(port=0) as core,
@@ -125,6 +126,8 @@ async def site(authenticator: Authenticator | None = None) -> AsyncIterator[Site
             await node.subscribe(
                 "/Robot1/emergency_stop", "std_msgs/Bool", lambda said: made.stops.append(said.data)
             )
+            for number in range(3, robots + 1):
+                await node.subscribe(f"/Robot{number}/emergency_stop", "std_msgs/Bool", lambda _said: None)
             await node.subscribe(
                 "/Robot1/raw_cmd_vel",
                 "geometry_msgs/Twist",
