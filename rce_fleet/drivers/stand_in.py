@@ -158,5 +158,5 @@ def status_of(goal: Goal) -> dict[str, Any]:
     return {
         "goal_id": {"stamp": Time.from_sec(goal.stamp), "id": goal.id},
         "status": goal.state.value,
-        "text": goal.state.name.lower(),
+        "text": goal.fault or goal.state.name.lower(),
     }

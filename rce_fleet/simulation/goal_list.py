@@ -7,6 +7,7 @@ stamp are recalled even if they arrive later.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 
 from rce_fleet.coordination.move_client import GoalState
 
@@ -16,13 +17,14 @@ REMEMBER = 5.0
 
 @dataclass(slots=True)
 class Goal:
-    """A navigation goal: id, time stamp (seconds), place (metres) and state."""
+    """A navigation goal: id, time stamp (seconds), place (metres) and state; why it was refused."""
 
     id: str
     stamp: float
     place: tuple[float, float]
     state: GoalState = GoalState.ACTIVE
     ended_at: float = 0.0
+    fault: str = ""
 
 
 class GoalList:
@@ -58,10 +60,17 @@ class GoalList:
         return ended
 
     def accept(self, goal_id: str, stamp: float, x: float, y: float) -> bool:
-        """Accept a goal; return whether the robot has to drive to it. A known one changes nothing."""
+        """Accept a goal; return whether the robot has to drive to it. A known one changes nothing.
+
+        One whose place is not finite is rejected, and the goal before it stays.
+        """
         if goal_id in self._goals:
             return False
         goal = self._goals[goal_id] = Goal(goal_id, stamp, (x, y))
+        if not (isfinite(x) and isfinite(y)):
+            goal.fault = f"target_pose.pose.position is x={x}, y={y}; send finite numbers, in metres"
+            self._end(goal, GoalState.REJECTED)
+            return False
         if stamp <= self._recalled_until:
             self._end(goal, GoalState.RECALLED)
             return False
