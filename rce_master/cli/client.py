@@ -35,6 +35,8 @@ UPLOAD_S = 300.0
 RETRY_S = 1.0
 REPEAT_S = 30.0
 """How long a POST whose answer was lost is repeated: another master may have to take the lead."""
+LEADER_S = 8.0
+"""How long a request waits for a leading master, if a stand-by answers."""
 IDEMPOTENCY_KEY = "Idempotency-Key"
 PAGE_ITEMS = 1000
 _OK = 400
@@ -93,6 +95,8 @@ class ApiClient:
     ) -> Any:
         """Make a request. A POST whose answer is lost is repeated, with the key by which it is done once.
 
+        While the lead changes, it is repeated as long as the masters say that nothing was done.
+
         Returns:
             What came back, or None if nothing did.
 
@@ -104,6 +108,8 @@ class ApiClient:
         untried = len(self._masters.all)
         end: float | None = None
         """Until when a lost answer is asked for; None: none was lost."""
+        led: float | None = None
+        """Until when a leading master is waited for; None: none was missed."""
         clock = asyncio.get_running_loop().time
         while True:
             url = self._masters.current
@@ -121,8 +127,12 @@ class ApiClient:
                 ) as reply:
                     if headers and _may_be_done(reply) and end is None:
                         end = clock() + REPEAT_S
-                    others = untried > 0 and STANDBY_HEADER in reply.headers
-                    if not others and not (end is not None and _is_undecided(reply) and clock() < end):
+                    if _is_unled(reply, method):
+                        led = led or clock() + LEADER_S
+                        again = untried > 0 or clock() < led
+                    else:
+                        again = False
+                    if not again and not (end is not None and _is_undecided(reply) and clock() < end):
                         return await _result(reply)
             except (aiohttp.ClientError, TimeoutError, ValueError) as error:
                 # Only without a connection it is certain that the request had no effect.
@@ -131,7 +141,8 @@ class ApiClient:
                 )
                 if headers and not unsent and end is None:
                     end = clock() + REPEAT_S
-                if not (unsent and untried > 0) and (end is None or clock() >= end):
+                others = untried > 0 or (led is not None and clock() < led)
+                if not (unsent and others) and (end is None or clock() >= end):
                     warning = (
                         "; it may have done this or not: look first" if sent.begun and method != "GET" else ""
                     )
@@ -141,6 +152,7 @@ class ApiClient:
             self._masters.failed(url)
             if untried <= 0:
                 await asyncio.sleep(RETRY_S)
+                untried = len(self._masters.all)
 
     async def items(
         self, path: str, name: str = "", query: dict[str, str | int] | None = None
@@ -297,6 +309,14 @@ def _may_be_done(reply: aiohttp.ClientResponse) -> bool:
     if reply.status == HTTPStatus.SERVICE_UNAVAILABLE:  # by a leader that ends; a stand-by does nothing
         return "Retry-After" in reply.headers and STANDBY_HEADER not in reply.headers
     return reply.status == HTTPStatus.BAD_GATEWAY
+
+
+def _is_unled(reply: aiohttp.ClientResponse, method: str) -> bool:
+    """Return whether a request found no leading master, and did nothing or only reads."""
+    if STANDBY_HEADER in reply.headers:
+        return True
+    is_ending = reply.status == HTTPStatus.SERVICE_UNAVAILABLE and "Retry-After" in reply.headers
+    return method == "GET" and is_ending
 
 
 def _is_undecided(reply: aiohttp.ClientResponse) -> bool:

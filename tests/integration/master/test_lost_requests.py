@@ -11,10 +11,11 @@ import aiohttp
 import pytest
 from aiohttp import web
 from aiohttp.test_utils import TestServer
+from support.ports import free_port
 
 from rce.guard import TrustedProxies
 from rce_master.cli.client import IDEMPOTENCY_KEY, ApiClient
-from rce_master.cli.exceptions import CliError
+from rce_master.cli.exceptions import ApiError, CliError
 from rce_master.http.forward import Forwarder, NotForwardedError
 from rce_master.http.forwarded import ForwardingKey
 from rce_master.store.etcd.layout import Leader
@@ -140,3 +141,48 @@ async def test_rce_repeats_what_a_leader_left_open(monkeypatch: pytest.MonkeyPat
         assert await client.call("POST", "/containers", {"tag": "a"}) == {"tag": "a"}
     assert len(keys) == 3
     assert len(set(keys)) == 1
+
+
+@pytest.mark.parametrize("method", ["GET", "POST", "PUT", "DELETE"])
+async def test_rce_waits_while_the_lead_is_handed_over(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The former leader has ended, and the stand-by, which did nothing, takes the lead."""
+    monkeypatch.setattr("rce_master.cli.client.RETRY_S", 0.01)
+    answered: list[int] = []
+
+    async def answer(_: web.Request) -> web.Response:
+        answered.append(503 if len(answered) < 5 else 200)
+        headers = {"Retry-After": "1", "RCE-Standby": "yes"}
+        if answered[-1] == 503:
+            return web.json_response({"error": "no master leads"}, status=503, headers=headers)
+        return web.json_response({"tag": "a"})
+
+    app = web.Application()
+    app.router.add_route("*", "/api/v1/containers/a", answer)
+    ended = f"http://127.0.0.1:{free_port()}/"
+    async with TestServer(app) as server, ApiClient(f"{ended},{server.make_url('/')}") as client:
+        assert await client.call(method, "/containers/a") == {"tag": "a"}
+        monkeypatch.setattr("rce_master.cli.client.LEADER_S", 0.0)
+        answered.clear()
+        async with ApiClient(str(server.make_url("/"))) as other:
+            with pytest.raises(ApiError, match="no master leads"):
+                await other.call(method, "/containers/a")
+
+
+async def test_rce_repeats_what_it_wanted_to_read_from_a_leader_that_ends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("rce_master.cli.client.RETRY_S", 0.01)
+    asked: list[str] = []
+
+    async def answer(request: web.Request) -> web.Response:
+        asked.append(request.method)
+        status = 503 if len(asked) == 1 else 200
+        return web.json_response({"error": "ask again"}, status=status, headers={"Retry-After": "1"})
+
+    app = web.Application()
+    app.router.add_route("*", "/api/v1/containers", answer)
+    async with TestServer(app) as server, ApiClient(str(server.make_url("/"))) as client:
+        await client.call("GET", "/containers")
+        asked.clear()
+        with pytest.raises(ApiError, match="ask again"):
+            await client.call("DELETE", "/containers")  # it may have been done
