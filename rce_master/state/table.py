@@ -61,6 +61,8 @@ class Table(Generic[R]):
         key: Tells a record's key.
         order: Tells a record's place among those that are loaded; without it they come as the store has them.
         amount: Tells what a record adds to the total of which key.
+        share: Called with key, record and the row's size in bytes when a record was decoded, before it is
+            kept; puts equal values in place of parts of it.
         indexes: By name.
     """
 
@@ -73,6 +75,7 @@ class Table(Generic[R]):
         persistent: bool = True,
         order: Callable[[R], int] | None = None,
         amount: Callable[[R], tuple[str, int]] | None = None,
+        share: Callable[[str, R, int], None] | None = None,
         **indexes: Callable[[R], Iterable[str]],
     ) -> None:
         self.name = name
@@ -82,6 +85,7 @@ class Table(Generic[R]):
         self._rows: dict[str, R] = {}
         self._order = order
         self._amount = amount
+        self._share = share
         self._totals: dict[str, int] = {}
         self._indexes = indexes
         self._found = {name: _Index() for name in indexes}
@@ -160,7 +164,7 @@ class Table(Generic[R]):
         """
         records = []
         for number, (key, body) in enumerate(rows.items(), 1):
-            records.append((key, self._decoder.decode(body)))
+            records.append((key, self._decode(key, body)))
             if number % piece == 0:
                 yield
         if (order := self._order) is not None:
@@ -177,7 +181,7 @@ class Table(Generic[R]):
             msgspec.ValidationError: The record cannot be read.
         """
         if body is not None:
-            self.assign(key, self._decoder.decode(body))
+            self.assign(key, self._decode(key, body))
         elif key in self._rows:
             self.assign(key, None)
 
@@ -213,6 +217,12 @@ class Table(Generic[R]):
                 key, amount = self._amount(record)
                 totals[key] = totals.get(key, 0) + amount
         return {key: total for key, total in totals.items() if total}
+
+    def _decode(self, key: str, body: bytes) -> R:
+        record: R = self._decoder.decode(body)
+        if self._share is not None:
+            self._share(key, record, len(body))
+        return record
 
     def _count(self, record: R | None, sign: int) -> None:
         if record is None or self._amount is None:

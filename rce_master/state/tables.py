@@ -35,6 +35,7 @@ from rce_master.state.records import (
     user_volume_key,
 )
 from rce_master.state.rooms import Rooms
+from rce_master.state.sharing import Sharing
 from rce_master.state.table import Table
 from rce_master.state.waiting import PlacementQueue, group_key
 from rce_master.state.wiring_records import (
@@ -77,6 +78,7 @@ class Tables:
     """
 
     def __init__(self) -> None:
+        sharing = Sharing(self._kept_id)
         self.users = Table[User]("users", type_=User, key=lambda u: u.name)
         self.tokens = Table[Token]("tokens", type_=Token, key=lambda t: t.digest, user=lambda t: [t.user])
         self.known_logins = Table[KnownLogin]("known_logins", type_=KnownLogin, key=lambda k: k.user)
@@ -124,6 +126,7 @@ class Tables:
             type_=Robot | Container,
             key=lambda e: e.id,
             amount=lambda e: (e.user, e.size),
+            share=sharing.endpoint,
             user=lambda e: [e.user],
             robots_of=lambda e: [e.user] if isinstance(e, Robot) else [],
             task_set=lambda e: [e.task_set],
@@ -136,6 +139,7 @@ class Tables:
             type_=Interface,
             key=lambda i: i.id,
             order=lambda i: i.number,
+            share=sharing.interface,
             endpoint=lambda i: [i.endpoint],
             user=lambda i: [i.endpoint.partition("/")[0]],
         )
@@ -143,6 +147,7 @@ class Tables:
             "links",
             type_=Link,
             key=lambda k: k.id,
+            share=sharing.link,
             endpoint=lambda k: dict.fromkeys((k.a, k.b)),
             pair=lambda k: [f"{k.a} {k.b}"],
         )
@@ -151,6 +156,7 @@ class Tables:
             type_=Connection,
             key=lambda c: str(c.id),
             order=lambda c: c.id,
+            share=sharing.connection,
             user=lambda c: [c.a.partition("/")[0]],
             link=lambda c: [c.link],
             endpoint=lambda c: dict.fromkeys((c.a, c.b)),
@@ -281,6 +287,10 @@ class Tables:
         """Find an interface of an endpoint."""
         found = self.interfaces.get(interface_key(endpoint, tag))
         return None if found is None else found.spec
+
+    def _kept_id(self, endpoint: str) -> str:
+        found = self.endpoints.get(endpoint)
+        return endpoint if found is None else found.id
 
     def _count_requests(self, before: Endpoint | None, after: Endpoint | None) -> None:
         was = before if isinstance(before, Container) else None
