@@ -131,7 +131,8 @@ class Dispatcher:
         hull = set() if isnan(record.x) else self._placement.hull(record)
         ledger.overlap(record.id, self._beside(record, hull) if has_cell else self._around(record))
         claims = ledger.claims(record.id)
-        self.state.index.displaced.put(record.id, () if hull <= claims else hull)
+        wanted = hull | record.earlier
+        self.state.index.displaced.put(record.id, () if wanted <= claims else wanted)
         if claims != before:
             self.avoid(record)
             self.require(other.id for other in self.state.robots.values() if other.unreachable)

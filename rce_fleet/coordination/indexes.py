@@ -62,7 +62,8 @@ class FleetIndex:
         stopping: Robots with a cell that were told to stand still, and when; the newest last.
         under_way: Active robots that are not at rest in the last cell of their route.
         hindered: Robots that stand still and cannot be placed, and the cells that they overlap.
-        displaced: Robots that overlap cells of other robots, and the cells that they overlap.
+        displaced: Robots that overlap cells of other robots, or may be in them since before a restart, and
+            the cells.
     """
 
     def __init__(self) -> None:

@@ -215,6 +215,9 @@ class FleetPlanner:
             record = self._record(robot)
             record.earlier = frozenset(cells)
             self.state.ledger.overlap(robot, cells)
+            if not record.earlier <= self.state.ledger.claims(robot):
+                # Others, on whose paths they are, claim some of them until they are heard.
+                self.state.index.displaced.put(robot, cells)
             self._dispatcher.avoid(record)
 
     def _look_soon_if_silent(self, record: RobotRecord) -> None:

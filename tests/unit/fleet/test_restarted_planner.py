@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rce_fleet.coordination.events import GoalSet, PoseSeen, ReportSeen, RobotsExpected, SendCells, Tick
+from rce_fleet.coordination.events import (
+    GoalSet,
+    PoseSeen,
+    ReportSeen,
+    RobotRemoved,
+    RobotsExpected,
+    SendCells,
+    Tick,
+)
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.nodes.known_robots import KNOWN_FOR, WRITTEN_EVERY, KnownRobots
@@ -113,6 +121,27 @@ def test_cells_of_an_earlier_planner_stay_claimed_till_a_report() -> None:
     assert claims("Robot1") == {8, 9, 10}
     planner.handle(ReportSeen("Robot1", ClientReport(7, ClientState.DRIVING, (8, 9))), 0.2)
     assert claims("Robot1") == {8, 9}
+
+
+def test_a_cell_that_two_robots_may_be_in_stays_claimed_until_both_are_heard() -> None:
+    """The next cells of one robot's path are cells in which others may stand."""
+    planner = FleetPlanner(GRID)
+    claims = planner.state.ledger.claims
+    planner.handle(RobotsExpected({"Robot1": (0, 1, 2), "Robot2": (2, 3), "Robot3": (1, 7)}), 0.0)
+    join(planner, "Robot1", 0, 0.1, 2.0)
+    assert claims("Robot1") == {0}
+    assert claims("Robot2") == {2, 3}
+    assert claims("Robot3") == {1, 7}
+    planner.validate()
+    planner.handle(PoseSeen("Robot3", *GRID.centre(7), 0.0), 2.0)
+    assert claims("Robot3") == {1, 7}
+    planner.handle(GoalSet("Robot1", 5), 2.0)
+    join(planner, "Robot1", 0, 2.0, planner.settings.expect_timeout + 2.0)
+    assert claims("Robot2") == {2, 3}
+    assert not {1, 2, 3, 7} & set(planner.state.ledger.granted("Robot1"))
+    planner.handle(RobotRemoved("Robot3"), 9.0)
+    assert claims("Robot2") == {2, 3}
+    planner.validate()
 
 
 def test_kept_robots_are_those_of_the_same_grid(tmp_path: Path) -> None:
