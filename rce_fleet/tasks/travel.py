@@ -143,7 +143,7 @@ class TravelCosts:
         return field if cut_off is None else np.where(cut_off, np.float32(inf), field)
 
     def _look(self, grid: GridMap, goal: int, costs: Costs) -> tuple[Floats, Cells | None]:
-        """Return distances to a cell, and from which cells there is no way although a distance says so."""
+        """Return distances to a cell, and from which cells no way leads there although a distance says so."""
         field = self._fields.get((goal, costs))
         if field is not None:
             self._fields.move_to_end((goal, costs))

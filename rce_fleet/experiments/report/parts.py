@@ -132,7 +132,7 @@ def write_environments(path: Path, environments: Mapping[str, Mapping[str, Any]]
 
 
 def read_environments(path: Path) -> dict[str, Mapping[str, Any]]:
-    """Read what :func:`write_environments` wrote; nothing if there is no file.
+    """Read what :func:`write_environments` wrote; nothing if the file is missing.
 
     Raises:
         OSError: The file cannot be read.

@@ -121,7 +121,7 @@ def no_budget(monkeypatch: pytest.MonkeyPatch) -> None:
 @settings(max_examples=40)
 @given(st.integers(0, 2**32))
 def test_estimates_know_exactly_where_no_way_leads(seed: int) -> None:
-    """An estimate lacks a detour at most; where there is no way for a robot, it says so."""
+    """An estimate lacks a detour at most; where a robot has none, it says so."""
     rng = Random(seed)
     grid = GridMap(5, 6)
     cells = range(len(grid))
