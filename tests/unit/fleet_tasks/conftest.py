@@ -1,12 +1,15 @@
-"""A fleet without clocks or sockets: robots that move one cell a second to the goals that they are given."""
+"""A fleet without clocks or sockets, whose robots move one cell a second; a client of a fleet manager."""
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from math import inf
+from pathlib import Path
 from typing import Any
 
 import pytest
+from support.fleet_manager import ManagerClient
 
 from rce_fleet.planning.dijkstra import shortest_path
 from rce_fleet.planning.grid import GridMap
@@ -95,3 +98,10 @@ class Floor:
 @pytest.fixture
 def floor() -> Floor:
     return Floor()
+
+
+@pytest.fixture
+async def client(tmp_path: Path) -> AsyncIterator[ManagerClient]:
+    made = ManagerClient(tmp_path / "j.sqlite")
+    yield made
+    await made.manager.close()

@@ -7,6 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from support.fleet_manager import Planner
 
 from rce_fleet.journal.journal import Journal
 from rce_fleet.manager import clock as clocks
@@ -15,8 +16,6 @@ from rce_fleet.manager.manager import FleetManager
 from rce_fleet.tasks.dispatch import TaskRules
 from rce_fleet.tasks.facts import RobotFacts
 from rce_fleet.tasks.order import Action, Order, Stop
-
-from .test_manager_requests import Planner
 
 DAY = 86400.0
 

@@ -1,0 +1,190 @@
+"""What the fleet manager tells the planner: zones, cells, modes and goals; also after restarts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.fleet_manager import GO, ManagerClient
+
+from rce_fleet.manager.goals import GoalKeeper
+from rce_fleet.manager.mirror import REFUSED_S
+from rce_fleet.tasks.facts import FleetFacts, RobotFacts
+from rce_fleet.tasks.records import BlockedCells, PlannerRun, Zone
+
+
+async def test_the_map_shows_a_cell_as_it_was_just_set(client: ManagerClient) -> None:
+    """The planner's change comes later; the person who blocked the cell looks at once."""
+    assert (await client.ask("PUT", "/cells/5", {"blocked": True}))[0] == 200
+    assert (await client.ask("GET", "/map"))[1]["blocked"] == [5]
+    client.manager.facts.shut = frozenset({5, 9})
+    assert (await client.ask("PUT", "/cells/5", {"blocked": False}))[0] == 200
+    shown = (await client.ask("GET", "/map"))[1]
+    assert (shown["blocked"], shown["walls"]) == ([], [9])
+
+
+@pytest.mark.parametrize(
+    ("zone", "status", "text"),
+    [
+        ({"kind": "fast", "value": 1.0}, 422, "'slow', 'one_way', 'limited' or 'cost'"),
+        ({"kind": "slow"}, 409, "needs a value"),
+        ({"kind": "slow", "value": 0.0}, 409, "a speed of 0.01 .. 100 m/s"),
+        ({"kind": "one_way", "value": 0.8}, 409, "a direction is 0, pi/2, pi or -pi/2"),
+        ({"kind": "room", "value": 1.5}, 409, "whole number"),
+        ({"kind": "room", "value": 0}, 409, "within 1 .. 1000000"),
+        ({"kind": "cost", "value": -1}, 409, "a metre counts 1 .. 1000000"),
+    ],
+)
+async def test_zones_that_cannot_be(client: ManagerClient, zone: Any, status: int, text: str) -> None:
+    said, answer, _ = await client.ask("PUT", "/zones/z", {"cells": [3], **zone})
+    assert (said, text in answer["error"]) == (status, True), answer
+
+
+async def test_former_words_of_zones_are_understood(client: ManagerClient) -> None:
+    body = {"kind": "room", "cells": [3], "value": 2}
+    assert (await client.ask("PUT", "/zones/lift", body))[1]["kind"] == "limited"
+
+
+async def test_zones_reach_the_planner(client: ManagerClient) -> None:
+    """Also when it was away; a zone that only costs does not."""
+    manager, planner = client.manager, client.planner
+    manager.facts.is_current = True
+    manager.planner_began(PlannerRun("1", "8 x 8"))
+    planner.refusal = "the planner does not answer"
+    slow = {"kind": "slow", "cells": [3, 4], "value": 0.2, "until": manager.clock() + 1000}
+    assert (await client.ask("PUT", "/zones/aisle", slow))[0] == 201
+    assert (await client.ask("PUT", "/zones/dear", {"kind": "cost", "cells": [6], "value": 2.0}))[0] == 201
+    planner.refusal = ""
+    planner.calls.clear()
+    await manager.step()
+    assert planner.calls == [], "it was sent again at once"
+    manager.clock._now += REFUSED_S  # type: ignore[attr-defined]  # the clock is moved on
+    await manager.step()
+    assert planner.calls == [("zone", "aisle", "slow")]
+    manager.facts.zones["aisle"] = manager.book.zones["aisle"]
+    manager.clock._now += 1000.0  # type: ignore[attr-defined]
+    await manager.step()
+    assert planner.calls[-1] == ("zone", "aisle", None)
+    assert [zone["id"] for zone in (await client.ask("GET", "/zones"))[1]["zones"]] == ["dear"]
+
+
+@pytest.mark.parametrize("zone", [{"kind": "blocked"}, {"kind": "cost", "value": 2.0}])
+async def test_a_removed_zone_leaves_the_journal(client: ManagerClient, zone: dict[str, Any]) -> None:
+    """Once the planner has confirmed it; what happened to it stays among the events."""
+    manager, planner = client.manager, client.planner
+    manager.facts.is_current = True
+    manager.planner_began(PlannerRun("1", "8 x 8"))
+    await client.ask("PUT", "/zones/z", {**zone, "cells": [3]})
+    if zone["kind"] == "blocked":
+        manager.facts.zones["z"] = manager.book.zones["z"]
+    await manager.step()
+    assert [record for record in client.journal.load()[0] if isinstance(record, Zone)]
+    planner.refusal = "the planner does not answer"
+    assert (await client.ask("DELETE", "/zones/z"))[0] == 200
+    kept = [record for record in client.journal.load()[0] if isinstance(record, Zone)]
+    assert [record.is_removed for record in kept] == [True]
+    manager.facts.zones.clear()
+    planner.refusal = ""
+    manager.clock._now += REFUSED_S  # type: ignore[attr-defined]  # the clock is moved on
+    for _ in range(2):
+        await manager.step()
+    assert not [record for record in client.journal.load()[0] if isinstance(record, Zone)]
+    events = (await client.ask("GET", "/events?id=z"))[1]["events"]
+    assert [event["name"] for event in events] == ["zone", "zone removed"]
+
+
+async def test_a_request_reaches_the_planner_after_a_kill(tmp_path: Path) -> None:
+    """The planner was away when it was accepted; once it has it, only changes at the planner count."""
+
+    def begin() -> ManagerClient:
+        made = ManagerClient(tmp_path / "j.sqlite")
+        made.manager.facts.is_current, made.manager.facts.requested = True, frozenset()
+        made.manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+        made.manager.planner_began(PlannerRun("1", "8 x 8"))
+        return made
+
+    first = begin()
+    await first.manager.step()
+    first.manager.facts.is_live = False
+    assert (await first.ask("POST", "/robots/Robot1/pause", {"reason": "tea"}))[0] == 200
+    await first.manager.close()
+    second = begin()
+    await second.manager.step()
+    assert second.planner.calls == [("mode", "Robot1", "paused", "tea", "erp")]
+    await second.manager.step()
+    await second.manager.close()
+    third = begin()
+    await third.manager.step()
+    assert (third.planner.calls, third.manager.book.entry("Robot1").mode) == ([], "automatic")
+    await third.manager.close()
+
+
+async def test_a_mode_that_the_planner_refuses_stays(client: ManagerClient) -> None:
+    client.manager.facts.is_current = True
+    client.manager.planner_began(PlannerRun("1", "8 x 8"))
+    client.manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+    client.planner.refusal = "not now"
+    status, body, _ = await client.ask("POST", "/robots/Robot1/take-out")
+    assert (status, body["error"]) == (409, "not now")
+    assert (await client.ask("GET", "/robots/Robot1"))[1]["mode"] == "automatic"
+
+
+async def test_a_goal_set_by_hand_holds_the_task(client: ManagerClient) -> None:
+    robot = client.manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+    await client.ask("POST", "/tasks", GO)
+    for _ in range(2):
+        await client.manager.step()
+        robot.goal, robot.state = client.planner.goals.get("Robot1"), "driving"
+    assert robot.goal == 5
+    await client.manager.step()
+    robot.goal = 60
+    await client.manager.step()
+    task = (await client.ask("GET", "/tasks/T1"))[1]
+    assert (task["state"], task["robot_assigned"]) == ("held", "")
+    assert "Robot1 was sent to cell 60 by hand" in task["reason"]
+    assert client.planner.goals["Robot1"] == 5, "the goal that was set by hand was overwritten"
+
+
+def test_goals_are_sent_again_after_a_restart() -> None:
+    keeper, facts = GoalKeeper(), FleetFacts(is_live=True)
+    robot = facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0)
+    assert keeper.to_send(facts, {"Robot1": 5}, 0.0) == [("Robot1", 5)]
+    assert keeper.to_send(facts, {"Robot1": 5}, 0.5) == []
+    assert keeper.to_send(facts, {"Robot1": 5}, 2.0) == [("Robot1", 5)]
+    robot.goal = 5
+    assert keeper.notice(facts, {"Robot1": 5}) == {}
+    keeper.reset()
+    robot.goal = None
+    assert keeper.notice(facts, {"Robot1": 5}) == {}
+    assert keeper.to_send(facts, {"Robot1": 5}, 3.0) == [("Robot1", 5)]
+
+
+async def test_a_blocked_cell_is_in_the_journal_first(client: ManagerClient) -> None:
+    """The planner is told what the journal has; a cell that only sensors blocked is freed as well."""
+    kept: list[tuple[int, ...]] = []
+    planner, block = client.planner, client.planner.block_cell
+
+    async def block_cell(cell: int, *, blocked: bool) -> str:
+        records, _ = client.journal.load()
+        kept.extend(record.unsent for record in records if isinstance(record, BlockedCells))
+        return await block(cell, blocked=blocked)
+
+    planner.block_cell = block_cell  # type: ignore[method-assign]  # looks into the journal first
+    status, said, _ = await client.ask("PUT", "/cells/12", {"blocked": True})
+    assert (status, said, kept) == (200, {"message": "cell 12 is blocked"}, [(12,)])
+    event = (await client.ask("GET", "/events"))[1]["events"][-1]
+    assert (event["kind"], event["name"], event["user"]) == ("cells", "blocked", "erp")
+    assert (await client.ask("PUT", "/cells/20", {"blocked": False}))[0] == 200
+    assert planner.calls == [("cell", 12, True), ("cell", 20, False)]
+    assert (await client.ask("PUT", "/cells/12", {"blocked": True}, role="viewer"))[0] == 403
+
+
+async def test_a_cell_that_the_planner_refuses_stays(client: ManagerClient) -> None:
+    for refusal, expected in (("remove the zone", 409), ("the planner does not answer: gone", 503)):
+        client.planner.refusal = refusal
+        status, said, _ = await client.ask("PUT", "/cells/12", {"blocked": True})
+        assert (status, said, client.manager.book.blocked.cells) == (expected, {"error": refusal}, ())
+    client.manager.facts.is_live = False
+    assert (await client.ask("PUT", "/cells/12", {"blocked": True}))[0] == 200
+    assert client.manager.book.blocked == BlockedCells((12,), (12,))
