@@ -1,21 +1,224 @@
-"""A cancelled task whose load is on a robot that does not answer: people are asked where the load is."""
+"""Loads on robots that do not answer or cannot go on: people are asked where the load is."""
 
 from __future__ import annotations
 
 from math import inf
-from typing import Any
 
 import pytest
 
+from rce_fleet.exceptions import TaskRefusedError
 from rce_fleet.tasks.loads import settle_load
+from rce_fleet.tasks.order import Action, Order, Stop
 from rce_fleet.tasks.records import RobotEntry
-from rce_fleet.tasks.task import Task, TaskState
+from rce_fleet.tasks.task import RETURN, Task, TaskState
+
+from .conftest import Floor
 
 
-def strand(floor: Any, *, is_dead: bool, cancel_first: bool) -> Task:
+def test_a_load_stays_with_a_silent_robot(floor: Floor) -> None:
+    first = floor.add("Robot1", 0)
+    floor.add("Robot2", 63)
+    task = floor.deliver(1, 20)
+    floor.run(6)
+    first.state, first.away_since = "silent", floor.now
+    floor.run(60)
+    waiting = floor.task(task)
+    assert (waiting.state, waiting.robot) == (TaskState.SUSPENDED, "Robot1")
+    assert "its load is on Robot1" in waiting.reason
+    first.state, first.away_since = "idle", float("inf")
+    floor.run_until_ended(task)
+    assert floor.task(task).state is TaskState.DONE
+
+
+def test_a_load_that_does_not_come_back_fails(floor: Floor) -> None:
+    first = floor.add("Robot1", 0)
+    task = floor.deliver(1, 20)
+    floor.run(6)
+    first.state, first.away_since = "silent", floor.now
+    floor.run_until_ended(task, most=4000)
+    assert floor.task(task).state is TaskState.FAILED
+    assert floor.book.task_of("Robot1") is None
+
+
+def _vanish_with_load(floor: Floor) -> Task:
+    """Let a robot pick a load, and be silent from then on."""
+    robot = floor.add("Robot1", 0)
+    task = floor.deliver(3, 60)
+    while not floor.task(task).is_loaded:
+        floor.run(1)
+    robot.state, robot.reason, robot.away_since = "silent", "no messages", floor.now
+    floor.run(20)
+    assert floor.task(task).state is TaskState.SUSPENDED
+    return task
+
+
+def test_people_are_asked_where_a_vanished_load_is(floor: Floor) -> None:
+    task = _vanish_with_load(floor)
+    assert "Where is the load that Robot1 has" in floor.task(task).question
+    assert [event.name for event in floor.events].count("question") == 1
+    floor.add("Robot2", 63)
+    settled = settle_load(floor.book, task.id, 20, floor.now, user="anna")
+    assert (settled.state, settled.question) == (TaskState.QUEUED, "")
+    floor.run_until_ended(task)
+    ended = floor.task(task)
+    assert (ended.state, ended.loads) == (TaskState.DONE, 0)
+    assert [(visit.robot, visit.cell) for visit in ended.visits] == [
+        *(("Robot1", 3), ("Robot2", 20), ("Robot2", 60)),
+    ]
+
+
+def test_a_lost_load_fails_its_task(floor: Floor) -> None:
+    task = _vanish_with_load(floor)
+    settle_load(floor.book, task.id, None, floor.now, user="anna")
+    assert (floor.task(task).state, floor.task(task).reason) == (
+        *(TaskState.FAILED, "its load is lost, says anna"),
+    )
+    with pytest.raises(TaskRefusedError, match="is failed"):
+        settle_load(floor.book, task.id, 20, floor.now)
+
+
+def test_a_found_load_ends_a_cancelled_task(floor: Floor) -> None:
+    task = _vanish_with_load(floor)
+    floor.book.cancel(task.id, floor.now)
+    assert floor.task(task).state is TaskState.CANCELLING
+    settle_load(floor.book, task.id, 20, floor.now)
+    assert floor.task(task).state is TaskState.CANCELLED
+
+
+def test_the_load_of_a_robot_that_drives_stays(floor: Floor) -> None:
+    floor.add("Robot1", 0)
+    task = floor.deliver(3, 60)
+    floor.run(2)
+    with pytest.raises(TaskRefusedError, match="T1 is running"):
+        settle_load(floor.book, task.id, 20, floor.now)
+
+
+@pytest.mark.parametrize("is_on_its_way", [False, True])
+@pytest.mark.parametrize("answer", ["freed", "told"])
+def test_a_load_without_a_path_is_asked_for_until_it_is_settled(
+    floor: Floor, answer: str, *, is_on_its_way: bool
+) -> None:
+    """The question was there for one step; then the task ran, with a robot that stood still."""
+    floor.add("Robot1", 0)
+    task = floor.deliver(3, 60)
+    while floor.task(task).target != (60 if is_on_its_way else 3):
+        floor.run(1)
+    floor.facts.shut, floor.facts.map_revision = frozenset({60}), 1
+    floor.run(60)
+    events = len(floor.events)
+    floor.run(300)
+    assert (floor.task(task).state, floor.task(task).loads) == (TaskState.SUSPENDED, 1)
+    assert "Where is the load that Robot1 has?" in floor.task(task).question
+    assert len(floor.events) == events
+    assert [event.name for event in floor.events].count("question") == 1
+    if answer == "told":
+        settle_load(floor.book, task.id, 5, floor.now)
+    floor.facts.shut, floor.facts.map_revision = frozenset(), 2
+    floor.run_until_ended(task)
+    assert floor.task(task).state is TaskState.DONE
+    picked = [visit.cell for visit in floor.task(task).visits]
+    assert picked == ([3, 5, 60] if answer == "told" else [3, 60])
+
+
+def test_people_can_answer_for_a_load_while_its_robot_is_stuck(floor: Floor) -> None:
+    """It tries again and again; they are asked once, and have time to say where the load is."""
+    floor.add("Robot1", 0)
+    task = floor.deliver(3, 60)
+    while not floor.task(task).is_loaded:
+        floor.run(1)
+    floor.stuck.add("Robot1")
+    states = []
+    for _ in range(600):
+        floor.run(1)
+        states.append(floor.task(task).state)
+    names = [event.name for event in floor.events]
+    assert states.count(TaskState.SUSPENDED) >= 60
+    assert names.count("continued") >= 3
+    assert names.count("question") == 1
+    while floor.task(task).state is not TaskState.SUSPENDED:
+        floor.run(1)
+    floor.run(5)
+    settle_load(floor.book, task.id, 5, floor.now)
+    floor.stuck.clear()
+    floor.run_until_ended(task)
+    assert floor.task(task).state is TaskState.DONE
+
+
+@pytest.mark.parametrize("is_cancelled", [False, True])
+def test_a_dead_robot_with_a_load_keeps_no_cell(floor: Floor, *, is_cancelled: bool) -> None:
+    """Others go to the cell to which it was on its way."""
+    robot = floor.add("Robot1", 0)
+    task = floor.deliver(3, 60, return_cells=(20,))
+    while not floor.task(task).is_loaded:
+        floor.run(1)
+    if is_cancelled:
+        floor.book.cancel(task.id, floor.now)
+    floor.run(2)
+    target = 20 if is_cancelled else 60
+    assert floor.task(task).target == target
+    robot.state, robot.away_since = "dead", floor.now
+    floor.book.emit(RobotEntry("Robot1", mode="dead"), "dead", floor.now)
+    floor.add("Robot2", 63)
+    other = floor.go(target)
+    floor.run_until_ended(other, most=60)
+    assert (floor.task(task).target, floor.task(task).loads) == (None, 1)
+    events = len(floor.events)
+    floor.run(5)
+    assert len(floor.events) == events
+    floor.book.emit(RobotEntry("Robot1"), "put in", floor.now)
+    robot.state, robot.away_since = "idle", float("inf")
+    floor.run_until_ended(task)
+    assert floor.task(task).loads == 0
+
+
+@pytest.mark.parametrize("stop", [0, 1, RETURN])
+def test_a_cancelled_task_asks_for_the_load_of_a_dead_robot_at_once(floor: Floor, stop: int) -> None:
+    """A robot that died while it takes a load or gives it away may have it; the task waited for two hours."""
+    robot = floor.add("Robot1", 0)
+    seconds = (7200.0 if stop == 0 else 1.0, 1.0 if stop == 0 else 7200.0)
+    stops = (Stop(Action.PICK, (2,), seconds[0]), Stop(Action.DELIVER, (5,), seconds[1]))
+    task = floor.book.create(Order(stops), floor.now)
+    if stop == RETURN:
+        while floor.task(task).loads == 0:
+            floor.run(1)
+        floor.book.cancel(task.id, floor.now)
+    floor.run(15)
+    assert floor.task(task).visits[-1].stop == stop
+    assert floor.task(task).action is not None
+    robot.state, robot.away_since = "dead", floor.now
+    floor.book.emit(RobotEntry("Robot1", mode="dead"), "dead", floor.now)
+    floor.run(1)
+    floor.book.cancel(task.id, floor.now)
+    floor.run(1)
+    assert (floor.task(task).state, floor.task(task).action) == (TaskState.CANCELLING, None)
+    assert floor.task(task).loads == 1
+    settle_load(floor.book, task.id, 2, floor.now)
+    assert floor.task(task).state is TaskState.CANCELLED
+    assert floor.book.task_of("Robot1") is None
+
+
+@pytest.mark.parametrize("state", ["silent", "unknown"])
+def test_a_cancelled_pick_of_a_silent_robot_takes_its_time(floor: Floor, state: str) -> None:
+    """It may be lifting the load now, and drives away with it when it is heard again."""
+    robot = floor.add("Robot1", 0)
+    task = floor.deliver(2, 20, 60.0)
+    floor.run(5)
+    assert floor.task(task).action is not None
+    if state == "silent":
+        robot.state, robot.away_since = state, floor.now
+    else:
+        del floor.facts.robots["Robot1"]
+    floor.book.cancel(task.id, floor.now)
+    floor.run(30)
+    assert floor.task(task).action is not None
+    floor.run(40)
+    assert (floor.task(task).action, floor.task(task).loads) == (None, 1)
+
+
+def strand(floor: Floor, *, is_dead: bool, cancel_first: bool) -> Task:
     """Let a robot vanish with the load of a task that is cancelled, before or after that."""
     robot = floor.add("Robot1", 0)
-    task: Task = floor.deliver(3, 60)
+    task = floor.deliver(3, 60)
     while not floor.task(task).is_loaded:
         floor.run(1)
     floor.run(1)
@@ -38,7 +241,7 @@ def strand(floor: Any, *, is_dead: bool, cancel_first: bool) -> Task:
 @pytest.mark.parametrize("cancel_first", [True, False])
 @pytest.mark.parametrize("is_dead", [True, False])
 def test_people_are_asked_for_the_load_of_a_cancelled_task(
-    floor: Any, *, is_dead: bool, cancel_first: bool
+    floor: Floor, *, is_dead: bool, cancel_first: bool
 ) -> None:
     """The task waited an hour without a word, and then failed."""
     task = strand(floor, is_dead=is_dead, cancel_first=cancel_first)
@@ -51,7 +254,7 @@ def test_people_are_asked_for_the_load_of_a_cancelled_task(
     assert floor.task(task).question == ""
 
 
-def test_the_question_ends_when_the_robot_comes_back(floor: Any) -> None:
+def test_the_question_ends_when_the_robot_comes_back(floor: Floor) -> None:
     task = strand(floor, is_dead=False, cancel_first=True)
     floor.restart()
     assert floor.task(task).question != ""
