@@ -17,7 +17,7 @@ from rce_fleet.tasks.book import TaskBook
 from rce_fleet.tasks.dispatch import Dispatcher, TaskRules
 from rce_fleet.tasks.facts import FleetFacts, RobotFacts
 from rce_fleet.tasks.order import Action, Order, Stop
-from rce_fleet.tasks.records import FleetEvent
+from rce_fleet.tasks.records import FleetEvent, RobotEntry
 from rce_fleet.tasks.task import Task
 
 
@@ -42,6 +42,11 @@ class Floor:
     def add(self, name: str, cell: int, **facts: Any) -> RobotFacts:
         self.facts.robots[name] = RobotFacts(name, "idle", cell=cell, moved_at=self.now, **facts)
         return self.facts.robots[name]
+
+    def let_die(self, robot: RobotFacts) -> None:
+        """Let a person say that a robot lies dead on the floor, which does not move it then."""
+        robot.state, robot.mode, robot.away_since = "dead", "dead", self.now
+        self.book.emit(RobotEntry(robot.id, mode="dead"), "dead", self.now)
 
     def go(self, *cells: int, **order: Any) -> Task:
         return self.book.create(Order(tuple(Stop(Action.GO, (cell,)) for cell in cells), **order), self.now)

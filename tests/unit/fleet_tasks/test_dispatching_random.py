@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from rce_fleet.tasks.loads import settle_load
 from rce_fleet.tasks.order import Action, Order, Stop
-from rce_fleet.tasks.records import RobotEntry
 from rce_fleet.tasks.task import Task, TaskState
 
 from .conftest import Floor
@@ -108,12 +107,12 @@ def test_people_can_end_each_task_whatever_happened(things: list[tuple[str, int,
         elif what == "charge":
             shift.tasks.append(floor.book.create(Order((Stop(Action.CHARGE, (8 + first,)),)), floor.now))
         elif what == "kill":
-            _kill(floor, NAMES[first % len(NAMES)])
+            floor.let_die(floor.facts.robots[NAMES[first % len(NAMES)]])
         else:
             shift.happen(what, first, second)
         floor.run(seconds)
     for name in NAMES:
-        _kill(floor, name)
+        floor.let_die(floor.facts.robots[name])
     floor.run(5)
     for task in map(floor.task, shift.tasks):
         if not task.has_ended:
@@ -126,9 +125,3 @@ def test_people_can_end_each_task_whatever_happened(things: list[tuple[str, int,
     assert all(floor.task(task).has_ended for task in shift.tasks)
     assert all(floor.book.task_of(name) is None for name in NAMES)
     assert floor.dispatcher.goals() == dict.fromkeys(NAMES)
-
-
-def _kill(floor: Floor, name: str) -> None:
-    robot = floor.facts.robots[name]
-    robot.state, robot.mode, robot.away_since = "dead", "dead", floor.now
-    floor.book.emit(RobotEntry(name, mode="dead"), "dead", floor.now)

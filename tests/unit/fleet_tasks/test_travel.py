@@ -15,7 +15,7 @@ from rce_fleet.compiled import is_available
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks import travel as travel_module
 from rce_fleet.tasks.records import Zone
-from rce_fleet.tasks.travel import TravelCosts
+from rce_fleet.tasks.travel import REFRESHED, TravelCosts
 from rce_fleet.tasks.travel_loops import measure_ways
 
 COST = {"ice": 2.5, "shut": inf}
@@ -34,6 +34,23 @@ def measured(seed: int, loop: Any, size: int = 6) -> list[Any]:
         travel.measure(list(cells), COST)
         assert travel.missing(cells, COST) == []
         return [travel.field(cell, COST).tolist() for cell in cells]
+
+
+def test_a_zone_costs_a_robot_more() -> None:
+    """The way through the zone is four metres long and counts ten; around it are six."""
+    travel, grid = TravelCosts(), GridMap(2, 5)
+    zone = {"ice": Zone("ice", "cost", (1, 2, 3))}
+    travel.set_map(grid, frozenset(), zone, 0)
+    assert travel.metres(0, 4) == 4.0
+    assert travel.metres(0, 4, {"ice": 3.0}) == 6.0
+
+
+def test_a_robot_may_leave_a_blocked_cell_but_not_enter_it() -> None:
+    travel, grid = TravelCosts(), GridMap(1, 3)
+    travel.set_map(grid, frozenset({1}), {}, 0)
+    assert travel.metres(1, 2) == 1.0
+    assert travel.metres(2, 1) == float("inf")
+    assert travel.metres(0, 2) == float("inf")
 
 
 @settings(max_examples=15)
@@ -71,6 +88,24 @@ def test_together_and_alone_are_the_same() -> None:
             travel.measure([0, 3, 44])
         both.append([travel.field(cell) for cell in (0, 3, 44)])
     np.testing.assert_array_equal(both[0], both[1])
+
+
+def test_a_changed_map_is_measured_in_slices() -> None:
+    """After a cell is blocked, distances follow a few at a time; to a blocked cell no way leads at once."""
+    travel, grid = TravelCosts(), GridMap(3, 40)
+    travel.set_map(grid, frozenset(), {}, 0)
+    goals = range(80, 120)
+    before = [travel.metres(0, goal) for goal in goals]
+    shut = frozenset({1, 40, 119})
+    travel.set_map(grid, shut, {}, 1)
+    travel.begin_step()
+    first = [travel.metres(0, goal) for goal in goals]
+    assert sum(way == inf for way in first) == REFRESHED + 1
+    assert all(now in (way, inf) for way, now in zip(before, first, strict=True))
+    for _ in range(3):
+        travel.begin_step()
+        last = [travel.metres(0, goal) for goal in goals]
+    assert last == [inf] * len(goals)
 
 
 def test_new_grid_is_measured_in_slices(floor: Any) -> None:
