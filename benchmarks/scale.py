@@ -25,7 +25,7 @@ from rce_master.exceptions import NoRoomError
 from rce_master.state import commands
 from rce_master.state.changes import Changes
 from rce_master.state.core import State
-from rce_master.state.records import User, UserRole
+from rce_master.state.user_records import User, UserRole
 
 SIZES = (10, 100, 1000)
 PER_MACHINE = 100

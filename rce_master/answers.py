@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from rce_master.exceptions import ConflictError, InvalidRequestError, UnderWayError
 from rce_master.state import commands
 from rce_master.state.answers import is_over
-from rce_master.state.records import KeptAnswer, kept_answer_key
+from rce_master.state.user_records import KeptAnswer, kept_answer_key
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -18,7 +18,7 @@ from argon2.low_level import ARGON2_VERSION
 
 from rce.guard import CrowdedError, Turns
 from rce_master.exceptions import TooManyFailuresError, TooManyLoginsError, WrongCredentialsError
-from rce_master.state.records import KnownLogin, User
+from rce_master.state.user_records import KnownLogin, User
 from rce_master.throttle import MAX_DELAY_S, FailureThrottle
 
 if TYPE_CHECKING:

@@ -30,8 +30,8 @@ from rce import __version__
 from rce_master.exceptions import StoreError
 from rce_master.packages.contents import ARCHIVES
 from rce_master.snapshots.service import SNAPSHOTS
-from rce_master.state.records import UserPackage
 from rce_master.state.tables import Tables
+from rce_master.state.user_records import UserPackage
 from rce_master.store.base import SCHEMA_VERSION
 from rce_master.store.lock import FolderLock
 from rce_master.store.sqlite import FILE_NAME

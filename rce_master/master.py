@@ -38,7 +38,7 @@ from rce_master.reconciler import Reconciler
 from rce_master.snapshots.service import SNAPSHOT, SNAPSHOTS_PATH, SnapshotService
 from rce_master.snapshots.service import SNAPSHOTS as SNAPSHOTS_FOLDER
 from rce_master.state import commands
-from rce_master.state.records import User, UserRole
+from rce_master.state.user_records import User, UserRole
 from rce_master.state_service import StateService
 from rce_master.tokens import Tokens
 

@@ -28,7 +28,7 @@ from rce.control.node_states import (
 from rce.model import MAX_STATE
 from rce_master.exceptions import FencedError, MasterError
 from rce_master.state import commands, saved_states
-from rce_master.state.records import SavedState
+from rce_master.state.volume_records import SavedState
 
 if TYPE_CHECKING:
     from collections.abc import Callable

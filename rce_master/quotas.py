@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from rce.guard import CrowdedError, Rates, Turns
 from rce_master.exceptions import TooMuchError
-from rce_master.state.records import User, UserRole
+from rce_master.state.user_records import User, UserRole
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator

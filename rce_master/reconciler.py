@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rce_master.state.changes import Changes, Notice, Touched
-    from rce_master.state.records import VolumeRemoval
+    from rce_master.state.volume_records import VolumeRemoval
     from rce_master.state_service import StateService
 
 _log = logging.getLogger(__name__)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from rce_master.exceptions import WrongCredentialsError
 from rce_master.state import commands
-from rce_master.state.records import Token, User
+from rce_master.state.user_records import Token, User
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ def new_token(
         label: What its owner calls it.
         now: Seconds since 1970.
         lifetime: Seconds for which it is good; 0: until it is revoked.
-        scope: What it is good for, see :attr:`rce_master.state.records.Token.scope`.
+        scope: What it is good for, see :attr:`rce_master.state.user_records.Token.scope`.
 
     Returns:
         The token, which only its owner gets, and what is kept of it.

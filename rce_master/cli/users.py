@@ -19,7 +19,7 @@ from rce_master.cli.exceptions import CliError
 from rce_master.cli.offline import OfflineState, StateDir, StoreOption, choose, open_state, read_etcd
 from rce_master.cli.session import read_password
 from rce_master.state import commands
-from rce_master.state.records import User, UserRole
+from rce_master.state.user_records import User, UserRole
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

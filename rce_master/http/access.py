@@ -9,7 +9,7 @@ from aiohttp import hdrs, web
 
 from rce_master.exceptions import ForbiddenError, WrongCredentialsError
 from rce_master.http.forwarded import HEADER
-from rce_master.state.records import FLEET_SCOPE, METRICS_SCOPE, Token, User, UserRole
+from rce_master.state.user_records import FLEET_SCOPE, METRICS_SCOPE, Token, User, UserRole
 
 if TYPE_CHECKING:
     from rce_master.http.routes import Route, Services

@@ -11,7 +11,7 @@ from rce_master.http.paging import PAGE, Listing, Span, answer, keys_of
 from rce_master.http.routes import Call, route_table
 from rce_master.http.views import Views
 from rce_master.state import commands
-from rce_master.state.records import User, UserRole
+from rce_master.state.user_records import User, UserRole
 from rce_master.tokens import new_token, token_digest
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from rce_master.audit import choose
 from rce_master.exceptions import ForbiddenError
 from rce_master.http import models
 from rce_master.http.routes import Call, route_table
-from rce_master.state.records import UserRole
+from rce_master.state.user_records import UserRole
 
 if TYPE_CHECKING:
     from rce_master.audit import Record

@@ -14,7 +14,7 @@ from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.packages.service import PushRequest
 from rce_master.state import commands
 from rce_master.state.packages import find, uses
-from rce_master.state.records import PackageKey, UserPackage, user_package_key
+from rce_master.state.user_records import PackageKey, UserPackage, user_package_key
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -12,8 +12,8 @@ from rce_master.state import commands
 if TYPE_CHECKING:
     from aiohttp import web
 
-    from rce_master.state.records import SavedState
     from rce_master.state.tables import Tables
+    from rce_master.state.volume_records import SavedState
 
 routes = route_table("states")
 

@@ -7,7 +7,7 @@ from rce_master.exceptions import ForbiddenError, InvalidRequestError
 from rce_master.http import models
 from rce_master.http.routes import OF_USER, Call, route_table
 from rce_master.state import commands
-from rce_master.state.records import METRICS_SCOPE, ROBOT_SCOPE, Token
+from rce_master.state.user_records import METRICS_SCOPE, ROBOT_SCOPE, Token
 from rce_master.tokens import new_token, token_digest
 
 routes = route_table("tokens")

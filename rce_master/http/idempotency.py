@@ -16,7 +16,7 @@ from rce_master.exceptions import RefusedError
 
 if TYPE_CHECKING:
     from rce_master.answers import Answer
-    from rce_master.state.records import User
+    from rce_master.state.user_records import User
 
 HEADER = "Idempotency-Key"
 REPLAYED = "Idempotent-Replayed"

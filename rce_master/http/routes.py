@@ -13,7 +13,7 @@ from rce.web import routes
 from rce.web.openapi import Query
 from rce_master.exceptions import ForbiddenError, InvalidRequestError, NotFoundError, WrongCredentialsError
 from rce_master.http.forwarded import HEADER, ForwardingKey
-from rce_master.state.records import User, UserRole
+from rce_master.state.user_records import User, UserRole
 
 if TYPE_CHECKING:
     from aiohttp import web

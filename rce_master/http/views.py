@@ -9,7 +9,9 @@ from rce_master.http import models, spec_models
 from rce_master.http.spec_models import shown
 from rce_master.state import capacity, volume_moves
 from rce_master.state.lifecycle import ContainerPhase
-from rce_master.state.records import Container, Endpoint, Robot, TaskSet, User, UserVolume
+from rce_master.state.records import Container, Endpoint, Robot, TaskSet
+from rce_master.state.user_records import User
+from rce_master.state.volume_records import UserVolume
 from rce_master.state.volumes import holder_of, volumes_of
 from rce_master.state.wiring_records import Connection, Interface, open_end_key
 

@@ -12,8 +12,9 @@ import msgspec
 
 from rce_master.exceptions import StoreError
 from rce_master.packages.contents import ARCHIVES
-from rce_master.state.records import SavedState, UserPackage
 from rce_master.state.tables import Tables
+from rce_master.state.user_records import UserPackage
+from rce_master.state.volume_records import SavedState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

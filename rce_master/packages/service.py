@@ -12,7 +12,7 @@ from rce.packages import BadKeyError, BadSignatureError, statement, verify
 from rce_master.exceptions import BusyError, ForbiddenError, InvalidRequestError
 from rce_master.packages.uploads import MAX_UPLOADS, Uploads
 from rce_master.state import commands, packages
-from rce_master.state.records import UserPackage, package_key_key, user_package_key
+from rce_master.state.user_records import UserPackage, package_key_key, user_package_key
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from rce_master.packages.contents import ContentStore
-    from rce_master.state.records import UserVolume
     from rce_master.state.table import Table
+    from rce_master.state.volume_records import UserVolume
 
 
 class NeededSnapshots:

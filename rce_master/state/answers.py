@@ -14,7 +14,7 @@ from rce_master.exceptions import ConflictError
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import ForgetAnswers
-    from rce_master.state.records import KeptAnswer
+    from rce_master.state.user_records import KeptAnswer
 
 KEPT_S = 3600.0
 MAX_ANSWERS = 1000

@@ -11,7 +11,8 @@ from rce.model import DEFAULT_PREFIX, MEGABYTE, MIN_MEMORY, Network, Resources
 from rce_master.exceptions import ConflictError, ForbiddenError, InvalidRequestError
 from rce_master.state import limits, volumes
 from rce_master.state.placement import Room
-from rce_master.state.records import Container, TaskSet, UserRole, tombstone_key
+from rce_master.state.records import Container, TaskSet, tombstone_key
+from rce_master.state.user_records import UserRole
 from rce_master.state.waiting import group_key
 
 if TYPE_CHECKING:

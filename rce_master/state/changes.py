@@ -14,24 +14,23 @@ from rce_master.state.records import (
     Departure,
     Drain,
     Endpoint,
-    KeptAnswer,
-    KnownLogin,
     Move,
-    PackageKey,
     Presence,
     Robot,
     RobotLive,
-    SavedState,
     TaskSet,
-    Token,
     Tombstone,
+)
+from rce_master.state.user_records import (
+    KeptAnswer,
+    KnownLogin,
+    PackageKey,
+    Token,
     User,
     UserLimits,
     UserPackage,
-    UserVolume,
-    VolumeMove,
-    VolumeRemoval,
 )
+from rce_master.state.volume_records import SavedState, UserVolume, VolumeMove, VolumeRemoval
 from rce_master.state.wiring_records import ActiveInterface, Connection, Interface, Link, OpenEnd
 from rce_master.store.base import Row
 

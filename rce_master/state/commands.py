@@ -13,16 +13,16 @@ from rce.model import InterfaceSpec, NodeSpec, ParameterValue, ResourceChanges, 
 
 if TYPE_CHECKING:
     from rce.control import EndpointStatus, Hello, StatusPatch
-    from rce_master.state.records import (
+    from rce_master.state.user_records import (
         KeptAnswer,
         KnownLogin,
         PackageKey,
-        SavedState,
         Token,
         User,
         UserPackage,
         UserRole,
     )
+    from rce_master.state.volume_records import SavedState
 
 
 _NOTHING_REQUESTED = Resources()
@@ -89,7 +89,7 @@ class RevokeToken:
 
     user: str
     id: str
-    """As :attr:`rce_master.state.records.Token.id`."""
+    """As :attr:`rce_master.state.user_records.Token.id`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +113,7 @@ class SetLimits:
 
     user: str
     limits: dict[str, float | None]
-    """By fields of :class:`rce_master.state.records.UserLimits`: how much, 0: no limit, None: as for all."""
+    """By fields of :class:`rce_master.state.user_records.UserLimits`: 0: no limit, None: as for all."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

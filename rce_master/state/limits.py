@@ -8,7 +8,7 @@ from msgspec.structs import asdict, replace
 
 from rce.model import MEGABYTE, write_cores
 from rce_master.exceptions import LimitReachedError, NotFoundError
-from rce_master.state.records import UserLimits, UserRole
+from rce_master.state.user_records import UserLimits, UserRole
 
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction

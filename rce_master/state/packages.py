@@ -13,7 +13,8 @@ from rce.model import NodeSpec, is_name, is_version, newest, split_package
 from rce.packages import key_id
 from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
 from rce_master.state import limits
-from rce_master.state.records import Container, UserPackage, package_key_key, user_package_key
+from rce_master.state.records import Container
+from rce_master.state.user_records import UserPackage, package_key_key, user_package_key
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

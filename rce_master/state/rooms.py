@@ -20,8 +20,9 @@ from rce_master.state.records import Container
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
-    from rce_master.state.records import Drain, Endpoint, Move, Presence, TaskSet, VolumeMove
+    from rce_master.state.records import Drain, Endpoint, Move, Presence, TaskSet
     from rce_master.state.table import Table
+    from rce_master.state.volume_records import VolumeMove
 
 CANDIDATES = 16
 """So many machines that would take a container are compared for it, the least loaded ones."""

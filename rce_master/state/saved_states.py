@@ -14,14 +14,15 @@ from typing import TYPE_CHECKING
 from rce.model import MAX_STATE, MEGABYTE, about
 from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReachedError, NotFoundError
 from rce_master.state import limits
-from rce_master.state.records import Container, saved_state_key
+from rce_master.state.records import Container
+from rce_master.state.volume_records import saved_state_key
 
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import RemoveState, SaveState
-    from rce_master.state.records import SavedState
     from rce_master.state.settings import StateSettings
     from rce_master.state.tables import Tables
+    from rce_master.state.volume_records import SavedState
 
 
 def save(tx: Transaction, command: SaveState) -> None:

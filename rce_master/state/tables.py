@@ -14,29 +14,27 @@ from rce_master.state.records import (
     Departure,
     Drain,
     Endpoint,
-    KeptAnswer,
-    KnownLogin,
     Live,
     Move,
-    PackageKey,
     Presence,
     Robot,
     RobotLive,
-    SavedState,
     TaskSet,
-    Token,
     Tombstone,
-    User,
-    UserLimits,
-    UserPackage,
-    UserVolume,
-    VolumeMove,
-    VolumeRemoval,
-    user_volume_key,
 )
 from rce_master.state.rooms import Rooms
 from rce_master.state.sharing import Sharing
 from rce_master.state.table import Table
+from rce_master.state.user_records import (
+    KeptAnswer,
+    KnownLogin,
+    PackageKey,
+    Token,
+    User,
+    UserLimits,
+    UserPackage,
+)
+from rce_master.state.volume_records import SavedState, UserVolume, VolumeMove, VolumeRemoval, user_volume_key
 from rce_master.state.waiting import PlacementQueue, group_key
 from rce_master.state.wiring_records import (
     ActiveInterface,

@@ -12,7 +12,7 @@ from rce_master.state import robots
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction
     from rce_master.state.commands import AddToken, NoteTokenUses, RemoveToken, RevokeRobotToken, RevokeToken
-    from rce_master.state.records import Token
+    from rce_master.state.user_records import Token
 
 
 def add(tx: Transaction, command: AddToken) -> None:

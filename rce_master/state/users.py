@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from rce.model import is_name
 from rce_master.exceptions import ConflictError, InvalidRequestError, NotFoundError
 from rce_master.state import answers, endpoints, limits, packages, robots, tokens, volumes
-from rce_master.state.records import User, UserRole
+from rce_master.state.user_records import User, UserRole
 
 if TYPE_CHECKING:
     from rce_master.state.changes import Transaction

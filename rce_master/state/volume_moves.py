@@ -23,7 +23,8 @@ from msgspec.structs import replace
 from rce.control import LinkAddress, RestoreVolume, SaveVolume
 from rce_master.state import activity, capacity, endpoints, placing, volumes
 from rce_master.state.lifecycle import VOLUME_MOVE_LIFE, ContainerEvent, VolumeMoveEvent, VolumeMovePhase
-from rce_master.state.records import Container, UserVolume, VolumeMove, tombstone_key, volume_removal_key
+from rce_master.state.records import Container, tombstone_key
+from rce_master.state.volume_records import UserVolume, VolumeMove, volume_removal_key
 
 if TYPE_CHECKING:
     from rce.control import ToTaskSet

@@ -20,9 +20,8 @@ from rce.model import MEGABYTE, Resources
 from rce_master.exceptions import ConflictError, LimitReachedError, NotFoundError
 from rce_master.state import limits
 from rce_master.state.lifecycle import VOLUME_MOVE_LIFE, VolumeMoveEvent, VolumeMovePhase
-from rce_master.state.records import (
-    Container,
-    Endpoint,
+from rce_master.state.records import Container, Endpoint
+from rce_master.state.volume_records import (
     UserVolume,
     VolumeMove,
     VolumeRemoval,

@@ -23,8 +23,9 @@ from rce_master.state.records import Container
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from rce_master.state.records import Endpoint, Tombstone, VolumeRemoval
+    from rce_master.state.records import Endpoint, Tombstone
     from rce_master.state.table import Table
+    from rce_master.state.volume_records import VolumeRemoval
 
 
 class Look(NamedTuple):

@@ -30,8 +30,8 @@ from rce_master.control_handler import ControlHandler
 from rce_master.exceptions import SaveTooLargeError, StoreError
 from rce_master.reconciler import Reconciler
 from rce_master.state import commands
-from rce_master.state.records import User, UserRole
 from rce_master.state.settings import StateSettings
+from rce_master.state.user_records import User, UserRole
 from rce_master.state_service import StateService
 from rce_master.store import MemoryStore, Row
 

@@ -10,8 +10,8 @@ from rce.model.specs import InterfaceSpec, NodeSpec, Resources
 from rce_master.state import commands
 from rce_master.state.changes import Changes
 from rce_master.state.core import State
-from rce_master.state.records import User, UserRole
 from rce_master.state.settings import StateSettings
+from rce_master.state.user_records import User, UserRole
 from support.parts import MachineParts, ResourceParts, StatusParts
 
 

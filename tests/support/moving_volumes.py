@@ -9,8 +9,8 @@ from rce.model import MEGABYTE, Network, Volume
 from rce_master.state import commands
 from rce_master.state.core import State
 from rce_master.state.lifecycle import VolumeMovePhase
-from rce_master.state.records import UserVolume
 from rce_master.state.settings import StateSettings
+from rce_master.state.volume_records import UserVolume
 from support.master_world import World
 
 SIZE = 64 * MEGABYTE

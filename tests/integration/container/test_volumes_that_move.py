@@ -39,7 +39,7 @@ from rce_container.volumes import images
 from rce_container.volumes.store import VolumeStore
 from rce_master.packages.contents import ContentStore
 from rce_master.snapshots.service import SNAPSHOT, SnapshotService
-from rce_master.state.records import UserVolume
+from rce_master.state.volume_records import UserVolume
 from rce_master.state_service import StateService
 from rce_master.store.memory import MemoryStore
 

@@ -30,8 +30,8 @@ from rce_master.packages.copies import ArchiveCopies, Forget
 from rce_master.packages.transfer import ArchiveClient
 from rce_master.snapshots.service import SnapshotService
 from rce_master.state.changes import make_row
-from rce_master.state.records import UserVolume
 from rce_master.state.tables import Tables
+from rce_master.state.volume_records import UserVolume
 from rce_master.state_service import StateService
 from rce_master.store import MemoryStore
 from rce_master.store.etcd.layout import OtherMaster

@@ -15,8 +15,8 @@ from support.user_packages import KEY
 from rce_master.etcd_backup import MORE_TERMS
 from rce_master.state.changes import make_row
 from rce_master.state.core import State
-from rce_master.state.records import UserVolume
 from rce_master.state.tables import Tables
+from rce_master.state.volume_records import UserVolume
 from rce_master.store import SqliteStore
 from rce_master.store.etcd import EtcdClient
 from rce_master.store.etcd.store import EtcdStore

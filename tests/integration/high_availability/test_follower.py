@@ -18,8 +18,8 @@ from rce.model.specs import InterfaceSpec
 from rce_master.follower import StateFollower
 from rce_master.state import commands
 from rce_master.state.core import State
-from rce_master.state.records import User, UserRole
 from rce_master.state.settings import StateSettings
+from rce_master.state.user_records import User, UserRole
 from rce_master.state_service import StateService
 from rce_master.store import Row
 from rce_master.store.etcd import EtcdClient, EtcdStore

@@ -10,8 +10,8 @@ import pytest
 from support.etcd import cluster
 from support.master_program import rce
 
-from rce_master.state.records import UserPackage
 from rce_master.state.tables import Tables
+from rce_master.state.user_records import UserPackage
 from rce_master.store import Row, SqliteStore
 from rce_master.store.copying import UNFINISHED
 from rce_master.store.etcd import EtcdClient, EtcdStore

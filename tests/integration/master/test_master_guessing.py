@@ -14,7 +14,7 @@ from support.master_program import master
 
 from rce_master.auth import client_digest
 from rce_master.state.commands import AddUser
-from rce_master.state.records import User, UserRole
+from rce_master.state.user_records import User, UserRole
 from rce_master.throttle import FREE, FREE_OF_ADDRESS
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from rce.control_channel.uploads import Uploader
 from rce.masters import Masters
 from rce_master.packages.contents import ContentStore
 from rce_master.snapshots.service import SNAPSHOT, SPARED_S, SnapshotService
-from rce_master.state.records import UserVolume
+from rce_master.state.volume_records import UserVolume
 from rce_master.state_service import StateService
 from rce_master.store import MemoryStore
 

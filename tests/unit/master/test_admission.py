@@ -19,8 +19,9 @@ from rce_master.exceptions import (
 from rce_master.state import commands, placing
 from rce_master.state.changes import Changes, Transaction
 from rce_master.state.placement import Room
-from rce_master.state.records import Container, UserRole
+from rce_master.state.records import Container
 from rce_master.state.settings import StateSettings
+from rce_master.state.user_records import UserRole
 
 MB = 1 << 20
 

@@ -13,7 +13,7 @@ from rce_master.http.idempotency import MAX_KEY, read_key
 from rce_master.state import commands
 from rce_master.state.answers import KEPT_S, MAX_ANSWERS
 from rce_master.state.core import State
-from rce_master.state.records import KeptAnswer, User, UserRole
+from rce_master.state.user_records import KeptAnswer, User, UserRole
 
 SECRET = b"s" * 32
 REQUEST = KeyedRequest("anna", "key-1", b'POST /api/v1/users\n{"password": "hunter2"}')

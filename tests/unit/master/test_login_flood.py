@@ -14,7 +14,7 @@ from support.master_world import World
 from rce_master.auth import HASH_WORKERS, MAX_WAITING, Authenticator, client_digest
 from rce_master.exceptions import TooManyFailuresError, TooManyLoginsError, WrongCredentialsError
 from rce_master.state import commands
-from rce_master.state.records import User, UserRole
+from rce_master.state.user_records import User, UserRole
 from rce_master.throttle import MAX_ADDRESS_DELAY_S
 
 RIGHT = client_digest("right")

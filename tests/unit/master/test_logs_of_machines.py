@@ -11,8 +11,9 @@ from rce.control.model import EndpointState, EndpointStatus
 from rce_master.exceptions import NotFoundError, TaskSetAwayError
 from rce_master.logs import LogRequest, read_log
 from rce_master.state.lifecycle import ContainerPhase
-from rce_master.state.records import Container, ContainerLive, TaskSet, User, UserRole
+from rce_master.state.records import Container, ContainerLive, TaskSet
 from rce_master.state.tables import Tables
+from rce_master.state.user_records import User, UserRole
 
 BOX = "anna/box"
 PREVIOUS = LogQuery(previous=True)

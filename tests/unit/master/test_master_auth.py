@@ -12,8 +12,8 @@ from support.master_world import World
 from rce_master.auth import Authenticator, client_digest, hash_public
 from rce_master.exceptions import TooManyFailuresError, WrongCredentialsError
 from rce_master.state import commands
-from rce_master.state.records import KnownLogin, User, UserRole
 from rce_master.state.tables import Tables
+from rce_master.state.user_records import KnownLogin, User, UserRole
 from rce_master.throttle import FREE, PACE_S
 
 KEY = b"a key"

@@ -7,8 +7,8 @@ import pytest
 from rce.control.snapshots import FileEntry, Manifest
 from rce_master.packages.contents import ContentStore
 from rce_master.snapshots.needed import NeededSnapshots
-from rce_master.state.records import UserVolume
 from rce_master.state.tables import Tables
+from rce_master.state.volume_records import UserVolume
 
 
 def digest(number: int) -> bytes:

@@ -6,7 +6,7 @@ import pytest
 
 from rce_master.exceptions import TooMuchError
 from rce_master.quotas import ITEMS_PER_REQUEST, Quotas, QuotaSettings
-from rce_master.state.records import User, UserRole
+from rce_master.state.user_records import User, UserRole
 
 ANNA, BERT = (User(name=name, role=UserRole.USER, password="x", created=0.0) for name in ("anna", "bert"))
 ADMIN = User(name="root", role=UserRole.ADMIN, password="x", created=0.0)

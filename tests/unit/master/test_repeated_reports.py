@@ -16,8 +16,8 @@ from rce_master.exceptions import StoreError
 from rce_master.packages.contents import ContentStore
 from rce_master.snapshots.service import SnapshotService
 from rce_master.state import commands
-from rce_master.state.records import UserVolume
 from rce_master.state.settings import StateSettings
+from rce_master.state.volume_records import UserVolume
 
 ID = "anna/c"
 

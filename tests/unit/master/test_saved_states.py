@@ -14,7 +14,7 @@ from rce_master.exceptions import ConflictError, InvalidRequestError, LimitReach
 from rce_master.state import commands, saved_states
 from rce_master.state.core import State
 from rce_master.state.limits import used_of
-from rce_master.state.records import SavedState
+from rce_master.state.volume_records import SavedState
 
 SERVICES = StateServices(save="save", restore="restore")
 FIRST = SavedState(

@@ -10,7 +10,7 @@ import pytest
 from rce_master.audit import AUDIT, FILE_NAME
 from rce_master.cli.offline import give_to_owner, open_state
 from rce_master.state import commands
-from rce_master.state.records import User, UserRole
+from rce_master.state.user_records import User, UserRole
 
 pytestmark = pytest.mark.needs("root")
 

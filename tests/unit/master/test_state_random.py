@@ -19,8 +19,8 @@ from rce_master.exceptions import RefusedError
 from rce_master.state import commands
 from rce_master.state.changes import Changes
 from rce_master.state.core import State
-from rce_master.state.records import User, UserRole
 from rce_master.state.settings import StateSettings
+from rce_master.state.user_records import User, UserRole
 from rce_master.state.volumes import volumes_of
 
 USERS = st.sampled_from(["ann", "bob"])

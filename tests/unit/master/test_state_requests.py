@@ -16,8 +16,8 @@ from rce_master.exceptions import (
     RefusedError,
 )
 from rce_master.state import commands
-from rce_master.state.records import UserRole
 from rce_master.state.settings import StateSettings
+from rce_master.state.user_records import UserRole
 
 
 def revision(world: World, tag: str) -> int:

@@ -13,7 +13,7 @@ from rce_master.exceptions import FencedError, StoreError
 from rce_master.http.server import settling
 from rce_master.leadership.core import Fence, LeadershipCore, LeaseSettings
 from rce_master.state import commands
-from rce_master.state.records import User, UserRole
+from rce_master.state.user_records import User, UserRole
 from rce_master.state_service import StateService
 
 

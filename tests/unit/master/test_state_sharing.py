@@ -11,8 +11,8 @@ from rce.control import CONTROL_VERSION, Hello, MachineInfo, TaskSetKind
 from rce.model import InterfaceSpec, NodeSpec, Resources
 from rce_master.state import commands
 from rce_master.state.core import State
-from rce_master.state.records import User, UserRole
 from rce_master.state.sharing import LARGEST, Pool
+from rce_master.state.user_records import User, UserRole
 
 if TYPE_CHECKING:
     from rce_master.state.table import Table

@@ -9,8 +9,8 @@ from rce.model import MEGABYTE, Volume
 from rce_master.exceptions import ConflictError, LimitReachedError, NoRoomError, NotFoundError
 from rce_master.state import commands
 from rce_master.state.core import State
-from rce_master.state.records import UserVolume
 from rce_master.state.settings import StateSettings
+from rce_master.state.volume_records import UserVolume
 
 SIZE = 64 * MEGABYTE
 

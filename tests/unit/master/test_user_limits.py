@@ -8,8 +8,8 @@ from rce.model.specs import ResourceChanges
 from rce_master.exceptions import LimitReachedError, NotFoundError
 from rce_master.state import commands
 from rce_master.state.limits import limit_of, used_of
-from rce_master.state.records import UserRole
 from rce_master.state.settings import StateSettings
+from rce_master.state.user_records import UserRole
 
 
 def limit(world: World, kind: str, user: str = "anna") -> tuple[float, str]:
