@@ -35,6 +35,8 @@ RETRY = Backoff(first=1.0, longest=300.0)
 TIMEOUT = aiohttp.ClientTimeout(total=10.0)
 BATCH = 100
 """Events of one delivery."""
+KEEP_EVERY = 1000
+"""A position is kept after so many events that its receiver does not want: far fewer than are kept."""
 _OK = range(200, 300)
 _AWAY_S = 2.0
 _SHOWN = 200
@@ -88,6 +90,8 @@ class WebhookSender:
         self._clock = clock
         self._retry = retry
         self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._kept: dict[str, int] = {}
+        """The position of each webhook when it was kept last, or could not be."""
         self._group: TaskGroup | None = None
         self._saving = asyncio.Lock()
 
@@ -100,6 +104,7 @@ class WebhookSender:
 
     def start(self, webhook: Webhook) -> None:
         """Begin to deliver to a webhook."""
+        self._kept[webhook.id] = webhook.position
         if self._group is not None:
             task = self._group.create_task(self._deliver(webhook), name=f"webhook {webhook.id}")
             self._tasks[webhook.id] = task
@@ -172,10 +177,11 @@ class WebhookSender:
             webhook.position = forgotten.last
         else:
             webhook.position = int(events[-1]["number"])
-        if wanted or is_gap:
+        if wanted or is_gap or webhook.position - self._kept[webhook.id] >= KEEP_EVERY:
             await self._keep(webhook)
 
     async def _keep(self, webhook: Webhook) -> None:
+        self._kept[webhook.id] = webhook.position
         try:
             await self.save()
         except OSError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from pathlib import Path
 from typing import Any
 
 from aiohttp import web
@@ -91,3 +92,49 @@ async def test_a_receiver_behind_more_than_is_kept_is_told() -> None:
             await asyncio.sleep(0.01)
         running.cancel()
         await asyncio.wait([running])
+
+
+async def test_events_that_a_receiver_does_not_want_are_done(tmp_path: Path) -> None:
+    """A station that is started again does not begin with them: the manager has forgotten most by then."""
+
+    class Growing(Manager):
+        """A journal of tasks that keeps the newest events only; the last one may be of a zone."""
+
+        kept = 3000
+        has_zone = False
+
+        async def ask(self, after: int, limit: int) -> EventBatch:
+            found = await super().ask(max(after, self.count - self.kept), limit)
+            if self.has_zone and found.events and found.events[-1]["number"] == self.count:
+                found.events[-1]["kind"] = "zone"
+            return found
+
+    manager, said = Growing(), asyncio.Queue[dict[str, Any]]()
+    manager.count = 2900
+
+    async def take(request: web.Request) -> web.Response:
+        said.put_nowait(await request.json())
+        return web.Response()
+
+    app = web.Application()
+    app.router.add_post("/", take)
+    file = tmp_path / "webhooks.json"
+    async with TestServer(app) as server, asyncio.timeout(60):
+        wanted = WebhookRequest(url=str(server.make_url("/")), allow_private=True, kinds=["zone"])
+        store = WebhookStore(file)
+        hook = store.add(wanted, "anna", 0, "aa")
+        store.save()
+        running = asyncio.create_task(WebhookSender(store, EventFeed(manager.ask)).run())
+        while hook.position != manager.count:
+            await asyncio.sleep(0.01)
+        running.cancel()
+        await asyncio.wait([running])
+
+        manager.count, manager.has_zone = 4400, True
+        again = WebhookStore(file)
+        again.load()
+        running = asyncio.create_task(WebhookSender(again, EventFeed(manager.ask)).run())
+        first = await said.get()
+        running.cancel()
+        await asyncio.wait([running])
+    assert ("gap" in first, [event["number"] for event in first["events"]]) == (False, [4400])
