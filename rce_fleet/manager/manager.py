@@ -185,6 +185,7 @@ class FleetManager:
             for robot in self.facts.robots.values():
                 robot.moved_at += step
                 robot.away_since += step
+            self.statistics.skip(step)
 
     def planner_began(self, run: PlannerRun) -> None:
         """Begin with a planner that was started, or is heard for the first time.

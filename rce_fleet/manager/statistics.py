@@ -48,6 +48,14 @@ class FleetStatistics:
         self._last = now
         self._minutes: deque[Minute] = deque([*before, Minute(now)], BUCKETS)
 
+    def skip(self, seconds: float) -> None:
+        """Leave out a step of the clock since the last call: no robot did anything in it.
+
+        Args:
+            seconds: By which it was set forward.
+        """
+        self._last += seconds
+
     def update(self, now: float, facts: FleetFacts, book: TaskBook) -> Minute | None:
         """Add the time since the last call; return the minute that has ended, if one has."""
         passed, self._last = max(0.0, now - self._last), now

@@ -104,3 +104,19 @@ async def test_a_forward_step_makes_no_robot_stuck(machine: Machine, tmp_path: P
     await manager.step()
     assert robot.moved_at == manager.clock()
     await manager.close()
+
+
+async def test_a_forward_step_is_no_time_of_robots(machine: Machine, tmp_path: Path) -> None:
+    """The utilization of the next day would be that of the moment at which the clock was set."""
+    journal = Journal(tmp_path / "j.sqlite")
+    manager = FleetManager(journal, Planner(), TaskRules(), logging.getLogger("manager"))
+    manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=0, moved_at=manager.clock())
+    machine.wait(30.0)
+    await manager.step()
+    machine.wall += DAY / 4
+    machine.wait(1.0)
+    await manager.step()
+    machine.wait(60.0)
+    await manager.step()
+    assert sum(total for _, _, total in journal.minutes()) == pytest.approx(31.0)
+    await manager.close()
