@@ -27,6 +27,12 @@ REPEAT_AFTER = 1.0
 QUIET_TIME = 1.0
 """Seconds without an active goal after which the robot is considered to have none."""
 
+STAMP_STEP = 1e-3
+"""Seconds between two time stamps while the clock is behind the newest one."""
+
+LATEST_STAMP = 4.2e9
+"""Seconds; a ROS time has 32 bits for them. Goals of others may have any time stamp."""
+
 
 class ClientState(Enum):
     """What a move client does."""
@@ -156,16 +162,25 @@ class MoveClient:
     It begins in ``CANCELLING``: a goal from before a restart of this client may be active, and only the
     robot knows that.
 
+    Time stamps never go back: a robot drops goals that are older than a cancellation, and a cancellation
+    does not stop newer goals. When the clock was set back they grow from the newest one, and waits begin
+    anew.
+
     Args:
         grid: Size and place of the cells.
         name: Prefix of goal ids; two clients of one robot must have different ones.
         started: Time of the start, seconds; makes goal ids different from those before a restart.
+
+    Attributes:
+        newest_stamp: The newest time stamp of a goal or cancellation, seconds.
     """
 
     grid: GridMap
     name: str
     started: float
     _report: ClientReport = field(default_factory=ClientReport)
+    newest_stamp: float = float("-inf")
+    _now: float = float("-inf")
     _heading: float = 0.0
     _goal: SendGoal | None = None
     _step: int | None = None
@@ -190,6 +205,7 @@ class MoveClient:
         Raises:
             ValueError: The list leaves the map or is not a path; nothing was changed.
         """
+        self._see(now)
         known = self._report
         if revision is None:
             if tuple(cells) == known.cells:
@@ -205,10 +221,22 @@ class MoveClient:
 
     def cancel(self, now: float) -> list[Instruction]:
         """Drop the list and stop the robot."""
+        self._see(now)
         return self._drop(self._report.revision, now)
 
-    def take_goal_states(self, states: dict[str, GoalState], now: float) -> list[Instruction]:
-        """Handle the robot's status list, with the finished goals in it."""
+    def take_goal_states(
+        self, states: dict[str, GoalState], now: float, newest_stamp: float = float("-inf")
+    ) -> list[Instruction]:
+        """Handle the robot's status list, with the finished goals in it.
+
+        Args:
+            states: State of each goal by its id.
+            now: Time, seconds.
+            newest_stamp: The newest time stamp of these goals, seconds: of others too, by their clocks.
+        """
+        self._see(now)
+        # One step more: seconds as a number are not exact to the nanosecond.
+        self.newest_stamp = max(self.newest_stamp, min(newest_stamp + STAMP_STEP, LATEST_STAMP))
         if self._report.state is ClientState.CANCELLING:
             return self._await_stop(states, now)
         if self._goal is None:
@@ -221,6 +249,7 @@ class MoveClient:
 
     def take_result(self, goal_id: str, state: GoalState, now: float) -> list[Instruction]:
         """Handle the result of a goal; results of replaced goals are ignored."""
+        self._see(now)
         if self._goal is None or goal_id != self._goal.id or not state.over:
             return []
         if self._report.state is ClientState.CANCELLING:
@@ -229,9 +258,9 @@ class MoveClient:
 
     def tick(self, now: float) -> list[Instruction]:
         """Send a cancellation that had no effect again; call it a few times a second."""
+        self._see(now)
         if self._report.state is ClientState.CANCELLING and now - self._sent_at >= REPEAT_AFTER:
-            self._sent_at = now
-            return [SendStop(now)]
+            return [self._make_stop(now)]
         return []
 
     # Lists
@@ -276,7 +305,8 @@ class MoveClient:
         self._step = cell - report.cells[index - 1] if index else None
         self._update(target=cell)
         self._count += 1
-        self._goal = SendGoal(f"{self.name}-{self.started:.3f}-{self._count}", now, cell, self._heading)
+        stamp = self.newest_stamp = max(now, self.newest_stamp + STAMP_STEP)
+        self._goal = SendGoal(f"{self.name}-{self.started:.3f}-{self._count}", stamp, cell, self._heading)
         self._sent_at = now
         return [self._goal]
 
@@ -324,8 +354,12 @@ class MoveClient:
     def _stop(self, now: float) -> list[Instruction]:
         self._advance(ClientEvent.STOP)
         self._update(target=None)
+        return [self._make_stop(now)]
+
+    def _make_stop(self, now: float) -> SendStop:
         self._sent_at = now
-        return [SendStop(now)]
+        self.newest_stamp = max(now, self.newest_stamp)
+        return SendStop(self.newest_stamp)
 
     def _await_stop(self, states: dict[str, GoalState], now: float) -> list[Instruction]:
         """Return whether all goals have ended.
@@ -350,7 +384,14 @@ class MoveClient:
         self._advance(ClientEvent.STOPPED)
         return [*self._proceed(now), self._report]
 
-    # State
+    # Time and state
+
+    def _see(self, now: float) -> None:
+        """Note the time; if the clock was set back, waits begin anew."""
+        if now < self._now:
+            self._sent_at = min(self._sent_at, now)
+            self._quiet_since = None
+        self._now = now
 
     def _advance(self, event: ClientEvent) -> None:
         state = CLIENT_LIFE.advance(self._report.state, event, self.name, self._recent)

@@ -175,14 +175,14 @@ class MoveClientNode:
     def take_grid(self, grid: GridMap, made: Time | None = None) -> None:
         """Drive on a grid; a goal on another one before is cancelled."""
         self._grid = made or Time()
-        revision = 0
+        revision, newest = 0, float("-inf")
         if self._client is not None:
             if grid == self._client.grid:
                 return
-            revision = self._client.report.revision
+            revision, newest = self._client.report.revision, self._client.newest_stamp
             self._node.log.info("new grid of %d x %d cells", grid.columns, grid.rows)
         now = self._node.time()
-        self._client = MoveClient(grid, self._node.namespace.strip("/"), now, ClientReport(revision))
+        self._client = MoveClient(grid, self._node.namespace.strip("/"), now, ClientReport(revision), newest)
         self._do(self._client.tick(now))
 
     def _take_blocked(self, message: Message) -> None:
@@ -226,9 +226,11 @@ class MoveClientNode:
             self._hear()
         if self._client is not None:
             states = {entry.goal_id.id: GoalState(entry.status) for entry in message.status_list}
+            stamps = (entry.goal_id.stamp.to_sec() for entry in message.status_list)
             if self._client.report.state is ClientState.CANCELLING:
                 self._warn_of_others(self._client, states)
-            self._do(self._client.take_goal_states(states, self._node.time()))
+            newest = max(stamps, default=float("-inf"))
+            self._do(self._client.take_goal_states(states, self._node.time(), newest))
 
     def _warn_of_others(self, client: MoveClient, states: dict[str, GoalState]) -> None:
         """Tell people why their goal ends, who sent it past the planner."""
@@ -273,7 +275,7 @@ class MoveClientNode:
         x, y = self._client.grid.centre(goal.cell)
         z, w = quaternion_z(goal.heading)
         stamp = Time.from_sec(goal.stamp)
-        header = {"stamp": stamp, "frame_id": MAP_FRAME}
+        header = {"stamp": self._node.now(), "frame_id": MAP_FRAME}
         self._goals.publish(
             header=header,
             goal_id={"stamp": stamp, "id": goal.id},

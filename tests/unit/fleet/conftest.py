@@ -63,12 +63,14 @@ class MakeBelieveRobot:
     goals: dict[str, GoalState] = field(default_factory=dict)
     current: SendGoal | None = None
     stopped_until: float = float("-inf")
+    newest_stamp: float = float("-inf")
     stopping: GoalState | None = None
     found: set[int] = field(default_factory=set)
 
     def take_goal(self, goal: SendGoal) -> None:
         if goal.id in self.goals:
             return
+        self.newest_stamp = max(self.newest_stamp, goal.stamp)
         if goal.stamp <= self.stopped_until:
             self.goals[goal.id] = GoalState.RECALLED
             return
@@ -152,6 +154,8 @@ class SimulatedClients:
         self.told_cells: dict[int, str] = {}
         self.sequence = 0
         self.now = 1000.0
+        self.set_forward = 1e9
+        """Seconds by which the clock of move clients, which people can set, is ahead of the planner's."""
         self.planner = planner
         self.grid = planner.state.grid
         self.hidden: set[int] = set()
@@ -168,13 +172,18 @@ class SimulatedClients:
         for number, cell in enumerate(starts, start=1):
             self.add_robot(f"Robot{number}", cell)
 
+    @property
+    def wall(self) -> float:
+        """The time of the move clients."""
+        return self.now + self.set_forward
+
     def add_robot(self, robot: str, cell: int) -> None:
         x, y = self.grid.centre(cell)
         self.robots[robot] = MakeBelieveRobot(robot, self.grid, x, y, self.rng.uniform(0.3, 0.9))
-        self.clients[robot] = MoveClient(self.grid, robot, self.now)
+        self.clients[robot] = MoveClient(self.grid, robot, self.wall)
 
     def restart_client(self, robot: str) -> None:
-        self.clients[robot] = MoveClient(self.grid, robot, self.now)
+        self.clients[robot] = MoveClient(self.grid, robot, self.wall)
 
     def carry(self, robot: str, x: float, y: float) -> None:
         """Let a person put a robot elsewhere. There must be room, and others must be able to stop."""
@@ -264,11 +273,11 @@ class SimulatedClients:
             if robot.id in self.silent:
                 continue
             self._sense(robot)
-            self._post("states", robot.id, self._goal_states, robot.id, dict(robot.goals))
+            self._post("states", robot.id, self._goal_states, robot.id, dict(robot.goals), robot.newest_stamp)
             if robot.found:
                 self._post("obstacle", robot.id, self.tell, ObstacleSeen(robot.id, tuple(robot.found)))
             client = self.clients[robot.id]
-            self._instruct(robot.id, [*client.tick(self.now), client.report])
+            self._instruct(robot.id, [*client.tick(self.wall), client.report])
         self.tell(Tick())
         self.check()
 
@@ -358,17 +367,17 @@ class SimulatedClients:
                 self._plans.append((due, PlanMade(compute_plan(request))))
 
     def _cells(self, robot: str, revision: int, cells: list[int]) -> None:
-        self._instruct(robot, self.clients[robot].take_cells(revision, cells, self.now))
+        self._instruct(robot, self.clients[robot].take_cells(revision, cells, self.wall))
 
     def _cancel(self, robot: str) -> None:
-        self._instruct(robot, self.clients[robot].cancel(self.now))
+        self._instruct(robot, self.clients[robot].cancel(self.wall))
 
     def _result(self, robot: str, goal_id: str, state: GoalState) -> None:
-        self._instruct(robot, self.clients[robot].take_result(goal_id, state, self.now))
+        self._instruct(robot, self.clients[robot].take_result(goal_id, state, self.wall))
 
-    def _goal_states(self, robot: str, states: dict[str, GoalState]) -> None:
+    def _goal_states(self, robot: str, states: dict[str, GoalState], newest: float) -> None:
         self.signs[robot].hear(self.now)
-        self._instruct(robot, self.clients[robot].take_goal_states(states, self.now))
+        self._instruct(robot, self.clients[robot].take_goal_states(states, self.wall, newest))
 
     def _instruct(self, robot: str, instructions: Iterable[SendGoal | SendStop | ClientReport]) -> None:
         for instruction in instructions:

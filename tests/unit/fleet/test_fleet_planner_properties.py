@@ -64,6 +64,29 @@ def test_every_robot_arrives_within_its_own_cells(
 
 
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32), count=st.integers(1, 8))
+def test_robots_stop_and_arrive_though_a_clock_jumps(
+    make_fleet: type[SimulatedClients], seed: int, count: int
+) -> None:
+    """The clock of the machine of the move clients is set by up to an hour, again and again."""
+    rng = Random(seed)
+    grid = connected_map(rng, 3)
+    starts, goals = rng.sample(grid.free, count), rng.sample(grid.free, count)
+    fleet = make_fleet(FleetPlanner(grid), starts, seed, loss=rng.choice((0.0, 0.2)))
+    fleet.send(goals)
+    for _ in range(rng.randrange(4)):
+        for _ in range(rng.randrange(40)):
+            fleet.step()
+        fleet.set_forward += rng.choice((-3600.0, -7.0, -0.5, 3600.0))
+        if rng.random() < 0.3:
+            fleet.restart_client(rng.choice(sorted(fleet.robots)))
+        assert fleet.ask(ModeSet(None, RobotMode.STOPPED)).ok
+        fleet.run(lambda: all(robot.current is None for robot in fleet.robots.values()), limit=10.0)
+        assert fleet.ask(ModeSet(None, RobotMode.AUTOMATIC)).ok
+    fleet.run(fleet.all_arrived)
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 8), carries=st.booleans())
 @example(seed=1523888, count=2, carries=False)  # signs of life come before the poses of a silent time
 @example(seed=3607634174, count=5, carries=True)  # a robot is carried into the way of another

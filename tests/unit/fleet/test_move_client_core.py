@@ -6,6 +6,7 @@ from math import pi
 
 import pytest
 
+from rce.ros.types import Time
 from rce_fleet.coordination.answers import numbered_array, revision_of
 from rce_fleet.coordination.move_client import (
     QUIET_TIME,
@@ -140,8 +141,8 @@ def test_list_while_stopping_waits_for_standstill(client: MoveClient) -> None:
 
 def test_a_list_without_the_target_stops_the_robot_first(client: MoveClient) -> None:
     goal = goal_of(reach(client, goal_of(client.take_cells(1, [0, 1, 2, 3], 10.0))))
-    done = client.take_cells(2, [1, 9], 10.5)
-    assert SendStop(10.5) in done
+    done = client.take_cells(2, [1, 9], 11.5)
+    assert SendStop(11.5) in done
     assert cells_sent(client.take_result(goal.id, GoalState.PREEMPTED, 10.9)) == [1]
 
 
@@ -182,6 +183,67 @@ def test_goal_from_before_a_restart_is_waited_for() -> None:
     assert state_of(client) is ClientState.CANCELLING
     client.take_goal_states({"old": GoalState.PREEMPTED}, 6.0 + QUIET_TIME)
     assert state_of(client) is ClientState.IDLE
+
+
+HOUR = 3600.0
+
+
+def test_after_a_clock_step_back_a_stop_still_counts(client: MoveClient) -> None:
+    """A robot does not stop for a cancellation that is older than its goal."""
+    goal = goal_of(client.take_cells(1, [0, 1], 10_000.0))
+    (stop, _) = client.cancel(10_001.0 - HOUR)
+    assert isinstance(stop, SendStop)
+    assert stop.stamp >= goal.stamp
+    assert client.take_goal_states({goal.id: GoalState.ACTIVE}, 10_001.5 - HOUR) == []
+    assert client.tick(10_001.0 + REPEAT_AFTER - HOUR) == [stop], "it was lost, perhaps"
+
+
+def test_after_a_clock_step_back_new_goals_are_newer_than_stops(client: MoveClient) -> None:
+    """A robot recalls a goal that is older than a cancellation."""
+    goal = goal_of(client.take_cells(1, [0, 1], 10_000.0))
+    (stop, _) = client.cancel(10_001.0)
+    assert isinstance(stop, SendStop)
+    client.take_goal_states({goal.id: GoalState.PREEMPTED}, 10_001.2)
+    first = goal_of(client.take_cells(2, [0, 1], 10_002.0 - HOUR))
+    assert first.stamp > stop.stamp
+    second = goal_of(reach(client, first, 10_003.0 - HOUR))
+    assert second.stamp > first.stamp
+
+
+def test_after_a_clock_step_back_waits_begin_anew(client: MoveClient) -> None:
+    """Without this a lost goal is sent again, and a silent robot counts as quiet, after an hour."""
+    goal = goal_of(client.take_cells(1, [0, 1], 10_000.0))
+    now = 10_000.5 - HOUR
+    assert client.take_goal_states({}, now) == []
+    assert client.take_goal_states({}, now + REPEAT_AFTER) == [goal]
+    client.cancel(now + 1.5)
+    client.take_goal_states({}, now + 1.6)
+    now -= HOUR
+    client.take_goal_states({}, now)
+    client.take_goal_states({}, now + QUIET_TIME / 2)
+    assert state_of(client) is ClientState.CANCELLING
+    client.take_goal_states({}, now + QUIET_TIME)
+    assert state_of(client) is ClientState.IDLE
+
+
+def test_goals_of_a_clock_that_is_ahead_are_stopped() -> None:
+    """A goal from before a restart on another machine, or of a person's computer."""
+    client = MoveClient(GridMap(), "Robot1", 0.0)
+    client.tick(0.0)
+    ahead = 1_700_000_000.123456789
+    client.take_goal_states({"rviz-1": GoalState.ACTIVE}, 0.5, ahead)
+    (stop,) = client.tick(REPEAT_AFTER)
+    assert isinstance(stop, SendStop)
+    assert stop.stamp > ahead
+    client.take_goal_states({"rviz-1": GoalState.PREEMPTED}, 2.0, ahead)
+    client.take_goal_states({"rviz-1": GoalState.PREEMPTED}, 2.0 + QUIET_TIME, ahead)
+    assert goal_of(client.take_cells(1, [0, 1], 4.0)).stamp > stop.stamp
+
+
+def test_a_goal_at_the_end_of_time_breaks_no_message(client: MoveClient) -> None:
+    client.take_goal_states({"rviz-1": GoalState.SUCCEEDED}, 10.0, 2.0**32 - 1)
+    goal = goal_of(client.take_cells(1, [0, 1], 11.0))
+    assert Time.from_sec(goal.stamp)
 
 
 def test_a_robot_that_gives_up_is_reported_and_can_be_sent_again(client: MoveClient) -> None:
