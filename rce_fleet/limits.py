@@ -2,11 +2,15 @@
 
 MOST_CELL = 2**31 - 1
 """Largest number of a cell: messages have 32 bits for it."""
+MOST_METRES = 1e9
+"""Farthest place, metres from the map's origin along x or y: sums of greater ones are not finite."""
 MOST_TIME = 1e11
 """Latest time, seconds since 1970: in three thousand years."""
 MOST_LATE = 1e9
 """Seconds; a task that is later is not more urgent."""
 MOST_OCCURRENCES = 10**9
+MOST_REVISION = 2**53
+"""Largest number of a robot's list of cells: messages have 63 bits, and the planner counts on from it."""
 MOST_AMOUNT = 1e6
 """Most kilograms, watts, watt hours, and watt hours for each metre."""
 LEAST_CAPACITY = 1e-3

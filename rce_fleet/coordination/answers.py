@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rce_fleet.coordination.move_client import ClientReport, ClientState
 from rce_fleet.coordination.robot_signs import NO_SIGN, RobotPose, RobotSign
+from rce_fleet.limits import MOST_REVISION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -80,8 +81,31 @@ def read_answer(labels: Sequence[str], sizes: Sequence[int], data: Sequence[int]
     ends = accumulate(sizes, initial=0)
     cells, progress, blocked, *rest = (tuple(data[begin:end]) for begin, end in pairwise(ends))
     reached, target = (None if cell == _NONE else cell for cell in progress)
-    report = ClientReport(int(revision), ClientState(state), cells, reached, target)
+    report = ClientReport(read_revision(int(revision)), read_client_state(state), cells, reached, target)
     return Answer(report, blocked, rest[0] if rest else (), _read_sign(labels[1]))
+
+
+def read_client_state(text: str) -> ClientState:
+    """Return the state that a move client reports.
+
+    Raises:
+        ValueError: There is no such state.
+    """
+    known = {state.value: state for state in ClientState}
+    if text not in known:
+        raise ValueError(f"its state must be one of {', '.join(known)}, not {text!r}")
+    return known[text]
+
+
+def read_revision(revision: int) -> int:
+    """Return the number of a list that a move client reports.
+
+    Raises:
+        ValueError: No planner has sent so many lists.
+    """
+    if not 0 <= revision <= MOST_REVISION:
+        raise ValueError(f"the number of its list must be within 0 .. {MOST_REVISION}, not {revision}")
+    return revision
 
 
 def _sign_label(sign: RobotSign) -> str:

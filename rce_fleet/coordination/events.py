@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf
+from math import inf, isfinite
 from typing import TYPE_CHECKING
+
+from rce_fleet.limits import MOST_METRES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,6 +36,11 @@ class PoseSeen:
     yaw: float
     spread: float | None = None
     yaw_spread: float | None = None
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether a robot can be there; other poses are ignored."""
+        return abs(self.x) <= MOST_METRES and abs(self.y) <= MOST_METRES and isfinite(self.yaw)
 
 
 @dataclass(frozen=True, slots=True)

@@ -142,7 +142,7 @@ class FleetPlanner:
     # What robots say
 
     def _take_pose(self, event: PoseSeen) -> None:
-        if not (isfinite(event.x) and isfinite(event.y) and isfinite(event.yaw)) or self._gone(event.robot):
+        if not event.is_possible or self._gone(event.robot):
             return
         record = self._record(event.robot)
         record.see(event.x, event.y, event.yaw, self._now, self.settings)
@@ -174,7 +174,7 @@ class FleetPlanner:
             self._blocking.take_robot(here)
 
     def _take_sign(self, event: RobotHeard) -> None:
-        if self._gone(event.robot):
+        if not isfinite(event.age) or self._gone(event.robot):
             return
         record = self._record(event.robot)
         record.hear(self._now - max(event.age, 0.0), self.settings)

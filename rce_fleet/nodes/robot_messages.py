@@ -5,8 +5,9 @@ from __future__ import annotations
 from math import hypot, isfinite, sqrt
 from typing import TYPE_CHECKING
 
+from rce_fleet.coordination.answers import read_client_state, read_revision
 from rce_fleet.coordination.events import PoseSeen
-from rce_fleet.coordination.move_client import ClientReport, ClientState
+from rce_fleet.coordination.move_client import ClientReport
 from rce_fleet.coordination.robot_signs import RobotSign
 from rce_fleet.geometry.angles import yaw_of
 
@@ -43,10 +44,14 @@ def _spreads(covariance: Sequence[float]) -> tuple[float | None, float | None]:
 
 
 def read_report(message: Message) -> ClientReport:
-    """Return the report of a ``fleet/MoveStatus``."""
+    """Return the report of a ``fleet/MoveStatus``.
+
+    Raises:
+        ValueError: No move client has this state, or its list this number.
+    """
     return ClientReport(
-        revision=message.revision,
-        state=ClientState(message.state),
+        revision=read_revision(message.revision),
+        state=read_client_state(message.state),
         cells=tuple(message.cells),
         reached=None if message.reached < 0 else message.reached,
         target=None if message.target < 0 else message.target,

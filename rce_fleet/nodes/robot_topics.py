@@ -9,6 +9,7 @@ from rce_fleet.coordination.answers import is_answer, numbered_array, read_answe
 from rce_fleet.coordination.events import Event, ObstacleGone, ObstacleSeen, PoseSeen, ReportSeen, RobotHeard
 from rce_fleet.nodes.grid_messages import grid_name
 from rce_fleet.nodes.robot_messages import read_pose_seen, read_report, read_sign
+from rce_fleet.nodes.throttled_log import ThrottledLog
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -48,6 +49,7 @@ class RobotTopics:
         self._cells: dict[str, Publisher] = {}
         self._cancels: dict[str, Publisher] = {}
         self._obstacles_from = 0.0
+        self._throttled_log = ThrottledLog(node)
         self.client_grids: dict[str, str] = {}
 
     def __contains__(self, robot: str) -> bool:
@@ -92,7 +94,12 @@ class RobotTopics:
         seen = await node.advertise(f"/fleet/poses/{robot}", POSE, latch=True)
 
         def take(message: Message) -> None:
-            self._take(read_pose_seen(robot, message))
+            pose = read_pose_seen(robot, message)
+            if not pose.is_possible:
+                text = f"expected finite numbers (metres, radians), found {pose.x}, {pose.y}, {pose.yaw}"
+                self._throttled_log.warn(robot, f"poses of {robot} are ignored: {text}")
+                return
+            self._take(pose)
             self._poses.take(robot, message)
             seen.publish(message)
 
@@ -126,7 +133,7 @@ class RobotTopics:
         try:
             answer = read_answer(labels, [dimension.size for dimension in dimensions], message.data)
         except ValueError as error:
-            self._node.log.warning("%s: %s", robot, error)
+            self._warn_of_report(robot, error)
             return
         self._take_report(robot, answer.report, answer.sign)
         if answer.blocked:
@@ -135,8 +142,16 @@ class RobotTopics:
             self._take(ObstacleGone(robot, answer.freed))
 
     def _take_status(self, robot: str, message: Message) -> None:
+        try:
+            report = read_report(message)
+        except ValueError as error:
+            self._warn_of_report(robot, error)
+            return
         self.client_grids[robot] = grid_name(message.grid)
-        self._take_report(robot, read_report(message), read_sign(message))
+        self._take_report(robot, report, read_sign(message))
+
+    def _warn_of_report(self, robot: str, error: ValueError) -> None:
+        self._throttled_log.warn(robot, f"a report of the move client of {robot} is ignored: {error}")
 
     def _take_obstacle(self, event: ObstacleSeen | ObstacleGone) -> None:
         """Handle cells that a robot reports, unless they may be of the grid before."""

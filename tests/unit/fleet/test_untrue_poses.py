@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from math import inf, nan
 from typing import TYPE_CHECKING
 
-from rce_fleet.coordination.events import GoalSet, PoseSeen, SendCancel
+import pytest
+
+from rce_fleet.coordination.events import GoalSet, PoseSeen, RobotHeard, SendCancel
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.snapshot import RobotSnapshot, RobotState
 from rce_fleet.planning.grid import GridMap
@@ -41,6 +44,34 @@ def test_a_robot_that_jumps_to_and_fro_is_not_driven(make_fleet: type[SimulatedC
         fleet.tell(PoseSeen("Robot1", *(false, true)[number % 2], 0.0))
         assert 0 in fleet.planner.state.ledger.claims("Robot1")
         assert robot(fleet).state in (RobotState.STOPPING, RobotState.SILENT)
+
+
+@pytest.mark.parametrize("far", [nan, inf, -inf, 1.7e308, -1e308, 1.001e9])
+@pytest.mark.parametrize("is_mute", [False, True])
+def test_a_place_that_no_robot_can_be_at_is_ignored(
+    make_fleet: type[SimulatedClients], far: float, is_mute: bool
+) -> None:
+    """The sums of such a place with a cell's size are not finite: the planner ended, or lost other robots."""
+    fleet = make_fleet(FleetPlanner(GridMap(cell_size=0.8, yaw=0.5)), [0, 24], 1, loss=0.0)
+    fleet.mute = {"Robot1"} if is_mute else set()
+    fleet.run(lambda: fleet.states() == [RobotState.IDLE] * 2)
+    for number, goal in enumerate((7, 31), start=1):
+        assert fleet.ask(GoalSet(f"Robot{number}", goal)).ok
+    for step in range(100):
+        fleet.tell(PoseSeen("Robot1", *((far, 0.5), (0.5, far))[step % 2], 0.0))
+        fleet.step()
+    fleet.run(fleet.all_arrived)
+
+
+def test_an_age_that_is_no_number_tells_nothing(make_fleet: type[SimulatedClients]) -> None:
+    fleet = make_fleet(FleetPlanner(GridMap()), [0], 1, loss=0.0, pose_step=0.2)
+
+    def settled_meanwhile() -> bool:
+        fleet.tell(RobotHeard("Robot1", nan))
+        fleet.tell(RobotHeard("Robot1", inf))
+        return fleet.settled()
+
+    fleet.run(settled_meanwhile, limit=20.0)
 
 
 def test_a_move_client_that_answers_nothing_is_driven_by_poses(make_fleet: type[SimulatedClients]) -> None:
