@@ -10,7 +10,7 @@ from __future__ import annotations
 from math import ceil, isnan
 from typing import TYPE_CHECKING
 
-from rce_fleet.coordination.events import Instruction, PoseSeen
+from rce_fleet.coordination.events import Instruction, PoseSeen, RobotsExpected
 from rce_fleet.coordination.move_client import ClientState
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.coordination.robot import Phase, RobotRecord
@@ -42,8 +42,10 @@ def refuse_grid(planner: FleetPlanner, grid: GridMap) -> str:
     holders: dict[int, str] = {}
     for robot in sorted(state.robots):
         record = state.robots[robot]
-        reason = _under_way(state, record, planner.settings) or _misplaced(
-            state, record, planner.settings, grid, shut, holders
+        reason = (
+            _under_way(state, record, planner.settings)
+            or _unheard(state, record)
+            or _misplaced(state, record, planner.settings, grid, shut, holders)
         )
         if reason:
             return reason
@@ -75,7 +77,7 @@ def next_planner(planner: FleetPlanner, grid: GridMap, now: float) -> tuple[Flee
         made.state.block(cell)
     made.state.requested |= by_people - grid.blocked
     made.state.sensed |= sensed - grid.blocked
-    instructions = []
+    instructions = made.handle(RobotsExpected(dict.fromkeys(planner.expected, ())), now)
     for record in old.robots.values():
         if not isnan(record.x):
             instructions += made.handle(PoseSeen(record.id, record.x, record.y, record.yaw), now)
@@ -116,6 +118,13 @@ def _under_way(state: FleetState, record: RobotRecord, settings: FleetSettings) 
     has_finished = report is not None and report.revision == record.revision and report.state in _AT_REST
     if not has_finished and not record.pose_only:
         return f"the move client of {robot} has not finished its last list of cells: try again in a second"
+    return ""
+
+
+def _unheard(state: FleetState, record: RobotRecord) -> str:
+    """Return why a robot may be in cells that an earlier planner granted it; empty if its place is known."""
+    if isnan(record.x) and state.ledger.claims(record.id):
+        return f"{record.id} may be driving and has sent no pose yet: wait for it, or remove it"
     return ""
 
 

@@ -123,6 +123,11 @@ class FleetPlanner:
         return self._dispatcher.is_taking_over()
 
     @property
+    def expected(self) -> list[str]:
+        """Robots that exist and have not been heard yet; no cells are granted until they are, for a while."""
+        return sorted(self._dispatcher.expected)
+
+    @property
     def sequence(self) -> int:
         """Number of the last change that :meth:`take_changes` returned; the snapshot holds it."""
         return self.state.log.sequence

@@ -10,7 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rce_fleet.coordination.events import CellBlocked, GoalSet, ObstacleGone, ObstacleSeen, Tick
+from rce_fleet.coordination.events import (
+    CellBlocked,
+    GoalSet,
+    ObstacleGone,
+    ObstacleSeen,
+    RobotRemoved,
+    RobotsExpected,
+    Tick,
+)
 from rce_fleet.coordination.grid_change import carried_cells, next_planner, refuse_grid
 from rce_fleet.coordination.move_client import ClientReport, MoveClient
 from rce_fleet.coordination.planner import FleetPlanner
@@ -73,6 +81,23 @@ def test_a_silent_robot_forbids_the_change(make_fleet: type[SimulatedClients]) -
     fleet.silent = {"Robot1"}
     fleet.run(lambda: fleet.states() == [RobotState.SILENT])
     assert "Robot1 is silent" in refuse_grid(fleet.planner, FINER)
+
+
+def test_a_robot_that_was_not_heard_yet_forbids_the_change() -> None:
+    """An earlier planner granted it cells. The planner of the new grid would not know of them."""
+    planner = FleetPlanner(GridMap())
+    planner.handle(RobotsExpected({"Robot2": (61, 62)}), 0.0)
+    assert "Robot2 may be driving and has sent no pose yet" in refuse_grid(planner, FINER)
+    planner.handle(RobotRemoved("Robot2"), 1.0)
+    assert refuse_grid(planner, FINER) == ""
+
+
+def test_robots_are_awaited_on_the_new_grid_too(make_fleet: type[SimulatedClients]) -> None:
+    fleet = make_fleet(FleetPlanner(GridMap()), [0], 3, loss=0.0)
+    fleet.tell(RobotsExpected({"Robot2": ()}))
+    fleet.run(lambda: refuse_grid(fleet.planner, FINER) == "", limit=3.0)
+    planner, _ = next_planner(fleet.planner, FINER, fleet.now)
+    assert planner.expected == ["Robot2"]
 
 
 @pytest.mark.parametrize(
