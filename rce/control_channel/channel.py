@@ -265,7 +265,7 @@ class TaskSetChannel:
                 compression=None,
                 proxy=None,
                 open_timeout=self._timeouts.open,
-                ping_interval=self._timeouts.ping_interval,
+                ping_interval=self._timeouts.master_ping_interval,
                 ping_timeout=self._timeouts.ping_timeout,
                 close_timeout=self._timeouts.close,
                 max_size=MAX_FRAME,

@@ -14,6 +14,9 @@ class ControlTimeouts:
     open: float = 5.0
     """A dial, with its handshake, and the first message after it."""
     ping_interval: float = 5.0
+    master_ping_interval: float = 2.0
+    """The task set's on the control channel: of several masters, another one leads soon after the leading one
+    hangs."""
     ping_timeout: float = 5.0
     """A peer that does not answer a ping for so long is gone."""
     close: float = 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from rce.control_channel.timeouts import DEFAULT_TIMEOUTS
 from rce.liveness import Liveness, Step
 
 
@@ -21,6 +22,15 @@ def test_silent_peer_is_pinged_and_given_up() -> None:
     assert steps(liveness, 3.5) == []
     assert steps(liveness, 0.5) == [Step.GIVE_UP]
     assert liveness.silent == pytest.approx(6.0)
+
+
+def test_task_set_leaves_a_hanging_master_soon() -> None:
+    """Another master leads when the lease of 3 s has ended; task sets have 10 s from then."""
+    liveness = Liveness(DEFAULT_TIMEOUTS.master_ping_interval, DEFAULT_TIMEOUTS.ping_timeout)
+    liveness.look(liveness.period, heard=True)  # and the master hangs right after its last sign of life
+    while liveness.look(liveness.period, heard=False) is not Step.GIVE_UP:
+        pass
+    assert liveness.silent + liveness.period + DEFAULT_TIMEOUTS.close < 9.0
 
 
 def test_each_sign_of_life_begins_anew() -> None:

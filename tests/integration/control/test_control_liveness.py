@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from rce.control import ToMaster
     from rce.control_channel.peer import Peer
 
-IMPATIENT = replace(QUICK, ping_interval=0.3, ping_timeout=0.5)
+IMPATIENT = replace(QUICK, ping_interval=0.3, master_ping_interval=0.3, ping_timeout=0.5)
 """A message on the slow link takes much longer."""
-PATIENT = replace(QUICK, ping_interval=60.0, ping_timeout=60.0)
+PATIENT = replace(QUICK, ping_interval=60.0, master_ping_interval=60.0, ping_timeout=60.0)
 RATE = 400e3
 LONG = "x" * 1_500_000
 
