@@ -64,7 +64,7 @@ class CertificateFolder:
 
     @property
     def revoked(self) -> Path:
-        """The list of revoked certificates; missing before the first revocation."""
+        """The list of revoked certificates; may be missing before the first revocation."""
         return self.certificate(REVOKED)
 
     def has(self, name: str) -> bool:
@@ -143,10 +143,23 @@ class CertificateFolder:
         now = datetime.now(UTC)
         added = [Revocation(serial, now) for serial in sorted(serials - {one.serial for one in known})]
         if added:
-            text = make_list(self._authority(), [*known, *added])
-            with self._writing():
-                _write_private(self.revoked, text)
+            self._write_list([*known, *added])
         return added
+
+    def ensure_list(self) -> None:
+        """Write an empty list of revoked certificates if there is none, for programs that need the file.
+
+        Raises:
+            CertificateError: No authority is here, or the file cannot be written.
+        """
+        self._need_authority()
+        if not self.revoked.exists():
+            self._write_list([])
+
+    def _write_list(self, revoked: list[Revocation]) -> None:
+        text = make_list(self._authority(), revoked)
+        with self._writing():
+            _write_private(self.revoked, text)
 
     def revocations(self) -> list[Revocation]:
         """Return the revocations, oldest first.

@@ -25,7 +25,7 @@ from rce.services.units import SYSTEM_STATE, Role
 from rce.supervision.process import end_with
 from rce.tls import CertificateError
 from rce.tls.choice import TlsChoice
-from rce.tls.folder import CertificateFolder
+from rce.tls.folder import AUTHORITY, CertificateFolder
 from rce_master.cli.client import run
 from rce_master.cluster.files import CERTIFICATE, Machine, find_etcd, read_config
 from rce_master.cluster.joining import (
@@ -326,6 +326,8 @@ async def _init(local: _Local) -> None:
                 done = folder.ensure(
                     CERTIFICATE, [machine.host, socket.gethostname(), "localhost", "127.0.0.1"]
                 )
+                if folder.has(AUTHORITY):
+                    folder.ensure_list()
             except CertificateError as error:
                 raise ClusterError(str(error)) from error
             if done:
@@ -344,9 +346,9 @@ async def _init(local: _Local) -> None:
         if machine.tls:
             typer.echo(
                 f"for each further machine: rce certificate issue NAME --host ADDRESS --certificates"
-                f" {machine.certificates}; copy NAME.pem, NAME.key and authority.pem to it, as"
-                f" {CERTIFICATE}.pem,"
-                f" {CERTIFICATE}.key and authority.pem in its folder of certificates"
+                f" {machine.certificates}; copy NAME.pem, NAME.key, authority.pem and"
+                f" revoked.pem to it, as {CERTIFICATE}.pem, {CERTIFICATE}.key, authority.pem and revoked.pem"
+                " in its folder of certificates"
             )
         typer.echo(f"there, with the same secret: rce cluster join {machine.client} --address ADDRESS")
         return members
@@ -385,7 +387,7 @@ def _check_certificate(machine: Machine) -> None:
         f"on the machine with the authority run: rce certificate issue {machine.name} --host"
         f" {machine.host}; copy"
         f" {machine.name}.pem to {folder.certificate(CERTIFICATE)}, {machine.name}.key to"
-        f" {folder.key(CERTIFICATE)} and authority.pem to {folder.authority}"
+        f" {folder.key(CERTIFICATE)}, and authority.pem and revoked.pem to {folder.path}"
     )
     if not folder.has(CERTIFICATE) or not folder.authority.exists():
         raise ClusterError(f"this machine has no certificate in {folder.path}: {how}")

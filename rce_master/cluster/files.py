@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from rce.tls.choice import ENGINE
+from rce.tls.folder import CertificateFolder
 from rce_master.cluster.members import ClusterError
 from rce_master.store.etcd.client import MIN_VERSION
 from rce_master.store.etcd.layout import MAX_OPERATIONS
@@ -30,6 +31,9 @@ _KEYS = {"name", "advertise-client-urls", "initial-advertise-peer-urls", "initia
 """What a configuration must have."""
 _STATE = "initial-cluster-state"
 _JOINS = "existing"
+_REVOCATION = ("ClientTLSInfo", "PeerTLSInfo")
+"""Where etcd takes the list of revoked certificates, which it reads at each connection: its configuration has
+no key of its own for the list, only the names of its fields."""
 _FIXED = {
     "enable-grpc-gateway": True,  # etcd 3.4 leaves it out if a file configures it
     "max-txn-ops": MAX_OPERATIONS,
@@ -134,6 +138,9 @@ class Machine:
                 "client-cert-auth": True,
             }
             found |= {"client-transport-security": security, "peer-transport-security": security}
+            revoked = CertificateFolder(self.certificates).revoked
+            if revoked.exists():  # with a file that is missing, etcd refuses all
+                found |= {key: {"CRLFile": str(revoked)} for key in _REVOCATION}
         return found
 
     def write(self, peers: dict[str, str], *, new: bool) -> None:

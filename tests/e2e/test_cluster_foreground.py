@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
+import ssl
 import sys
+from http import HTTPStatus
 from pathlib import Path
 
+import aiohttp
 import psutil
 import pytest
 from faults.machines import fetch
@@ -124,3 +127,37 @@ async def test_requests_with_a_certificate_are_not_logged_by_etcd(tmp_path: Path
         assert "ignoring common name" not in init.program.output()
     finally:
         await init.program.stop()
+
+
+async def test_etcd_refuses_a_certificate_from_its_revocation_on(tmp_path: Path) -> None:
+    """A stolen machine must not read the state, which holds the hashes of passwords."""
+    init = Init(tmp_path)
+    await init.start()
+    folder = init.state / "certificates"
+    try:
+        await rce_certificate(init, "issue", "m2", "--host", LOOPBACK)
+        assert await serves(init.client, folder, "m2")
+        await rce_certificate(init, "revoke", "m2")
+        assert not await serves(init.client, folder, "m2")
+        assert await serves(init.client, folder, "engine")
+    finally:
+        await init.program.stop()
+
+
+async def rce_certificate(init: Init, *words: str) -> None:
+    argv = (RCE, "certificate", *words, "--certificates", str(init.state / "certificates"))
+    code, output = await run_to_end(*argv, env=init.env)
+    assert code == 0, output
+
+
+async def serves(port: int, folder: Path, name: str) -> bool:
+    """Ask etcd with a certificate; return whether it answered."""
+    context = ssl.create_default_context(cafile=str(folder / "authority.pem"))
+    context.load_cert_chain(folder / f"{name}.pem", folder / f"{name}.key")
+    connector = aiohttp.TCPConnector(ssl=context)
+    async with aiohttp.ClientSession(connector=connector) as session:
+        try:
+            async with session.get(f"https://{LOOPBACK}:{port}/health") as answer:
+                return answer.status == HTTPStatus.OK
+        except aiohttp.ClientError:
+            return False

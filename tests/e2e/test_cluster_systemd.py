@@ -210,7 +210,7 @@ async def make_cluster(made: list[Server]) -> None:
         issue = f"certificate issue {server.name} --host {server.address} --certificates {CERTIFICATES}"
         await first.rce(issue)
         given = {f"{server.name}.pem": "engine.pem", f"{server.name}.key": "engine.key"}
-        for source, target in {**given, "authority.pem": "authority.pem"}.items():
+        for source, target in {**given, **{name: name for name in ("authority.pem", "revoked.pem")}}.items():
             text = first.machine.run(f"cat {CERTIFICATES}/{source}")
             put = f"umask 077; mkdir -p {CERTIFICATES}; cat >{CERTIFICATES}/{target}"
             server.machine.run(put, stdin=text)

@@ -140,6 +140,16 @@ def test_configuration_is_written_and_read(tmp_path: Path) -> None:
     assert plain["initial-cluster-state"] == "new"
 
 
+def test_etcd_reads_the_list_of_revoked_certificates_if_there_is_one(tmp_path: Path) -> None:
+    one = machine(tmp_path)
+    one.certificates.mkdir()
+    assert "ClientTLSInfo" not in one.document({}, new=True)
+    (one.certificates / "revoked.pem").touch()
+    found = one.document({}, new=True)
+    expected = {"CRLFile": str(one.certificates / "revoked.pem")}
+    assert (found["ClientTLSInfo"], found["PeerTLSInfo"]) == (expected, expected)
+
+
 def test_the_master_asks_its_own_member_first(tmp_path: Path) -> None:
     words = machine(tmp_path).master_arguments(("10.0.0.2:2379", "10.0.0.1:2379"))
     assert words[:2] == ["--store", "etcds://10.0.0.1:2379,10.0.0.2:2379"]
