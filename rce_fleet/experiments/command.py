@@ -19,6 +19,7 @@ from rce_fleet.experiments.experiment import PAPER_SYSTEMS, Experiment, Options
 from rce_fleet.experiments.machines import check_machines
 from rce_fleet.experiments.ownership import sweep
 from rce_fleet.experiments.report import make_report, read_second
+from rce_fleet.experiments.results import error_text
 from rce_fleet.experiments.runner import TABLE, Plan, Runner
 from rce_fleet.experiments.systems.registry import system_of
 from rce_fleet.experiments.systems.software import SOFTWARES, USUAL, software_of
@@ -116,18 +117,13 @@ def experiment(
         typer.echo(f"raw data: {folder / TABLE}")
         _report([folder], page, second or [])
     except (ExperimentError, OSError) as error:
-        typer.echo(f"rce experiment: {_told(error)}", err=True)
+        typer.echo(f"rce experiment: {error_text(error)}", err=True)
+        if folder is not None:
+            typer.echo(f"what is done stays; go on with --resume {folder}", err=True)
         raise typer.Exit(1) from error
     except (asyncio.CancelledError, KeyboardInterrupt):
         typer.echo("interrupted" + (f"; go on with --resume {folder}" if folder else ""), err=True)
         raise typer.Exit(INTERRUPTED) from None
-
-
-def _told(error: Exception) -> str:
-    """Return an error's text; of an error of the system, the file and the reason."""
-    if isinstance(error, OSError) and error.strerror and error.filename:
-        return f"{error.filename}: {error.strerror}"
-    return str(error)
 
 
 def _experiments(name: str, folders: list[Path] | None) -> list[Experiment]:
@@ -149,7 +145,7 @@ def _check_report(page: Path | None, second: list[Path]) -> None:
         page.with_suffix("").mkdir(parents=True, exist_ok=True)
         page.open("a").close()
     except OSError as error:
-        raise ExperimentError(f"--page {page} cannot be written: {_told(error)}") from error
+        raise ExperimentError(f"--page {page} cannot be written: {error_text(error)}") from error
 
 
 def _report(folders: list[Path], page: Path | None, second: list[Path]) -> None:
@@ -223,7 +219,7 @@ def _folder(planned: Plan, resume: Path | None, output: Path | None) -> Path:
         folder.mkdir(parents=True)
         environment.write(folder, description)
     except OSError as error:
-        raise ExperimentError(f"--output {folder} cannot be made: {_told(error)}") from error
+        raise ExperimentError(f"--output {folder} cannot be made: {error_text(error)}") from error
     return folder
 
 
@@ -240,7 +236,7 @@ def _check_same(folder: Path, planned: Plan) -> None:
             f"--resume {folder}: it is not the folder of an experiment, for there is no {environment.FILE}"
         ) from None
     except (OSError, ValueError) as error:
-        raise ExperimentError(f"--resume {folder}: {_told(error)}") from error
+        raise ExperimentError(f"--resume {folder}: {error_text(error)}") from error
     description = environment.describe(planned.options, planned.seed, planned.runs)
     for key in ("commit", "seed", "options"):
         if former.get(key) != description[key]:

@@ -106,6 +106,13 @@ def by_condition(rows: Iterable[Row], metric: str) -> Mapping[Condition, list[fl
     return {condition: [value for _, value in sorted(pairs)] for condition, pairs in found.items()}
 
 
+def error_text(error: Exception) -> str:
+    """Return an error's text; of an error of the system, the file and the reason."""
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
 def joined_factors(factors: tuple[tuple[str, str], ...]) -> str:
     """Return factors as they are written in tables, ``name=value;name=value``.
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.bench import CLIENT, SERVER, Bench
 from rce_fleet.experiments.experiment import NOT_ANY, Experiment, Options, Trial
-from rce_fleet.experiments.results import Condition, Row, read_rows, write_rows
+from rce_fleet.experiments.results import Condition, Row, error_text, read_rows, write_rows
 from rce_fleet.experiments.schedule import WARM_UP, Run, remaining, schedule
 from rce_fleet.experiments.systems.base import together
 from rce_fleet.experiments.systems.software import software_of
@@ -186,6 +186,7 @@ class Runner:
 
         Raises:
             ExperimentError: Something cannot be done; what is done stays.
+            OSError: The table cannot be read or written.
         """
         self._drop_unfinished()
         await self._prepare_software()
@@ -226,10 +227,11 @@ class Runner:
             try:
                 measured = await work.experiment.measure(trial)
                 break
-            except ExperimentError as error:
+            except (ExperimentError, OSError) as error:
+                text = error_text(error)
                 if attempt == TRIES:
-                    raise ExperimentError(f"{_named(work)}: {error}") from error
-                self._say(f"{_named(work)} is tried again: {error}")
+                    raise ExperimentError(f"{_named(work)}: {text}") from error
+                self._say(f"{_named(work)} is tried again: {text}")
         if run.number == WARM_UP:
             return
         rows = [Row(one.condition, run.number, *one.value) for one in measured]

@@ -257,13 +257,13 @@ async def together(*works: Coroutine[object, object, object]) -> None:
     """Do several things at the same time.
 
     Raises:
-        ExperimentError: One of them cannot be done; the others are cancelled.
+        ExperimentError, OSError: One of them cannot be done; the others are cancelled.
     """
     try:
         async with asyncio.TaskGroup() as tasks:
             for work in works:
                 tasks.create_task(work)
-    except* ExperimentError as errors:
+    except* (ExperimentError, OSError) as errors:
         raise next(errors_in(errors)) from None
 
 

@@ -186,3 +186,17 @@ class Stuck(Dice):
 async def test_an_error_of_a_quick_plan_ends_its_other_runs(tmp_path: Path) -> None:
     with pytest.raises(ExperimentError, match="the dice fell off the table"):
         await runner(tmp_path, Stuck(), [], options=QUICK).run()
+
+
+async def test_an_error_of_the_system_names_the_run(tmp_path: Path) -> None:
+    """As a full disk: it is told as other errors are, and what is done stays."""
+
+    class Full(Dice):
+        async def measure(self, trial: Trial) -> list[Measured]:
+            if len(self.trials) < len(OPTIONS.systems):
+                return await super().measure(trial)
+            (tmp_path / "missing" / "images").write_bytes(b"")
+            raise AssertionError
+
+    with pytest.raises(ExperimentError, match=r"dice: \w+ rce, run 1: .*missing/images: No such file"):
+        await runner(tmp_path, Full(), []).run()
