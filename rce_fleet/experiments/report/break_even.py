@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from math import isnan
 from typing import TYPE_CHECKING
 
 from rce_fleet.experiments.report.crossing import crossing_table
@@ -10,6 +11,7 @@ from rce_fleet.experiments.report.judging import is_above
 from rce_fleet.experiments.report.labels import natural, software_label, system_label
 from rce_fleet.experiments.report.measurements import Quantity
 from rce_fleet.experiments.report.tables import MISSING, folded, markdown
+from rce_fleet.experiments.statistics import MIN_RUNS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 
 TIME = Quantity("task_time")
 NEVER = "at none that was measured"
+NOT_JUDGED = f"not judged: fewer than {MIN_RUNS} runs"
 
 
 def break_even_table(measurements: Measurements, experiment: str) -> str:
@@ -46,17 +49,19 @@ def break_even_table(measurements: Measurements, experiment: str) -> str:
         }
         if others:
             names = (system_label(system), software_label(software), task, delay)
-            rows.append([*names, first_faster(by_rate, others) or NEVER])
+            rows.append([*names, first_faster(by_rate, others)])
     head = ("system", "software", "task", "delay", f"cloud is faster (`{TIME}`) from this rate on, Mbit/s")
     first = folded("Break-even", markdown(head, rows)) if rows else ""
     return "\n\n".join(filter(None, (first, crossing_table(measurements, experiment))))
 
 
 def first_faster(cloud: Mapping[str, Sample], robot: Mapping[str, Sample]) -> str:
-    """Return the lowest rate from which on, at all higher rates too, the cloud is faster; empty for none."""
+    """Return the lowest rate that the cloud is faster at, and at all higher ones; else that there is none."""
     found = ""
     for rate in sorted(robot, key=natural, reverse=True):
+        if any(isnan(one[rate].estimate.low) for one in (robot, cloud)):
+            return found or NOT_JUDGED
         if not is_above(robot[rate], cloud[rate]):
             break
         found = rate
-    return found
+    return found or NEVER

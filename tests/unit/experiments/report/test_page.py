@@ -258,6 +258,10 @@ def test_break_even_is_the_lowest_rate_at_which_the_cloud_is_faster() -> None:
     assert "| CRS | RCE | amcl | 5 | 2 |" in page_text(Measurements.of(found), {}, {}, "images")
     slow = [row for row in found if dict(row.condition.factors)["rate"] == "1"]
     assert "| amcl | 5 | at none that was measured |" in page_text(Measurements.of(slow), {}, {}, "images")
+    few = [row for row in found if row.run < 3]
+    assert "| amcl | 5 | not judged: fewer than 3 runs |" in page_text(Measurements.of(few), {}, {}, "images")
+    half = [row for row in found if row.run < 3 or dict(row.condition.factors)["rate"] == "10"]
+    assert "| amcl | 5 | 10 |" in page_text(Measurements.of(half), {}, {}, "images")
 
 
 @pytest.mark.parametrize(
