@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from rce_fleet.exceptions import ExperimentError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
 COLUMNS = ("experiment", "system", "software", "factors", "run", "metric", "value", "unit")
@@ -81,13 +81,8 @@ def read_rows(path: Path) -> list[Row]:
         OSError: The file cannot be read.
         ExperimentError: It is not such a table; the text names the line.
     """
-    with path.open(newline="", encoding="utf-8") as file:
-        text = file.read()
-    lines = text[: text.rfind("\n") + 1].splitlines()
-    if not lines or tuple(next(csv.reader(lines[:1]))) != COLUMNS:
-        raise ExperimentError(f"{path} has no columns {', '.join(COLUMNS)}")
     found = []
-    for number, fields in enumerate(csv.reader(lines[1:]), 2):
+    for number, fields in read_table(path, COLUMNS, "a table of raw data"):
         try:
             experiment, system, software, factors, run, metric, value, unit = fields
             condition = Condition(experiment, system, software, split_factors(factors))
@@ -95,6 +90,34 @@ def read_rows(path: Path) -> list[Row]:
         except ValueError as error:
             raise ExperimentError(f"{path}:{number}: {error}") from error
     return found
+
+
+def read_table(path: Path, columns: Sequence[str], what: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the lines of a CSV file after the first one, each with its number.
+
+    A last line that was not completely written is left out.
+
+    Args:
+        path: The file.
+        columns: What its first line must have.
+        what: What the file must be, for errors.
+
+    Raises:
+        OSError: The file cannot be read.
+        ExperimentError: It is not such a table.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")  # spreadsheets begin with the mark
+    except UnicodeDecodeError as error:
+        raise ExperimentError(f"{path} is not UTF-8: {error}") from error
+    reader = csv.reader(text.split("\n")[:-1])
+    try:
+        if tuple(next(reader, ())) != tuple(columns):
+            raise ExperimentError(f"{path} is not {what}: it has no columns {', '.join(columns)}")
+        for fields in reader:
+            yield reader.line_num, fields
+    except csv.Error as error:
+        raise ExperimentError(f"{path}:{reader.line_num}: {error}") from error
 
 
 def by_condition(rows: Iterable[Row], metric: str) -> Mapping[Condition, list[float]]:

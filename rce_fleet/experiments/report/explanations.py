@@ -119,7 +119,7 @@ def medians(samples: Mapping[str, Sample]) -> str:
     scale = scale_for(next(iter(samples.values())).unit, (sample.median for sample in samples.values()))
     texts = (
         f"{system_label(system)} {scaled(samples[system].median, scale)}"
-        for system in (*SYSTEMS, *(samples.keys() - SYSTEMS.keys()))
+        for system in (*SYSTEMS, *sorted(samples.keys() - SYSTEMS.keys()))
         if system in samples
     )
     return f"{', '.join(texts)} {scale.unit}".rstrip()

@@ -90,10 +90,10 @@ def factors_label(factors: Iterable[tuple[str, str]]) -> str:
     return ", ".join(f"{name}={value}" for name, value in factors) or "-"
 
 
-def natural(text: str) -> tuple[tuple[int, str], ...]:
+def natural(text: str) -> tuple[tuple[float, str], ...]:
     """Return a key that sorts numbers in texts by their value: ``160x120`` before ``1920x1080``."""
-    parts = re.split(r"(\d+)", text)
-    return tuple((int(part), "") if at % 2 else (0, part) for at, part in enumerate(parts))
+    parts = re.split(r"(\d+(?:\.\d+)?)", text)
+    return tuple((float(part), "") if at % 2 else (0.0, part) for at, part in enumerate(parts))
 
 
 def condition_order(condition: Condition) -> tuple[object, ...]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass
-from math import isnan
+from math import inf, isfinite, isnan
 from typing import TYPE_CHECKING
 
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.report.labels import condition_order
-from rce_fleet.experiments.results import Condition, joined_factors, split_factors
+from rce_fleet.experiments.results import Condition, joined_factors, read_table, split_factors
 from rce_fleet.experiments.statistics import Estimate
 
 if TYPE_CHECKING:
@@ -84,18 +84,30 @@ def read_summary(path: Path) -> list[Summary]:
         ExperimentError: It is not a summary; the text names the line.
     """
     found = []
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.reader(file)
-        if tuple(next(reader, ())) != COLUMNS:
-            raise ExperimentError(f"{path} is not a summary: its columns must be {', '.join(COLUMNS)}")
-        for fields in reader:
-            try:
-                experiment, system, software, factors, metric, unit, runs, *numbers = fields
-                median, low, high = (float(text or "nan") for text in numbers)
-                condition = Condition(experiment, system, software, split_factors(factors))
-                found.append(Summary(condition, metric, unit, Estimate(median, low, high, int(runs))))
-            except ValueError as error:
-                raise ExperimentError(f"{path}:{reader.line_num}: {error}") from error
+    for number, fields in read_table(path, COLUMNS, "a summary"):
+        try:
+            experiment, system, software, factors, metric, unit, runs, *numbers = fields
+            median, low, high = (float(text or "nan") for text in numbers)
+            condition = Condition(experiment, system, software, split_factors(factors))
+            estimate = _checked(Estimate(median, low, high, int(runs)))
+            found.append(Summary(condition, metric, unit, estimate))
+        except ValueError as error:
+            raise ExperimentError(f"{path}:{number}: {error}") from error
+    return found
+
+
+def _checked(found: Estimate) -> Estimate:
+    """Return an estimate that runs can give.
+
+    Raises:
+        ValueError: They cannot.
+    """
+    median, low, high, runs = found
+    has_interval = not (isnan(low) and isnan(high))
+    if not isfinite(median) or (has_interval and not -inf < low <= high < inf) or runs < 1:
+        raise ValueError(
+            "runs must be 1 or more, the median a number, and low and high in rising order or both empty"
+        )
     return found
 
 

@@ -50,6 +50,31 @@ def test_other_files_are_refused(tmp_path: Path, text: str, error: str) -> None:
         read_rows(path)
 
 
+HEAD = b"experiment,system,software,factors,run,metric,value,unit\n"
+ROW = b"laser,SMS,ros,,1,rate,7.5,Hz\n"
+
+
+@pytest.mark.parametrize(
+    ("data", "error"),
+    [
+        (HEAD + ROW + ROW.replace(b"Hz", b"\xb5s"), "is not UTF-8"),
+        (HEAD + b'"' + ROW * 10_000, "field larger than field limit"),
+    ],
+    ids=["saved-in-latin-1", "quotation-mark"],
+)
+def test_a_table_that_was_edited_is_named(tmp_path: Path, data: bytes, error: str) -> None:
+    path = tmp_path / "raw.csv"
+    path.write_bytes(data)
+    with pytest.raises(ExperimentError, match=f"raw.csv.*{error}"):
+        read_rows(path)
+
+
+def test_the_mark_and_the_ends_of_lines_of_spreadsheets_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "raw.csv"
+    path.write_bytes(b"\xef\xbb\xbf" + (HEAD + ROW).replace(b"\n", b"\r\n"))
+    assert [row.value for row in read_rows(path)] == [7.5]
+
+
 def test_factors_must_not_contain_separators(tmp_path: Path) -> None:
     row = Row(Condition.of("laser", "SMS", "ros", path="a;b"), 1, "network", 1.0, "B/s")
     with pytest.raises(ExperimentError, match="'path' = 'a;b'"):

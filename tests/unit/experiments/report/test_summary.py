@@ -77,6 +77,25 @@ def test_bad_line_of_a_summary_is_named(tmp_path: Path) -> None:
         read_summary(path)
 
 
+@pytest.mark.parametrize("numbers", ["10,,,", "10,nan,1,2", "10,1,inf,2", "10,1,2,1", "10,1,1,", "0,1,1,1"])
+def test_numbers_that_no_runs_give_are_refused(tmp_path: Path, numbers: str) -> None:
+    path = tmp_path / "summary.csv"
+    write_summary(path, [])
+    path.write_text(path.read_text() + f"laser,cloud,ros,,rate,Hz,{numbers}\n")
+    with pytest.raises(ExperimentError, match=r"summary.csv:2: "):
+        read_summary(path)
+
+
+def test_a_summary_that_was_cut_is_read_up_to_its_last_whole_line(tmp_path: Path) -> None:
+    path = tmp_path / "summary.csv"
+    write_summary(path, summarize(Measurements.of(rows(SMS, "rate", [7.1, 7.2, 7.34]))))
+    path.write_text(path.read_text()[:-2])
+    assert read_summary(path) == []
+    path.write_bytes(b"\xb5")
+    with pytest.raises(ExperimentError, match="not UTF-8"):
+        read_summary(path)
+
+
 def test_medians_of_a_second_run_are_counted() -> None:
     """Of four: one in the interval, one outside by 2 %, one by 100 %, and one of which nothing is known."""
     first = Measurements.of(
@@ -163,3 +182,4 @@ def test_units_fit_the_values() -> None:
 def test_numbers_in_texts_are_sorted_by_value() -> None:
     assert sorted(["1920x1080", "160x120", "640x480"], key=natural) == ["160x120", "640x480", "1920x1080"]
     assert sorted(["full", "10", "9"], key=natural) == ["9", "10", "full"]
+    assert sorted(["2", "0.5", "0.25"], key=natural) == ["0.25", "0.5", "2"]
