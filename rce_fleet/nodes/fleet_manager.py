@@ -10,6 +10,7 @@ import asyncio
 import json
 import os
 import re
+import sys
 import time
 from collections import deque
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any
 from rce.ros.node import MasterError, Message, Node, Publisher, RosError, ServiceClient, run
 from rce.ros.tools.plain import plain
 from rce.ros.types import TypesError
+from rce_fleet.exceptions import JournalError
 from rce_fleet.journal.journal import Journal
 from rce_fleet.manager.fleet_routes import ROUTES as FLEET_ROUTES
 from rce_fleet.manager.goals import NO_ANSWER
@@ -31,10 +33,15 @@ from rce_fleet.nodes.grid_messages import GRID_TOPIC, read_grid
 from rce_fleet.nodes.known_robots import VOLUME_VARIABLE
 from rce_fleet.nodes.manager_parameters import ManagerParameters, rules_of
 from rce_fleet.nodes.parameters import read_parameters
+from rce_fleet.nodes.standby import stand_by, successor
 from rce_fleet.nodes.task_loops import COMPILE_FROM, compile_beside
 from rce_fleet.nodes.throttled_log import ThrottledLog
 from rce_fleet.tasks.records import Places, Zone
 
+SERVICE = "/fleet/request"
+"""Every fleet manager provides this service."""
+BAD_JOURNAL = 2
+"""Exit code of a manager that cannot open its journal."""
 STEP_S = 0.2
 """Seconds between two steps."""
 LOOK_AROUND_S = 2.0
@@ -102,6 +109,9 @@ class ManagerNode:
         node: Running node.
         parameters: Its parameters.
         journal: Where everything is kept.
+
+    Attributes:
+        successor: The node of another manager that has taken over; empty: none has.
     """
 
     def __init__(self, node: Node, parameters: ManagerParameters, journal: Journal) -> None:
@@ -115,9 +125,10 @@ class ManagerNode:
         self._requested: deque[tuple[float, frozenset[int]]] = deque(maxlen=MOST_LISTS)
         self._manager: FleetManager
         self._facts: FactKeeper
+        self.successor = ""
 
     async def run(self) -> None:
-        """Run until the node is stopped."""
+        """Run until the node is stopped, or another manager has taken over."""
         node = self._node
         self._events = await node.advertise("/fleet/events", "std_msgs/String")
         self._manager = FleetManager(
@@ -143,12 +154,12 @@ class ManagerNode:
 
         await node.subscribe("/fleet/changes", "fleet/FleetChanges", self._take_changes)
         await node.subscribe("/fleet/requestedCells", "std_msgs/Int32MultiArray", self._take_requested)
-        await node.advertise_service("/fleet/request", "fleet/Request", answer)
+        await node.advertise_service(SERVICE, "fleet/Request", answer)
         node.log.info("the fleet manager has %d open tasks", self._manager.book.open_count)
         async with asyncio.TaskGroup() as tasks:
             others = [tasks.create_task(self._follow_planner()), tasks.create_task(self._look_around())]
             is_compiling = False
-            while await node.sleep(STEP_S):
+            while not self.successor and await node.sleep(STEP_S):
                 await self._step()
                 if not is_compiling and len(self._manager.facts.robots) >= COMPILE_FROM:
                     is_compiling = True
@@ -260,7 +271,9 @@ class ManagerNode:
         async with GraphLook(self._node, LOOK_AROUND_S) as graph:
             while True:
                 try:
-                    for topic in (await graph.look()).publishers:
+                    topics = await graph.look()
+                    self.successor = successor(self._node, topics, SERVICE)
+                    for topic in topics.publishers:
                         found = BATTERY_TOPIC.fullmatch(topic)
                         if found is not None and found[1] not in self._batteries:
                             self._batteries.add(found[1])
@@ -293,19 +306,41 @@ def open_journal(given: str) -> Journal:
     return Journal(path)
 
 
-async def main() -> None:
-    """Run the manager until the node is stopped."""
+async def main() -> int:
+    """Run the manager until the node is stopped; return the program's exit code."""
+    code = None
+    while code is None:
+        code = await serve()
+    return code
+
+
+async def serve() -> int | None:
+    """Run the manager once; return the program's exit code, or None if another manager has taken over."""
     async with Node("fleet_manager") as node:
         parameters = await read_parameters(node, ManagerParameters)
+        if not await stand_by(node, "fleet manager", SERVICE):
+            return 0
         place = parameters.journal or os.environ.get(VOLUME_VARIABLE, "")
         if not place:
             node.log.warning(
                 "tasks are kept in the home of this container: they survive the end of this node, and are"
                 " lost with the container; give the container a volume with the name fleet"
             )
-        journal = await asyncio.to_thread(open_journal, place)
-        await ManagerNode(node, parameters, journal).run()
+        try:
+            journal = await asyncio.to_thread(open_journal, place)
+        except (JournalError, OSError) as error:
+            node.log.error("the fleet manager cannot start: %s", error)  # noqa: TRY400 - the reason says it all
+            print(f"fleet_manager: {error}", file=sys.stderr)  # noqa: T201
+            return BAD_JOURNAL
+        manager = ManagerNode(node, parameters, journal)
+        await manager.run()
+        if not manager.successor:
+            return 0
+        node.log.error(
+            "the fleet manager %s has taken over this fleet: this one stops, and stands by", manager.successor
+        )
+    return None
 
 
 if __name__ == "__main__":
-    run(main())
+    sys.exit(run(main()))

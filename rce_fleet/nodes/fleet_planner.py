@@ -42,11 +42,11 @@ from rce_fleet.nodes.grid_messages import GRID_TOPIC, grid_name
 from rce_fleet.nodes.grid_parameters import make_grid, read_fleet_parameters, unknown_parameters
 from rce_fleet.nodes.grid_topics import GridTopics
 from rce_fleet.nodes.known_robots import KnownRobots, file_of_robots
-from rce_fleet.nodes.other_planner import stand_by
 from rce_fleet.nodes.plan_worker import PlanWorker
 from rce_fleet.nodes.planner_parameters import KNOWN, read_settings
 from rce_fleet.nodes.pose_publisher import PosePublisher
 from rce_fleet.nodes.robot_topics import RobotTopics
+from rce_fleet.nodes.standby import stand_by, successor
 from rce_fleet.nodes.state_publisher import StatePublisher
 from rce_fleet.nodes.throttled_log import ThrottledLog
 from rce_fleet.nodes.zone_messages import read_mode_set, read_zones_set
@@ -62,6 +62,8 @@ LOOK_AROUND = 0.5
 """Seconds between two searches for new robots, in a small graph."""
 KEEP_EVERY = 1.0
 """Seconds between two looks whether robots have other cells than those kept for the next planner."""
+SERVICE = "/fleet/set_goal"
+"""Every planner provides this service."""
 BAD_PARAMETERS = 2
 """Exit code of a planner that cannot start with its parameters."""
 ROBOT_TOPIC = re.compile(r"/([A-Za-z][A-Za-z0-9_]*)/amcl_pose")
@@ -77,6 +79,9 @@ class PlannerNode:
         chooser: Makes other grids over its map; if None, over the planner's grid.
         takes_answers: Move clients answer on ``goalNodesList`` instead of their own topics.
         known: Keeps robots for the planner after this one.
+
+    Attributes:
+        successor: The node of another planner that has taken over; empty: none has.
     """
 
     def __init__(
@@ -99,9 +104,10 @@ class PlannerNode:
         self._grid = GridTopics(node)
         self._known = known
         self._throttled_log = ThrottledLog(node)
+        self.successor = ""
 
     async def run(self, blocked: list[int]) -> None:
-        """Run until the node is stopped.
+        """Run until the node is stopped, or another planner has taken over.
 
         Args:
             blocked: Cells that are blocked at the start, and can be freed.
@@ -112,7 +118,7 @@ class PlannerNode:
         await self._expect_known()
         for cell in blocked:
             self._handle(CellBlocked(cell))
-        await node.advertise_service("/fleet/set_goal", "fleet/SetGoal", self._set_goal)
+        await node.advertise_service(SERVICE, "fleet/SetGoal", self._set_goal)
         await node.advertise_service("/fleet/block_cell", "fleet/BlockCell", self._block_cell)
         await node.advertise_service("/fleet/remove_robot", "fleet/RemoveRobot", self._remove_robot)
         await node.advertise_service("/fleet/set_zones", "fleet/SetZones", self._set_zones)
@@ -155,7 +161,7 @@ class PlannerNode:
 
     async def _keep_known(self) -> None:
         """Write the robots and their cells, if they changed, beside the planner's work."""
-        while self._known is not None and await self._node.sleep(KEEP_EVERY):
+        while self._known is not None and not self.successor and await self._node.sleep(KEEP_EVERY):
             content = self._known.content(self._planner.state, time.time())
             if content is None:
                 continue
@@ -170,6 +176,9 @@ class PlannerNode:
             while True:
                 try:
                     topics = await graph.look()
+                    self.successor = successor(self._node, topics, SERVICE)
+                    if self.successor:
+                        return
                     for topic in topics.publishers:
                         found = ROBOT_TOPIC.fullmatch(topic)
                         if found is not None and found[1] not in self._robots:
@@ -183,7 +192,7 @@ class PlannerNode:
     # What comes in
 
     async def _keep_time(self) -> None:
-        while await self._node.sleep(TICK):
+        while not self.successor and await self._node.sleep(TICK):
             self._handle(Tick())
             self._state.update(time.monotonic())
             self._poses.update(self._planner.state.robots, time.monotonic())
@@ -309,6 +318,14 @@ def warn_of_size(node: Node, grid: GridMap, settings: FleetSettings) -> None:
 
 async def main() -> int:
     """Run the planner until the node is stopped; return the program's exit code."""
+    code = None
+    while code is None:
+        code = await serve()
+    return code
+
+
+async def serve() -> int | None:
+    """Run the planner once; return the program's exit code, or None if another planner has taken over."""
     async with Node("fleet_planner") as node:
         values = await read_fleet_parameters(node)
         for remark in unknown_parameters(values, KNOWN):
@@ -325,7 +342,7 @@ async def main() -> int:
             print(f"fleet_planner: {error}", file=sys.stderr)  # noqa: T201
             return BAD_PARAMETERS
         warn_of_size(node, grid, settings)
-        if not await stand_by(node):
+        if not await stand_by(node, "planner", SERVICE):
             return 0
         if remark:
             node.log.warning("%s", remark)
@@ -334,7 +351,12 @@ async def main() -> int:
         made = FleetPlanner(grid, settings)
         planner = PlannerNode(node, made, chooser, takes_answers=takes_answers, known=kept)
         await planner.run(blocked)
-    return 0
+        if not planner.successor:
+            return 0
+        node.log.error(
+            "the planner %s has taken over this fleet: this one stops, and stands by", planner.successor
+        )
+    return None
 
 
 if __name__ == "__main__":

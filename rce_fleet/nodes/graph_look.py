@@ -19,15 +19,17 @@ TOPICS_PER_S = 1000
 
 
 class GraphState(NamedTuple):
-    """The topics of a graph.
+    """The topics and services of a graph.
 
     Attributes:
         publishers: Names of the nodes that publish each topic.
         subscribers: Names of the nodes that subscribe to each topic.
+        services: Name of the node that provides each service, in a list.
     """
 
     publishers: Mapping[str, list[str]]
     subscribers: Mapping[str, list[str]]
+    services: Mapping[str, list[str]]
 
 
 class GraphLook:
@@ -59,7 +61,7 @@ class GraphLook:
         return self._least + self._topics / TOPICS_PER_S
 
     async def look(self) -> GraphState:
-        """Return the topics that are there now.
+        """Return the topics and services that are there now.
 
         Raises:
             MasterError: The master cannot be asked.
@@ -68,8 +70,8 @@ class GraphLook:
         master = MasterClient(node.master_uri, node.name, node.uri, self._rpc)
         answer = await master.call("getSystemState")
         try:
-            publishers, subscribers = (dict(part) for part in answer[:2])
+            publishers, subscribers, services = (dict(part) for part in answer[:3])
         except (TypeError, ValueError) as error:
             raise MasterUnreachableError(node.master_uri, "its state has no known form") from error
         self._topics = len(publishers) + len(subscribers)
-        return GraphState(publishers, subscribers)
+        return GraphState(publishers, subscribers, services)

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
+import signal
 from contextlib import AsyncExitStack
 from math import hypot
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 from support.resting_robot import PACKAGES, fleet_program
 
 from rce.ros.core import Core
-from rce.ros.node import Node, Publisher
+from rce.ros.node import Node, Publisher, RosError
+from rce.ros.node.master import MasterClient
 from rce.ros.types import Message, TypeRegistry
+from rce.ros.xmlrpc import RpcClient
 
 SPEED, STEP, POSE_EVERY = 1.0, 0.05, 0.2
 
@@ -101,38 +108,135 @@ async def test_a_move_client_of_the_paper_drives_to_its_goal() -> None:
         assert hypot(robot.place[0] - 6.5, robot.place[1] - 3.5) < 0.2
 
 
-async def test_a_second_planner_stands_by_until_the_first_ends() -> None:
-    async with Core(port=0) as core, AsyncExitStack() as stack:
-        types = TypeRegistry(PACKAGES)
-        node = Node("judge", argv=[], master_uri=core.uri, types=types)
-        judge = await stack.enter_async_context(node)
-        heard: asyncio.Queue[str] = asyncio.Queue()
-        await judge.subscribe("/rosout", "rosgraph_msgs/Log", lambda message: heard.put_nowait(message.msg))
+class Judge:
+    """A node that hears the log of all, and asks the planner that serves the fleet."""
 
-        async def hears(text: str) -> None:
-            async with asyncio.timeout(60):
-                while text not in await heard.get():
-                    pass
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._heard: asyncio.Queue[str] = asyncio.Queue()
 
-        first = await stack.enter_async_context(fleet_program(core, "fleet_planner.py"))
-        async with asyncio.timeout(60):
-            await judge.wait_for_service("/fleet/get_state")
-        before = await judge.service_client("/fleet/get_state", "fleet/GetState")()
-        await stack.enter_async_context(fleet_program(core, "fleet_planner.py", "__name:=spare"))
-        await hears("this one stands by")
-        again = await judge.service_client("/fleet/get_state", "fleet/GetState")()
-        assert again.state.started == before.state.started
-        first.kill()
-        await hears("this one takes over")
-        async with asyncio.timeout(60):
+    @classmethod
+    async def start(cls, stack: AsyncExitStack, core: Core) -> Judge:
+        node = Node("judge", argv=[], master_uri=core.uri, types=TypeRegistry(PACKAGES))
+        judge = cls(await stack.enter_async_context(node))
+        await node.subscribe("/rosout", "rosgraph_msgs/Log", judge._take)
+        return judge
+
+    def _take(self, message: Message) -> None:
+        self._heard.put_nowait(f"{message.name}: {message.msg}")
+
+    async def hears(self, text: str) -> str:
+        async with asyncio.timeout(90):
+            while text not in (said := await self._heard.get()):
+                pass
+        return said
+
+    async def planner_began(self) -> Any:
+        """Return when the planner that answers began; one that has ended stays registered for a while."""
+        async with asyncio.timeout(90):
             while True:
                 try:
-                    client = judge.service_client("/fleet/get_state", "fleet/GetState", persistent=False)
-                    after = await client()
-                    break
-                except Exception:  # noqa: BLE001 - the registration of the killed planner is still there
+                    client = self._node.service_client("/fleet/get_state", "fleet/GetState", persistent=False)
+                    return (await client.call({}, timeout=5.0)).state.started
+                except RosError:
                     await asyncio.sleep(0.2)
-        assert after.state.started != before.state.started
+
+    async def fill_backlog(self, service: str) -> None:
+        """Connect to a hung program until it accepts no more connections."""
+        async with RpcClient() as rpc:
+            master = MasterClient(self._node.master_uri, self._node.name, self._node.uri, rpc)
+            place = urlsplit(str(await master.call("lookupService", service)))
+        with contextlib.suppress(TimeoutError):
+            while True:
+                async with asyncio.timeout(1):
+                    _, writer = await asyncio.open_connection(place.hostname, place.port)
+                writer.close()
+
+
+async def test_a_second_planner_stands_by_until_the_first_ends() -> None:
+    async with Core(port=0) as core, AsyncExitStack() as stack:
+        judge = await Judge.start(stack, core)
+        first = await stack.enter_async_context(fleet_program(core, "fleet_planner.py"))
+        before = await judge.planner_began()
+        await stack.enter_async_context(fleet_program(core, "fleet_planner.py", "__name:=spare"))
+        await judge.hears("this one stands by")
+        assert await judge.planner_began() == before
+        first.kill()
+        await judge.hears("this one takes over")
+        assert await judge.planner_began() != before
+
+
+async def test_a_planner_that_was_hung_leaves_the_fleet_to_its_successor() -> None:
+    """A hung program accepts connections, until its backlog is full: then it counts as ended."""
+    async with Core(port=0) as core, AsyncExitStack() as stack:
+        judge = await Judge.start(stack, core)
+        first = await stack.enter_async_context(fleet_program(core, "fleet_planner.py", "__name:=first"))
+        await judge.planner_began()
+        first.send_signal(signal.SIGSTOP)
+        stack.callback(first.send_signal, signal.SIGCONT)
+        await stack.enter_async_context(fleet_program(core, "fleet_planner.py", "__name:=spare"))
+        await judge.hears("/spare: another planner serves this fleet")
+        await judge.fill_backlog("/fleet/set_goal")
+        await judge.hears("/spare: the other planner has ended: this one takes over")
+        after = await judge.planner_began()
+        first.send_signal(signal.SIGCONT)
+        await judge.hears(
+            "/first: the planner /spare has taken over this fleet: this one stops, and stands by"
+        )
+        await judge.hears("/first: another planner serves this fleet")
+        assert await judge.planner_began() == after
+
+
+async def test_a_second_manager_stands_by_until_the_first_ends(tmp_path: Path) -> None:
+    """Each would send the robots to its own goals, and hold the tasks of the other."""
+    async with Core(port=0) as core, AsyncExitStack() as stack:
+        judge = await Judge.start(stack, core)
+        programs = {}
+        for name in ("one", "two"):
+            arguments = f"__name:={name}", f"_journal:={tmp_path / name}.sqlite"
+            program = fleet_program(core, "fleet_manager.py", *arguments)
+            programs[f"/{name}"] = await stack.enter_async_context(program)
+        said = await judge.hears("another fleet manager serves this fleet (/fleet/request")
+        del programs[said.partition(":")[0]]
+        for first in programs.values():
+            first.kill()
+        await judge.hears("the other fleet manager has ended: this one takes over")
+        await judge.hears("the fleet manager has 0 open tasks")
+
+
+async def test_a_manager_without_its_journal_says_so(tmp_path: Path) -> None:
+    kept = tmp_path / "journal.sqlite"
+    kept.write_text("a letter")
+    async with Core(port=0) as core:
+        code, said = await ended(core, "fleet_manager.py", f"_journal:={kept}")
+    assert code == 2
+    assert f"fleet_manager: the journal {kept} cannot be opened: it is damaged" in said
+    assert "Traceback" not in said
+
+
+async def ended(core: Core, exe: str, *arguments: str) -> tuple[int | None, str]:
+    """Run a node that cannot start; return its exit code and what it said."""
+    process = await asyncio.create_subprocess_exec(
+        *PACKAGES.find("fleet").executable(exe),
+        *arguments,
+        env={**os.environ, "ROS_MASTER_URI": core.uri},
+        stderr=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+    )
+    async with asyncio.timeout(60):
+        out, err = await process.communicate()
+    return process.returncode, (out + err).decode()
+
+
+async def test_of_two_planners_that_start_together_one_stands_by() -> None:
+    async with Core(port=0) as core, AsyncExitStack() as stack:
+        judge = await Judge.start(stack, core)
+        for name in ("one", "two"):
+            await stack.enter_async_context(fleet_program(core, "fleet_planner.py", f"__name:={name}"))
+        said = await judge.hears("another planner serves this fleet")
+        began = await judge.planner_began()
+        assert said.startswith(("/one", "/two"))
+        assert await judge.planner_began() == began
 
 
 @pytest.mark.parametrize(
@@ -144,15 +248,6 @@ async def test_a_second_planner_stands_by_until_the_first_ends() -> None:
 )
 async def test_a_planner_refuses_wrong_parameters(arguments: tuple[str, ...], text: str) -> None:
     async with Core(port=0) as core:
-        command = PACKAGES.find("fleet").executable("fleet_planner.py")
-        process = await asyncio.create_subprocess_exec(
-            *command,
-            *arguments,
-            env={**os.environ, "ROS_MASTER_URI": core.uri},
-            stderr=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-        )
-        async with asyncio.timeout(60):
-            out, err = await process.communicate()
-        assert text in (out + err).decode()
-        assert process.returncode
+        code, said = await ended(core, "fleet_planner.py", *arguments)
+    assert text in said
+    assert code

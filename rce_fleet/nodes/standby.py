@@ -1,0 +1,93 @@
+"""Keeps two programs from doing the same for one fleet: the second stands by until the first has ended.
+
+Each planner provides one service, each fleet manager another. A program that was hung, or was started at the
+same moment as another one, finds that the other has taken over its service: it stops, and stands by.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from rce.ros.errors import MasterError
+from rce.ros.node.master import MasterClient
+from rce.ros.xmlrpc import RpcClient
+
+if TYPE_CHECKING:
+    from rce.ros.node import Node
+    from rce_fleet.nodes.graph_look import GraphState
+
+_LOOK_EVERY = 1.0
+"""Seconds between two looks for another program."""
+_PROBE_S = 2.0
+"""Seconds in which a running program accepts a connection."""
+
+
+async def stand_by(node: Node, program: str, service: str) -> bool:
+    """Wait while another program of its kind serves this ROS graph.
+
+    The registration of a program that was killed stays at the master; so the service's address is tried too.
+
+    Args:
+        node: Running node, before it provides services.
+        program: What it is, for people: ``planner``.
+        service: The service that every program of its kind provides.
+
+    Returns:
+        Whether to go on; False if the node was stopped meanwhile.
+    """
+    is_told = False
+    async with RpcClient() as rpc:
+        master = MasterClient(node.master_uri, node.name, node.uri, rpc)
+        while True:
+            address = await _service_address(master, service)
+            if not address or not await _answers(address):
+                break
+            if not is_told:
+                node.log.error(
+                    "another %s serves this fleet (%s at %s): this one stands by until it ends",
+                    program,
+                    service,
+                    address,
+                )
+                is_told = True
+            if not await node.sleep(_LOOK_EVERY):
+                return False
+    if is_told:
+        node.log.warning("the other %s has ended: this one takes over", program)
+    return not node.is_shutdown
+
+
+def successor(node: Node, graph: GraphState, service: str) -> str:
+    """Return the node that has taken over the service of a running one; empty: none has.
+
+    Args:
+        node: The node that has provided the service since it went on.
+        graph: The ROS graph as it is now.
+        service: The service.
+    """
+    providers = graph.services.get(service, [])
+    return "" if not providers or node.name in providers else providers[0]
+
+
+async def _service_address(master: MasterClient, service: str) -> str:
+    """Return the address of the service's provider; empty without one."""
+    try:
+        return str(await master.call("lookupService", service))
+    except MasterError:
+        return ""
+
+
+async def _answers(address: str) -> bool:
+    """Return whether something accepts connections at an address such as ``rosrpc://host:port``."""
+    place = urlsplit(address)
+    if place.hostname is None or place.port is None:
+        return False
+    try:
+        async with asyncio.timeout(_PROBE_S):
+            _, writer = await asyncio.open_connection(place.hostname, place.port)
+    except (OSError, TimeoutError):
+        return False
+    writer.close()
+    return True
