@@ -153,7 +153,7 @@ class FleetManager:
             await self._try_journal()
             return
         now = self.clock()
-        self._follow_clock()
+        self._follow_clock(now)
         self.book.grid = self.facts.grid or self.book.grid
         self._sync.adopt(now)
         if self.facts.is_live:
@@ -177,14 +177,12 @@ class FleetManager:
                 if refusal:
                     self.goals.refused(robot)
 
-    def _follow_clock(self) -> None:
-        """Count no step of the clock as time in which robots did not move or were away."""
+    def _follow_clock(self, now: float) -> None:
+        """Count no step of the clock as time in which robots did something, or did not."""
         step, self._wall.stepped = self._wall.stepped, 0.0
         if step > CLOCK_STEP_S and self.clock is self._wall:
             self._log.warning("the clock of this machine was set %.0f s forward", step)
-            for robot in self.facts.robots.values():
-                robot.moved_at += step
-                robot.away_since += step
+            self.facts.skip(step, now)
             self.statistics.skip(step)
 
     def planner_began(self, run: PlannerRun) -> None:

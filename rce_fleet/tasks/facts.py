@@ -16,6 +16,8 @@ AT_REST = frozenset({"idle", "arrived"})
 """States of the planner in which a robot has nothing to do."""
 AWAY = frozenset({"silent", "joining"})
 """States in which the planner cannot send a robot anywhere."""
+MOST_STEPS = 100
+"""So many steps of the clock are remembered."""
 NOT_DRIVEN = frozenset({"paused", "stopped", "manual", "out_of_service", "dead", "lost"})
 """States in which the planner does not drive a robot: a person decided so, or the robot is lost."""
 
@@ -84,6 +86,7 @@ class FleetFacts:
         zones: The planner's zones, by name.
         pending: Cells that will be blocked once a robot has left them.
         requested: Cells that people blocked, as the planner says; None: it has not said so since it began.
+        clock_steps: When the clock was set forward, by the time before, and by how many seconds.
     """
 
     robots: dict[str, RobotFacts] = field(default_factory=dict)
@@ -96,6 +99,23 @@ class FleetFacts:
     zones: dict[str, Zone] = field(default_factory=dict)
     pending: frozenset[int] = frozenset()
     requested: frozenset[int] | None = None
+    clock_steps: list[tuple[float, float]] = field(default_factory=list)
+
+    def skip(self, seconds: float, now: float) -> None:
+        """Note that the clock was set forward: robots neither moved nor were away in that time.
+
+        Args:
+            seconds: By which it was set forward.
+            now: Seconds since 1970, after the step.
+        """
+        self.clock_steps = [*self.clock_steps[1 - MOST_STEPS :], (now - seconds, seconds)]
+        for robot in self.robots.values():
+            robot.moved_at += seconds
+            robot.away_since += seconds
+
+    def elapsed(self, since: float, now: float) -> float:
+        """Return the seconds from one time to another, without steps of the clock."""
+        return now - since - sum(seconds for before, seconds in self.clock_steps if since <= before)
 
     def standing(self) -> dict[int, str]:
         """Return the cells of robots that the planner does not drive now, and which robot is in each."""

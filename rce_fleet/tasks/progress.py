@@ -91,6 +91,7 @@ class TaskProgress:
         """
         self._nearest, self._short_of_energy = nearest, short_of_energy
         self._charger_users = charger_users
+        self._elapsed = facts.elapsed
         self.avoid = {pair: until for pair, until in self.avoid.items() if until > now}
         self._taken = self.targets()
         self.standing = self._standing(facts)
@@ -297,7 +298,7 @@ class TaskProgress:
         duration = stop.duration
         if visit.stop == RETURN:
             duration = max((s.duration for s in task.order.stops if s.action is Action.DELIVER), default=0.0)
-        return now >= visit.started_at + duration
+        return self._elapsed(visit.started_at, now) >= duration
 
     def _finish(self, task: Task, now: float) -> None:
         if task.state is TaskState.CANCELLING:
@@ -324,12 +325,13 @@ class TaskProgress:
             return
         if not facts.is_live:
             return
-        since = robot.away_since if robot is not None else self._unknown_since.setdefault(task.robot, now)
         if robot is None:
+            waited = self._elapsed(self._unknown_since.setdefault(task.robot, now), now)
             reason = f"{task.robot} is not known to the planner"
         else:
+            waited = now - robot.away_since
             reason = f"{task.robot} is {robot.state}: {robot.reason or 'it has no pose'}"
-        if now - since > self._rules.lost_after or self._book.entry(task.robot).is_out:
+        if waited > self._rules.lost_after or self._book.entry(task.robot).is_out:
             self._give_up(task, now, reason, is_away=True)
 
     def _give_up(self, task: Task, now: float, reason: str, *, is_away: bool = False) -> None:
@@ -354,7 +356,7 @@ class TaskProgress:
         what = f"its load is on {task.robot}" if task.is_loaded else f"{task.robot} acts for it"
         if task.state is TaskState.RUNNING:
             self._suspend(task, now, f"{what}: {reason}", is_away=is_away)
-        elif now - task.changed_at > self._rules.load_lost_after:
+        elif self._elapsed(task.changed_at, now) > self._rules.load_lost_after:
             self._book.advance(task, TaskCause.FAIL, now, f"{what}; it did not come back: {reason}")
         elif is_away and task.state is TaskState.CANCELLING and task.action is None and not task.is_stranded:
             reason = f"{what}: {reason}"

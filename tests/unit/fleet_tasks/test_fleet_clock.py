@@ -13,9 +13,11 @@ from rce_fleet.journal.journal import Journal
 from rce_fleet.manager import clock as clocks
 from rce_fleet.manager.clock import SLOWER, WallClock
 from rce_fleet.manager.manager import FleetManager
+from rce_fleet.planning.grid import GridMap
 from rce_fleet.tasks.dispatch import TaskRules
 from rce_fleet.tasks.facts import RobotFacts
 from rce_fleet.tasks.order import Action, Order, Stop
+from rce_fleet.tasks.task import TaskState
 
 DAY = 86400.0
 
@@ -119,4 +121,58 @@ async def test_a_forward_step_is_no_time_of_robots(machine: Machine, tmp_path: P
     machine.wait(60.0)
     await manager.step()
     assert sum(total for _, _, total in journal.minutes()) == pytest.approx(31.0)
+    await manager.close()
+
+
+def begin(tmp_path: Path, *stops: Stop) -> tuple[FleetManager, RobotFacts, int]:
+    """Return a manager, its robot, which is in cell 5, and the number of a task with these stops."""
+    journal = Journal(tmp_path / "j.sqlite")
+    manager = FleetManager(journal, Planner(), TaskRules(), logging.getLogger("manager"))
+    manager.facts.grid, manager.facts.is_live = GridMap(), True
+    robot = RobotFacts("Robot1", "idle", cell=5, moved_at=manager.clock())
+    manager.facts.robots["Robot1"] = robot
+    return manager, robot, manager.book.create(Order(stops), manager.clock()).number
+
+
+async def wait(machine: Machine, manager: FleetManager, seconds: int) -> None:
+    for _ in range(seconds):
+        machine.wait(1.0)
+        await manager.step()
+
+
+async def test_a_forward_step_ends_no_action(machine: Machine, tmp_path: Path) -> None:
+    """The robot's arm is in the shelf for a minute, whatever the clock says."""
+    manager, _, number = begin(tmp_path, Stop(Action.PICK, (5,), 60.0), Stop(Action.DELIVER, (5,), 1.0))
+    await wait(machine, manager, 3)
+    for _ in range(2):
+        machine.wall += 3600.0
+        await wait(machine, manager, 20)
+        assert manager.book.tasks[number].action is not None
+    await wait(machine, manager, 25)
+    assert manager.book.tasks[number].state is TaskState.DONE
+    await manager.close()
+
+
+async def test_a_forward_step_loses_no_load(machine: Machine, tmp_path: Path) -> None:
+    """A task whose load is on a silent robot fails after an hour, and not when the clock is set."""
+    manager, robot, number = begin(tmp_path, Stop(Action.PICK, (5,)), Stop(Action.DELIVER, (9,), 1.0))
+    await wait(machine, manager, 3)
+    robot.state, robot.away_since = "silent", manager.clock()
+    await wait(machine, manager, 30)
+    assert manager.book.tasks[number].state is TaskState.SUSPENDED
+    machine.wall += DAY
+    await wait(machine, manager, 30)
+    assert manager.book.tasks[number].state is TaskState.SUSPENDED
+    await manager.close()
+
+
+async def test_a_forward_step_takes_no_task_from_an_unknown_robot(machine: Machine, tmp_path: Path) -> None:
+    """The planner was restarted, and does not know the robot for some seconds."""
+    manager, robot, number = begin(tmp_path, Stop(Action.GO, (9,)))
+    await wait(machine, manager, 3)
+    del manager.facts.robots["Robot1"]
+    await wait(machine, manager, 2)
+    machine.wall += DAY
+    await wait(machine, manager, 2)
+    assert manager.book.tasks[number].robot == robot.id
     await manager.close()
