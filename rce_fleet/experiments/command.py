@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
-import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from rce.own_process import end_signals
 from rce_fleet.exceptions import ExperimentError
-from rce_fleet.experiments import environment
 from rce_fleet.experiments.catalogue import experiments_of
 from rce_fleet.experiments.experiment import PAPER_SYSTEMS, Experiment, Options
-from rce_fleet.experiments.machines import check_machines
+from rce_fleet.experiments.folders import RUNS, check_same, former_of, go_on, new_folder, runs_of, used_alone
 from rce_fleet.experiments.ownership import sweep
 from rce_fleet.experiments.report import make_report, read_second
 from rce_fleet.experiments.results import error_text
@@ -24,7 +21,6 @@ from rce_fleet.experiments.runner import TABLE, Plan, Runner
 from rce_fleet.experiments.systems.registry import system_of
 from rce_fleet.experiments.systems.software import SOFTWARES, USUAL, software_of
 
-RUNS = 10
 PAGE = "experiments.md"
 MAKE_PAGE = "page"
 """Name by which only the page is made."""
@@ -48,7 +44,12 @@ def experiment(
             show_default=False,
         ),
     ] = None,
-    runs: Annotated[int, typer.Option(min=1, help="Runs of each set-up that count.")] = RUNS,
+    runs: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help=f"Runs of each set-up that count [{RUNS}; with --resume, as many as before]."
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the order of runs and of random choices.")] = 1,
     *,
     quick: Annotated[
@@ -103,19 +104,23 @@ def experiment(
             _report(folders or [], page, second or [])
             return
         options = _options(systems, software, robots, quick=quick)
-        planned = Plan(_experiments(name, folders), options, 1 if quick else runs, seed)
+        experiments = _experiments(name, folders)
+        former = _former(resume, output)
+        planned = Plan(experiments, options, 1 if quick else runs or runs_of(former), seed)
         for line in planned.left_out():
             typer.echo(line)
+        if resume is not None:
+            check_same(resume, former, planned)
         if plan:
             _show(planned, resume)
             return
         _check_report(page, second or [])
-        folder = _folder(planned, resume, output)
-        for left in sweep():
-            typer.echo(f"removed what an experiment left that was killed: {left}")
-        asyncio.run(_run(Runner(planned, folder, typer.echo)))
-        typer.echo(f"raw data: {folder / TABLE}")
-        _report([folder], page, second or [])
+        folder = resume or new_folder(planned, output)
+        with used_alone(folder):
+            if resume is not None:
+                go_on(resume, former, planned)
+            _measure(planned, folder)
+            _report([folder], page, second or [])
     except (ExperimentError, OSError) as error:
         typer.echo(f"rce experiment: {error_text(error)}", err=True)
         if folder is not None:
@@ -130,6 +135,17 @@ def _experiments(name: str, folders: list[Path] | None) -> list[Experiment]:
     if folders:
         raise ExperimentError(f"only {MAKE_PAGE} takes folders; {name} writes to --output DIR")
     return experiments_of(name)
+
+
+def _former(resume: Path | None, output: Path | None) -> dict[str, Any]:
+    """Return what the raw data depend on that a command goes on with; nothing for a new folder."""
+    if resume is None:
+        return {}
+    if output is not None:
+        raise ExperimentError(
+            "--resume DIR goes on in its folder; --output DIR needs a new one: give one of both"
+        )
+    return former_of(resume)
 
 
 def _check_report(page: Path | None, second: list[Path]) -> None:
@@ -155,6 +171,14 @@ def _report(folders: list[Path], page: Path | None, second: list[Path]) -> None:
     page = page or folders[0] / PAGE
     make_report(folders, page=page, figures=page.with_suffix(""), second=second)
     typer.echo(f"page: {page}")
+
+
+def _measure(planned: Plan, folder: Path) -> None:
+    """Do what is not done yet of a plan."""
+    for left in sweep():
+        typer.echo(f"removed what an experiment left that was killed: {left}")
+    asyncio.run(_run(Runner(planned, folder, typer.echo)))
+    typer.echo(f"raw data: {folder / TABLE}")
 
 
 async def _run(runner: Runner) -> None:
@@ -198,62 +222,9 @@ def _names(text: str, option: str) -> tuple[str, ...]:
     return names
 
 
-def _folder(planned: Plan, resume: Path | None, output: Path | None) -> Path:
-    """Return the folder of the raw data; make it and describe what they depend on."""
-    if resume is not None and output is not None:
-        raise ExperimentError(
-            "--resume DIR goes on in its folder; --output DIR needs a new one: give one of both"
-        )
-    if resume is not None:
-        _check_same(resume, planned)
-        asyncio.run(check_machines())
-        return resume
-    folder = output or Path(time.strftime("experiment-%Y%m%d-%H%M%S"))
-    if folder.exists():
-        is_started = (folder / environment.FILE).is_file()
-        way = f"go on in it with --resume {folder}" if is_started else "name a new folder"
-        raise ExperimentError(f"{folder} exists already; {way}")
-    asyncio.run(check_machines())
-    description = environment.describe(planned.options, planned.seed, planned.runs)
-    try:
-        folder.mkdir(parents=True)
-        environment.write(folder, description)
-    except OSError as error:
-        raise ExperimentError(f"--output {folder} cannot be made: {error_text(error)}") from error
-    return folder
-
-
-def _check_same(folder: Path, planned: Plan) -> None:
-    """Make sure that a folder's raw data were made in the same way.
-
-    Raises:
-        ExperimentError: They were not, or cannot be read.
-    """
-    try:
-        former = environment.read(folder)
-    except (FileNotFoundError, NotADirectoryError):
-        raise ExperimentError(
-            f"--resume {folder}: it is not the folder of an experiment, for there is no {environment.FILE}"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise ExperimentError(f"--resume {folder}: {error_text(error)}") from error
-    description = environment.describe(planned.options, planned.seed, planned.runs)
-    for key in ("commit", "seed", "options"):
-        if former.get(key) != description[key]:
-            raise ExperimentError(
-                f"--resume {folder}: its {key} is {_shown(former.get(key))}, now it is "
-                f"{_shown(description[key])}; data of both cannot be in one table"
-            )
-
-
-def _shown(value: object) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
-
-
 def _show(planned: Plan, resume: Path | None) -> None:
     rows = []
     if resume is not None:
-        _check_same(resume, planned)
         rows = Runner(planned, resume, typer.echo).rows()
     total = 0.0
     for one in planned.experiments:

@@ -30,6 +30,11 @@ PROGRAMS = {
     "bwrap": ("bwrap", "--version"),
 }
 """Programs that take part, and what prints their versions."""
+DECISIVE = (
+    *("commit", "seed", "options"),
+    *("machine", "processor", "cores", "kernel", "python", "cpu_shares", "versions"),
+)
+"""What must be the same for all rows of a table, by its name in the description."""
 
 
 def describe(options: Options, seed: int, runs: int) -> dict[str, Any]:
@@ -101,15 +106,25 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def commit() -> str:
-    """Return the commit of the checkout that this package is in; with ``+`` if files were changed."""
-    folder = Path(rce.__file__).parent
+def commit(folder: Path = Path(rce.__file__).parent) -> str:
+    """Return the commit of the checkout that this package is in; with ``+`` if files were changed.
+
+    Args:
+        folder: Of the package.
+
+    Returns:
+        ``unknown`` if it was installed; also below a repository of something else.
+    """
     git = ("git", "-C", str(folder))
-    if shutil.which("git") is None:
+    if shutil.which("git") is None or _output(*git, "ls-files", "--error-unmatch", "__init__.py") is None:
         return "unknown"
-    head = subprocess.run((*git, "rev-parse", "HEAD"), check=False, capture_output=True, text=True)  # noqa: S603
-    if head.returncode:
+    head = _output(*git, "rev-parse", "HEAD")
+    if head is None:
         return "unknown"
-    status = ("status", "--porcelain", "--untracked-files=no")
-    changed = subprocess.run((*git, *status), check=False, capture_output=True, text=True).stdout  # noqa: S603
-    return head.stdout.strip() + ("+" if changed.strip() else "")
+    return head + ("+" if _output(*git, "status", "--porcelain", "--untracked-files=no") else "")
+
+
+def _output(*argv: str) -> str | None:
+    """Return what a program prints; None: it failed."""
+    done = subprocess.run(argv, check=False, capture_output=True, text=True)  # noqa: S603
+    return None if done.returncode else done.stdout.strip()
