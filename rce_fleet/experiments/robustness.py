@@ -134,7 +134,8 @@ class Robustness(Experiment):
             steady = repaired + STEADY_S
             seen = Seen()
             end = repaired
-            while end < repaired + times.watch:
+            watched = time.monotonic() + times.watch
+            while time.monotonic() < watched:
                 await asyncio.sleep(POLL_S)
                 end = time.time()  # before it is read: that takes a second where all are busy
                 seen = Seen.of(reports(await watcher.lines()))

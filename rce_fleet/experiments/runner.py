@@ -11,10 +11,11 @@ import zlib
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.bench import CLIENT, SERVER, Bench
+from rce_fleet.experiments.clock_watch import ClockWatch
 from rce_fleet.experiments.experiment import NOT_ANY, Experiment, Options, Trial
 from rce_fleet.experiments.results import Condition, Row, error_text, read_rows, write_rows
 from rce_fleet.experiments.schedule import WARM_UP, Run, remaining, schedule
@@ -22,8 +23,10 @@ from rce_fleet.experiments.systems.base import together
 from rce_fleet.experiments.systems.software import software_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Awaitable, Callable, Iterator
     from pathlib import Path
+
+T = TypeVar("T")
 
 TABLE = "results.csv"
 DONE = "done"
@@ -158,10 +161,19 @@ class Runner:
         plan: What is to be done.
         folder: For the raw data; rows that are there count as done.
         say: Called with each line of progress.
+        wall: The clock whose stamps messages have, seconds since 1970.
     """
 
-    def __init__(self, plan: Plan, folder: Path, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        folder: Path,
+        say: Callable[[str], None],
+        *,
+        wall: Callable[[], float] = time.time,
+    ) -> None:
         self._plan = plan
+        self._wall = wall
         self._table = folder / TABLE
         self._say = say
         self._prepared: dict[str, dict[str, float]] = {}
@@ -223,22 +235,39 @@ class Runner:
         options = self._plan.options_of(work.experiment)
         trial = Trial(run.condition, options, seed, run.number == WARM_UP, prepared)
         began = time.monotonic()
-        for attempt in range(1, TRIES + 1):
-            try:
-                measured = await work.experiment.measure(trial)
-                break
-            except (ExperimentError, OSError) as error:
-                text = error_text(error)
-                if attempt == TRIES:
-                    raise ExperimentError(f"{_named(work)}: {text}") from error
-                self._say(f"{_named(work)} is tried again: {text}")
+        measured, tries = await self._tried(_named(work), lambda: work.experiment.measure(trial))
         if run.number == WARM_UP:
             return
         rows = [Row(one.condition, run.number, *one.value) for one in measured]
         took = Row(run.condition, run.number, DONE, time.monotonic() - began, "s")
-        attempts = Row(run.condition, run.number, "tries", float(attempt), "")
+        attempts = Row(run.condition, run.number, "tries", float(tries), "")
         async with self._writing:
             await asyncio.to_thread(write_rows, self._table, [*rows, attempts, took])
+
+    async def _tried(self, name: str, measure: Callable[[], Awaitable[T]]) -> tuple[T, int]:
+        """Return what was measured, and how often that was tried.
+
+        Args:
+            name: What is measured.
+            measure: Measures it.
+
+        Raises:
+            ExperimentError: The last attempt failed too.
+        """
+        attempt = 0
+        while True:
+            attempt += 1
+            watch = ClockWatch(self._wall)
+            try:
+                found = await measure()
+                watch.check()
+            except (ExperimentError, OSError) as error:
+                text = error_text(error)
+                if attempt == TRIES:
+                    raise ExperimentError(f"{name}: {text}") from error
+                self._say(f"{name} is tried again: {text}")
+            else:
+                return found, attempt
 
     async def _prepare_software(self) -> None:
         """Have the software make what it needs, before anything is measured."""
@@ -259,7 +288,9 @@ class Runner:
         options = self._plan.options_of(experiment)
         if not found and experiment.preparation_seconds(options):
             self._say(f"{experiment.name}: preparing")
-            values = await experiment.prepare(options, self._plan.seed)
+            values, _ = await self._tried(
+                f"{experiment.name}: preparation", lambda: experiment.prepare(options, self._plan.seed)
+            )
             write_rows(self._table, [Row(condition, 1, *value) for value in values])
             found = {value.metric: value.value for value in values}
         return found

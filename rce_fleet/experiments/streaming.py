@@ -151,8 +151,8 @@ class Streaming:
         emulation = await self._bench.emulation_s()
         client = [await self._bench.read(CLIENT)]
         server = [await self._bench.read(SERVER)]
-        end = server[0].at + seconds
-        while (left := end - time.time()) > 0:
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
             await asyncio.sleep(min(left, STEP_S))
             server.append(await self._bench.read(SERVER))
         client.append(await self._bench.read(CLIENT))

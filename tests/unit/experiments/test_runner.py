@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -64,13 +66,14 @@ def runner(
     runs: int = RUNS,
     seed: int = 1,
     options: Options = OPTIONS,
+    wall: Callable[[], float] = time.time,
 ) -> Runner:
     if not (folder / TABLE).exists():
         conditions = [
             Condition.of(LINK, NOT_ANY, NOT_ANY, delay=round(1000 * delay)) for delay in LINK_DELAYS_S
         ]
         write_rows(folder / TABLE, [Row(condition, 1, "rate", 1.0, "bit/s") for condition in conditions])
-    return Runner(Plan([dice], options, runs, seed), folder, said.append)
+    return Runner(Plan([dice], options, runs, seed), folder, said.append, wall=wall)
 
 
 async def test_each_setup_is_warmed_up_and_run(tmp_path: Path) -> None:
@@ -200,3 +203,24 @@ async def test_an_error_of_the_system_names_the_run(tmp_path: Path) -> None:
 
     with pytest.raises(ExperimentError, match=r"dice: \w+ rce, run 1: .*missing/images: No such file"):
         await runner(tmp_path, Full(), []).run()
+
+
+@pytest.mark.parametrize("step", [-3600.0, 0.5, 7200.0])
+async def test_a_run_in_which_the_clock_was_set_is_done_again(tmp_path: Path, step: float) -> None:
+    """By a time server, or because the machine slept: delays and rates of such a run are wrong."""
+
+    class Sleeping(Dice):
+        async def measure(self, trial: Trial) -> list[Measured]:
+            measured = await super().measure(trial)
+            if len(self.trials) == 5:
+                ahead.append(step)
+            return measured
+
+    ahead, dice, said = [0.0], Sleeping(), list[str]()
+    await runner(tmp_path, dice, said, wall=lambda: time.time() + sum(ahead)).run()
+    assert f"the clock of this machine was set by {step:+.2f} s meanwhile, or the machine slept" in "".join(
+        said
+    )
+    tries = [row.value for row in read_rows(tmp_path / TABLE) if row.metric == "tries"]
+    assert sorted(tries) == [1.0, 1.0, 1.0, 2.0]
+    assert len(dice.trials) == 7, "two warm-ups, four runs, and one of them again"
