@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, NamedTuple
+from urllib.parse import quote
 
 from rce_fleet.experiments.report import drawing
 from rce_fleet.experiments.report.break_even import break_even_table
@@ -79,7 +80,7 @@ def make_report(folders: Sequence[Path], *, page: Path, figures: Path, second: S
     if drawing.can_draw():
         for one in (*schematics(), *(one for found in drawings.values() for one in found)):
             drawing.save(one, figures)
-    where = PurePath(os.path.relpath(figures, page.parent)).as_posix()
+    where = quote(PurePath(os.path.relpath(figures, page.parent)).as_posix())
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(page_text(measurements, environments, drawings, where, again), encoding="utf-8")
 

@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import unquote
 
 import pytest
 from support.experiment_rows import CRS, SMS, example_rows, in_three_systems, rows_of
@@ -365,6 +366,16 @@ def test_page_without_matplotlib_says_what_to_install(
     assert [path.name for path in (tmp_path / "figures").iterdir() if path.suffix != ".json"] == [
         "summary.csv"
     ]
+
+
+def test_links_of_a_page_with_spaces_lead_to_its_figures(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drawing, "can_draw", lambda: False)
+    page = tmp_path / "run 2 (at home).md"
+    make_report([folder], page=page, figures=page.with_suffix(""))
+    (link,) = re.findall(r"\[summary\.csv\]\(([^\s()]+)\)", page.read_text(encoding="utf-8"))
+    assert (tmp_path / unquote(link)).is_file()
 
 
 @pytest.mark.parametrize("text", ["{", "[]"])
