@@ -282,13 +282,14 @@ class PlannerNode:
                 case SendCancel(robot):
                     self._robots.send_cancel(robot)
                 case BlockedChanged(cells):
-                    self._publish_blocked(cells)
+                    self._grid.change(cells)
                 case MakePlan(request):
                     self._requests.put_nowait((self._planner, request))
                 case Reply():
                     pass  # for the caller
                 case _:
                     assert_never(instruction)
+        self._grid.update(self._planner.state, self._state.started)
 
     def _publish_blocked(self, cells: tuple[int, ...]) -> None:
         self._grid.publish(self._planner.state, self._state.started, cells)

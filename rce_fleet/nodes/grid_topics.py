@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 OLD_TOPIC_LOOKS = 3
 """So many looks in a row must find only robot files from before on the old topic of the grid."""
+LEAST_PAUSE = 0.1
+"""Seconds between two messages of the grid at least, however many cells are blocked one by one."""
 SEND_AGAIN = 5.0
 """Seconds between two messages of the grid for move clients that have another one."""
 
@@ -35,6 +37,8 @@ class GridTopics:
         self._map: Publisher
         self._old_map: Publisher | None = None
         self._shown_blocked: tuple[int, ...] = ()
+        self._next_blocked: tuple[int, ...] | None = None
+        """Blocked cells that are not published yet; None: those that were are as they are."""
         self._shown_requested: tuple[str, tuple[int, ...]] | None = None
         self._looks_for_old = 0
         self._sent_at = 0.0
@@ -55,13 +59,28 @@ class GridTopics:
             cells: The blocked cells.
         """
         self._blocked.publish(data=list(cells))
-        self._shown_blocked = cells
+        self._shown_blocked, self._next_blocked = cells, None
         self.publish_requested(state)
         fields = grid_fields(state.grid, cells, self._node.now(), started)
         for grids in (self._map, self._old_map):
             if grids is not None:
                 grids.publish(fields)
         self._sent_at = time.monotonic()
+
+    def change(self, cells: tuple[int, ...]) -> None:
+        """Note other blocked cells, for the next :meth:`update`: a message has the whole grid."""
+        self._next_blocked = cells
+
+    def update(self, state: FleetState, started: Time) -> None:
+        """Publish the grid if its blocked cells have changed, unless it was published just now.
+
+        Args:
+            state: The fleet.
+            started: When the planner took the grid.
+        """
+        cells = self._next_blocked
+        if cells is not None and time.monotonic() - self._sent_at >= LEAST_PAUSE:
+            self.publish(state, started, cells)
 
     def publish_requested(self, state: FleetState) -> None:
         """Publish the blocked cells that people asked for, if they or the grid have changed.

@@ -10,10 +10,12 @@ import pytest
 
 from rce.ros.core import Core
 from rce.ros.node import Node
+from rce.ros.types import Message
 from rce_fleet.coordination.planner import FleetPlanner
 from rce_fleet.nodes import move_client
 from rce_fleet.nodes.fleet_planner import PlannerNode
 from rce_fleet.nodes.grid_messages import grid_fields
+from rce_fleet.nodes.grid_topics import LEAST_PAUSE
 from rce_fleet.nodes.move_client import MoveClientNode
 from rce_fleet.planning.grid import GridMap
 
@@ -23,9 +25,9 @@ TYPE = "nav_msgs/OccupancyGrid"
 
 
 @asynccontextmanager
-async def planning(uri: str) -> AsyncIterator[Node]:
+async def planning(uri: str, grid: GridMap = GRID) -> AsyncIterator[Node]:
     async with Node("fleet_planner", argv=[], master_uri=uri) as node:
-        task = asyncio.create_task(PlannerNode(node, FleetPlanner(GRID)).run([2]))
+        task = asyncio.create_task(PlannerNode(node, FleetPlanner(grid)).run([2]))
         yield node
         node.shutdown("the test is over")
         await task
@@ -43,6 +45,35 @@ async def test_the_planner_publishes_its_grid() -> None:
         assert (info.origin.position.x, info.origin.position.y) == (1.0, 2.0)
         assert info.origin.orientation.z == pytest.approx(0.2474, abs=1e-4)
         assert [cell for cell, value in enumerate(message.data) if value] == [2, 5]
+
+
+async def test_a_flood_of_blocked_cells_is_published_together() -> None:
+    """Each message has the whole grid, for every robot; the last one has all cells."""
+    floor = GridMap(40, 40)
+    async with (
+        Core(port=0) as core,
+        planning(core.uri, floor),
+        Node("judge", argv=[], master_uri=core.uri) as judge,
+    ):
+        blocked: list[int] = []
+        whole = asyncio.Event()
+
+        def take(message: Message) -> None:
+            blocked.append(sum(map(bool, message.data)))
+            if blocked[-1] == 401:
+                whole.set()
+
+        await judge.subscribe("/fleet/map", TYPE, take)
+        block = judge.service_client("/fleet/block_cell", "fleet/BlockCell")
+        async with asyncio.timeout(PATIENCE):
+            await judge.wait_for_service("/fleet/block_cell")
+            began = asyncio.get_running_loop().time()
+            for cell in range(1000, 1400):
+                assert (await block.call({"cell": cell, "blocked": True}, timeout=PATIENCE)).ok
+            await whole.wait()
+            took = asyncio.get_running_loop().time() - began
+        assert len(blocked) <= 3 + took / LEAST_PAUSE
+        assert blocked == sorted(blocked)
 
 
 async def test_an_old_robot_file_gets_the_grid_on_map() -> None:
