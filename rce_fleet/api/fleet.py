@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, field_validator
 
-from rce_fleet.api.tasks import ApiModel, Cell, Moment
+from rce_fleet.api.tasks import ApiModel, Cell, Moment, numbers_only
 from rce_fleet.limits import (
     LEAST_CAPACITY,
     LEAST_FACTOR,
@@ -98,6 +98,8 @@ class RobotChange(ApiModel):
 class ChargersModel(ApiModel):
     """Cells with a purpose, and who charges."""
 
+    _numbers = field_validator("chargers", "parking", "returns", mode="before")(numbers_only)
+
     chargers: list[Cell] = Field(default_factory=list, description="Cells with a charger.", max_length=10000)
     parking: list[Cell] = Field(
         default_factory=list, description="Cells where idle robots wait.", max_length=10000
@@ -122,6 +124,8 @@ def _present_kind(kind: object) -> object:
 
 class ZoneRequest(ApiModel):
     """Cells with a rule."""
+
+    _numbers = field_validator("cells", "edges", "until", mode="before")(numbers_only)
 
     kind: Annotated[ZoneKindName, BeforeValidator(_present_kind)] = Field(
         description="The rule: blocked: robots do not enter it; slow: with at most this speed; one_way: not"
@@ -167,6 +171,8 @@ class CellChange(ApiModel):
 
 class GoalChange(ApiModel):
     """The goal of a robot."""
+
+    _numbers = field_validator("cell", mode="before")(numbers_only)
 
     cell: Cell | None = Field(description="Number of the goal cell; null: stop and stay.")
 

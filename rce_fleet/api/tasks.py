@@ -4,13 +4,32 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from rce_fleet.limits import MOST_AMOUNT, MOST_CELL, MOST_OCCURRENCES, MOST_TIME
 
 Cell: TypeAlias = Annotated[int, Field(ge=0, le=MOST_CELL)]
 Moment: TypeAlias = Annotated[float, Field(ge=0, le=MOST_TIME)]
 """Seconds since 1970."""
+
+
+def _has_boolean(value: object) -> bool:
+    return isinstance(value, bool) or (isinstance(value, list) and any(map(_has_boolean, value)))
+
+
+def numbers_only(value: object) -> object:
+    """Return a number, or numbers in lists; refuse true and false.
+
+    What other languages return for something that was not found would be cell 0, or the year 1970.
+
+    Raises:
+        ValueError: It is true or false, or a list has such a value.
+    """
+    if _has_boolean(value):
+        raise ValueError("true and false do not stand for numbers")
+    return value
+
+
 ActionName = Literal["go", "pick", "deliver", "charge", "park"]
 StateName = Literal[
     "queued", "assigned", "running", "held", "suspended", "cancelling", "done", "failed", "cancelled"
@@ -25,6 +44,8 @@ class ApiModel(BaseModel):
 
 class StopModel(ApiModel):
     """One stop of a task. Give ``cell``, or ``cells`` of which any one serves."""
+
+    _numbers = field_validator("cell", "cells", mode="before")(numbers_only)
 
     action: ActionName = Field(default="go", description="What the robot does there.")
     cell: Cell | None = Field(default=None, description="Where.")
@@ -53,6 +74,8 @@ class RepeatModel(ApiModel):
 
 class OrderFields(ApiModel):
     """What a task asks for, beside its stops. Times are seconds since 1970."""
+
+    _numbers = field_validator("deadline", "earliest_start", "return_cells", mode="before")(numbers_only)
 
     name: str = Field(default="", description="For people.", max_length=200)
     rounds: int = Field(default=1, description="How often the stops are made: a patrol.", ge=1, le=500)
@@ -98,6 +121,8 @@ class TaskChange(ApiModel):
 
     A change of a recurring task that has ended counts for its next occurrence.
     """
+
+    _numbers = field_validator("deadline", "earliest_start", "return_cells", mode="before")(numbers_only)
 
     stops: list[StopModel] | None = Field(default=None, min_length=1, max_length=500)
     name: str | None = Field(default=None, max_length=200)
@@ -163,6 +188,8 @@ class TaskPage(ApiModel):
 
 class LoadRequest(ApiModel):
     """Where the load of a task is whose robot does not come back."""
+
+    _numbers = field_validator("cell", mode="before")(numbers_only)
 
     cell: Cell | None = Field(
         description="Any robot picks it up there, and continues; null: the load is lost, and the task fails."

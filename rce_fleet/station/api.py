@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from rce_fleet.api.tasks import numbers_only
 
 MAX_CELL = 2**31 - 1
 """Largest number of a cell that the planner's messages hold."""
@@ -14,6 +16,8 @@ class _Model(BaseModel):
 
 class GoalRequest(_Model):
     """The goal of a robot."""
+
+    _numbers = field_validator("cell", mode="before")(numbers_only)
 
     cell: int | None = Field(description="Number of the goal cell; null: stop and stay.", ge=0, le=MAX_CELL)
 

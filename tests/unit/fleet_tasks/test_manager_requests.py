@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 from support.fleet_manager import GO, ManagerClient
 
 from rce_fleet.manager import manager as managers
 from rce_fleet.manager import task_routes
+from rce_fleet.station.api import GoalRequest
 from rce_fleet.tasks.facts import RobotFacts
 from rce_fleet.tasks.loads import carried
 from rce_fleet.tasks.records import RobotEntry
@@ -128,6 +130,16 @@ async def test_no_robot_is_denied_before_the_planner_has_told_its_robots(
         ("PUT", "/zones/z", {"kind": "blocked", "edges": [[0, -1]]}, 422),
         ("PUT", "/zones/z", {"kind": "blocked", "cells": [1], "until": 1e12}, 422),
         ("PUT", f"/cells/{2**31}", {"blocked": True}, 404),
+        # What other languages return for "not found" must not send a robot to cell 0, or be the year 1970.
+        ("POST", "/tasks", {"stops": [{"cell": False}]}, 422),
+        ("POST", "/tasks", {"stops": [{"cells": [3, False]}]}, 422),
+        ("POST", "/tasks", {**GO, "return_cells": [True]}, 422),
+        ("POST", "/tasks", {**GO, "deadline": False}, 422),
+        ("POST", "/tasks", {**GO, "earliest_start": True}, 422),
+        ("PATCH", "/tasks/T1", {"stops": [{"cell": True}]}, 422),
+        ("PUT", "/chargers", {"parking": [False]}, 422),
+        ("PUT", "/zones/z", {"kind": "blocked", "cells": [True]}, 422),
+        ("PUT", "/zones/z", {"kind": "blocked", "edges": [[False, 1]]}, 422),
     ],
 )
 async def test_bad_requests_say_why(
@@ -136,6 +148,15 @@ async def test_bad_requests_say_why(
     said, answer, _ = await client.ask(method, path, body)
     assert (said, set(answer)) == (status, {"error"})
     assert client.manager.book.number == 0
+
+
+async def test_a_robot_is_sent_to_no_cell_that_is_false(client: ManagerClient) -> None:
+    client.manager.facts.robots["Robot1"] = RobotFacts("Robot1", "idle", cell=5)
+    status, answer, _ = await client.ask("PUT", "/robots/Robot1/goal", {"cell": False})
+    assert (status, "true and false" in answer["error"]) == (422, True)
+    assert client.manager.book.number == 0
+    with pytest.raises(ValidationError, match="true and false"):
+        GoalRequest.model_validate_json('{"cell": false}')
 
 
 async def test_a_task_is_given_to_another_robot(client: ManagerClient) -> None:
