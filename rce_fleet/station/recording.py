@@ -180,7 +180,8 @@ class Recorder:
         """
         if self._view.map() is None:
             return None
-        whole = now - self._whole_at >= WHOLE_EVERY_S
+        # A clock that is set back begins anew, too.
+        whole = not 0.0 <= now - self._whole_at < WHOLE_EVERY_S
         robots = {robot["id"]: self._row(robot) for robot in self._view.robots()}
         cells = {"blocked": self._view.blocked(), "pending": self._view.pending()}
         frame: Frame = {

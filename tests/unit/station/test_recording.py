@@ -55,6 +55,17 @@ def test_the_state_of_any_moment_is_known(view: FleetView, records: Records) -> 
     assert recorder.records.read(START + 70, 0.0)[0]["blocked"] == [6]
 
 
+def test_a_clock_that_is_set_back_begins_with_a_whole_record(view: FleetView, records: Records) -> None:
+    """A machine whose clock was ahead would replay yesterday's robots, for as long as it was ahead."""
+    recorder = Recorder(view, records)
+    record(recorder, START + 7200)
+    view.on_pose("Robot1", pose(3.0, 0.5, 0.0))
+    record(recorder, START)
+    whole = recorder.records.read(START, 10.0)[0]
+    assert (whole["time"], whole["robots"]["Robot1"][:2]) == (START, [3.0, 0.5])
+    assert set(whole["robots"]) == {"Robot1", "Robot2"}
+
+
 def test_nothing_is_written_while_nothing_changes(view: FleetView, records: Records) -> None:
     recorder = Recorder(view, records)
     assert [record(recorder, START + second) for second in range(5)] == [True, False, False, False, False]
