@@ -10,7 +10,7 @@ from rce_fleet.tasks.assignment import Assigner, AssignmentRules, FreeRobot, mis
 from rce_fleet.tasks.charging import ChargerQueue
 from rce_fleet.tasks.conditions import Conditions
 from rce_fleet.tasks.energy import BatteryLevels, driven, effort_of
-from rce_fleet.tasks.explaining import why_none
+from rce_fleet.tasks.explaining import why_none, why_none_drives
 from rce_fleet.tasks.idle_ways import IdleWays
 from rce_fleet.tasks.parking import Parking, ParkingCells
 from rce_fleet.tasks.progress import ProgressRules, TaskProgress
@@ -21,7 +21,7 @@ from rce_fleet.tasks.travel import MOST_GRAPHS, TravelCosts
 from rce_fleet.tasks.zone_costs import zone_profiles
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Collection, Iterable, Sequence
 
     from rce_fleet.tasks.book import TaskBook
     from rce_fleet.tasks.charging import ChargerUser
@@ -359,13 +359,8 @@ class Dispatcher:
 
     def _explain(self, facts: FleetFacts, now: float) -> None:
         """Say of tasks that wait why no robot can do them."""
-        robots = [
-            self._free(robot)
-            for robot in facts.robots.values()
-            if robot.cell is not None and not self._book.entry(robot.id).is_out
-        ]
+        robots = [robot for robot in facts.robots.values() if not self._book.entry(robot.id).is_out]
         known: dict[object, str] = {}
-        chargers = self._open_chargers()
         waiting = [self._book.tasks[ready.number] for ready in self._conditions.ready]
         waiting = [task for task in waiting if task.state is TaskState.QUEUED]
         begin = self._explained % len(waiting) if waiting else 0
@@ -376,5 +371,19 @@ class Dispatcher:
                 replace(task.order, name="", priority=0, deadline=None, earliest_start=None),
             )
             if like not in known:
-                known[like] = why_none(task, robots, self._travel, self._assigner, chargers)
+                known[like] = self._why_waiting(task, robots, facts)
             self._conditions.note(task, known[like], now)
+
+    def _why_waiting(self, task: Task, robots: Sequence[RobotFacts], facts: FleetFacts) -> str:
+        """Return why no robot in service can do a task; empty if one can, and is only busy."""
+        if not robots:
+            return "no robot is in service"
+        placed = [self._free(robot) for robot in robots if robot.cell is not None]
+        if not placed:
+            return why_none_drives(robots)
+        reason = why_none(task, placed, self._travel, self._assigner, self._open_chargers())
+        if reason or facts.mode != AUTOMATIC:  # the fleet stands: people know why
+            return reason
+        return why_none_drives(
+            [robot for robot in robots if not misfit(task, robot.id, self.profile(robot.id))]
+        )

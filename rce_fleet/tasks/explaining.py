@@ -7,16 +7,21 @@ from typing import TYPE_CHECKING
 
 from rce_fleet.tasks.assignment import misfit
 from rce_fleet.tasks.energy import charges, effort_of
+from rce_fleet.tasks.order import Action
+from rce_fleet.tasks.records import AUTOMATIC
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rce_fleet.tasks.assignment import Assigner, FreeRobot
+    from rce_fleet.tasks.facts import RobotFacts
     from rce_fleet.tasks.task import Task
     from rce_fleet.tasks.travel import TravelCosts
 
 MOST_ROBOTS = 20
 """So many robots that fit are looked at for ways and batteries."""
+MOST_NAMED = 3
+"""So many robots are named in a reason."""
 
 
 def why_none(
@@ -26,30 +31,48 @@ def why_none(
 
     Args:
         task: The task.
-        robots: All robots in service.
+        robots: Robots in service, at least one.
         travel: Distances.
         assigner: Decides about batteries.
         chargers: Cells with chargers.
     """
-    if not robots:
-        return "no robot is in service"
     fitting = [robot for robot in robots if not misfit(task, robot.id, robot.profile)]
     if not fitting:
         return _why_no_fit(task, robots)
+    if not chargers and any(stop.action is Action.CHARGE and not stop.cells for stop in task.order.stops):
+        return "no charger is open for its stop 'charge': set chargers, or free the cell of one"
     lacks = set()
     for robot in fitting[:MOST_ROBOTS]:
         lack = _lack(task, robot, travel, assigner, chargers)
         if not lack:
             return ""
         lacks.add(lack)
-    cells = ", ".join(str(cell) for cell in dict.fromkeys(task.order.cells()))
+    cells, whom = ", ".join(str(cell) for cell in dict.fromkeys(task.order.cells())), task.order.robot
     worst = next(lack for lack in ("energy", "capacity", "charger", "path") if lack in lacks)
+    when = "it waits until one has charged" if chargers else "no charger is open"
     return {
-        "path": f"no path leads any robot to all of its stops (cells {cells})",
+        "path": f"no path leads {whom or 'any robot'} to all of its stops (cells {cells})",
         "charger": f"no path leads from its last stop to a charger (cells {', '.join(map(str, chargers))})",
         "capacity": "no robot's battery is large enough for it, even when it is full; split the task",
-        "energy": "no robot's battery has enough energy for it now; it waits until one has charged",
+        "energy": f"no robot's battery has enough energy for it now; {when}",
     }[worst]
+
+
+def why_none_drives(robots: Sequence[RobotFacts]) -> str:
+    """Return why the planner drives none of some robots now; empty if it drives one.
+
+    Args:
+        robots: Robots that could do a task.
+    """
+    if not robots or any(robot.is_driven for robot in robots):
+        return ""
+    said = [f"{robot.id} is {_how(robot)}{robot.reason and f' ({robot.reason})'}" for robot in robots]
+    more = f", and {len(said) - MOST_NAMED} more" if len(said) > MOST_NAMED else ""
+    return f"no robot that could do it can be sent now: {', '.join(said[:MOST_NAMED])}{more}"
+
+
+def _how(robot: RobotFacts) -> str:
+    return robot.state if robot.mode == AUTOMATIC else robot.mode.replace("_", " ")
 
 
 def _lack(

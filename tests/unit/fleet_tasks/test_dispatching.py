@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
+from typing import Any
 
 import pytest
 
@@ -253,16 +255,48 @@ def test_a_change_of_the_recurrence_respects_its_count(
         ({"capabilities": ("fork",)}, "no robot has all of the capabilities fork"),
         ({"robot": "Robot9"}, "only Robot9 may do it, which is not in service"),
         ({}, "no path leads any robot to all of its stops (cells 63)"),
+        (
+            {"stops": (Stop(Action.GO, (63,)),), "robot": "Robot1"},
+            "no path leads Robot1 to all of its stops (cells 63)",
+        ),
+        (
+            {"stops": (Stop(Action.CHARGE),)},
+            "no charger is open for its stop 'charge': set chargers, or free the cell of one",
+        ),
     ],
 )
-def test_a_task_that_no_robot_can_do_says_why(order: dict[str, object], reason: str) -> None:
+def test_a_task_that_no_robot_can_do_says_why(order: dict[str, Any], reason: str) -> None:
     floor = Floor(GridMap(blocked=frozenset({54, 55, 62})))
     floor.add("Robot1", 0)
     floor.add("Robot2", 1)
     floor.book.emit(RobotEntry("Robot2", profile=RobotProfile(payload=50.0)), "profile", floor.now)
-    task = floor.go(63 if not order else 5, **order)
-    floor.run(3)
+    stops = (Stop(Action.GO, (5 if order else 63,)),)
+    task = floor.book.create(Order(**{"stops": stops, **order}), floor.now)
+    floor.run(60)
     assert floor.task(task).reason == reason
+
+
+def test_a_task_whose_robots_cannot_be_sent_says_so(floor: Floor) -> None:
+    """It waited without a reason, or the robots were said to be out of service."""
+    first, second = floor.add("Robot1", 0), floor.add("Robot2", 1)
+    task = floor.go(5)
+    first.state, first.away_since, first.reason = "silent", floor.now, "its move client sends no reports"
+    second.state = second.mode = "paused"
+    second.away_since = floor.now  # else the floor moves it
+    floor.run(3)
+    said = "Robot1 is silent (its move client sends no reports), Robot2 is paused"
+    assert floor.task(task).reason == f"no robot that could do it can be sent now: {said}"
+    for robot in (first, second):
+        robot.state, robot.reason, robot.cell, robot.mode = (
+            "joining",
+            "it is outside the map",
+            None,
+            "automatic",
+        )
+    floor.run(3)
+    assert "Robot1 is joining (it is outside the map)" in floor.task(task).reason
+    first.state, first.away_since, first.cell = "idle", inf, 0
+    floor.run_until_ended(task)
 
 
 def test_an_action_is_not_begun_again_after_a_restart(floor: Floor) -> None:
