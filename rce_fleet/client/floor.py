@@ -10,7 +10,7 @@ from rce_fleet.api.fleet import (
     ZoneModel,
     ZoneRequest,
 )
-from rce_fleet.client.requests import ApiRequests, path_part
+from rce_fleet.client.requests import ApiRequests, if_match, path_part
 from rce_fleet.station.api import CellRequest, FleetModel
 
 
@@ -77,7 +77,12 @@ class FloorRequests(ApiRequests):
             await fleet.remove_zone("gate")
             ```
         """
-        await self._change("DELETE", f"/zones/{path_part(name)}", ZoneModel, None, revision)
+        await self._transport.request(
+            *("DELETE", f"/zones/{path_part(name)}"),
+            headers=if_match(revision),
+            repeatable=revision is None,
+            removes=True,
+        )
 
     async def chargers(self) -> ChargersState:
         """Return chargers, parking places and return cells, and who charges.

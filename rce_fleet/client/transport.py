@@ -14,7 +14,7 @@ from yarl import URL
 
 from rce.aio.backoff import Backoff
 from rce.web.client import session_connector
-from rce_fleet.client.errors import FleetApiUnavailableError, error_of
+from rce_fleet.client.errors import FleetApiUnavailableError, NotFoundError, error_of
 
 TIMEOUT = aiohttp.ClientTimeout(total=30.0, sock_connect=10.0)
 STREAM_TIMEOUT = aiohttp.ClientTimeout(total=None, sock_connect=10.0, sock_read=45.0)
@@ -71,6 +71,7 @@ class Transport:
         query: Mapping[str, str] | None = None,
         headers: Mapping[str, str] | None = None,
         repeatable: bool = True,
+        removes: bool = False,
     ) -> str:
         """Send a request; return the body of the answer.
 
@@ -81,6 +82,8 @@ class Transport:
             query: Parameters.
             headers: Further headers.
             repeatable: Whether a second request does no harm, so that it is sent again without an answer.
+            removes: Whether one that is sent again and finds nothing was carried out before; the answer is
+                empty then.
 
         Raises:
             ApiError: The request was refused.
@@ -96,6 +99,10 @@ class Transport:
                 if not repeatable or attempt >= self.attempts:
                     raise
                 await asyncio.sleep(pauses.next())
+            except NotFoundError:
+                if not removes or attempt == 1:
+                    raise
+                return ""
 
     async def _once(
         self,

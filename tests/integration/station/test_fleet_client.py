@@ -13,7 +13,7 @@ from aiohttp.test_utils import TestServer
 from typer.testing import CliRunner
 
 from rce_fleet.cli.commands import app as commands
-from rce_fleet.client import ApiError, FleetApiUnavailableError, FleetClient
+from rce_fleet.client import ApiError, FleetApiUnavailableError, FleetClient, NotFoundError
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -64,6 +64,29 @@ async def test_a_proxy_without_its_station_is_unavailable(status: int) -> None:
         with pytest.raises(FleetApiUnavailableError, match=f"answered {status}"):
             await client.task("1")
     assert asked == 2
+
+
+@pytest.mark.parametrize("is_first", [False, True])
+async def test_a_zone_that_was_removed_without_an_answer_is_removed(is_first: bool) -> None:
+    """The request is sent again, and finds nothing. One that is answered at once says that there was none."""
+    asked = 0
+
+    async def remove(_request: web.Request) -> web.Response:
+        nonlocal asked
+        asked += 1
+        if asked == 1 and not is_first:
+            return web.Response(status=503, text="the fleet manager did not answer")
+        return web.json_response({"error": "there is no zone 'gate'"}, status=404)
+
+    async with client_of(remove) as client:
+        if is_first:
+            with pytest.raises(NotFoundError, match="no zone 'gate'"):
+                await client.remove_zone("gate")
+        else:
+            await client.remove_zone("gate")
+            with pytest.raises(NotFoundError):
+                await client.remove_zone("gate", revision=3)
+    assert asked == (1 if is_first else 3)
 
 
 async def test_an_answer_that_is_not_text_is_an_error_of_the_client() -> None:
