@@ -323,7 +323,7 @@ class Bench:
         return found.union(*(processes_in(one.namespace) for one in self._network.machines.values()))
 
     def _environ(self, machine: Machine) -> dict[str, str]:
-        kept = {name: value for name, value in os.environ.items() if not name.startswith(("ROS_", "RCE_"))}
+        kept = {name: value for name, value in os.environ.items() if _is_for_programs(name)}
         folder = str(Path(sys.executable).parent)
         return kept | {
             "HOME": str(self.folder),
@@ -342,6 +342,14 @@ def client(number: int) -> str:
 def shape_of(delay: float) -> LinkShape:
     """Return the shape of a link with a delay, seconds; jitter is that of a wireless LAN, or less."""
     return LinkShape(delay=delay, jitter=min(JITTER_S, delay))
+
+
+def _is_for_programs(variable: str) -> bool:
+    """Return whether programs on machines get an environment variable of this process.
+
+    They have settings of their own, and no way to the computer's proxy.
+    """
+    return not variable.startswith(("ROS_", "RCE_")) and not variable.lower().endswith("_proxy")
 
 
 async def _end(programs: list[Program], number: signal.Signals) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 
 import pytest
 
 from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments import machines as module
+from rce_fleet.experiments.bench import CLIENT, Bench
 from rce_fleet.experiments.delay_line import LinkShape
 from rce_fleet.experiments.machines import MachineLink, MachineNetwork
 
@@ -74,3 +76,13 @@ async def test_a_link_gets_another_rate_while_it_is_in_use() -> None:
         assert found.rate <= 2e6
         with pytest.raises(ExperimentError, match="server was made without a rate"):
             await network.set_rate("server", 2e6)
+
+
+@needs_machines
+async def test_programs_do_not_use_the_proxy_of_the_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It cannot be reached from the machines, and their addresses are not among its exceptions."""
+    monkeypatch.setenv("http_proxy", "http://proxy.example.com:3128")
+    monkeypatch.setenv("ALL_PROXY", "socks5://proxy.example.com:1080")
+    code = "import os, urllib.request; print(urllib.request.getproxies(), os.environ.get('ALL_PROXY'))"
+    async with Bench() as bench:
+        assert await bench.run(CLIENT, "proxies", [sys.executable, "-c", code]) == "{} None\n"
