@@ -118,11 +118,9 @@ class Amcl:
         Raises:
             MapError: The map has no free cell; the filter keeps the one it has.
         """
-        free = np.argwhere(grid.free)
-        if not len(free):
+        if not grid.free_count:
             raise MapError("the map has no free cell, so the robot cannot be anywhere on it")
         self._grid = grid
-        self._free = free
         uses_beams = self.parameters.laser_model_type is LaserModel.BEAM
         self._beams = BeamModel(grid, self.parameters) if uses_beams else None
         self._field = None if uses_beams else LikelihoodField(grid, self.parameters)
@@ -307,7 +305,7 @@ class Amcl:
         return share if share and contradicts_map(self._grid, best, beams) else 0.0
 
     def _anywhere(self, count: int) -> NDArray[np.float64]:
-        cells = self._free[self._rng.integers(len(self._free), size=count)]
+        cells = self._grid.free_cells(self._rng.integers(self._grid.free_count, size=count))
         inside = cells + self._rng.random((count, 2)) - 0.5
         drawn = np.empty((3, count))
         drawn[:2] = self._grid.cell_to_world(inside).T

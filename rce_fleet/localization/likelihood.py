@@ -7,21 +7,25 @@ probabilities, and can leave out beams that contradict the map.
 
 from __future__ import annotations
 
-from math import cos, sin
+from math import ceil, cos, sin
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rce_fleet.compiled import kernel
-from rce_fleet.maps.distance import distance_field
+from rce_fleet.maps.distance import squares_to_nearest
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rce_fleet.localization.parameters import AmclParameters
     from rce_fleet.localization.scan import Beams
+    from rce_fleet.maps.distance import Squares
     from rce_fleet.maps.occupancy_map import OccupancyMap
 
+_AT_ONCE = 16_000
+"""Ends of beams that are looked up at a time in numpy: larger arrays leave the cache, and their memory
+is made anew by the kernel each time."""
 _TABLES = 8
 """Tables that are kept: one or two for each laser with a range of its own."""
 
@@ -39,8 +43,11 @@ class LikelihoodField:
         self._resolution = grid.resolution
         self._to_map = grid.origin.inverse().as_array()
         farthest = parameters.laser_likelihood_max_dist
+        reach = min(ceil(farthest / grid.resolution), grid.rows + grid.columns)
         # One cell more on each side stands for everything outside.
-        self._distance = np.pad(distance_field(grid, farthest), 1, constant_values=farthest)
+        self._squares = np.pad(squares_to_nearest(grid.occupied, reach), 1, constant_values=reach**2 + 1)
+        self._distances = np.minimum(np.sqrt(np.arange(reach**2 + 2)) * grid.resolution, farthest)
+        self._distances[-1] = farthest
         self._tables: dict[tuple[str, float], NDArray[np.float64]] = {}
 
     def sums_of_cubes(self, particles: NDArray[np.float64], beams: Beams) -> NDArray[np.float64]:
@@ -73,26 +80,25 @@ class LikelihoodField:
     def _sum(
         self, table: NDArray[np.float64], particles: NDArray[np.float64], ends: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        return sum_at_ends(
-            table, np.ascontiguousarray(particles), np.ascontiguousarray(ends), self._to_map, self._resolution
-        )
+        places = np.ascontiguousarray(particles), np.ascontiguousarray(ends)
+        return sum_at_ends(table, self._squares, *places, self._to_map, self._resolution)
 
     def _agreeing(self, particles: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.bool_]:
         parameters = self._parameters
-        rows, columns = _cells(particles, ends, self._to_map, self._resolution, self._distance.shape)
-        near = self._distance[rows, columns] < parameters.beam_skip_distance
+        rows, columns = _cells(particles, ends, self._to_map, self._resolution, self._squares.shape)
+        near = self._distances[self._squares[rows, columns]] < parameters.beam_skip_distance
         agrees = near.mean(axis=0) > parameters.beam_skip_threshold
         if (~agrees).mean() >= parameters.beam_skip_error_threshold:
             return np.ones_like(agrees)
         return np.asarray(agrees)
 
     def _table(self, form: str, range_max: float) -> NDArray[np.float64]:
-        """Return what a beam that ends in a cell adds; shape (rows + 2, columns + 2)."""
+        """Return what a beam adds that ends in a cell, by the square of the cell's distance in cells."""
         key = (form, range_max)
         if key not in self._tables:
             parameters = self._parameters
             sigma = parameters.laser_sigma_hit
-            hit = np.exp(-(self._distance**2) / (2 * sigma * sigma))
+            hit = np.exp(-(self._distances**2) / (2 * sigma * sigma))
             chance = parameters.laser_z_hit * hit + parameters.laser_z_rand / range_max
             if len(self._tables) >= _TABLES:
                 self._tables.clear()
@@ -129,22 +135,32 @@ def _cells(
 
 def _sum_numpy(
     table: NDArray[np.float64],
+    squares: Squares,
     particles: NDArray[np.float64],
     ends: NDArray[np.float64],
     to_map: NDArray[np.float64],
     resolution: float,
 ) -> NDArray[np.float64]:
-    rows, columns = _cells(particles, ends, to_map, resolution, table.shape)
-    rows *= table.shape[1]
-    rows += columns
-    return np.asarray(table.reshape(-1).take(rows).sum(axis=1))
+    flat = squares.reshape(-1)
+    sums = np.empty(particles.shape[1])
+    step = max(_AT_ONCE // max(ends.shape[1], 1), 1)
+    for first in range(0, len(sums), step):
+        part = particles[:, first : first + step]
+        rows, columns = _cells(part, ends, to_map, resolution, squares.shape)
+        rows *= squares.shape[1]
+        rows += columns
+        table.take(flat.take(rows)).sum(axis=1, out=sums[first : first + step])
+    return sums
 
 
 @kernel(
-    "float64[::1](float64[:,::1], float64[:,::1], float64[:,::1], float64[::1], float64)", numpy=_sum_numpy
+    "float64[::1](float64[::1], uint16[:,::1], float64[:,::1], float64[:,::1], float64[::1], float64)",
+    "float64[::1](float64[::1], uint32[:,::1], float64[:,::1], float64[:,::1], float64[::1], float64)",
+    numpy=_sum_numpy,
 )
 def sum_at_ends(
     table: NDArray[np.float64],
+    squares: Squares,
     particles: NDArray[np.float64],
     ends: NDArray[np.float64],
     to_map: NDArray[np.float64],
@@ -153,8 +169,9 @@ def sum_at_ends(
     """Return the sums of a table's values where beams end.
 
     Args:
-        table: shape (rows + 2, columns + 2): values of the map's cells, and one more on each side for what
-            is outside.
+        table: shape (S,): values by the squares of distances, in cells.
+        squares: shape (rows + 2, columns + 2), below S: the squares of the map's cells, and one more on each
+            side for what is outside.
         particles: shape (3, N): x, y, yaw in the world.
         ends: shape (2, K): ends of the beams in the frame of the particle, metres.
         to_map: shape (3,): pose of the world in the map's own frame.
@@ -163,10 +180,10 @@ def sum_at_ends(
     Returns:
         shape (N,).
     """
-    last_row, last_column = table.shape[0] - 1.0, table.shape[1] - 1.0
+    last_row, last_column = squares.shape[0] - 1.0, squares.shape[1] - 1.0
     turn_c, turn_s = np.cos(to_map[2]), np.sin(to_map[2])
     inverse = 1.0 / resolution
-    width, values = table.shape[1], table.reshape(table.size)
+    width, flat = squares.shape[1], squares.reshape(squares.size)
     # First the cells, then the values: a loop without look-ups is compiled to vector instructions.
     cells = np.empty(ends.shape[1], np.int32)
     result = np.empty(particles.shape[1])
@@ -181,6 +198,6 @@ def sum_at_ends(
             cells[k] = np.int32(row) * np.int32(width) + np.int32(column)
         total = 0.0
         for k in range(ends.shape[1]):
-            total += values[np.uint32(cells[k])]  # unsigned: no look whether the index is negative
+            total += table[flat[np.uint32(cells[k])]]  # unsigned: no look whether the index is negative
         result[i] = total
     return result

@@ -3,15 +3,44 @@
 from __future__ import annotations
 
 from math import inf
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from rce_fleet.maps.occupancy_map import OccupancyMap
+
+
+Squares = NDArray[np.unsignedinteger[Any]]
+"""Squared distances in cells. Such a field takes a quarter of the memory of one in metres."""
+_BAND = 1 << 18
+"""Cells that are computed at a time: scipy needs 40 bytes for each."""
+
+
+def squares_to_nearest(mask: NDArray[np.bool_], reach: int) -> Squares:
+    """Return the square of each cell's distance to the nearest cell that is set, in cells.
+
+    Args:
+        mask: Shape (rows, columns).
+        reach: Cells that are farther away than so many get ``reach**2 + 1``.
+
+    Returns:
+        Shape (rows, columns), uint16 if ``reach`` is below 256, else uint32.
+    """
+    far = reach * reach + 1
+    rows, columns = mask.shape
+    found: Squares = np.full(mask.shape, far, np.uint16 if far <= np.iinfo(np.uint16).max else np.uint32)
+    height = max(4 * reach, _BAND // columns, 1)
+    for low in range(0, rows, height):
+        high = min(low + height, rows)
+        first = max(low - reach, 0)
+        around = mask[first : high + reach]  # what lies beyond is too far away to matter
+        if around.any():
+            away = ndimage.distance_transform_edt(~around)[low - first : high - first]
+            np.minimum(np.rint(away * away), far, out=found[low:high], casting="unsafe")
+    return found
 
 
 def distance_field(grid: OccupancyMap, max_m: float = inf) -> NDArray[np.float64]:

@@ -32,7 +32,6 @@ TINY = {
     "rce_container/runtimes/process.py": "one runtime a file",
     "rce_fleet/limits.py": BASE,
     "rce_fleet/mapping/mapper.py": "what two algorithms, in packages of their own, have in common",
-    "rce_fleet/maps/distance.py": "one computation on a map; several rooms use only this one",
     "rce_fleet/offline/inputs.py": "chooses between two readers, one of which needs rosbags",
     "rce_master/cli/exceptions.py": BASE,
     "rce_master/command.py": TYPER,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -125,7 +125,11 @@ class CostGrid:
 
     def centres_of(self, cells: Cells) -> Floats:
         """Return the centres of cells in metres, shape (N, 2), from rows and columns, shape (N, 2)."""
-        return np.asarray((cells[:, ::-1] + 0.5) * self.resolution + np.asarray(self.origin), np.float64)
+        return self.corners_of(cells + 0.5)
+
+    def corners_of(self, cells: NDArray[np.number[Any]]) -> Floats:
+        """Return the lower left corners of cells in metres, shape (N, 2), from rows and columns, likewise."""
+        return np.asarray(cells[:, ::-1] * self.resolution + np.asarray(self.origin), np.float64)
 
     def contains(self, cells: Cells) -> NDArray[np.bool_]:
         """Return which of the cells, shape (N, 2), are inside the grid."""

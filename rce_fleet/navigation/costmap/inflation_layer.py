@@ -6,8 +6,8 @@ from math import ceil
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
+from rce_fleet.maps.distance import squares_to_nearest
 from rce_fleet.navigation.costmap.cost_grid import NOWHERE, Area, CostGrid
 from rce_fleet.navigation.costmap.costs import FREE, INSCRIBED, LETHAL, UNKNOWN, cost_of_distance
 
@@ -55,15 +55,14 @@ class InflationLayer:
         """Write costs around the lethal cells of an area and of its surroundings."""
         reach = self.reach(grid)
         around = area.grown(reach).clipped(*grid.shape)
-        free = grid.values[around.slices] != LETHAL
-        if free.all():
+        lethal = grid.values[around.slices] == LETHAL
+        if not lethal.any():
             return
-        squared = np.rint(distance_transform_edt(free) ** 2).astype(np.intp)
+        squares = squares_to_nearest(lethal, reach)
         inner = Area(
             area.low - around.low, area.left - around.left, area.high - around.low, area.right - around.left
         )
-        table = self._costs_by_square(grid.resolution, reach)
-        costs = table[np.minimum(squared[inner.slices], len(table) - 1)]
+        costs = self._costs_by_square(grid.resolution, reach)[squares[inner.slices]]
         below = grid.values[area.slices]
         least = FREE + 1 if self.parameters.inflate_unknown else INSCRIBED
         unknown = below == UNKNOWN

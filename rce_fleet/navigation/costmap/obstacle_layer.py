@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 
+PARTS = 255
+"""Parts of a cell's edge, by which it is known where in the cell a hit was."""
 MAX_KEPT = 1000
 """Observations of a source that are kept, however long it persists."""
 JUMP = 1.0
@@ -42,7 +44,8 @@ class ObstacleLayer:
         grid: The costmap.
 
     Attributes:
-        hits: The last point that was hit in each marked cell, shape (rows, columns, 2), metres; else NaN.
+        hits: Where in each marked cell the last hit was, shape (rows, columns, 2): x and y from the cell's
+            corner in its :data:`PARTS`, counted from 1; else 0.
     """
 
     def __init__(
@@ -82,12 +85,13 @@ class ObstacleLayer:
     def match(self, grid: CostGrid) -> None:
         """Begin with nothing marked."""
         self._costs: NDArray[np.uint8] = np.full(grid.shape, self._fill, np.uint8)
-        self.hits: NDArray[np.float32] = np.full((*grid.shape, 2), np.nan, np.float32)
+        # Zeros: memory of parts that no sensor reaches is not used.
+        self.hits: NDArray[np.uint8] = np.zeros((*grid.shape, 2), np.uint8)
 
     def move(self, _grid: CostGrid, rows: int, columns: int) -> None:
         """Shift the marks."""
         self._costs = shifted(self._costs, rows, columns, self._fill)
-        self.hits = shifted(self.hits, rows, columns, np.nan)
+        self.hits = shifted(self.hits, rows, columns, 0)
 
     def update_bounds(self, grid: CostGrid, robot: Pose, now: float) -> Area:
         """Clear and mark by the observations that are kept; return what may have changed."""
@@ -144,7 +148,7 @@ class ObstacleLayer:
         if not passed.any():
             return NOWHERE
         rows, columns = cells[passed].T
-        self._costs[rows, columns], self.hits[rows, columns] = FREE, np.nan
+        self._costs[rows, columns], self.hits[rows, columns] = FREE, 0
         return _bounds(cells[passed])
 
     def _mark(self, grid: CostGrid, hits: Floats) -> Area:
@@ -153,7 +157,9 @@ class ObstacleLayer:
         if not inside.any():
             return NOWHERE
         rows, columns = cells[inside].T
-        self._costs[rows, columns], self.hits[rows, columns] = LETHAL, hits[inside]
+        parts = (hits[inside] - grid.corners_of(cells[inside])) * (PARTS / grid.resolution)
+        self._costs[rows, columns] = LETHAL
+        self.hits[rows, columns] = 1 + np.clip(parts, 0, PARTS - 1)
         return _bounds(cells[inside])
 
     def _clear_footprint(self, grid: CostGrid, robot: Pose) -> Area:
@@ -167,7 +173,7 @@ class ObstacleLayer:
         if not under.any():
             return NOWHERE
         rows, columns = cells[under].T
-        self._costs[rows, columns], self.hits[rows, columns] = FREE, np.nan
+        self._costs[rows, columns], self.hits[rows, columns] = FREE, 0
         return _bounds(cells[under])
 
 
@@ -222,5 +228,6 @@ def lethal_points(grid: CostGrid, layer: ObstacleLayer | None, area: Area) -> Fl
     points = grid.centres_of(cells)
     if layer is None:
         return points
-    hits = layer.hits[cells[:, 0], cells[:, 1]].astype(np.float64)
-    return np.where(np.isnan(hits), points, hits)
+    parts = layer.hits[cells[:, 0], cells[:, 1]]
+    hits = grid.corners_of(cells) + (parts - 0.5) * (grid.resolution / PARTS)
+    return np.where(parts > 0, hits, points)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rce_fleet.geometry.poses import transform_points
-from rce_fleet.maps.distance import distance_field
+from rce_fleet.maps.distance import squares_to_nearest
 from rce_fleet.navigation.costmap.obstacle_layer import passed_by_rays
 from rce_fleet.navigation.obstacle_cells.passage import can_pass
 
@@ -97,7 +97,7 @@ class CellWatch:
         self.fleet = fleet
         self.parameters = parameters
         self._known = known
-        self._away = None if known is None else distance_field(known, 1.0)
+        self._mapped = None if known is None else _near_occupied(known, parameters.map_tolerance)
         self._part = fleet.resolution / parameters.parts
         self._now = -inf
         self._begin(-inf)
@@ -164,11 +164,10 @@ class CellWatch:
     def _foreign(self, hits: Floats, robots: Floats | None) -> Floats:
         """Return the hits that belong neither to the map nor to other robots."""
         keep = np.ones(len(hits), np.bool_)
-        if self._known is not None and self._away is not None and len(hits):
+        if self._known is not None and self._mapped is not None and len(hits):
             cells = self._known.world_to_cell(hits)
             inside = self._known.inside(cells)
-            near = self._away[tuple(np.where(inside[:, None], cells, 0).T)]
-            keep &= ~(inside & (near <= self.parameters.map_tolerance))
+            keep &= ~(inside & self._mapped[tuple(np.where(inside[:, None], cells, 0).T)])
         for x, y, radius in robots if robots is not None else ():
             keep &= np.hypot(hits[:, 0] - x, hits[:, 1] - y) > radius + self.parameters.robot_tolerance
         return hits[keep]
@@ -225,6 +224,12 @@ class CellWatch:
         """Return whether most of a cell was seen to be free a moment ago."""
         fresh = self._seen_at[self._square(cell)] >= now - self._start - _FRESH
         return float(fresh.mean()) >= self.parameters.seen_share
+
+
+def _near_occupied(known: OccupancyMap, within: float) -> NDArray[np.bool_]:
+    """Return which cells of a map are at most so far from an occupied one, metres; shape (rows, columns)."""
+    limit = within / known.resolution
+    return np.asarray(squares_to_nearest(known.occupied, ceil(limit)) <= limit * limit + 1e-9)
 
 
 def _shadow(occupied: NDArray[np.bool_], sensor: Floats) -> NDArray[np.bool_]:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Ints = NDArray[np.int64]
+    Steps = NDArray[np.int16]
 
 UNREACHED = 1 << 62
 """The cost of cells from which the goal cannot be reached, or that are farther from it than the start."""
@@ -31,7 +32,7 @@ _DIAGONAL = (181, 7)
 """A diagonal step's cost in straight ones: 181 / 2**7, 0.01 % below the square root of 2."""
 
 
-def steps_of(costs: NDArray[np.uint8], *, allow_unknown: bool = True) -> Ints:
+def steps_of(costs: NDArray[np.uint8], *, allow_unknown: bool = True) -> Steps:
     """Return the cost of a straight step from each cell, with a border of cells that cannot be entered.
 
     Args:
@@ -41,34 +42,37 @@ def steps_of(costs: NDArray[np.uint8], *, allow_unknown: bool = True) -> Ints:
     Returns:
         Shape (rows + 2, columns + 2); 0 where a cell cannot be entered.
     """
-    table = NEUTRAL_COST + np.arange(256) * _PER_COST[0] // _PER_COST[1]
+    table = (NEUTRAL_COST + np.arange(256) * _PER_COST[0] // _PER_COST[1]).astype(np.int16)
     table[INSCRIBED:] = 0
     table[UNKNOWN] = table[INSCRIBED - 1] if allow_unknown else 0
-    return np.pad(table[costs].astype(np.int64), 1)
+    return np.pad(table[costs], 1)
 
 
-def _spread_numpy(steps: Ints, goal: int, stop: int) -> Ints:
+def _spread_numpy(steps: Steps, goal: int, stop: int) -> Ints:
     """Compute the field with scipy."""
     columns = steps.shape[1]
     flat = steps.reshape(-1)
-    cells = np.flatnonzero(flat)
-    origins, targets, weights = [], [], []
+    cells = np.flatnonzero(flat).astype(np.int32)
+    origins, targets = [], []
     for offset in (1, -1, columns, -columns):
-        into = cells[flat[cells + offset] > 0] + offset
-        origins.append(into - offset)
-        targets.append(into)
-        weights.append(flat[into])
+        into = cells[flat[cells + offset] > 0]
+        origins.append(into)
+        targets.append(into + offset)
+    straight = sum(map(len, origins))
     for down in (columns, -columns):
         for across in (1, -1):
             open_ones = (
                 (flat[cells + down + across] > 0) & (flat[cells + down] > 0) & (flat[cells + across] > 0)
             )
-            into = cells[open_ones] + down + across
-            origins.append(into - down - across)
-            targets.append(into)
-            weights.append((flat[into] * _DIAGONAL[0]) >> _DIAGONAL[1])
-    edges = (np.concatenate(origins), np.concatenate(targets))
-    graph = csr_array((np.concatenate(weights).astype(np.float64), edges), shape=(len(flat), len(flat)))
+            into = cells[open_ones]
+            origins.append(into)
+            targets.append(into + down + across)
+    edges = np.concatenate(origins), np.concatenate(targets)
+    del origins, targets  # on a large map, edges are most of the memory
+    weights = flat[edges[1]].astype(np.float64)
+    weights[straight:] = np.floor(weights[straight:] * _DIAGONAL[0] / (1 << _DIAGONAL[1]))
+    graph = csr_array((weights, edges), shape=(len(flat), len(flat)))
+    del weights, edges
     found = dijkstra(graph, indices=goal)
     field = np.full(len(flat), UNREACHED, np.int64)
     limit = found[stop] if stop >= 0 else np.inf
@@ -77,8 +81,8 @@ def _spread_numpy(steps: Ints, goal: int, stop: int) -> Ints:
     return field.reshape(steps.shape)
 
 
-@kernel("int64[:,::1](int64[:,::1], int64, int64)", numpy=_spread_numpy)
-def spread(steps: Ints, goal: int, stop: int) -> Ints:  # noqa: C901, PLR0912, PLR0915 - one loop, to compile
+@kernel("int64[:,::1](int16[:,::1], int64, int64)", numpy=_spread_numpy)
+def spread(steps: Steps, goal: int, stop: int) -> Ints:  # noqa: C901, PLR0912, PLR0915 - one loop, to compile
     """Return the cost of the cheapest way from each cell to the goal, shape as ``steps``.
 
     A way makes straight and diagonal steps; a diagonal one only where both cells beside it can be entered.
@@ -89,23 +93,24 @@ def spread(steps: Ints, goal: int, stop: int) -> Ints:  # noqa: C901, PLR0912, P
         stop: Index of a cell: costs above its cost are not computed; -1: all.
     """
     columns = steps.shape[1]
-    flat = steps.copy().reshape(-1)
+    flat = steps.reshape(steps.size)
     count = len(flat)
-    buckets = ((flat.max() * 181) >> 7) + 1
+    buckets = ((np.int64(flat.max()) * 181) >> 7) + 1
     field = np.full(count, 1 << 62, np.int64)
-    head = np.full(buckets, -1, np.int64)
-    before = np.full(count, -1, np.int64)
-    after = np.full(count, -1, np.int64)
+    # 32 bits for indices of cells: with 64, a plan on a large map takes twice the memory.
+    head = np.full(buckets, -1, np.int32)
+    before = np.full(count, -1, np.int32)
+    after = np.full(count, -1, np.int32)
     offsets = np.array((1, -1, columns, -columns, columns + 1, columns - 1, 1 - columns, -1 - columns))
     beside = np.array((0, 0, 0, 0, 1, -1, 1, -1))
     field[goal] = 0
-    head[0] = goal
+    head[0] = np.int32(goal)
     waiting = 1
     cost = 0
     limit = 1 << 62
     while waiting > 0 and cost <= limit:
         bucket = cost % buckets
-        cell = head[bucket]
+        cell = int(head[bucket])
         if cell < 0:
             cost += 1
             continue
@@ -117,7 +122,7 @@ def spread(steps: Ints, goal: int, stop: int) -> Ints:  # noqa: C901, PLR0912, P
             limit = cost
         for way in range(8):
             other = cell + offsets[way]
-            step = flat[other]
+            step = int(flat[other])  # not of 16 bits: a diagonal one is computed from it
             if step == 0:
                 continue
             if beside[way] != 0:
@@ -141,8 +146,8 @@ def spread(steps: Ints, goal: int, stop: int) -> Ints:  # noqa: C901, PLR0912, P
             before[other] = -1
             after[other] = head[new]
             if head[new] >= 0:
-                before[head[new]] = other
-            head[new] = other
+                before[head[new]] = np.int32(other)
+            head[new] = np.int32(other)
             waiting += 1
     for cell in range(count):
         if field[cell] > limit:
@@ -150,7 +155,7 @@ def spread(steps: Ints, goal: int, stop: int) -> Ints:  # noqa: C901, PLR0912, P
     return field.reshape(steps.shape)
 
 
-def descend(field: Ints, steps: Ints, start: int) -> list[int]:
+def descend(field: Ints, steps: Steps, start: int) -> list[int]:
     """Return the cells of a cheapest way from ``start`` to the field's goal, as indices of flattened arrays.
 
     Raises:

@@ -126,7 +126,7 @@ class _Window:
 
     grid: CostGrid
     area: Area
-    steps: Ints
+    steps: NDArray[np.int16]
 
     def index_of(self, cell: tuple[int, int]) -> tuple[int, int]:
         """Return the index of a cell of the costmap in ``steps``."""

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
     Ints = NDArray[np.int64]
+    Steps = NDArray[np.int16]
 
 _TOLERANCE = 1.0001
 """How much more a straight line may cost than the steps that it replaces: the rounding of diagonal steps."""
@@ -41,7 +42,7 @@ def line_cells(start: Floats, end: Floats) -> tuple[Ints, Ints, Floats]:
     return rows, columns, lengths
 
 
-def line_cost(steps: Ints, start: Floats, end: Floats) -> float:
+def line_cost(steps: Steps, start: Floats, end: Floats) -> float:
     """Return the cost of a straight line; ``inf`` if it crosses a cell that cannot be entered."""
     rows, columns, lengths = line_cells(start, end)
     prices = steps[rows, columns]
@@ -51,7 +52,7 @@ def line_cost(steps: Ints, start: Floats, end: Floats) -> float:
     return float(prices @ lengths)
 
 
-def straighten(steps: Ints, cells: Ints) -> Ints:
+def straighten(steps: Steps, cells: Ints) -> Ints:
     """Return which cells of a way remain as corners, shape (K, 2); the first and the last remain.
 
     Args:

@@ -28,6 +28,7 @@ from rce_fleet.localization.resampling import (
     temper,
 )
 from rce_fleet.localization.scan import Beams, LaserScan, select_beams
+from rce_fleet.maps.distance import Squares
 from rce_fleet.maps.occupancy_map import OccupancyMap
 from rce_fleet.maps.ray_casting import cast_rays
 
@@ -160,11 +161,13 @@ def test_near_beams_count_less(beams: int, share: float) -> None:
 def test_compiled_likelihoods_equal_those_of_numpy() -> None:
     pytest.importorskip("numba")
     draw = rng(3)
-    table, ends = draw.random((30, 40)), draw.uniform(-2, 2, (2, 33))
+    table, ends = draw.random(50), draw.uniform(-2, 2, (2, 33))
     particles, frame = draw.uniform(-1, 4, (3, 200)), np.array((0.3, -0.5, 0.7))
     loop, plain = likelihood.sum_at_ends.compile(), likelihood.sum_at_ends.numpy
-    expected = plain(table, particles, ends, frame, 0.1)
-    assert loop(table, particles, ends, frame, 0.1) == pytest.approx(expected, rel=1e-12)
+    for kind in (np.uint16, np.uint32):
+        squares: Squares = draw.integers(0, 50, (30, 40)).astype(kind)
+        expected = plain(table, squares, particles, ends, frame, 0.1)
+        assert loop(table, squares, particles, ends, frame, 0.1) == pytest.approx(expected, rel=1e-12)
 
 
 def test_compiled_motion_equals_that_of_numpy() -> None:

