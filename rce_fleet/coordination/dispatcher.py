@@ -131,7 +131,7 @@ class Dispatcher:
         hull = set() if isnan(record.x) else self._placement.hull(record)
         ledger.overlap(record.id, self._beside(record, hull) if has_cell else self._around(record))
         claims = ledger.claims(record.id)
-        wanted = hull | record.earlier
+        wanted = hull | record.earlier | record.doubted
         self.state.index.displaced.put(record.id, () if wanted <= claims else wanted)
         if claims != before:
             self.avoid(record)
@@ -158,7 +158,7 @@ class Dispatcher:
             return {*self.state.ledger.claims(record.id), *self._may_reach(record)}
         touched = self._placement.touched(record)
         is_dead = self.state.mode_of(record) is RobotMode.DEAD
-        return touched if is_dead else touched | self._may_reach(record)
+        return touched if is_dead else touched | record.doubted | self._may_reach(record)
 
     def _stop_silent(self, record: RobotRecord) -> None:
         """Stop a silent robot as well as possible: its move client may hear. It keeps its cells."""

@@ -151,6 +151,7 @@ class FleetPlanner:
             return
         record = self._record(event.robot)
         record.see(event.x, event.y, event.yaw, self._now, self.settings)
+        self._doubt(record)
         why = is_lost(record, event, self.settings)
         if why != record.lost:
             self._modes.set_lost(record, why)
@@ -235,10 +236,16 @@ class FleetPlanner:
             record.rest = None  # It was carried away: it stays where it was put.
             self._dispatcher.hold(record, "it left its path")
 
+    def _doubt(self, record: RobotRecord) -> None:
+        """Note where a robot may be after its newest pose: also where it was, if the pose jumped."""
+        if record.jumped_at == self._now:
+            record.doubted |= self.state.ledger.overlapped(record.id)
+        elif record.doubted and record.is_steady(self.settings) and not self.state.ledger.length(record.id):
+            record.doubted = frozenset()
+
     def _distrust(self, record: RobotRecord) -> None:
         """Stop a robot whose pose jumped; it keeps its cells until its poses have agreed for a while."""
         record.rest = None
-        record.doubted = self.state.ledger.overlapped(record.id)
         self._dispatcher.hold(record, "its pose jumped farther than it can drive: localize it")
 
     # Requests

@@ -102,7 +102,7 @@ class RobotRecord:
         sent_at: When it was last sent a message.
         pose_only: Whether its move client answers nothing, so that its progress is judged by its poses.
         jumped_at: When a pose came that cannot be true.
-        doubted: Cells that it overlapped before that pose; it may be there still, until it is placed.
+        doubted: Cells that it overlapped before such poses; it may be there still, until it is placed.
         mode: Its own mode; the fleet's may count instead.
         mode_reason: Why it has this mode, and who set it.
         lost: Why it is lost, for people; empty: it is not.
@@ -207,6 +207,10 @@ class RobotRecord:
         self.obeyed_at = inf
         return self.revision
 
+    def is_steady(self, settings: FleetSettings) -> bool:
+        """Whether its poses have agreed with each other for a while."""
+        return self.alive_at - self.jumped_at >= settings.jump_settle_time
+
     def stands(self, settings: FleetSettings) -> bool:
         """Whether it was told to stand still, acknowledged it, and its poses stay in one place.
 
@@ -217,7 +221,7 @@ class RobotRecord:
 
         After a pose that cannot be true it takes longer: where the robot is, is known once its poses agree.
         """
-        if self.alive_at - self.jumped_at < settings.jump_settle_time:
+        if not self.is_steady(settings):
             return False
         if self.pose_only:
             return self.alive_at - max(self.held_at, self._anchored_at) >= settings.pose_only_settle

@@ -164,6 +164,8 @@ class SimulatedClients:
         self.mute: set[str] = set()
         """Robots whose move clients answer nothing."""
         self.carried: set[str] = set()
+        self.lies: dict[str, tuple[float, float]] = {}
+        """Where robots say that they are, of those that do not say where they are."""
         self.robots: dict[str, MakeBelieveRobot] = {}
         self.clients: dict[str, MoveClient] = {}
         self.replies: list[Reply] = []
@@ -283,13 +285,13 @@ class SimulatedClients:
 
     def _sense(self, robot: MakeBelieveRobot) -> None:
         """Send what localization and navigation publish."""
-        x, y = self.posed.get(robot.id, (float("inf"), 0.0))
-        if hypot(robot.x - x, robot.y - y) >= self.pose_step:
-            self.posed[robot.id] = robot.x, robot.y
-            self._post("pose", robot.id, self.tell, PoseSeen(robot.id, robot.x, robot.y, 0.0))
+        posed_x, posed_y = self.posed.get(robot.id, (float("inf"), 0.0))
+        x, y = self.lies.get(robot.id, (robot.x, robot.y))
+        if hypot(x - posed_x, y - posed_y) >= self.pose_step:
+            self.posed[robot.id] = x, y
+            self._post("pose", robot.id, self.tell, PoseSeen(robot.id, x, y, 0.0))
         if self.pose_step and self.clients[robot.id].report.target is not None:
-            signs = self.signs[robot.id]
-            self._post("feedback", robot.id, signs.take_pose, robot.x, robot.y, 0.0, self.now)
+            self._post("feedback", robot.id, self.signs[robot.id].take_pose, x, y, 0.0, self.now)
 
     def check(self) -> None:
         self.planner.validate()

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from rce_fleet.coordination.events import CellBlocked, CellFreed, GoalSet, ModeSet, ZonesSet
 from rce_fleet.coordination.modes import RobotMode
 from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.coordination.zones import Direction, Zone, ZoneKind
 from rce_fleet.planning.grid import GridMap
 from rce_fleet.planning.movingai import read_map, read_scenario
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from unit.fleet.conftest import SimulatedClients
 
 
+JUMP_SETTLE_TIME = FleetSettings().jump_settle_time
+FARTHER_THAN_IT_DRIVES = 5.0
+"""Metres, although some poses get lost."""
 STOPPING_DISTANCE = 3.0
 """Metres in which a robot stops although messages are late and get lost."""
 
@@ -113,6 +117,50 @@ def test_indexes_equal_a_recomputation_whatever_happens(
         fleet.run(fleet.settled)
         assert fleet.send_all(rng.sample(grid.free, len(fleet.robots)))
         fleet.run(fleet.all_arrived)
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32), count=st.integers(2, 8))
+@example(seed=100000, count=7)  # the pose of a robot jumps while it is stopping between two cells
+def test_robots_that_say_they_are_elsewhere_meet_no_other(
+    make_fleet: type[SimulatedClients], seed: int, count: int
+) -> None:
+    """For shorter than poses have to agree. Longer, it looks as if the robots had been carried there."""
+    rng = Random(seed)
+    grid = connected_map(rng, 3)
+    starts = rng.sample(grid.free, count)
+    delays = rng.choice(((0.0,), (0.1, 0.5), (0.0, 3.0)))
+    fleet = make_fleet(FleetPlanner(grid), starts, seed, loss=rng.choice((0.0, 0.1)), plan_delays=delays)
+    fleet.send(rng.sample(grid.free, count))
+    until: dict[str, float] = {}
+    for _ in range(300):
+        for robot in sorted(fleet.robots):
+            if robot in until and fleet.now > until[robot]:
+                del fleet.lies[robot], until[robot]
+            elif robot not in until and rng.random() < 0.02:
+                lie(fleet, rng, robot)
+                until[robot] = fleet.now + rng.uniform(0.1, JUMP_SETTLE_TIME - 1.5)
+            elif rng.random() < 0.01:
+                fleet.ask(GoalSet(robot, rng.choice(grid.free)))
+        fleet.step()
+    fleet.lies.clear()
+    fleet.run(fleet.settled)
+    assert fleet.send_all(rng.sample(grid.free, count))
+    fleet.run(fleet.all_arrived)
+
+
+def lie(fleet: SimulatedClients, rng: Random, robot: str) -> None:
+    """Let a robot say that it is far away: anywhere, in a wall, where another robot is, or beside the map."""
+    body = fleet.robots[robot]
+    while robot not in fleet.lies:
+        x, y = rng.uniform(-3.0, 11.0), rng.uniform(-3.0, 11.0)
+        if rng.random() < 0.3:
+            other = fleet.robots[rng.choice(sorted(fleet.robots))]
+            x, y = other.x, other.y
+        if hypot(x - body.x, y - body.y) > FARTHER_THAN_IT_DRIVES:
+            fleet.lies[robot] = x, y
+        elif rng.random() < 0.1:
+            fleet.lies[robot] = -30.0, 40.0
 
 
 def disturb(fleet: SimulatedClients, rng: Random, *, carries: bool) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from rce_fleet.coordination.events import GoalSet, PoseSeen, RobotHeard, SendCancel
 from rce_fleet.coordination.planner import FleetPlanner
+from rce_fleet.coordination.settings import FleetSettings
 from rce_fleet.coordination.snapshot import RobotSnapshot, RobotState
 from rce_fleet.planning.grid import GridMap
 
@@ -32,6 +33,35 @@ def test_a_pose_that_cannot_be_true_stops_the_robot(make_fleet: type[SimulatedCl
     assert "its pose jumped" in robot(fleet).reason
     assert before <= fleet.planner.state.ledger.claims("Robot1")
     fleet.run(fleet.all_arrived)
+
+
+def test_a_stopping_robot_whose_pose_jumps_keeps_its_cells(make_fleet: type[SimulatedClients]) -> None:
+    """It is partly in a cell beside its path, which another robot was granted otherwise."""
+    fleet = make_fleet(FleetPlanner(GridMap()), [0], 1, loss=0.0)
+    fleet.send([7])
+    body = fleet.robots["Robot1"]
+    for goal in (None, 56):
+        fleet.run(lambda: len(fleet.grid.cells_touched(body.x, body.y, 0.25)) == 2)
+        assert fleet.ask(GoalSet("Robot1", goal)).ok
+    fleet.run(lambda: len(fleet.planner.state.ledger.overlapped("Robot1")) == 1)
+    assert fleet.ask(GoalSet("Robot1", None)).ok
+    assert robot(fleet).state in (RobotState.STOPPING, RobotState.DRIVING)
+    before = fleet.planner.state.ledger.claims("Robot1")
+    fleet.tell(PoseSeen("Robot1", *fleet.grid.centre(63), 0.0))
+    assert before <= fleet.planner.state.ledger.claims("Robot1")
+
+
+def test_a_joining_robot_whose_pose_jumps_may_be_at_both_places() -> None:
+    grid, steady = GridMap(), FleetSettings().jump_settle_time
+    planner = FleetPlanner(grid)
+    claims = planner.state.ledger.claims
+    planner.handle(PoseSeen("Robot1", *grid.centre(0), 0.0), 0.0)
+    planner.handle(PoseSeen("Robot1", *grid.centre(63), 0.0), 0.1)
+    assert claims("Robot1") == {0, 63}
+    planner.handle(PoseSeen("Robot1", *grid.centre(63), 0.0), steady)
+    assert claims("Robot1") == {0, 63}
+    planner.handle(PoseSeen("Robot1", *grid.centre(63), 0.0), 0.2 + steady)
+    assert claims("Robot1") == {63}
 
 
 def test_a_robot_that_jumps_to_and_fro_is_not_driven(make_fleet: type[SimulatedClients]) -> None:
