@@ -57,6 +57,7 @@ from rce_fleet.station.recording import Recorder, Records
 from rce_fleet.station.ros_planner_client import RosPlannerClient
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
+from rce_fleet.station.webhook_store import webhooks_file
 from rce_fleet.station.world_link import WorldLink, states_text, things_text
 
 _log = logging.getLogger(__name__)
@@ -142,7 +143,7 @@ def ui(
         uvloop.run(
             serve(
                 *(backend, bind, port, authenticator, names, server_tls, history, world),
-                webhooks=place / "webhooks.json",
+                webhooks=webhooks_file(place, backend.fleet),
                 stops=stops_file(place, backend.fleet),
                 modes=modes_file(place, backend.fleet),
                 kill_leader=DemoProcess().kill_leader if demo else None,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
+import logging
 import secrets
 import threading
 from collections.abc import Iterator
@@ -15,9 +17,17 @@ from yarl import URL
 
 from rce_fleet.api.webhooks import WebhookRequest
 from rce_fleet.exceptions import RequestRefusedError
-from rce_fleet.station.private_files import write_private
+from rce_fleet.station.private_files import fleet_file, write_private
+
+_log = logging.getLogger(__name__)
 
 MAX_WEBHOOKS = 20
+FORMER = "webhooks.json"
+"""The file of earlier releases, for all fleets whose stations share the folder."""
+
+
+_NONE = len(msgspec.json.encode([]))
+"""Bytes of a file without webhooks."""
 
 
 class Webhook(Struct, kw_only=True):
@@ -47,6 +57,16 @@ class Webhook(Struct, kw_only=True):
         return f"Webhook(id={self.id!r}, url={self.url!r})"
 
 
+def webhooks_file(folder: Path, fleet: str) -> Path:
+    """Return the file of a fleet's webhooks.
+
+    Args:
+        folder: The folder.
+        fleet: What tells the fleet from others.
+    """
+    return fleet_file(folder, "webhooks", fleet)
+
+
 class WebhookStore:
     """All webhooks, in memory and in a file that only its owner reads.
 
@@ -67,10 +87,41 @@ class WebhookStore:
             OSError: It cannot be read.
             msgspec.DecodeError: It is damaged.
         """
-        if self._file is None or not self._file.exists():
+        if self._file is None:
             return
-        found = msgspec.json.decode(self._file.read_bytes(), type=list[Webhook])
+        source = self._source(self._file)
+        if not source.exists():
+            self._tell_of_others(self._file)
+            return
+        found = msgspec.json.decode(source.read_bytes(), type=list[Webhook])
         self._webhooks = {webhook.id: webhook for webhook in found}
+
+    def _source(self, file: Path) -> Path:
+        """Return the file to read: the fleet's own one, which that of earlier releases becomes."""
+        former = file.with_name(FORMER)
+        if file.exists() or not former.exists():
+            return file
+        try:
+            return former.rename(file)
+        except FileNotFoundError:  # another station was faster
+            return file
+        except OSError:  # the folder cannot be written
+            return former
+
+    def _tell_of_others(self, file: Path) -> None:
+        """Say once which webhooks may be this fleet's, too: with another URL it is another fleet here."""
+        others = sorted(
+            path.name for path in file.parent.glob("webhooks-*.json") if path.stat().st_size > _NONE
+        )
+        if not others:
+            return
+        _log.warning(
+            "this fleet has no webhooks yet. If those in %s are of this fleet, under another URL or robotID,"
+            " end the station and rename that file to %s, in %s",
+            *(" or ".join(others), file.name, file.parent),
+        )
+        with contextlib.suppress(OSError):
+            self.save()
 
     def __iter__(self) -> Iterator[Webhook]:
         return iter(list(self._webhooks.values()))

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from rce_fleet.api.webhooks import EventKind, WebhookRequest, sign, verify
 from rce_fleet.exceptions import RequestRefusedError
 from rce_fleet.station.webhook_sender import PublicResolver
-from rce_fleet.station.webhook_store import MAX_WEBHOOKS, WebhookStore, check_url
+from rce_fleet.station.webhook_store import MAX_WEBHOOKS, WebhookStore, check_url, webhooks_file
 from rce_fleet.tasks.records import RECORD_TYPES
 
 BODY = b'{"events": []}'
@@ -109,6 +109,51 @@ def test_webhooks_are_kept_where_only_the_owner_reads(tmp_path: Path) -> None:
     assert (kept.position, kept.failures, kept.secret, kept.kinds) == (12, 2, made.secret, ("task",))
     assert again.remove(made.id)
     assert not again.remove(made.id)
+
+
+def loaded(folder: Path, fleet: str) -> WebhookStore:
+    store = WebhookStore(webhooks_file(folder, fleet))
+    store.load()
+    return store
+
+
+def urls(store: WebhookStore) -> list[str]:
+    return [webhook.url for webhook in store]
+
+
+def test_each_fleet_has_webhooks_of_its_own(tmp_path: Path) -> None:
+    """The stations of a machine share a folder: each wrote its own list over that of the others."""
+    stores = {fleet: loaded(tmp_path, fleet) for fleet in ("hall 1", "hall 2")}
+    for fleet, store in stores.items():
+        store.add(WebhookRequest(url=f"https://example.com/{fleet[-1]}"), "anna", 0)
+        store.save()
+    assert [urls(loaded(tmp_path, fleet)) for fleet in stores] == [
+        ["https://example.com/1"],
+        ["https://example.com/2"],
+    ]
+
+
+def test_webhooks_of_a_file_for_all_fleets_go_to_the_first_one(tmp_path: Path) -> None:
+    """As an earlier release kept them, of a station that usually was the only one."""
+    former = WebhookStore(tmp_path / "webhooks.json")
+    former.add(WebhookRequest(url="https://example.com/"), "anna", 0)
+    former.save()
+    assert urls(loaded(tmp_path, "hall 1")) == ["https://example.com/"]
+    assert urls(loaded(tmp_path, "hall 2")) == []
+    assert urls(loaded(tmp_path, "hall 1")) == ["https://example.com/"]
+
+
+def test_a_fleet_under_another_url_is_told_of_its_webhooks_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    before = loaded(tmp_path, "http://here/ hall 1")
+    assert caplog.text == "", "there are none"
+    before.add(WebhookRequest(url="https://example.com/"), "anna", 0)
+    before.save()
+    for _ in range(2):
+        assert urls(loaded(tmp_path, "https://here/ hall 1")) == []
+    name = webhooks_file(tmp_path, "https://here/ hall 1").name
+    assert caplog.text.count(f"rename that file to {name}") == 1
 
 
 def test_a_kind_that_no_event_has_is_refused() -> None:
