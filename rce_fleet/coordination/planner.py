@@ -151,7 +151,7 @@ class FleetPlanner:
             return
         record = self._record(event.robot)
         record.see(event.x, event.y, event.yaw, self._now, self.settings)
-        self._doubt(record)
+        self._note_doubt(record)
         why = is_lost(record, event, self.settings)
         if why != record.lost:
             self._modes.set_lost(record, why)
@@ -236,7 +236,7 @@ class FleetPlanner:
             record.rest = None  # It was carried away: it stays where it was put.
             self._dispatcher.hold(record, "it left its path")
 
-    def _doubt(self, record: RobotRecord) -> None:
+    def _note_doubt(self, record: RobotRecord) -> None:
         """Note where a robot may be after its newest pose: also where it was, if the pose jumped."""
         if record.jumped_at == self._now:
             record.doubted |= self.state.ledger.overlapped(record.id)
