@@ -150,11 +150,20 @@ class Cluster:
         return await until(lambda: self._leader(but), timeout=PATIENCE_S, what="a master leads")
 
     async def _leader(self, but: Machine | None) -> Machine | None:
-        for machine in self.machines:
-            if machine is not but and machine.master.running:
-                found = await machine.health()
-                if found.get("role") == "leader" and found["ready"]:
-                    return machine
+        async def asked(machine: Machine) -> Machine | None:
+            found = await machine.health()
+            return machine if found.get("role") == "leader" and found["ready"] else None
+
+        running = [each for each in self.machines if each is not but and each.master.running]
+        tasks = [asyncio.create_task(asked(each)) for each in running]
+        try:
+            for answer in asyncio.as_completed(tasks):  # nothing waits for one that hangs
+                if (leader := await answer) is not None:
+                    return leader
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
         return None
 
     async def etcd_leader(self) -> Machine:
