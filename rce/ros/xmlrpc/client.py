@@ -5,47 +5,62 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Sequence
-from http import HTTPStatus
+from collections.abc import Sequence
+from functools import partial
 from types import TracebackType
 from typing import Any, Self
 from urllib.parse import urlsplit
 
 import h11
 
+from rce.aio.tasks import BackgroundTasks
 from rce.dialing import set_keepalive
 from rce.ros.dialing import open_peer_socket
-from rce.ros.errors import RpcRefusedError, RpcTimeoutError, RpcUnreachableError
+from rce.ros.errors import (
+    MalformedDocumentError,
+    RemoteFaultError,
+    RpcRefusedError,
+    RpcTimeoutError,
+    RpcUnreachableError,
+    XmlRpcError,
+)
+from rce.ros.xmlrpc.batches import METHOD, join_calls, raise_error, split_answer
+from rce.ros.xmlrpc.client_connection import ClientConnection
 from rce.ros.xmlrpc.codec import decode_response, encode_call
+from rce.ros.xmlrpc.requests import RequestQueue, RpcRequest
 
 _log = logging.getLogger(__name__)
 
-MAX_ANSWER = 64 * 2**20
-"""Longest answer in bytes."""
-
-MAX_IDLE = 4
-"""How many idle connections are kept to one server."""
+MAX_CONNECTIONS = 4
+"""How many connections there are to one server. More calls at once wait for their turn."""
 
 IDLE_TIME = 30.0
 """Seconds that an idle connection is kept."""
 
 DEFAULT_TIMEOUT = 10.0
 
-_CHUNK = 65536
+Address = tuple[str, int]
+
+_LOST = (ConnectionError, EOFError, h11.RemoteProtocolError)
+"""A connection that was kept may end so, because its server closed it."""
 
 
 class RpcClient:
     """Calls XML-RPC servers. An async context manager; leaving it closes the connections.
 
-    Any number of calls may run at once; those to one server each take a connection of their own. It is kept
-    for the next call until the server ends it, or for :data:`IDLE_TIME`: nodes come and go, each with ports
-    of its own.
+    Any number of calls may run at once. Those to one server share a few connections, so that a program which
+    registers thousands of topics at once takes neither the memory nor the sockets of its server. Calls that
+    wait go together in one request (:mod:`rce.ros.xmlrpc.batches`) to servers that say that they are
+    :class:`~rce.ros.xmlrpc.server.RpcServer`, and one by one to all others.
+
+    A connection is kept for the next call until the server ends it, or for :data:`IDLE_TIME`: nodes come and
+    go, each with ports of its own.
     """
 
     def __init__(self) -> None:
-        self._idle: dict[tuple[str, int], list[_Connection]] = {}
-        self._open: set[_Connection] = set()
-        self._closed = False
+        self._servers: dict[Address, _Server] = {}
+        self._open: set[ClientConnection] = set()
+        self._tasks = BackgroundTasks()
 
     async def __aenter__(self) -> Self:
         return self
@@ -53,9 +68,11 @@ class RpcClient:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._closed = True
-        for connection in [one for idle in self._idle.values() for one in idle]:
-            self._end_idleness(connection)
+        await self._tasks.close()
+        for server in list(self._servers.values()):
+            _fail(server.requests.give_up(), RpcUnreachableError, "the client is closed")
+            for connection in list(server.idle):
+                self._end_idleness(connection)
         for connection in list(self._open):
             await self._discard(connection)
 
@@ -64,18 +81,27 @@ class RpcClient:
         """How many connections it has now, idle ones among them."""
         return len(self._open)
 
+    def takes_batches(self, uri: str) -> bool:
+        """Return whether the server at ``uri`` is known to take several calls in one request."""
+        try:
+            server = self._servers.get(_address(uri))
+        except ValueError:
+            return False
+        return server is not None and any(connection.takes_batches for connection in server.idle)
+
     async def call(
         self, uri: str, method: str, arguments: Sequence[Any], *, timeout: float = DEFAULT_TIMEOUT
     ) -> Any:
         """Call ``method`` of the server at ``uri``.
 
-        Cancelling a call closes its connection.
+        Cancelling a call closes its connection, unless other calls wait for the same answer.
 
         Args:
             uri: ``http://host:port/``.
             method: The method's name.
             arguments: Values that XML-RPC can carry.
-            timeout: Seconds for all of it.
+            timeout: Seconds that the server may take. Those are not counted in which the call waits behind
+                others that the server answers.
 
         Raises:
             RpcUnreachableError: No answer came, for whatever reason; an RpcTimeoutError if none came in time,
@@ -92,7 +118,7 @@ class RpcClient:
             uri: ``http://host:port/``.
             method: The method's name, for errors.
             document: The call, by :func:`~rce.ros.xmlrpc.codec.encode_call`.
-            timeout: Seconds for all of it.
+            timeout: As for :meth:`call`.
 
         Raises:
             RpcUnreachableError: No answer came, for whatever reason; an RpcTimeoutError if none came in time,
@@ -100,16 +126,44 @@ class RpcClient:
             RemoteFaultError: The server answered with a fault.
             MalformedDocumentError: The answer cannot be read.
         """
+        (answer,) = await self.send_in_order(uri, method, (document,), timeout=timeout)
+        return raise_error(answer)
+
+    async def send_in_order(
+        self, uri: str, method: str, documents: Sequence[bytes], *, timeout: float = DEFAULT_TIMEOUT
+    ) -> list[Any]:
+        """Make calls one after the other, or in one request if the server takes that.
+
+        Args:
+            uri: ``http://host:port/``.
+            method: The first call's method, for errors.
+            documents: The calls, by :func:`~rce.ros.xmlrpc.codec.encode_call`.
+            timeout: Seconds that the server may take for each request, as for :meth:`call`.
+
+        Returns:
+            For each call its value, or a RemoteFaultError or MalformedDocumentError.
+
+        Raises:
+            RpcUnreachableError: Not all calls were answered; those that were are not known.
+        """
         try:
-            async with asyncio.timeout(timeout):
-                answer = await self._exchange(uri, document)
+            address = _address(uri)
+        except ValueError as error:
+            raise RpcUnreachableError(uri, str(error)) from error
+        if self._tasks.closed:
+            raise RpcUnreachableError(uri, "the client is closed")
+        server = self._servers.get(address)
+        if server is None:
+            server = self._servers[address] = _Server(address)
+        request = RpcRequest(uri, documents, timeout, is_alone=method == METHOD)
+        server.requests.add(request)
+        self._begin(server)
+        try:
+            return await server.requests.wait(request)
         except TimeoutError as error:
             raise RpcTimeoutError(uri, f"{method} took longer than {timeout:g} s") from error
-        except ConnectionRefusedError as error:
-            raise RpcRefusedError(uri, str(error)) from error
-        except (OSError, h11.ProtocolError, EOFError, ValueError) as error:
-            raise RpcUnreachableError(uri, str(error) or type(error).__name__) from error
-        return decode_response(answer)
+        finally:
+            server.requests.drop(request)
 
     async def until_lost(self, uri: str) -> None:
         """Wait until the server at ``uri`` goes away: until a connection made for nothing else is lost.
@@ -130,183 +184,171 @@ class RpcClient:
             with contextlib.suppress(OSError):
                 await writer.wait_closed()
 
-    async def _exchange(self, uri: str, document: bytes) -> bytes:
-        address = _address(uri)
-        while (idle := self._take_idle(address)) is not None:
-            try:
-                return await self._post(idle, document)
-            except (ConnectionError, EOFError, h11.RemoteProtocolError) as error:
-                # The server closed the idle connection, as it may at any time. ROS calls may be repeated.
-                _log.debug("reconnecting to %s: %s", uri, error)
-        connection = await _Connection.open(*address, on_eof=self._drop_idle, on_lost=self._lost)
-        self._open.add(connection)
-        return await self._post(connection, document)
+    # Requests whose turn it is
 
-    async def _post(self, connection: _Connection, document: bytes) -> bytes:
+    def _begin(self, server: _Server) -> None:
+        """Take requests from a queue, as many as there may be connections."""
+        while server.requests and server.busy < MAX_CONNECTIONS and not self._tasks.closed:
+            connection = self._take_idle(server)
+            group = server.requests.take(together=connection is not None and connection.takes_batches)
+            server.busy += 1
+            work = self._tasks.spawn(
+                self._perform(server, group, connection), name=f"calls of {group[0].uri}"
+            )
+            work.add_done_callback(partial(self._end, server, group))
+            for request in group:
+                request.work = work
+        self._forget_unused(server)
+
+    def _end(self, server: _Server, group: list[RpcRequest], work: asyncio.Task[None]) -> None:
+        """Continue with other requests when those of a group are done with."""
+        if work.cancelled():  # the callers have gone, or the client is closed
+            _fail(group, RpcUnreachableError, "the client is closed")
+        server.busy -= 1
+        self._begin(server)
+
+    async def _perform(
+        self, server: _Server, group: list[RpcRequest], connection: ClientConnection | None
+    ) -> None:
+        """Make the calls of some requests."""
         try:
-            answer = await connection.post(document)
-        except BaseException:
-            await self._discard(connection)
-            raise
-        await self._give_back(connection)
-        return answer
+            await self._make_calls(server, group, connection)
+        except ConnectionRefusedError as error:
+            _fail(group, RpcRefusedError, str(error), error)
+        except (OSError, h11.ProtocolError, EOFError, ValueError) as error:
+            _fail(group, RpcUnreachableError, str(error) or type(error).__name__, error)
 
-    async def _give_back(self, connection: _Connection) -> None:
-        idle = self._idle.get(connection.address, [])
-        if self._closed or not connection.reusable or len(idle) >= MAX_IDLE:
-            await self._discard(connection)
-            return
-        self._idle[connection.address] = [*idle, connection]
-        connection.idle_end = asyncio.get_running_loop().call_later(IDLE_TIME, self._drop_idle, connection)
+    async def _make_calls(
+        self, server: _Server, group: list[RpcRequest], connection: ClientConnection | None
+    ) -> None:
+        documents = [document for request in group for document in request.documents]
+        answers: list[Any] = []
+        together = True
+        was_used = connection is not None
+        while rest := documents[len(answers) :]:
+            if connection is None:
+                connection, was_used = await self._connect(server), False
+            try:
+                if together and len(rest) > 1 and connection.takes_batches:
+                    answered = await _post_together(connection, rest)
+                    together = bool(answered)
+                    answers += answered
+                else:
+                    answers.append(_decoded(await connection.post(rest[0])))
+            except BaseException as error:
+                await self._discard(connection)
+                if not was_used or not isinstance(error, _LOST):
+                    raise
+                # The server closed the idle connection, as it may at any time. ROS calls may be repeated.
+                _log.debug("reconnecting to %s: %s", group[0].uri, error)
+                connection = self._take_idle(server)
+                continue
+            was_used = True
+            server.requests.answered(group)
+            if not connection.reusable:
+                await self._discard(connection)
+                connection = None
+        for request in group:
+            count = len(request.documents)
+            request.finish(answers[:count])
+            del answers[:count]
+        if connection is not None:
+            await self._give_back(server, connection)
 
-    def _take_idle(self, address: tuple[str, int]) -> _Connection | None:
-        idle = self._idle.get(address)
-        if not idle:
-            return None
-        connection = idle[-1]
-        self._end_idleness(connection)
+    async def _connect(self, server: _Server) -> ClientConnection:
+        connection = await ClientConnection.open(*server.address, on_eof=self._drop_idle, on_lost=self._lost)
+        self._open.add(connection)
         return connection
 
-    def _end_idleness(self, connection: _Connection) -> bool:
+    # Connections
+
+    async def _give_back(self, server: _Server, connection: ClientConnection) -> None:
+        if self._tasks.closed or not connection.reusable:
+            await self._discard(connection)
+            return
+        server.idle.append(connection)
+        connection.idle_end = asyncio.get_running_loop().call_later(IDLE_TIME, self._drop_idle, connection)
+
+    def _take_idle(self, server: _Server) -> ClientConnection | None:
+        if not server.idle:
+            return None
+        connection = server.idle.pop()
+        _stop_idle_timer(connection)
+        return connection
+
+    def _end_idleness(self, connection: ClientConnection) -> bool:
         """Remove a connection from the idle ones; return whether it was one of them."""
-        idle = self._idle.get(connection.address, [])
-        if connection not in idle:
+        server = self._servers.get(connection.address)
+        if server is None or connection not in server.idle:
             return False
-        idle.remove(connection)
-        if not idle:
-            del self._idle[connection.address]
-        if connection.idle_end is not None:
-            connection.idle_end.cancel()
+        server.idle.remove(connection)
+        _stop_idle_timer(connection)
+        self._forget_unused(server)
         return True
 
-    def _drop_idle(self, connection: _Connection) -> None:
+    def _drop_idle(self, connection: ClientConnection) -> None:
         """Close a connection, if it is idle: its server has ended it, or its time is over."""
         if self._end_idleness(connection):
             connection.abort()
 
-    def _lost(self, connection: _Connection) -> None:
+    def _lost(self, connection: ClientConnection) -> None:
         self._end_idleness(connection)
         self._open.discard(connection)
 
-    async def _discard(self, connection: _Connection) -> None:
+    async def _discard(self, connection: ClientConnection) -> None:
         self._open.discard(connection)
         await connection.close()
 
-
-class _Protocol(asyncio.StreamReaderProtocol):
-    """Reports that the server ended its side, which a stream tells only those who read."""
-
-    def __init__(self, reader: asyncio.StreamReader) -> None:
-        super().__init__(reader)
-        self.on_eof: Callable[[], None] = lambda: None
-        self.on_lost: Callable[[], None] = lambda: None
-
-    def eof_received(self) -> bool:
-        stays_open = bool(super().eof_received())
-        self.on_eof()
-        return stays_open
-
-    def connection_lost(self, error: Exception | None) -> None:
-        super().connection_lost(error)
-        self.on_lost()
+    def _forget_unused(self, server: _Server) -> None:
+        if not server.requests and not server.busy and not server.idle:
+            self._servers.pop(server.address, None)
 
 
-class _Connection:
-    """One connection, used for one call at a time."""
+class _Server:
+    """What a client knows of one server: it is forgotten with its last connection."""
 
-    def __init__(
-        self, address: tuple[str, int], reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> None:
+    def __init__(self, address: Address) -> None:
         self.address = address
-        self.idle_end: asyncio.TimerHandle | None = None
-        """Closes it, if it is still idle then."""
-        self._reader = reader
-        self._writer = writer
-        self._http = h11.Connection(h11.CLIENT)
-
-    @classmethod
-    async def open(
-        cls,
-        host: str,
-        port: int,
-        *,
-        on_eof: Callable[[_Connection], None],
-        on_lost: Callable[[_Connection], None],
-    ) -> _Connection:
-        """Connect to a server.
-
-        Args:
-            host: Of the server.
-            port: Of the server.
-            on_eof: Called when the server ends its side.
-            on_lost: Called when the connection is closed.
-        """
-        loop = asyncio.get_running_loop()
-        reader = asyncio.StreamReader()
-        transport, protocol = await loop.create_connection(
-            lambda: _Protocol(reader), sock=await open_peer_socket(host, port)
-        )
-        connection = cls((host, port), reader, asyncio.StreamWriter(transport, protocol, reader, loop))
-        protocol.on_eof = lambda: on_eof(connection)
-        protocol.on_lost = lambda: on_lost(connection)
-        return connection
-
-    @property
-    def reusable(self) -> bool:
-        """Whether another call may follow."""
-        return self._http.our_state is h11.IDLE and not self._reader.at_eof()
-
-    def abort(self) -> None:
-        """Close at once."""
-        self._writer.transport.abort()
-
-    async def close(self) -> None:
-        """Close at once and wait until it is closed."""
-        self.abort()
-        with contextlib.suppress(OSError):  # it may have been lost already, which counts as closed
-            await self._writer.wait_closed()
-
-    async def post(self, document: bytes) -> bytes:
-        host, port = self.address
-        request = h11.Request(
-            method="POST",
-            target="/RPC2",
-            headers=[
-                ("Host", f"{host}:{port}"),
-                ("Content-type", "text/xml"),
-                ("Content-length", str(len(document))),
-            ],
-        )
-        parts = [self._http.send(request), self._http.send(h11.Data(data=document))]
-        self._http.send(h11.EndOfMessage())
-        self._writer.write(b"".join(part for part in parts if part))
-        await self._writer.drain()
-        body = await self._read_answer()
-        if self._http.our_state is h11.DONE and self._http.their_state is h11.DONE:
-            self._http.start_next_cycle()
-        return body
-
-    async def _read_answer(self) -> bytes:
-        body = bytearray()
-        while True:
-            event = self._http.next_event()
-            if event is h11.NEED_DATA:
-                data = await self._reader.read(_CHUNK)
-                if not data and self._http.their_state is h11.SEND_RESPONSE:
-                    raise EOFError("the connection was closed before an answer")
-                self._http.receive_data(data)
-            elif isinstance(event, h11.Response):
-                if event.status_code != HTTPStatus.OK:
-                    raise ValueError(f"HTTP status {event.status_code}")
-            elif isinstance(event, h11.Data):
-                body += event.data
-                if len(body) > MAX_ANSWER:
-                    raise ValueError(f"the answer is longer than {MAX_ANSWER} bytes")
-            elif isinstance(event, h11.EndOfMessage):
-                return bytes(body)
+        self.requests = RequestQueue()
+        self.busy = 0
+        """How many connections are used, or are being made."""
+        self.idle: list[ClientConnection] = []
 
 
-def _address(uri: str) -> tuple[str, int]:
+def _stop_idle_timer(connection: ClientConnection) -> None:
+    if connection.idle_end is not None:
+        connection.idle_end.cancel()
+        connection.idle_end = None
+
+
+async def _post_together(connection: ClientConnection, documents: list[bytes]) -> list[Any]:
+    """Make several calls in one request; return nothing if one of them keeps all from being answered."""
+    try:
+        return split_answer(await connection.post(join_calls(documents)), len(documents))
+    except XmlRpcError as error:
+        _log.debug("%d calls are repeated one by one: %s", len(documents), error)
+        return []
+
+
+def _decoded(answer: bytes) -> Any:
+    """Return the value that a document answers, or the error."""
+    try:
+        return decode_response(answer)
+    except (RemoteFaultError, MalformedDocumentError) as error:
+        return error
+
+
+def _fail(
+    group: list[RpcRequest],
+    error: type[RpcUnreachableError],
+    reason: str,
+    cause: Exception | None = None,
+) -> None:
+    for request in group:
+        request.fail(error(request.uri, reason), cause)
+
+
+def _address(uri: str) -> Address:
     parts = urlsplit(uri)
     if parts.scheme != "http" or not parts.hostname or not parts.port:
         raise ValueError("not a URI of the form http://host:port/")

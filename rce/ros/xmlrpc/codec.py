@@ -21,7 +21,8 @@ MAX_DEPTH = 200
 _DECIMAL = "bigdecimal"
 """An extension that only Python's library reads. The short text 1e99999999 becomes an integer of 40 MB."""
 
-_HEAD = b"<?xml version='1.0'?>\n"
+HEAD = b"<?xml version='1.0'?>\n"
+"""How every document begins."""
 _NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
 
@@ -32,7 +33,7 @@ def encode_call(method: str, arguments: Sequence[Any]) -> bytes:
         MalformedDocumentError: An argument has no XML-RPC form.
     """
     return (
-        _HEAD
+        HEAD
         + f"<methodCall>\n<methodName>{method}</methodName>\n{_params(arguments)}</methodCall>\n".encode()
     )
 
@@ -43,13 +44,13 @@ def encode_response(value: Any) -> bytes:
     Raises:
         MalformedDocumentError: ``value`` has no XML-RPC form.
     """
-    return _HEAD + f"<methodResponse>\n{_params((value,))}</methodResponse>\n".encode()
+    return HEAD + f"<methodResponse>\n{_params((value,))}</methodResponse>\n".encode()
 
 
 def encode_fault(code: int, text: str) -> bytes:
     """Write a fault; characters that XML does not have are replaced."""
     body = Marshaller("utf-8").dumps(Fault(code, _NOT_XML.sub("?", text)))
-    return _HEAD + f"<methodResponse>\n{body}</methodResponse>\n".encode()
+    return HEAD + f"<methodResponse>\n{body}</methodResponse>\n".encode()
 
 
 def decode_call(document: bytes) -> tuple[str, tuple[Any, ...]]:

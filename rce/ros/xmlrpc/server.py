@@ -17,6 +17,7 @@ import h11
 from rce.aio.servers import close_servers, open_server
 from rce.dialing import set_keepalive
 from rce.ros.closing import OpenConnections
+from rce.ros.xmlrpc.batches import PRODUCT
 from rce.ros.xmlrpc.dispatch import Dispatcher
 
 _log = logging.getLogger(__name__)
@@ -185,7 +186,7 @@ class _Connection(asyncio.Protocol):
 
     def _respond(self, status: int, kind: bytes, body: bytes, *, last: bool = False) -> None:
         # roscpp's parser is known to read this spelling of Content-length.
-        headers = [(b"Content-type", kind), (b"Content-length", b"%d" % len(body))]
+        headers = [(b"Content-type", kind), (b"Content-length", b"%d" % len(body)), (b"Server", PRODUCT)]
         if last:
             headers.append((b"Connection", b"close"))
         reason = HTTPStatus(status).phrase.encode()

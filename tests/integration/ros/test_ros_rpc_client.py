@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any, ClassVar
 
 import pytest
 from support.ports import free_port
+from support.ros_masters import serving
 
 from rce.dialing import connect_first
-from rce.ros.errors import RpcRefusedError
-from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer, client
+from rce.ros.errors import RpcRefusedError, RpcUnreachableError
+from rce.ros.xmlrpc import Dispatcher, RpcClient, RpcServer, batches, client
+from rce.ros.xmlrpc.codec import encode_call
 
 
 def server() -> RpcServer:
@@ -53,7 +58,7 @@ async def test_idle_connection_is_closed_after_a_time(monkeypatch: pytest.Monkey
 async def test_burst_leaves_few_idle_connections() -> None:
     async with RpcClient() as rpc, server() as one:
         await asyncio.gather(*(rpc.call(f"http://127.0.0.1:{one.port}/", "get", ("/a",)) for _ in range(40)))
-        assert rpc.connections <= client.MAX_IDLE
+        assert rpc.connections <= client.MAX_CONNECTIONS
 
 
 async def test_refused_call_is_told_from_a_lost_one() -> None:
@@ -66,3 +71,132 @@ async def test_host_of_two_addresses_that_refuse_refuses() -> None:
     port = free_port()
     with pytest.raises(ConnectionRefusedError, match="; "):
         await connect_first([(socket.AF_INET, (f"127.0.0.{host}", port)) for host in (1, 2)])
+
+
+class Counted(Dispatcher):
+    """Counts requests; a request may hold several calls."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            {
+                "get": lambda caller: (1, "", caller),
+                "none": lambda _: (1, "", None),
+                "sum": lambda _: (1, "", 5),
+            }
+        )
+        self.requests = 0
+
+    def respond(self, document: bytes) -> bytes:
+        self.requests += 1
+        return super().respond(document)
+
+
+async def test_thousand_calls_share_connections_and_requests() -> None:
+    """They register the topics of a container; with a connection each, its memory was at its end."""
+    dispatcher = Counted()
+    async with RpcClient() as rpc, RpcServer(dispatcher, "127.0.0.1") as one:
+        uri = f"http://127.0.0.1:{one.port}/"
+        most = 0
+
+        async def get(number: int) -> None:
+            nonlocal most
+            answer = await rpc.call(uri, "get", (f"/{number}",))
+            most = max(most, rpc.connections)
+            assert answer == [1, "", f"/{number}"]
+
+        await asyncio.gather(*map(get, range(1000)))
+        assert most <= client.MAX_CONNECTIONS
+        assert dispatcher.requests <= 2 * client.MAX_CONNECTIONS + 1000 / batches.MAX_CALLS
+
+
+async def test_call_that_cannot_be_answered_leaves_the_others_alone() -> None:
+    """Among them calls of several calls, as synchronizations of masters make them."""
+    several = [{"methodName": "sum", "params": ["/a"]}] * 3
+    async with RpcClient() as rpc, RpcServer(Counted(), "127.0.0.1") as one:
+        uri = f"http://127.0.0.1:{one.port}/"
+        calls: list[tuple[str, tuple[Any, ...]]] = [("get", ("/a",)), ("none", ("/a",)), ("sum", ("/a",))]
+        calls.append(("system.multicall", (several,)))
+        answers = await asyncio.gather(*(rpc.call(uri, *call) for call in calls * 20))
+    assert answers[::4] == [[1, "", "/a"]] * 20
+    assert all(status == 0 for status, _, _ in answers[1::4])
+    assert answers[2::4] == [[1, "", 5]] * 20
+    assert answers[3::4] == [[[[1, "", 5]]] * 3] * 20
+
+
+async def test_cancelled_call_leaves_those_beside_it_alone() -> None:
+    async with RpcClient() as rpc, RpcServer(Counted(), "127.0.0.1") as one:
+        uri = f"http://127.0.0.1:{one.port}/"
+        calls = [asyncio.create_task(rpc.call(uri, "get", (f"/{number}",))) for number in range(200)]
+        await asyncio.wait(calls, return_when=asyncio.FIRST_COMPLETED)
+        for call in calls[1::2]:
+            call.cancel()
+        await asyncio.wait(calls)
+        assert [(await call)[2] for call in calls[::2]] == [f"/{number}" for number in range(0, 200, 2)]
+
+
+async def test_other_servers_get_one_call_in_a_request() -> None:
+    """A server of ROS knows several calls in one request; a client must not find out by a call that fails."""
+
+    class Foreign:
+        methods: ClassVar[set[str]] = set()
+
+        def _dispatch(self, method: str, arguments: tuple[Any, ...]) -> Any:
+            self.methods.add(method)
+            return 1, "", arguments[0]
+
+    with serving(Foreign()) as uri:
+        async with RpcClient() as rpc:
+            answers = await asyncio.gather(*(rpc.call(uri, "get", (f"/{number}",)) for number in range(100)))
+            assert rpc.connections <= client.MAX_CONNECTIONS
+    assert [answer[2] for answer in answers] == [f"/{number}" for number in range(100)]
+    assert Foreign.methods == {"get"}
+
+
+async def test_calls_in_order_are_made_in_order_everywhere() -> None:
+    documents = [encode_call("get", (f"/{number}",)) for number in range(20)]
+    expected = [[1, "", f"/{number}"] for number in range(20)]
+
+    class Foreign:
+        def _dispatch(self, _method: str, arguments: tuple[Any, ...]) -> Any:
+            seen.append(arguments[0])
+            return 1, "", arguments[0]
+
+    seen: list[str] = []
+    dispatcher = Counted()
+    with serving(Foreign()) as foreign:
+        async with RpcClient() as rpc, RpcServer(dispatcher, "127.0.0.1") as one:
+            uri = f"http://127.0.0.1:{one.port}/"
+            assert not rpc.takes_batches(uri)
+            assert await rpc.send_in_order(foreign, "get", documents) == expected
+            assert await rpc.send_in_order(uri, "get", documents) == expected
+            assert rpc.takes_batches(uri)
+            assert not rpc.takes_batches(foreign)
+    assert seen == [f"/{number}" for number in range(20)]
+    assert dispatcher.requests == 2
+
+
+async def test_closed_client_fails_what_waits() -> None:
+    """Also calls that wait for their turn."""
+    async with asyncio.timeout(60), silent_server() as uri:
+        async with RpcClient() as rpc:
+            calls = [asyncio.create_task(rpc.call(uri, "get", ("/a",), timeout=600)) for _ in range(20)]
+            await until(lambda: rpc.connections == client.MAX_CONNECTIONS)
+        for call in calls:
+            with pytest.raises(RpcUnreachableError, match="client is closed"):
+                await call
+        with pytest.raises(RpcUnreachableError, match="client is closed"):
+            await rpc.call(uri, "get", ("/a",))
+
+
+@asynccontextmanager
+async def silent_server() -> AsyncIterator[str]:
+    """A server that takes requests and answers none."""
+
+    async def ignore(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(OSError):
+            await reader.read()
+        writer.close()
+
+    listener = await asyncio.start_server(ignore, "127.0.0.1", 0)
+    async with listener:
+        yield f"http://127.0.0.1:{listener.sockets[0].getsockname()[1]}/"
