@@ -7,10 +7,11 @@ group where the block is done when its tasks are.
 from __future__ import annotations
 
 import asyncio
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Iterator
+    from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator
     from types import TracebackType
 
 T = TypeVar("T")
@@ -161,6 +162,25 @@ async def cancel_and_wait(*tasks: asyncio.Future[Any]) -> None:
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def run_in_groups(works: Iterable[Callable[[], Awaitable[object]]], size: int) -> None:
+    """Run functions, ``size`` of them side by side, and then the next.
+
+    For many short requests to one server. One that fails does not stop those beside it, but the next are not
+    begun: the server may be away.
+
+    Raises:
+        Exception: Of the first one that failed, when those beside it have ended.
+
+    Example:
+        >>> await run_in_groups([subscriber.close for subscriber in subscribers], 100)
+    """
+    rest = iter(works)
+    while group := [work() for work in islice(rest, size)]:
+        for result in await asyncio.gather(*group, return_exceptions=True):
+            if isinstance(result, BaseException):
+                raise result
 
 
 async def finish(work: Coroutine[Any, Any, T]) -> T:

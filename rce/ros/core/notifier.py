@@ -5,13 +5,15 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from itertools import islice
 from typing import Any
 
 from rce.aio.backoff import Backoff
 from rce.aio.tasks import TaskScope
 from rce.ros.core.events import Call
-from rce.ros.errors import RpcRefusedError, RpcUnreachableError, XmlRpcError
+from rce.ros.errors import MalformedDocumentError, RpcRefusedError, RpcUnreachableError, XmlRpcError
 from rce.ros.xmlrpc import RpcClient
+from rce.ros.xmlrpc.batches import MAX_CALLS
 from rce.ros.xmlrpc.codec import encode_call
 from rce.ros.xmlrpc.dispatch import ERROR
 
@@ -29,7 +31,7 @@ MAX_REPEATS = 60
 SHUTDOWN = "shutdown"
 """The only call that is not repeated: it may reach a newer node at the same address."""
 
-MAX_DOCUMENTS = 32
+MAX_DOCUMENTS = 2 * MAX_CALLS
 """How many of the newest calls are kept in serialized form."""
 
 CALLER = "/master"
@@ -75,8 +77,8 @@ class Notifier:
         pauses, repeats = RETRY.start(), 0
         try:
             while queue:
-                call = queue.pop(next(iter(queue)))
-                if await self._call(call, queue):
+                unanswered = await self._make(uri, self._take(uri, queue), queue)
+                if not unanswered:
                     pauses.reset()
                     repeats = 0
                     continue
@@ -84,11 +86,15 @@ class Notifier:
                 if repeats > MAX_REPEATS:
                     _log.warning("%s has not answered %d calls: it is not called any more", uri, repeats)
                     return
-                if call.key not in queue:  # a newer one carries the whole state too
-                    _put_first(queue, call)
+                _put_first(queue, unanswered)
                 await asyncio.sleep(pauses.next())
         finally:
             del self._waiting[uri]
+
+    def _take(self, uri: str, queue: dict[object, Call]) -> list[Call]:
+        """Take the next call from a queue; several if the node answers them in one request."""
+        count = MAX_CALLS if self._client.takes_batches(uri) else 1
+        return [queue.pop(key) for key in list(islice(queue, count))]
 
     def _written(self, call: Call) -> bytes:
         """Return a call's document, made once for all nodes that are told the same.
@@ -106,33 +112,45 @@ class Notifier:
         self._documents[key] = call.arguments, document
         return document
 
-    async def _call(self, call: Call, queue: dict[object, Call]) -> bool:
-        """Make a call; return whether it is done with, delivered or not."""
+    async def _make(self, uri: str, calls: list[Call], queue: dict[object, Call]) -> list[Call]:
+        """Make calls, in their order; return those that are to be repeated."""
+        written: list[tuple[Call, bytes]] = []
+        for call in calls:
+            try:
+                written.append((call, self._written(call)))
+            except MalformedDocumentError as error:
+                _log.warning("%s to %s: %s", call.method, uri, error)
+        if not written:
+            return []
+        method, documents = written[0][0].method, [document for _, document in written]
         try:
-            document = self._written(call)
-            answer = await self._client.send(call.uri, call.method, document, timeout=CALL_TIMEOUT)
+            answers = await self._client.send_in_order(uri, method, documents, timeout=CALL_TIMEOUT)
         except RpcRefusedError as error:
-            _log.info("%s is not delivered: %s", call.method, error)
+            _log.info("%s is not delivered: %s", method, error)
             queue.clear()  # the node is gone; a new node at this address registers and learns the state again
+            return []
         except RpcUnreachableError as error:
-            if call.method == SHUTDOWN:
-                _log.info("%s is not delivered: %s", call.method, error)
-                return True
-            _log.info("%s is repeated: %s", call.method, error)
-            return False
-        except XmlRpcError as error:
-            _log.warning("%s to %s: %s", call.method, call.uri, error)
-        else:
-            if _is_error(answer):
+            again = [call for call, _ in written if call.method != SHUTDOWN]
+            _log.info("%s is %s: %s", method, "repeated" if again else "not delivered", error)
+            return again
+        for (call, _), answer in zip(written, answers, strict=True):
+            if isinstance(answer, XmlRpcError):
+                _log.warning("%s to %s: %s", call.method, uri, answer)
+            elif _is_error(answer):
                 self._on_unwanted(call)
-        return True
+        return []
 
 
-def _put_first(queue: dict[object, Call], call: Call) -> None:
-    """Keep the order: the update of a namespace must not come after that of a parameter in it."""
+def _put_first(queue: dict[object, Call], calls: list[Call]) -> None:
+    """Put calls back that were not answered, unless a newer one carries the whole state too.
+
+    Their order stays: the update of a namespace must not come after that of a parameter in it.
+    """
     later = queue.copy()
     queue.clear()
-    queue[call.key] = call
+    for call in calls:
+        if call.key not in later:
+            queue[call.key] = call
     queue.update(later)
 
 

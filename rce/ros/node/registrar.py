@@ -12,13 +12,16 @@ import logging
 import random
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from rce.aio.backoff import Backoff
+from rce.aio.tasks import run_in_groups
 from rce.ros.errors import MasterError, MasterRefusedError, MasterUnreachableError, RpcUnreachableError
 from rce.ros.node.master import MasterClient
 from rce.ros.node.parameters import Parameters
 from rce.ros.node.service import Service
+from rce.ros.node.topic_input import TopicInput
 from rce.ros.node.topics import Topics
 
 _log = logging.getLogger(__name__)
@@ -28,6 +31,9 @@ CHECK_INTERVAL = 30.0
 
 RETRY = Backoff(first=0.1, longest=3.0, jitter=0.5)
 """Pauses between attempts to reach a master that is away."""
+
+REGISTERED_AT_ONCE = 500
+"""How many topics and services are registered side by side, in requests of several."""
 
 RUN_ID = "/run_id"
 
@@ -53,20 +59,30 @@ class Registrar:
         Raises:
             MasterError: The registration at the master failed.
         """
-        master, topics = self.master, self.topics
-        for topic, output in list(topics.outputs.items()):
-            await master.register_publisher(topic, output.message_type_name)
-            if topic not in topics.outputs:  # closed meanwhile
-                await master.unregister_publisher(topic)
-        for topic, source in list(topics.inputs.items()):
-            await source.register()
-            if topics.inputs.get(topic) is not source:
-                await master.unregister_subscriber(topic)
-        for name in list(self.services):
-            await master.register_service(name, self.service_uri)
-            if name not in self.services:
-                await master.unregister_service(name, self.service_uri)
+        topics = self.topics
+        works = [
+            partial(self._publish, topic, output.message_type_name)
+            for topic, output in topics.outputs.items()
+        ]
+        works += [partial(self._subscribe, topic, source) for topic, source in topics.inputs.items()]
+        works += [partial(self._provide, name) for name in self.services]
+        await run_in_groups(works, REGISTERED_AT_ONCE)
         await self.parameters.renew()
+
+    async def _publish(self, topic: str, message_type: str) -> None:
+        await self.master.register_publisher(topic, message_type)
+        if topic not in self.topics.outputs:  # closed meanwhile
+            await self.master.unregister_publisher(topic)
+
+    async def _subscribe(self, topic: str, source: TopicInput) -> None:
+        await source.register()
+        if self.topics.inputs.get(topic) is not source:
+            await self.master.unregister_subscriber(topic)
+
+    async def _provide(self, name: str) -> None:
+        await self.master.register_service(name, self.service_uri)
+        if name not in self.services:
+            await self.master.unregister_service(name, self.service_uri)
 
     async def keep(self) -> None:
         """Watch the master for as long as the node runs."""

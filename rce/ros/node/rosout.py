@@ -31,7 +31,7 @@ class RosoutHandler(logging.Handler):
     """
 
     def __init__(
-        self, publisher: Publisher, node: str, clock: Clock, topics: Callable[[], list[str]]
+        self, publisher: Publisher, node: str, clock: Clock, topics: Callable[[int], list[str]]
     ) -> None:
         super().__init__()
         self._clock = clock
@@ -69,5 +69,5 @@ class RosoutHandler(logging.Handler):
             file=record.pathname,
             function=record.funcName or "",
             line=record.lineno,
-            topics=self._topics()[:MAX_TOPICS],
+            topics=self._topics(MAX_TOPICS),
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from itertools import chain, islice
 from typing import TYPE_CHECKING
 
 from rce.ros.errors import HandshakeRefusedError, TypeMismatchError
@@ -164,9 +165,11 @@ class Topics:
 
     # For the slave API
 
-    def names(self) -> list[str]:
-        """Return the topics that are published or subscribed to."""
-        return list(self.outputs.keys() | self.inputs.keys())
+    def names(self, count: int) -> list[str]:
+        """Return the first ``count`` topics that are published or subscribed to."""
+        return list(
+            islice(dict.fromkeys(chain(islice(self.outputs, count), islice(self.inputs, count))), count)
+        )
 
     def bus_info(self) -> list[list[object]]:
         """Return ``[id, destination, direction, protocol, topic, connected, text]`` of each connection."""

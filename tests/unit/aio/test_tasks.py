@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 
 import pytest
 
@@ -12,6 +13,7 @@ from rce.aio.tasks import (
     cancel_and_wait,
     finish,
     pass_cancellation,
+    run_in_groups,
     run_until_first,
 )
 
@@ -279,3 +281,32 @@ async def test_pass_cancellation_raises_only_that_of_the_present_task() -> None:
     waiting.cancel()
     await asyncio.wait((waiting,))
     assert waiting.cancelled()
+
+
+async def test_groups_run_one_after_the_other() -> None:
+    running, most, done = 0, 0, 0
+
+    async def work() -> None:
+        nonlocal running, most, done
+        running += 1
+        most = max(most, running)
+        await asyncio.sleep(0)
+        running -= 1
+        done += 1
+
+    await run_in_groups([work] * 25, 10)
+    assert (done, most) == (25, 10)
+
+
+async def test_failure_ends_its_group_but_not_the_works_in_it() -> None:
+    done: list[int] = []
+
+    async def work(number: int) -> None:
+        await asyncio.sleep(0)
+        if number in (1, 2):
+            raise ValueError(f"number {number}")
+        done.append(number)
+
+    with pytest.raises(ValueError, match="number 1"):
+        await run_in_groups([partial(work, number) for number in range(8)], 4)
+    assert done == [0, 3]
