@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 
@@ -28,7 +28,7 @@ from rce.link.takeover import Takeovers
 from rce.link.wiring import ChannelTable, Refusals, WiringNews
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 
     from rce.link.hub import LinkHub
     from rce.link.interface import InterfaceFactory
@@ -36,6 +36,11 @@ if TYPE_CHECKING:
     from rce.model import EndpointId, InterfaceSpec
 
 _log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+ADDED_AT_ONCE = 100
+"""How many interfaces or connections are made before the event loop has its turn again."""
 
 
 class Endpoint:
@@ -220,7 +225,7 @@ class Endpoint:
             self._takeovers.forget(link.spec.id)
         self._links.drop(gone)
         await self._close_slots(slots)
-        self._add(due)
+        await self._add(due)
         self._due = Difference()
 
     # Taking away
@@ -273,23 +278,25 @@ class Endpoint:
 
     # Adding
 
-    def _add(self, due: Difference) -> None:
+    async def _add(self, due: Difference) -> None:
         desired = self._desired
         for link_id in due.links:
             if (link := desired.links.get(link_id)) is not None:
                 self._links.put(link)
                 self._takeovers.review(link_id)
-        for tag in due.interfaces:
+        async for tag in _in_parts(due.interfaces):
             interface = desired.interfaces.get(tag)
             if interface is not None and tag not in self._slots and not self._refused.has_interface(tag):
                 self._add_slot(interface)
-        for number in due.connections:
+        async for number in _in_parts(due.connections):
             connection = desired.connections.get(number)
-            if connection is None:
-                continue
-            for end in self._ends(connection):
-                if not self._channels.has(end) and not self._refused.has_connection(number):
-                    self._add_channel(connection, end)
+            if connection is not None:
+                self._add_channels(connection)
+
+    def _add_channels(self, connection: ConnectionSpec) -> None:
+        for end in self._ends(connection):
+            if not self._channels.has(end) and not self._refused.has_connection(connection.id):
+                self._add_channel(connection, end)
 
     def _add_slot(self, spec: InterfaceSpec) -> None:
         try:
@@ -354,3 +361,11 @@ class Endpoint:
     def _tell(self) -> None:
         self._notice = None
         self._on_change()
+
+
+async def _in_parts(items: Iterable[T]) -> AsyncIterator[T]:
+    """Iterate, and let others have their turn in between: an endpoint may have thousands of parts."""
+    for count, item in enumerate(items, 1):
+        if count % ADDED_AT_ONCE == 0:
+            await asyncio.sleep(0)
+        yield item

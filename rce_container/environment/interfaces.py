@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from abc import abstractmethod
 from collections.abc import Awaitable, Callable, Collection
+from itertools import islice
 from typing import TYPE_CHECKING
 
 from rce.aio.tasks import cancel_and_wait
@@ -20,10 +21,13 @@ if TYPE_CHECKING:
 READY_TIMEOUT_S = 30.0
 """Maximum time that an interface waits for nodes that start one after the other."""
 _LOOK_AGAIN_S = 0.05
+"""Seconds between two looks whether nodes still start: one look for all interfaces that wait."""
+_RELEASED_AT_ONCE = 100
+"""How many interfaces stop waiting before others have their turn; a container may have thousands."""
 
 
 class Readiness:
-    """Delays a started interface until nodes of the container are ready for it.
+    """Delays started interfaces until nodes of the container are ready for them.
 
     Args:
         settling: Whether nodes of the container are starting, or soon will, and may yet register a topic or
@@ -32,18 +36,33 @@ class Readiness:
 
     def __init__(self, settling: Callable[[], bool]) -> None:
         self._settling = settling
+        self._waiting: dict[asyncio.Future[None], None] = {}
+        self._is_looking = False
 
     async def wait(self, ready: Awaitable[object]) -> None:
         """Wait for ``ready`` as long as nodes are starting."""
         task = asyncio.ensure_future(ready)
+        settled = asyncio.get_running_loop().create_future()
+        self._waiting[settled] = None
+        if not self._is_looking:
+            self._look()
         try:
-            async with asyncio.timeout(READY_TIMEOUT_S):
-                while self._settling() and not task.done():
-                    await asyncio.wait((task,), timeout=_LOOK_AGAIN_S)
-        except TimeoutError:
-            pass
+            await asyncio.wait((task, settled), timeout=READY_TIMEOUT_S, return_when=asyncio.FIRST_COMPLETED)
         finally:
+            self._waiting.pop(settled, None)
             await cancel_and_wait(task)
+
+    def _look(self) -> None:
+        """Release interfaces when no node is starting; look again while some wait."""
+        loop = asyncio.get_running_loop()
+        is_settling = self._settling()
+        if not is_settling:
+            for settled in list(islice(self._waiting, _RELEASED_AT_ONCE)):
+                del self._waiting[settled]
+                settled.set_result(None)
+        self._is_looking = bool(self._waiting)
+        if self._is_looking:
+            loop.call_later(_LOOK_AGAIN_S if is_settling else 0.0, self._look)
 
 
 class RosInterface(Interface):

@@ -9,6 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from rce.control.model import ConnectionSpec, LinkSpec, SpecPatch
+from rce.link.endpoint import ADDED_AT_ONCE
 from rce.model.specs import InterfaceSpec
 
 if TYPE_CHECKING:
@@ -269,3 +270,24 @@ async def test_an_interrupted_patch_is_made_up_for_by_the_next(rig: Rig) -> None
     a.fakes["i1"].may_close.set()
     await a.apply({"i2": "SubscriberInterface", "i3": "SubscriberInterface"})
     assert set(a.endpoint.interfaces) == {"i2", "i3"}
+
+
+async def test_large_spec_is_applied_in_parts(rig: Rig) -> None:
+    """The event loop of a container with thousands of interfaces serves its ROS core meanwhile."""
+    a, b = await rig.pair("unix")
+    turns = 0
+
+    async def count() -> None:
+        nonlocal turns
+        while True:
+            await asyncio.sleep(0)
+            turns += 1
+
+    counting = asyncio.create_task(count())
+    try:
+        before = turns
+        await rig.join(a, b, [TOPIC_OUT] * 5 * ADDED_AT_ONCE)
+        assert turns - before >= 2 * 2 * 4  # interfaces and connections, of both ends
+        await a.connected(*range(1, 5 * ADDED_AT_ONCE + 1))
+    finally:
+        counting.cancel()
