@@ -13,9 +13,11 @@ import re
 import sys
 import time
 from collections import deque
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rce.aio.tasks import run_in_groups
 from rce.ros.node import MasterError, Message, Node, Publisher, RosError, ServiceClient, run
 from rce.ros.tools.plain import plain
 from rce.ros.types import TypesError
@@ -33,6 +35,7 @@ from rce_fleet.nodes.grid_messages import GRID_TOPIC, read_grid
 from rce_fleet.nodes.known_robots import VOLUME_VARIABLE
 from rce_fleet.nodes.manager_parameters import ManagerParameters, rules_of
 from rce_fleet.nodes.parameters import read_parameters
+from rce_fleet.nodes.registering import ROBOTS_AT_ONCE
 from rce_fleet.nodes.standby import stand_by, successor
 from rce_fleet.nodes.task_loops import COMPILE_FROM, compile_beside
 from rce_fleet.nodes.throttled_log import ThrottledLog
@@ -273,23 +276,24 @@ class ManagerNode:
                 try:
                     topics = await graph.look()
                     self.successor = successor(self._node, topics, SERVICE)
-                    for topic in topics.publishers:
-                        found = BATTERY_TOPIC.fullmatch(topic)
-                        if found is not None and found[1] not in self._batteries:
-                            self._batteries.add(found[1])
-                            await self._follow_battery(found[1], topic)
+                    found = filter(None, map(BATTERY_TOPIC.fullmatch, topics.publishers))
+                    new = [robot[1] for robot in found if robot[1] not in self._batteries]
+                    await run_in_groups(
+                        [partial(self._follow_battery, robot) for robot in new], ROBOTS_AT_ONCE
+                    )
                 except MasterError as error:
                     self._node.log.warning("cannot search for batteries: %s", error)
                 await asyncio.sleep(graph.pause)
 
-    async def _follow_battery(self, robot: str, topic: str) -> None:
+    async def _follow_battery(self, robot: str) -> None:
         def take(message: Message) -> None:
             capacity = message.capacity if message.capacity > 0 else message.design_capacity
             self._facts.take_battery(
                 robot, message.percentage, message.charge, capacity, message.power_supply_status
             )
 
-        await self._node.subscribe(topic, "sensor_msgs/BatteryState", take)
+        await self._node.subscribe(f"/{robot}/battery_state", "sensor_msgs/BatteryState", take)
+        self._batteries.add(robot)
 
 
 def open_journal(given: str) -> Journal:

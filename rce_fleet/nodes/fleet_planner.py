@@ -179,10 +179,8 @@ class PlannerNode:
                     self.successor = successor(self._node, topics, SERVICE)
                     if self.successor:
                         return
-                    for topic in topics.publishers:
-                        found = ROBOT_TOPIC.fullmatch(topic)
-                        if found is not None and found[1] not in self._robots:
-                            await self._robots.join(found[1])
+                    found = filter(None, map(ROBOT_TOPIC.fullmatch, topics.publishers))
+                    await self._robots.join(robot[1] for robot in found if robot[1] not in self._robots)
                     await self._grid.serve_old_topic(topics, self._planner.state, self._state.started)
                 except MasterError as error:
                     self._node.log.warning("cannot search for robots: %s", error)

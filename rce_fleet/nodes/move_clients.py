@@ -10,10 +10,12 @@ import asyncio
 import re
 from typing import Any
 
+from rce.aio.tasks import run_in_groups
 from rce.ros.node import Message, Node, run
 from rce_fleet.nodes.grid_messages import GRID_TOPIC, read_grid
 from rce_fleet.nodes.move_client import TICK, MoveClientNode
 from rce_fleet.nodes.namespaced import NamespacedNode
+from rce_fleet.nodes.registering import ROBOTS_AT_ONCE
 
 _NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
@@ -49,8 +51,7 @@ class MoveClients:
 
     async def run(self) -> None:
         """Send the robots along until the node is stopped."""
-        for client in self._clients:
-            await client.start()
+        await run_in_groups([client.start for client in self._clients], ROBOTS_AT_ONCE)
         await self._node.subscribe(GRID_TOPIC, "nav_msgs/OccupancyGrid", self._take_map)
         async with asyncio.TaskGroup() as tasks:
             for number, client in enumerate(self._clients):

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
+from rce.aio.tasks import run_in_groups
+from rce.ros.closing import release_all
 from rce_fleet.coordination.answers import is_answer, numbered_array, read_answer
 from rce_fleet.coordination.events import Event, ObstacleGone, ObstacleSeen, PoseSeen, ReportSeen, RobotHeard
 from rce_fleet.nodes.grid_messages import grid_name
+from rce_fleet.nodes.registering import ROBOTS_AT_ONCE, register_together
 from rce_fleet.nodes.robot_messages import read_pose_seen, read_report, read_sign
 from rce_fleet.nodes.throttled_log import ThrottledLog
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Coroutine, Iterable, Iterator
 
-    from rce.ros.node import Node, Publisher
+    from rce.ros.node import Node, Publisher, Subscriber
     from rce.ros.types import Message
     from rce_fleet.coordination.events import SendCells
     from rce_fleet.coordination.move_client import ClientReport
@@ -48,13 +52,14 @@ class RobotTopics:
         self._takes_answers = takes_answers
         self._cells: dict[str, Publisher] = {}
         self._cancels: dict[str, Publisher] = {}
+        self._joined: set[str] = set()
         self._obstacles_from = 0.0
         self._throttled_log = ThrottledLog(node)
         self.client_grids: dict[str, str] = {}
 
     def __contains__(self, robot: str) -> bool:
         """Return whether a robot is connected."""
-        return robot in self._cells
+        return robot in self._joined
 
     def send_cells(self, instruction: SendCells, grid: str) -> None:
         """Send a robot its cells, which belong to a grid of this name.
@@ -77,21 +82,37 @@ class RobotTopics:
         """Take no cells from robots for a while, because they may be of the grid before."""
         self._obstacles_from = time.monotonic() + OLD_CELLS_LAST
 
-    async def join(self, robot: str) -> None:
-        """Connect a robot."""
+    async def join(self, robots: Iterable[str]) -> None:
+        """Connect robots, many at the same time: each topic has to be registered at the master.
+
+        Raises:
+            MasterError: The master did not take a topic of at least one of them. Such a robot is not
+                connected at all, and can be joined again, as those whose turn had not come.
+        """
+        await run_in_groups([partial(self._join, robot) for robot in robots], ROBOTS_AT_ONCE)
+
+    async def _join(self, robot: str) -> None:
+        """Connect a robot, or nothing of it."""
         node = self._node
-        self._cells[robot] = await node.advertise(f"/{robot}/goalNodesList", "std_msgs/Int32MultiArray")
-        self._cancels[robot] = await node.advertise(f"/{robot}/cancelGoal", "std_msgs/Bool")
-        if self._takes_answers:
-            await node.subscribe(
-                f"/{robot}/goalNodesList",
-                "std_msgs/Int32MultiArray",
-                lambda message: self._take_answer(robot, message),
-            )
-        else:
-            await self._hear_apart(robot)
-        # Clients of the planner's container do not receive what its other interfaces publish.
-        seen = await node.advertise(f"/fleet/poses/{robot}", POSE, latch=True)
+        cells, cancels, seen = publishers = await register_together(
+            node.advertise(f"/{robot}/goalNodesList", "std_msgs/Int32MultiArray"),
+            node.advertise(f"/{robot}/cancelGoal", "std_msgs/Bool"),
+            # Clients of the planner's container do not receive what its other interfaces publish.
+            node.advertise(f"/fleet/poses/{robot}", POSE, latch=True),
+        )
+        self._cells[robot], self._cancels[robot] = cells, cancels  # a message may come before all is joined
+        try:
+            await register_together(*self._subscriptions(robot, seen))
+        except Exception:
+            del self._cells[robot], self._cancels[robot]
+            await release_all(publishers)
+            raise
+        self._joined.add(robot)
+        node.log.info("found robot %s", robot)
+
+    def _subscriptions(self, robot: str, seen: Publisher) -> Iterator[Coroutine[Any, Any, Subscriber]]:
+        """Subscribe to the topics of a robot and its move client."""
+        node = self._node
 
         def take(message: Message) -> None:
             pose = read_pose_seen(robot, message)
@@ -103,22 +124,25 @@ class RobotTopics:
             self._poses.take(robot, message)
             seen.publish(message)
 
-        await node.subscribe(f"/{robot}/amcl_pose", POSE, take)
-        node.log.info("found robot %s", robot)
-
-    async def _hear_apart(self, robot: str) -> None:
-        """Subscribe to the topics of a move client and its robot."""
-        await self._node.subscribe(
+        yield node.subscribe(f"/{robot}/amcl_pose", POSE, take)
+        if self._takes_answers:
+            yield node.subscribe(
+                f"/{robot}/goalNodesList",
+                "std_msgs/Int32MultiArray",
+                lambda message: self._take_answer(robot, message),
+            )
+            return
+        yield node.subscribe(
             f"/{robot}/moveClient/status",
             "fleet/MoveStatus",
             lambda message: self._take_status(robot, message),
         )
-        await self._node.subscribe(
+        yield node.subscribe(
             f"/{robot}/blockedCells",
             "std_msgs/Int32MultiArray",
             lambda message: self._take_obstacle(ObstacleSeen(robot, tuple(message.data))),
         )
-        await self._node.subscribe(
+        yield node.subscribe(
             f"/{robot}/freedCells",
             "std_msgs/Int32MultiArray",
             lambda message: self._take_obstacle(ObstacleGone(robot, tuple(message.data))),

@@ -7,7 +7,7 @@ from rce.ros.multimaster.source import multicall
 from rce.ros.node import Node
 from rce.ros.node.master import MasterClient
 from rce.ros.xmlrpc import RpcClient
-from rce_fleet.nodes.graph_look import TOPICS_PER_S, GraphLook
+from rce_fleet.nodes.graph_look import CHANGING, TOPICS_PER_S, GraphLook
 
 MANY = 2000
 
@@ -31,4 +31,8 @@ async def test_large_graphs_are_looked_at_less_often() -> None:
         ]
         await multicall(other, calls)
         assert (await graph.look()).publishers[f"/Robot{MANY - 1}/scan"] == ["/other"]
+        assert (
+            graph.pause < 0.6 + MANY / TOPICS_PER_S / CHANGING
+        )  # robots come together, and wait for the next look
+        await graph.look()
         assert graph.pause > 0.5 + MANY / TOPICS_PER_S
