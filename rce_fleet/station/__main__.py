@@ -53,7 +53,7 @@ from rce_fleet.station.layers.ros_source import RosLayerSource
 from rce_fleet.station.layers.sources import LayerSource
 from rce_fleet.station.masters_watch import DemoProcess, MastersWatch, masters_text
 from rce_fleet.station.planner_client import PlannerClient
-from rce_fleet.station.recording import Recorder, Records
+from rce_fleet.station.recording import Recorder, open_records
 from rce_fleet.station.ros_planner_client import RosPlannerClient
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
@@ -340,7 +340,7 @@ async def serve(
     )
     owed_modes = OwedModes(modes)
     manual_modes = ManualModes(fleet, view, owed_modes)
-    recorder = Recorder(view, Records(history))
+    recorder = Recorder(view, open_records(history))
     station = Station(
         view,
         fleet,
@@ -359,7 +359,11 @@ async def serve(
         lambda state: feed.pages.send("masters", masters_text(state)), kills=kill_leader is not None
     )
     figures = FigureRecorder(view, recorder.records, station.fleet_api.statistics)
-    await station.fleet_api.load()
+    try:
+        await station.fleet_api.load()
+    except OSError as error:
+        typer.echo(f"rce ui: {error}", err=True)
+        raise typer.Exit(1) from None
     try:
         await asyncio.to_thread(desired_stops.load)
     except (OSError, ValueError) as error:

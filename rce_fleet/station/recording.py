@@ -44,17 +44,28 @@ class Records:
     Args:
         file: Where they are kept; None: in memory.
         limit: Most bytes of all records; None: :data:`MAX_BYTES`, or :data:`IN_MEMORY_BYTES` in memory.
+
+    Raises:
+        sqlite3.Error: The file cannot be used.
     """
 
     def __init__(self, file: Path | None = None, limit: int | None = None) -> None:
         self._limit = limit or (IN_MEMORY_BYTES if file is None else MAX_BYTES)
         self._lock = threading.Lock()
         self._database = sqlite3.connect(str(file or ":memory:"), check_same_thread=False)
+        try:
+            self._prepare(is_file=file is not None)
+        except sqlite3.Error:
+            self._database.close()
+            raise
+
+    def _prepare(self, *, is_file: bool) -> None:
+        """Make what is missing in the database."""
         self._database.execute(
             "CREATE TABLE IF NOT EXISTS records (time REAL PRIMARY KEY, whole INTEGER, data BLOB)"
         )
         self._database.execute("CREATE TABLE IF NOT EXISTS figures (time REAL PRIMARY KEY, data TEXT)")
-        if file is not None:
+        if is_file:
             self._database.execute("PRAGMA journal_mode=WAL")
             self._database.execute("PRAGMA synchronous=NORMAL")
         ((self._bytes,),) = self._database.execute("SELECT TOTAL(LENGTH(data)) FROM records")
@@ -131,6 +142,19 @@ class Records:
     def close(self) -> None:
         """Close the file."""
         self._database.close()
+
+
+def open_records(file: Path | None) -> Records:
+    """Return the records of a file; in memory if there is none, or if it cannot be used, which is logged."""
+    try:
+        return Records(file)
+    except sqlite3.Error as error:
+        _log.error(
+            "replays are kept in memory only: %s cannot be used: %s; move it away, or name another file",
+            file,
+            error,
+        )
+        return Records()
 
 
 def _merge(state: Frame, frame: Frame) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from unit.station.test_station_view import changes, pose, robot, state
 
-from rce_fleet.station.recording import WHOLE_EVERY_S, Recorder, Records
+from rce_fleet.station.recording import WHOLE_EVERY_S, Recorder, Records, open_records
 from rce_fleet.station.view import FleetView
 
 START = 1000.0
@@ -103,3 +103,16 @@ def test_nothing_is_recorded_before_the_first_state(records: Records) -> None:
     assert recorder.take(START) is None
     assert recorder.records.range() is None
     assert recorder.records.read(START, 10.0) == []
+
+
+@pytest.mark.parametrize("name", ["text.db", "missing/history.db", "."])
+def test_a_file_that_cannot_be_used_does_not_keep_the_station_from_starting(
+    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A damaged recording for replays must not take the emergency stops with it."""
+    (tmp_path / "text.db").write_text("this is text" * 100)
+    with closing(open_records(tmp_path / name)) as records:
+        records.add(START, {"robots": {}}, whole=True)
+        assert records.range() == (START, START)
+    assert "replays are kept in memory only" in caplog.text
+    assert str(tmp_path / name) in caplog.text
