@@ -109,6 +109,10 @@ class EngineWatch:
             except (aiohttp.ClientError, TimeoutError) as error:
                 self._masters.failed(master)
                 state = {"error": f"the master cannot be reached: {explain_to_client(error) or error}"}
+            except (AttributeError, KeyError, TypeError, ValueError):
+                self._token = ""
+                self._masters.failed(master)
+                state = {"error": f"another program than a master answers at {master}"}
             if state != self._last:
                 self._last = state
                 self._on_state(state)

@@ -113,6 +113,19 @@ async def test_a_master_that_cannot_answer_is_left_for_another() -> None:
         assert (await watched(before=str(cut_off.make_url("/"))))["containers"]
 
 
+@pytest.mark.parametrize("text", ["{}", "[]", "<html>", '{"token": "t", "containers": [{}]}'])
+async def test_another_program_at_a_masters_address_is_left_too(text: str) -> None:
+    """It ended the station, and with it the emergency stops."""
+
+    async def answer(_: web.Request) -> web.Response:
+        return web.Response(text=text, content_type="application/json")
+
+    app = web.Application()
+    app.router.add_route("*", "/api/v1/{name}", answer)
+    async with TestServer(app) as stranger:
+        assert (await watched(before=str(stranger.make_url("/"))))["containers"]
+
+
 @pytest.mark.needs("chromium")
 async def test_the_page_shows_bars_and_advice() -> None:
     from playwright.async_api import async_playwright
