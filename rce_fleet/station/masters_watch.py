@@ -88,7 +88,7 @@ class MastersWatch:
 
     async def _ask(self, session: aiohttp.ClientSession, url: str) -> dict[str, Any]:
         tls = True if self._tls is None else self._tls()
-        with contextlib.suppress(aiohttp.ClientError, TimeoutError, OSError, KeyError, ValueError):
+        with contextlib.suppress(aiohttp.ClientError, OSError, KeyError, TypeError, ValueError):
             async with session.get(f"{url.rstrip('/')}/healthz", ssl=tls, allow_redirects=False) as reply:
                 told = await reply.json()
             role = str(told["role"])

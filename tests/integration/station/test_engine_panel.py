@@ -14,6 +14,7 @@ from aiohttp.test_utils import TestServer
 from rce_fleet.station.engine_watch import EngineWatch
 from rce_fleet.station.fleet_link import FleetLink
 from rce_fleet.station.live import Broadcast
+from rce_fleet.station.masters_watch import MastersWatch
 from rce_fleet.station.server import Station
 from rce_fleet.station.view import FleetView
 
@@ -124,6 +125,29 @@ async def test_another_program_at_a_masters_address_is_left_too(text: str) -> No
     app.router.add_route("*", "/api/v1/{name}", answer)
     async with TestServer(app) as stranger:
         assert (await watched(before=str(stranger.make_url("/"))))["containers"]
+
+
+@pytest.mark.parametrize("text", ["[]", '{"role": "leader", "ready": true, "term": null}'])
+async def test_another_program_does_not_end_the_watch_of_masters(text: str) -> None:
+    async def answer(_: web.Request) -> web.Response:
+        return web.Response(text=text, content_type="application/json")
+
+    app = web.Application()
+    app.router.add_get("/healthz", answer)
+    seen: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+    async with TestServer(app) as stranger:
+        urls = f"http://127.0.0.1:1/,{stranger.make_url('/')}"
+        watch = asyncio.create_task(MastersWatch(urls, on_state=seen.put_nowait).run())
+        told = asyncio.create_task(seen.get())
+        try:
+            async with asyncio.timeout(30):
+                await asyncio.wait({watch, told}, return_when=asyncio.FIRST_COMPLETED)
+            assert not watch.done(), watch.exception()
+            assert [master["role"] for master in (await told)["masters"]] == ["away", "away"]
+        finally:
+            for task in (watch, told):
+                task.cancel()
+            await asyncio.gather(watch, told, return_exceptions=True)
 
 
 @pytest.mark.needs("chromium")
