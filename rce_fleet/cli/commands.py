@@ -192,7 +192,7 @@ def history(
     """Print what happened as CSV."""
 
     async def work(client: FleetClient) -> None:
-        since = time.time() - 3600.0 * hours
+        since = max(0.0, time.time() - 3600.0 * hours)
         if json_:
             async for event in client.history(since=since):
                 echo_json_line(event)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from aiohttp import web
@@ -162,3 +165,29 @@ def test_rce_fleet_names_a_value_that_is_out_of_range(command: str, value: str) 
 def test_rce_fleet_says_what_the_url_of_a_station_is_like(station: str) -> None:
     found = CliRunner().invoke(commands, ["robots", "--station", station])
     assert (found.exit_code, "must be such as http://" in found.output) == (1, True), found.output
+
+
+def test_the_history_of_any_time_can_be_asked_for() -> None:
+    """Before 1970 there is none; the station refused such a time."""
+    asked: list[str] = []
+
+    class History(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append(parse_qs(urlsplit(self.path).query)["since"][0])
+            self.send_response(200)
+            self.send_header("Content-Type", "text/csv")
+            self.end_headers()
+
+        def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+            del format, args
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), History) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            words = ["history", "--hours", "1e6", "--station", f"http://127.0.0.1:{server.server_port}"]
+            found = CliRunner().invoke(commands, words)
+        finally:
+            server.shutdown()
+            thread.join()
+    assert (found.exit_code, [float(since) for since in asked]) == (0, [0.0]), found.output
