@@ -63,6 +63,8 @@ def used_alone(folder: Path) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise ExperimentError(f"another command runs in {folder}; wait until it has ended") from None
+        except OSError:  # a network file system may have no locks
+            pass
         yield
     finally:
         os.close(descriptor)
