@@ -107,7 +107,7 @@ def _versions() -> dict[str, str]:
 
 
 def commit(folder: Path = Path(rce.__file__).parent) -> str:
-    """Return the commit of the checkout that this package is in; with ``+`` if files were changed.
+    """Return the commit of the checkout that this package is in; with ``+`` if files of it were changed.
 
     Args:
         folder: Of the package.
@@ -121,7 +121,8 @@ def commit(folder: Path = Path(rce.__file__).parent) -> str:
     head = _output(*git, "rev-parse", "HEAD")
     if head is None:
         return "unknown"
-    return head + ("+" if _output(*git, "status", "--porcelain", "--untracked-files=no") else "")
+    packages = ("--", f"../{folder.name}*")  # a page, or a note beside them, changes no figure
+    return head + ("+" if _output(*git, "status", "--porcelain", "--untracked-files=no", *packages) else "")
 
 
 def _output(*argv: str) -> str | None:

@@ -86,9 +86,11 @@ def test_the_commit_is_not_that_of_a_repository_around_it(tmp_path: Path) -> Non
     subprocess.run([*git, "init", "--quiet"], check=True)
     subprocess.run([*git, "commit", "--quiet", "--allow-empty", "--message", "notes"], check=True)
     assert environment.commit(package) == "unknown"
-    subprocess.run([*git, "add", "venv"], check=True)
+    (tmp_path / "page.md").touch()
+    subprocess.run([*git, "add", "venv", "page.md"], check=True)
     subprocess.run([*git, "commit", "--quiet", "--message", "rce"], check=True)
     head = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True).stdout
+    (tmp_path / "page.md").write_text("made of the data\n")
     assert environment.commit(package) == head.strip()
     (package / "__init__.py").write_text("changed\n")
     assert environment.commit(package) == f"{head.strip()}+"
