@@ -50,15 +50,20 @@ def used(machine: str, first: Reading, last: Reading) -> list[Value]:
     return [*found, Value(f"{machine}.memory", float(last.usage.memory), "B")]
 
 
-def over_time(readings: Sequence[Reading]) -> list[Value]:
-    """Return the network of machine 1 in both directions, by the seconds since the measurement began."""
+def over_time(readings: Sequence[Reading], due: Sequence[float]) -> list[Value]:
+    """Return the network of machine 1 in both directions, by the seconds since the measurement began.
+
+    Args:
+        readings: Of the beginning, and one for each time.
+        due: When they were to be read, seconds: the same in all runs, while readings take a while.
+    """
     return [
         Value(
-            f"{SERVER}.network@{after.at - readings[0].at:.1f}",
+            f"{SERVER}.network@{at:.1f}",
             (_carried(after) - _carried(before)) / (after.at - before.at),
             "B/s",
         )
-        for before, after in pairwise(readings)
+        for (before, after), at in zip(pairwise(readings), due, strict=True)
     ]
 
 

@@ -6,6 +6,7 @@ import asyncio
 import time
 from dataclasses import dataclass
 from itertools import chain, count
+from math import ceil
 from typing import TYPE_CHECKING
 
 from rce_fleet.exceptions import ExperimentError
@@ -61,10 +62,15 @@ class Part:
 
 @dataclass(slots=True)
 class _Watched:
-    """What was read during a part."""
+    """What was read during a part.
+
+    Attributes:
+        due: When the server was read after the first time, as planned, seconds.
+    """
 
     server: list[Reading]
     client: list[Reading]
+    due: list[float]
     emulation_s: float
 
 
@@ -151,13 +157,13 @@ class Streaming:
         emulation = await self._bench.emulation_s()
         client = [await self._bench.read(CLIENT)]
         server = [await self._bench.read(SERVER)]
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            await asyncio.sleep(min(left, STEP_S))
+        begin, due = time.monotonic(), readings_due(seconds)
+        for at in due:
+            await asyncio.sleep(max(0.0, begin + at - time.monotonic()))
             server.append(await self._bench.read(SERVER))
         client.append(await self._bench.read(CLIENT))
         self._bench.check()
-        return _Watched(server, client, await self._bench.emulation_s() - emulation)
+        return _Watched(server, client, due, await self._bench.emulation_s() - emulation)
 
     def _limit(self, cores: float) -> None:
         meter = self._bench.meters[CLIENT]
@@ -186,8 +192,14 @@ class Streaming:
             *used(CLIENT, client[0], client[-1]),
             Value("link.cpu", watched.emulation_s / seconds, "cores"),
             *delivered(stamps, arrivals, (first.at, last.at), carried_bytes(first, last)),
-            *over_time(server),
+            *over_time(server, watched.due),
         ]
+
+
+def readings_due(seconds: float) -> list[float]:
+    """Return when a machine is read after a measurement began: at each step, and at its end; seconds."""
+    steps = ceil(seconds / STEP_S)
+    return [min(seconds, number * STEP_S) for number in range(1, steps + 1)]
 
 
 async def told(workload: RunningWorkload, patience: float) -> list[dict[str, object]]:

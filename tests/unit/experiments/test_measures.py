@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
 import pytest
 
-from rce_fleet.experiments.bench import Reading
+from rce_fleet.experiments.bench import CLIENT, Bench, Reading
 from rce_fleet.experiments.machines import Traffic
 from rce_fleet.experiments.measures import Sample, by_topic, delivered, over_time, used
+from rce_fleet.experiments.streaming import Part, Streaming
 from rce_fleet.experiments.usage import Usage
+from rce_fleet.experiments.workloads.control import QUIET
 
 MICRO = 1_000_000
 
@@ -35,7 +43,10 @@ def test_what_a_machine_used_is_per_second() -> None:
 
 def test_the_network_over_time_counts_both_directions() -> None:
     readings = [reading(10.0, 0, 0, 0), reading(10.5, 0, 100, 400), reading(11.5, 0, 300, 1200)]
-    assert figures(over_time(readings)) == {"server.network@0.5": 1000.0, "server.network@1.5": 1000.0}
+    assert figures(over_time(readings, [0.5, 1.5])) == {
+        "server.network@0.5": 1000.0,
+        "server.network@1.5": 1000.0,
+    }
 
 
 def test_only_what_is_inside_the_window_counts() -> None:
@@ -67,3 +78,30 @@ def test_samples_are_told_in_several_reports() -> None:
         {"phase": "end"},
     ]
     assert by_topic(reports, "1") == {"/a": [(1, 2), (3, 4)]}
+
+
+class SlowBench:
+    """Machines whose meters take a while to be read, as on a small computer."""
+
+    def __init__(self) -> None:
+        self.meters = {CLIENT: SimpleNamespace(limits=False)}
+        self.read_s = iter([0.02, 0.09, 0.12, 0.06, 0.11, 0.08, 0.05, 0.1])
+
+    async def read(self, machine: str) -> Reading:
+        del machine
+        await asyncio.sleep(next(self.read_s))
+        return reading(time.time(), 0.0, 0, 0)
+
+    async def emulation_s(self) -> float:
+        return 0.0
+
+    def check(self) -> None:
+        pass
+
+
+async def test_runs_are_read_at_the_same_times(tmp_path: Path) -> None:
+    """Each value over time has a column: one that is read at 1.1 s is not compared with one at 1.0 s."""
+    streaming = Streaming(cast("Bench", SlowBench()), tmp_path / "control.json", [], [])
+    ((_, values),) = await streaming.measure([Part({}, QUIET, 30.0)], 1.2)
+    metrics = [value.metric for value in values if "@" in value.metric]
+    assert metrics == ["server.network@0.5", "server.network@1.0", "server.network@1.2"]
