@@ -8,6 +8,7 @@ machine.
 from __future__ import annotations
 
 import csv
+import os
 from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -72,6 +73,8 @@ def write_rows(path: Path, rows: Iterable[Row]) -> None:
                     row.unit,
                 )
             )
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def read_rows(path: Path) -> list[Row]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from pathlib import Path
 
@@ -24,6 +25,22 @@ def test_rows_are_read_as_they_were_written(tmp_path: Path) -> None:
         "experiment,system,software,factors,run,metric,value,unit",
         "laser,SMS,ros,printed=yes;robots=5,1,network,1500000.0,B/s",
     ]
+
+
+def test_rows_outlive_a_loss_of_power(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A resumed run replaces the table by a new file, which some file systems would leave empty."""
+    path, kept = tmp_path / "raw.csv", list[tuple[int, int]]()
+    really = os.fsync
+
+    def fsync(descriptor: int) -> None:
+        really(descriptor)
+        found = os.fstat(descriptor)
+        kept.append((found.st_ino, found.st_size))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_rows(path, [Row(SMS, 1, "network", 1.0, "B/s")])
+    found = path.stat()
+    assert kept == [(found.st_ino, found.st_size)]
 
 
 def test_an_interrupted_line_is_left_out(tmp_path: Path) -> None:
