@@ -27,7 +27,9 @@ def test_a_signature_covers_time_and_body() -> None:
         verify("secret", "1000", BODY + b" ", signature, now=1000.0),
         verify("secret", "1000", BODY, signature, now=1301.0),
         verify("secret", "soon", BODY, signature, now=1000.0),
+        verify("secret", "9" * 5000, BODY, signature, now=1000.0),
         verify("secret", "1000", BODY, "v1=ä", now=1000.0),
+        verify("secret", "1000", BODY, "v1=\udce4", now=1000.0),  # as aiohttp reads a byte that is not UTF-8
     ):
         assert not wrong
 
