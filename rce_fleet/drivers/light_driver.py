@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from functools import partial
 from math import cos, pi, sin
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rce.aio.tasks import run_in_groups
 from rce.ros.types import Message, Time
 from rce_fleet.drivers.fields import charge_fields
 from rce_fleet.drivers.stand_in import status_of
@@ -44,6 +46,8 @@ BATTERY_EVERY = 10.0
 """Seconds between two messages about a robot's battery."""
 STANDS = 0.01
 """A slower robot stands, metres or radians per second."""
+AT_ONCE = 100
+"""Robots whose topics are registered side by side."""
 POSE = "geometry_msgs/PoseWithCovarianceStamped"
 _HEAD = struct.Struct("<III")
 _FRAME = b"map"
@@ -83,21 +87,22 @@ class LightDriver:
 
     async def start(self) -> None:
         """Create publishers and subscribers. They end with the node."""
-        node = self._node
-        for row in self._rows.tolist():
-            name = f"/{self._robots.names[row]}"
-            await node.subscribe(
-                f"{name}/move_base/goal", "move_base_msgs/MoveBaseActionGoal", self._on_goal(row)
-            )
-            await node.subscribe(f"{name}/move_base/cancel", "actionlib_msgs/GoalID", self._on_cancel(row))
-            await node.subscribe(f"{name}/emergency_stop", "std_msgs/Bool", self._on_stop(row))
-            await node.subscribe(f"{name}/raw_cmd_vel", "geometry_msgs/Twist", self._on_velocity(row))
-            await node.subscribe(f"{name}/speed_limit", "std_msgs/Float64", self._on_speed_limit(row))
-            result = await node.advertise(f"{name}/move_base/result", "move_base_msgs/MoveBaseActionResult")
-            status = await node.advertise(f"{name}/move_base/status", "actionlib_msgs/GoalStatusArray")
-            battery = await node.advertise(f"{name}/battery_state", "sensor_msgs/BatteryState")
-            pose = await node.advertise(f"{name}/amcl_pose", POSE)
-            self._topics[row] = _Topics(pose, status, result, battery)
+        await run_in_groups([partial(self._start, row) for row in self._rows.tolist()], AT_ONCE)
+
+    async def _start(self, row: int) -> None:
+        node, name = self._node, f"/{self._robots.names[row]}"
+        await node.subscribe(
+            f"{name}/move_base/goal", "move_base_msgs/MoveBaseActionGoal", self._on_goal(row)
+        )
+        await node.subscribe(f"{name}/move_base/cancel", "actionlib_msgs/GoalID", self._on_cancel(row))
+        await node.subscribe(f"{name}/emergency_stop", "std_msgs/Bool", self._on_stop(row))
+        await node.subscribe(f"{name}/raw_cmd_vel", "geometry_msgs/Twist", self._on_velocity(row))
+        await node.subscribe(f"{name}/speed_limit", "std_msgs/Float64", self._on_speed_limit(row))
+        result = await node.advertise(f"{name}/move_base/result", "move_base_msgs/MoveBaseActionResult")
+        status = await node.advertise(f"{name}/move_base/status", "actionlib_msgs/GoalStatusArray")
+        battery = await node.advertise(f"{name}/battery_state", "sensor_msgs/BatteryState")
+        pose = await node.advertise(f"{name}/amcl_pose", POSE)
+        self._topics[row] = _Topics(pose, status, result, battery)
 
     def reset(self) -> None:
         """Begin anew with the world's time."""

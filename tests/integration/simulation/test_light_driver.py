@@ -6,11 +6,13 @@ import asyncio
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 
 from rce.ros.core import Core
 from rce.ros.node import Node
 from rce.ros.packages import PackageIndex
 from rce.ros.types import TypeRegistry
+from rce.ros.xmlrpc import Dispatcher
 from rce_fleet.drivers.light_driver import LightDriver
 from rce_fleet.geometry.poses import Pose
 from rce_fleet.simulation.light.robots import LightRobots
@@ -47,3 +49,26 @@ async def test_light_robots_obey_stops_and_hands() -> None:
         await until(has_moved)
         stop.publish(data=False)
         await until(lambda: not robots.stopped.any())
+
+
+async def test_topics_of_many_robots_are_registered_in_few_requests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A world of a thousand robots was ready after nine thousand of them, one after the other."""
+    requests: list[int] = []
+    respond = Dispatcher.respond
+
+    def count(self: Dispatcher, document: bytes) -> bytes:
+        requests.append(len(document))
+        return respond(self, document)
+
+    monkeypatch.setattr(Dispatcher, "respond", count)
+    poses = {f"Robot{number}": Pose(0, 5.0 * number, 0) for number in range(100)}
+    robots = LightRobots(poses, np.empty((0, 4)))
+    async with (
+        Core(port=0) as core,
+        Node("world", argv=[], master_uri=core.uri, types=TYPES) as node,
+        asyncio.timeout(LIMIT_S),
+    ):
+        before = len(requests)
+        await LightDriver(node, robots, range(100)).start()
+        assert len(requests) - before < 9 * 100 / 5
+        assert len(core.graph.published("/Robot99/")) == 4
