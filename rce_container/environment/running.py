@@ -8,6 +8,7 @@ import signal
 import socket
 from pathlib import Path
 
+from rce.own_process import collect_all_seldom
 from rce_container.environment.environment import Environment
 from rce_container.environment.logs.files import ENVIRONMENT_LOG, LogWriter
 from rce_container.environment.messages import Boot
@@ -40,6 +41,7 @@ def run_environment(
         node_server: See :class:`Environment`.
     """
     set_rlimits(boot.rlimits)
+    collect_all_seldom()
     writer = LogWriter(Path(boot.logs), ENVIRONMENT_LOG, mirror=(1, 2))
     logging.basicConfig(level=logging.INFO, handlers=[_Handler(writer)])
     try:

@@ -14,6 +14,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any, assert_never
 
+from rce.own_process import collect_all_seldom
 from rce.ros.errors import MasterError
 from rce.ros.node import Node, run
 from rce_fleet.coordination.events import (
@@ -133,6 +134,7 @@ class PlannerNode:
             # Modules, message types and the map stay: no garbage collection between two ticks looks at them.
             gc.collect()
             gc.freeze()
+            collect_all_seldom()
             await self._keep_time()
             planning.cancel()
 
