@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 WITH_ROBOT = frozenset({TaskState.RUNNING, TaskState.SUSPENDED, TaskState.CANCELLING})
 """States in which a task occupies its robot; a held task does while its load is on the robot."""
 
+_MOST_DIGITS = 18
+"""Digits of a task's number, of 64 bits; Python refuses to read numbers of some thousands."""
+
 
 class FleetTables:
     """All tasks that have not been forgotten, and what people decided about robots and places.
@@ -125,7 +128,8 @@ class FleetTables:
             UnknownTaskError: There is none of this id.
         """
         number = task_id.removeprefix("T")
-        task = self.tasks.get(int(number)) if number.isdecimal() and number.isascii() else None
+        is_number = number.isdecimal() and number.isascii() and len(number) <= _MOST_DIGITS
+        task = self.tasks.get(int(number)) if is_number else None
         if task is None or task.id != task_id:
             raise UnknownTaskError(f"there is no task {task_id!r}")
         return task

@@ -84,6 +84,8 @@ async def test_no_robot_is_denied_before_the_planner_has_told_its_robots(
         ("POST", "/tasks", {"stops": [{"cell": 9}]}, 409),
         ("POST", "/tasks", '{"stops": [{"cell": 5, "duration": NaN}]}', 422),
         ("GET", "/tasks/T1", None, 404),
+        ("GET", f"/tasks/T{'9' * 5000}", None, 404),
+        ("POST", "/tasks", {**GO, "after": [f"T{'9' * 5000}"]}, 409),
         ("GET", "/tasks?state=sleeping", None, 422),
         ("GET", "/tasks?limit=many", None, 422),
         ("GET", "/tasks?limit=1.5", None, 422),
