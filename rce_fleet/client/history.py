@@ -9,6 +9,9 @@ from rce_fleet.api.webhooks import NewWebhookModel, WebhookList, WebhookModel, W
 from rce_fleet.client.event_stream import follow_events
 from rce_fleet.client.requests import ApiRequests, parsed, path_part
 
+PAGE = 1000
+"""Events of one answer."""
+
 
 class HistoryRequests(ApiRequests):
     """Reads statistics and the history, follows events, and manages webhooks."""
@@ -41,12 +44,12 @@ class HistoryRequests(ApiRequests):
         """
         times = {"since": since, "until": until}
         query = {name: repr(value) for name, value in times.items() if value is not None}
-        query |= {"limit": "1000"} | ({"id": subject} if subject else {})
+        query |= {"limit": str(PAGE)} | ({"id": subject} if subject else {})
         while True:
             page = await self._read("/history", EventPage, query)
             for event in page.events:
                 yield event
-            if not page.events:
+            if len(page.events) < PAGE:  # what happens meanwhile is not waited for
                 return
             query["after"] = str(page.next)
 

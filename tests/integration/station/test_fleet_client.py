@@ -145,6 +145,26 @@ async def test_a_stream_that_broke_before_its_first_event_is_resumed() -> None:
     assert (found.number, asked) == (8, ["", *["abc:7"] * 4])
 
 
+async def test_the_history_until_now_ends_while_more_happens() -> None:
+    """In a fleet with an event for each request it went on as long as the fleet."""
+    texts = {"kind": "task", "id": "T1", "name": "", "user": "", "text": "", "state": "", "robot": ""}
+    asked: list[int] = []
+
+    async def answer(request: web.Request) -> web.Response:
+        after, limit = (int(request.query.get(name, "0")) for name in ("after", "limit"))
+        asked.append(after)
+        known = limit + 5 + len(asked)
+        numbers = range(after + 1, known + 1)[:limit] if len(asked) < 50 else []
+        events = [{"number": number, "time": 1.0, "revision": 1, **texts} for number in numbers]
+        page = {"events": events, "next": after + len(events), "journal": "aa", "newest": known}
+        return web.json_response(page)
+
+    async with client_of(answer) as client:
+        found = [event.number async for event in client.history()]
+    assert len(asked) == 2
+    assert found == list(range(1, asked[1] + 8))
+
+
 @pytest.mark.parametrize(
     ("command", "value"),
     [
