@@ -97,7 +97,8 @@ def read_second(paths: Sequence[Path]) -> OtherRun:
     parts = read_parts([path for path in paths if path not in files])
     environments = environments_of(parts)
     for path in files:
-        environments |= read_environments(path.parent / ENVIRONMENTS)
+        found = read_environments(path.parent / ENVIRONMENTS)
+        environments |= {f"{path.parent}: {name}": one for name, one in found.items()}
     return OtherRun(kept + summarize(Measurements.of(rows_of(parts))), environments)
 
 

@@ -368,6 +368,23 @@ def test_page_without_matplotlib_says_what_to_install(
     ]
 
 
+def test_a_second_run_in_parts_is_not_described_by_its_last_part(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drawing, "can_draw", lambda: False)
+    kept = []
+    for cores in (2, 64):
+        figures = tmp_path / f"{cores}"
+        make_report([folder], page=tmp_path / "part.md", figures=figures)
+        (figures / "environments.json").write_text(json.dumps({"value": {"cores": cores}}))
+        kept.append(figures / "summary.csv")
+    page = tmp_path / "page.md"
+    make_report([folder], page=page, figures=tmp_path / "figures", second=kept)
+    assert "| what differs |" not in page.read_text(encoding="utf-8")
+    make_report([folder], page=page, figures=tmp_path / "figures", second=kept[1:])
+    assert "| cores | 2 | 64 |" in page.read_text(encoding="utf-8")
+
+
 def test_links_of_a_page_with_spaces_lead_to_its_figures(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
