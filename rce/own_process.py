@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import io
 import logging
 import os
 import resource
 import signal
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -46,6 +48,15 @@ def open_missing_streams() -> None:
     while (fd := os.open(os.devnull, os.O_RDWR)) <= 2:  # noqa: PLR2004 - standard error
         os.set_inheritable(fd, True)
     os.close(fd)
+
+
+def escape_missing_letters() -> None:
+    """Have standard output escape the letters that the encoding of its locale lacks, as standard error does.
+
+    Names of robots and containers may be in any language; printing one that is not would end the program.
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def raise_file_limit() -> int:

@@ -16,7 +16,7 @@ import typer
 from rce import __version__
 from rce.cli.programs import missing_for
 from rce.cli.summaries import summary_of
-from rce.own_process import open_missing_streams
+from rce.own_process import escape_missing_letters, open_missing_streams
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -113,6 +113,7 @@ def main() -> None:
     Ctrl-C while a command is imported ends the program without a traceback.
     """
     open_missing_streams()
+    escape_missing_letters()
     points = sorted(entry_points(group=GROUP), key=lambda point: point.name)
     asked = [point for point in points if point.name == sys.argv[1]] if len(sys.argv) > 1 else []
     try:

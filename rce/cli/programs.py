@@ -10,7 +10,7 @@ import sys
 from importlib import import_module
 from importlib.util import find_spec
 
-from rce.own_process import open_missing_streams
+from rce.own_process import escape_missing_letters, open_missing_streams
 
 SERVER, FLEET, ALL = "server", "fleet", "all"
 
@@ -48,6 +48,7 @@ def container() -> None:
 
 def _run(program: str, package: str) -> None:
     open_missing_streams()
+    escape_missing_letters()
     if problem := missing_for(package):
         sys.exit(f"{program}: {problem}")
     import_module(f"{package}.__main__").main()

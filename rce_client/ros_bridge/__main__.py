@@ -18,7 +18,7 @@ from rce.aio.tasks import TaskScope
 from rce.cli.options import Authority
 from rce.config import ConfigError, ShippedFileError, examples_dir, start_logging
 from rce.config.documents import read_file
-from rce.own_process import open_missing_streams
+from rce.own_process import escape_missing_letters, open_missing_streams
 from rce.ros.errors import RosError
 from rce.ros.names import parse_arguments
 from rce.ros.packages import PackageIndex
@@ -233,6 +233,7 @@ def _packages(given: Iterable[Path]) -> PackageIndex:
 def main() -> None:
     """Run the program."""
     open_missing_streams()
+    escape_missing_letters()
     app()
 
 

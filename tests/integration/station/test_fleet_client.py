@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+import subprocess
+import sys
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
@@ -211,3 +215,46 @@ def test_the_history_of_any_time_can_be_asked_for() -> None:
             server.shutdown()
             thread.join()
     assert (found.exit_code, [float(since) for since in asked]) == (0, [0.0]), found.output
+
+
+@pytest.mark.parametrize(
+    ("encoding", "shown"), [("latin-1", b"\\u673a\\u5668 f\xe4hrt"), ("utf-8", "机器 fährt".encode())]
+)
+def test_letters_that_a_terminal_lacks_are_escaped(encoding: str, shown: bytes) -> None:
+    """As in a locale from before UTF-8: the command ended with a traceback."""
+
+    class Robots(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            state = {"state": "idle", "activity": "idle", "mode": "automatic", "reason": "机器 fährt"}
+            known: dict[str, Any] = {
+                "cell": 1,
+                "goal": None,
+                "battery": None,
+                "task": None,
+                "queue": [],
+                "profile": {},
+            }
+            self.send_response(200)
+            self.send_header("Content-Type", "application/json")
+            self.end_headers()
+            self.wfile.write(json.dumps({"robots": [{"id": "R", **state, **known, "revision": 1}]}).encode())
+
+        def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+            del format, args
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Robots) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            code = "import sys; from rce.cli.main import main; sys.argv[0] = 'rce'; main()"
+            words = ("fleet", "robots", "--station", f"http://127.0.0.1:{server.server_port}")
+            done = subprocess.run(
+                [sys.executable, "-c", code, *words],
+                capture_output=True,
+                check=False,
+                env=os.environ | {"PYTHONIOENCODING": encoding},
+            )
+        finally:
+            server.shutdown()
+            thread.join()
+    assert (done.returncode, shown in done.stdout) == (0, True), done.stderr
