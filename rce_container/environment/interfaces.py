@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from abc import abstractmethod
 from collections.abc import Awaitable, Callable, Collection
 from itertools import islice
 from typing import TYPE_CHECKING
 
+from rce.aio.backoff import Backoff
 from rce.aio.tasks import cancel_and_wait
 from rce.link import Buffer, CallError, Interface, InterfaceError, Port
 from rce.model import Form, InterfaceSpec, InterfaceType, Role
 from rce.ros import names
-from rce.ros.errors import RosError
+from rce.ros.errors import MasterUnreachableError, RosError
 
 if TYPE_CHECKING:
     from rce.ros.node import Node, Publisher, Service, ServiceClient, Subscriber
@@ -24,6 +26,10 @@ _LOOK_AGAIN_S = 0.05
 """Seconds between two looks whether nodes still start: one look for all interfaces that wait."""
 _RELEASED_AT_ONCE = 100
 """How many interfaces stop waiting before others have their turn; a container may have thousands."""
+RETRY = Backoff(first=0.2, longest=5.0, jitter=0.5)
+"""Pauses between attempts to register at a core that does not answer."""
+
+_log = logging.getLogger(__name__)
 
 
 class Readiness:
@@ -77,10 +83,18 @@ class RosInterface(Interface):
 
     async def start(self) -> None:
         """Register the topic or service, and wait until a starting node has registered it too."""
-        try:
-            await self.open()
-        except RosError as error:
-            raise InterfaceError(f"{self.addr}: {error}") from error
+        pauses = RETRY.start()
+        while True:
+            try:
+                await self.open()
+            except MasterUnreachableError as error:
+                # The core is in this process: it was held, or stopped, for longer than a call may take.
+                _log.info("%s is registered again: %s", self.addr, error)
+            except RosError as error:
+                raise InterfaceError(f"{self.addr}: {error}") from error
+            else:
+                return
+            await asyncio.sleep(pauses.next())
 
     @abstractmethod
     async def open(self) -> None:
