@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 TOPICS_PER_S = 1000
 """Topics that are looked at in a second, at most: master and node take about 30 us for each of them."""
-CHANGING = 8
+CHANGING = 4
 """How many times more are looked at while the graph changes: robots then come together, and wait for it."""
 
 
@@ -60,7 +60,7 @@ class GraphLook:
 
     @property
     def pause(self) -> float:
-        """Seconds until the next look: half a second more for each 500 topics, or 4000 while they change."""
+        """Seconds until the next look: half a second more for each 500 topics, or 2000 while they change."""
         rate = TOPICS_PER_S * (CHANGING if self._is_changing else 1)
         return self._least + self._topics / rate
 
