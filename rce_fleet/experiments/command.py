@@ -14,7 +14,7 @@ from rce_fleet.exceptions import ExperimentError
 from rce_fleet.experiments.catalogue import experiments_of
 from rce_fleet.experiments.experiment import PAPER_SYSTEMS, Experiment, Options
 from rce_fleet.experiments.folders import RUNS, check_same, former_of, go_on, new_folder, runs_of, used_alone
-from rce_fleet.experiments.ownership import sweep
+from rce_fleet.experiments.ownership import measuring, sweep
 from rce_fleet.experiments.report import make_report, read_second
 from rce_fleet.experiments.results import error_text
 from rce_fleet.experiments.runner import TABLE, Plan, Runner
@@ -177,7 +177,12 @@ def _measure(planned: Plan, folder: Path) -> None:
     """Do what is not done yet of a plan."""
     for left in sweep():
         typer.echo(f"removed what an experiment left that was killed: {left}")
-    asyncio.run(_run(Runner(planned, folder, typer.echo)))
+    with contextlib.nullcontext(True) if planned.options.quick else measuring() as is_alone:
+        if not is_alone:
+            typer.echo(
+                "another rce experiment runs on this computer: the figures of both are disturbed", err=True
+            )
+        asyncio.run(_run(Runner(planned, folder, typer.echo)))
     typer.echo(f"raw data: {folder / TABLE}")
 
 

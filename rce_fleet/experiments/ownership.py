@@ -29,6 +29,8 @@ _TAG = re.compile(r"rcx(\d+)\.\d+")
 _numbers = count(1)
 END_S = 10.0
 """How long programs that were left over may take to end."""
+LOCK = "rce-experiment.lock"
+"""File that an experiment has locked while it measures."""
 
 
 def new_tag() -> str:
@@ -62,6 +64,28 @@ def sweep() -> list[str]:
         for path in folders:
             shutil.rmtree(path)
         return [*namespaces, *sorted({path.name for path in groups}), *(path.name for path in folders)]
+
+
+@contextlib.contextmanager
+def measuring() -> Iterator[bool]:
+    """Note for the block that this process measures; yield whether no other one on this computer does.
+
+    Two that measure at the same time disturb each other's figures.
+    """
+    try:
+        file = os.open(Path(tempfile.gettempdir()) / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except OSError:  # another user has it
+        yield True
+        return
+    try:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            is_alone = True
+        except OSError:
+            is_alone = False
+        yield is_alone
+    finally:
+        os.close(file)
 
 
 @contextlib.contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import subprocess
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,13 @@ from typer.testing import CliRunner
 
 from rce_fleet.experiments import environment
 from rce_fleet.experiments.command import _options, experiment
+from rce_fleet.experiments.experiment import NOT_ANY
 from rce_fleet.experiments.folders import go_on
-from rce_fleet.experiments.runner import Plan
+from rce_fleet.experiments.laser import Laser
+from rce_fleet.experiments.ownership import measuring
+from rce_fleet.experiments.report import drawing
+from rce_fleet.experiments.results import Condition, Row, write_rows
+from rce_fleet.experiments.runner import DONE, LINK, LINK_DELAYS_S, Plan
 
 SYSTEMS = "single_master,cloud"
 app = typer.Typer()
@@ -75,6 +81,33 @@ def test_a_folder_is_used_by_one_command_at_a_time(data: Path) -> None:
     finally:
         os.close(descriptor)
     assert not (data / "results.csv").exists()
+
+
+def test_a_second_experiment_is_told_that_it_is_not_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with measuring() as first, measuring() as second:
+        assert (first, second) == (True, False)
+    with measuring() as again:
+        assert again
+
+
+@pytest.mark.needs("netns")
+def test_two_experiments_at_once_say_so(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each would spoil the figures of the other, for hours. The plan of this one is done already."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(drawing, "can_draw", lambda: False)
+    options = _options(SYSTEMS, "rce", 5, quick=False)
+    planned = Plan([Laser()], options, 1, seed=1)
+    links = [Condition.of(LINK, NOT_ANY, NOT_ANY, delay=round(1000 * delay)) for delay in LINK_DELAYS_S]
+    done = [Row(run.condition, 1, DONE, 1.0, "s") for _, run in planned.works(Laser(), []) if run.number]
+    write_rows(data / "results.csv", [*(Row(link, 1, "rate", 1.0, "bit/s") for link in links), *done])
+    with measuring():
+        code, told = invoke("--resume", data, "--runs", "1")
+    assert (code, "the figures of both are disturbed" in told) == (0, True), told
+    code, told = invoke("--resume", data, "--runs", "1")
+    assert (code, "the figures of both are disturbed" in told) == (0, False), told
 
 
 def test_the_commit_is_not_that_of_a_repository_around_it(tmp_path: Path) -> None:
