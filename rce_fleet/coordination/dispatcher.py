@@ -132,6 +132,7 @@ class Dispatcher:
         ledger.overlap(record.id, self._beside(record, hull) if has_cell else self._around(record))
         claims = ledger.claims(record.id)
         wanted = hull | record.earlier | record.doubted
+        self._retry_beside(record.id)
         self.state.index.displaced.put(record.id, () if wanted <= claims else wanted)
         if claims != before:
             self.avoid(record)
@@ -140,6 +141,17 @@ class Dispatcher:
                 self._stop_silent(record)  # It would be driven back to its cells, through those of others.
         if not has_cell or not hull <= before:
             self.make_room(record)
+
+    def _retry_beside(self, robot: str) -> None:
+        """Look again at robots that wait for a place beside one that overlaps their cells, which may move."""
+        index = self.state.index
+        if robot in index.displaced.cells:
+            self.to_settle.update(index.hindered.at(index.displaced.cells[robot]))
+
+    def forget(self, robot: str) -> None:
+        """Note that a robot is being removed."""
+        self.expected.pop(robot, None)
+        self._retry_beside(robot)
 
     def _beside(self, record: RobotRecord, hull: set[int]) -> set[int]:
         """Return the cells that a robot with a cell overlaps, if its hull is not within its cells."""
@@ -181,12 +193,40 @@ class Dispatcher:
         for cell in () if isnan(record.x) else sorted(self._placement.touched(record)):
             owner = self.state.ledger.owner(cell)
             other = self.state.robots.get(owner) if owner is not None else None
-            if other is None or other is record or cell not in self.state.ledger.granted(other.id)[1:]:
+            if other is None or other is record or not self._meets(other, cell, record):
                 continue
             if other.phase is Phase.ACTIVE:
                 self.hold(other, f"{record.id} is in its way")
             elif other.phase is Phase.SILENT and self.now - other.sent_at >= self.settings.repeat_after:
                 self._stop_silent(other)
+
+    def _meets(self, record: RobotRecord, cell: int, other: RobotRecord) -> bool:
+        """Return whether a robot may drive towards another one that overlaps a cell of it."""
+        granted = self.state.ledger.granted(record.id)
+        if cell in granted[1:]:
+            return True
+        if record.phase is not Phase.ACTIVE or (record.centred and len(granted) == 1):
+            return False
+        return not self._placement.keeps_off([(record.x, record.y), *self._centres(granted)], other)
+
+    def has_room(self, record: RobotRecord) -> bool:
+        """Return whether a robot's way along its granted cells keeps off robots in cells of others."""
+        claims, granted = self.state.ledger.claims(record.id), self.state.ledger.granted(record.id)
+        places = [(record.x, record.y), *self._centres(granted)]
+        others = self._placement.beside(record.id, claims)
+        return all(self._placement.keeps_off(places, other) for other in others)
+
+    def _centres(self, cells: Iterable[int]) -> list[tuple[float, float]]:
+        return [self.state.grid.centre(cell) for cell in cells]
+
+    def _way_is_clear(self, record: RobotRecord) -> bool:
+        """Return whether a robot's way to the next cell of its path keeps off robots in cells of others."""
+        if not self.state.index.displaced.cells:
+            return True
+        route, granted = self.state.ledger.route(record.id), len(self.state.ledger.granted(record.id))
+        cells = route[granted - 1 : granted + 1]
+        others = self._placement.beside(record.id, cells)
+        return all(self._placement.keeps_off(self._centres(cells), other) for other in others)
 
     def _block_left_cells(self) -> None:
         if not self.left:
@@ -208,9 +248,11 @@ class Dispatcher:
         for robot in list(islice(self._ripe, self.settings.robots_per_step)):
             del self._ripe[robot]
             record = self.state.robots.get(robot)
-            if record is None or record.phase is not Phase.ACTIVE:
+            if record is None or record.phase is not Phase.ACTIVE or record.leaving:
                 continue
-            if ledger.grant(robot, self.settings.ahead):
+            if not self._way_is_clear(record) and ledger.may_grant(robot, self.settings.ahead):
+                self.hold(record, "another robot is in its way")
+            elif ledger.grant(robot, self.settings.ahead):
                 self.send(record, tuple(ledger.granted(robot)))
 
     # One robot
@@ -231,7 +273,9 @@ class Dispatcher:
             index -= 1  # It cuts a corner, and is still partly in the cell before.
         extra = self.state.ledger.overlapped(record.id)
         if index > 0 or extra or not record.centred:
-            record.centred = True
+            if record.leaving:
+                self._ripe[record.id] = None
+            record.centred, record.leaving = True, False
             self.state.touch(record)
             still = extra and extra & self._placement.hull(record)
             self.state.ledger.arrive(record.id, index, still)
@@ -241,7 +285,7 @@ class Dispatcher:
         """Return whether a robot that is not on its path was carried out of its granted cells."""
         here = self.state.grid.cell_at(record.x, record.y)
         granted = self.state.ledger.granted(record.id)
-        if here in granted:
+        if here in granted or (record.leaving and here in self.state.ledger.overlapped(record.id)):
             return False
         # It may begin in a cell that is shut, and that it only overlaps.
         in_others = here not in self.state.ledger.claims(record.id)
@@ -280,7 +324,8 @@ class Dispatcher:
         state = self.state
         self._placement.validate()
         for record in state.robots.values() if self._is_granting() else ():
-            if record.phase is Phase.ACTIVE and state.ledger.may_grant(record.id, self.settings.ahead):
+            may_drive = record.phase is Phase.ACTIVE and not record.leaving
+            if may_drive and state.ledger.may_grant(record.id, self.settings.ahead):
                 raise InvariantError(f"{record.id} was not granted a cell that is free for it")
         undone = [cell for cell in state.pending if state.ledger.owner(cell) is None]
         if undone:

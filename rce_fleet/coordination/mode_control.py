@@ -103,8 +103,11 @@ class ModeControl:
         state, dispatcher = self._state, self._dispatcher
         if record.phase is Phase.STANDING:
             state.change(record, Cause.RESUMED, "")
-            dispatcher.send(record, tuple(state.ledger.granted(record.id)))
-            dispatcher.require([record.id])
+            if dispatcher.has_room(record):
+                dispatcher.send(record, tuple(state.ledger.granted(record.id)))
+                dispatcher.require([record.id])
+            else:
+                dispatcher.hold(record, "another robot is in its way")
         elif record.phase is Phase.HOLDING:
             dispatcher.hold(record, "it joins again")
         dispatcher.require(other.id for other in state.robots.values() if other.unreachable)

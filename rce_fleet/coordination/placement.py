@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from math import isnan
-from typing import TYPE_CHECKING
+from itertools import pairwise
+from math import hypot, isnan
+from typing import TYPE_CHECKING, NamedTuple
 
 from rce_fleet.coordination.modes import RobotMode
 from rce_fleet.coordination.progress import standing_cell
@@ -12,11 +13,32 @@ from rce_fleet.coordination.robot import Cause, Phase, RobotRecord
 from rce_fleet.exceptions import InvariantError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from rce_fleet.coordination.dispatcher import Dispatcher
     from rce_fleet.coordination.fleet_state import FleetState
     from rce_fleet.coordination.settings import FleetSettings
+
+
+_ROUNDING = 1e-6
+_SAMPLES = 20
+"""Places on a way at which the cells that a robot overlaps are looked at: one in 5 cm of a cell of 1 m."""
+_BETWEEN_SAMPLES = 0.01
+"""Margin for what a robot overlaps between two of these places, metres."""
+
+
+class _Entry(NamedTuple):
+    """How a robot that stands gets into a cell.
+
+    Attributes:
+        cell: The cell; None: it has to wait.
+        swept: Cells that it overlaps on the way there.
+        reason: Why it has to wait.
+    """
+
+    cell: int | None
+    swept: frozenset[int] = frozenset()
+    reason: str = ""
 
 
 class Placement:
@@ -86,8 +108,10 @@ class Placement:
         """Place a robot that stands still in its cell."""
         state, dispatcher = self._state, self._dispatcher
         hull, own, cell, reason = self._place_of(record)
+        entry = self._entry(record, hull, own, cell) if cell is not None and not reason else _Entry(cell)
+        reason = reason or entry.reason
         state.index.hindered.put(record.id, self.touched(record) if reason else ())
-        if cell is None or reason:
+        if cell is None or entry.cell is None or reason:
             if record.reason != reason:
                 record.reason = reason
                 state.touch(record)
@@ -98,11 +122,11 @@ class Placement:
             return
         is_driven = state.mode_of(record) is RobotMode.AUTOMATIC
         state.change(record, Cause.SETTLED if is_driven else Cause.STAYED, "" if is_driven else record.reason)
-        record.centred, record.doubted = False, frozenset()
-        state.ledger.place(record.id, cell, self._open(own))
+        record.centred, record.leaving, record.doubted = False, entry.cell != cell, frozenset()
+        state.ledger.place(record.id, entry.cell, self._open({cell, *own, *entry.swept}))
         if is_driven:
             dispatcher.require([record.id])
-            dispatcher.send(record, (cell,))
+            dispatcher.send(record, (entry.cell,))
         else:
             record.reason = state.reason_of(record)
             dispatcher.avoid(record)
@@ -145,7 +169,97 @@ class Placement:
         shut = {cell for cell in own if state.is_shut(cell)}
         cell = standing_cell(state.grid, own, record.x, record.y, shut)
         reachable = {other for other in hull - own if self._may_drive_to(other)}
-        return hull, own, cell, hindrance(state, record, hull, own, cell, reachable)
+        held = set() if self._holders_wait(record, hull - own) else hull - own
+        return hull, own, cell, hindrance(state, record, hull, held, cell, reachable)
+
+    def _holders_wait(self, record: RobotRecord, cells: Iterable[int]) -> bool:
+        """Return whether the owners of cells stand there without a place: one of all has to leave first."""
+        state = self._state
+        owners = {state.ledger.owner(cell) for cell in cells}
+        records = [state.robots.get(owner) for owner in owners if owner is not None]
+        return not state.ledger.length(record.id) and all(
+            other is not None and other.phase is Phase.HOLDING and not state.ledger.length(other.id)
+            for other in records
+        )
+
+    # Robots in one cell
+
+    def keeps_off(self, places: Sequence[tuple[float, float]], other: RobotRecord) -> bool:
+        """Return whether a robot that drives straight from place to place keeps off one that stands.
+
+        It may begin near it, if it does not come nearer.
+        """
+        begins = hypot(other.x - places[0][0], other.y - places[0][1])
+        least = min(2 * self._settings.robot_radius + self._settings.clearance, begins)
+        return all(_distance(a, b, (other.x, other.y)) >= least - _ROUNDING for a, b in pairwise(places))
+
+    def beside(self, robot: str, cells: Iterable[int]) -> list[RobotRecord]:
+        """Return other robots that overlap cells which are not theirs, and one of these cells."""
+        displaced = self._state.index.displaced
+        if not displaced.cells:
+            return []
+        wanted = set(cells)
+        found = (self._state.robots.get(name) for name in sorted(displaced.at(wanted) - {robot}))
+        return [other for other in found if other and not isnan(other.x) and wanted & self.hull(other)]
+
+    def _entry(self, record: RobotRecord, hull: set[int], own: set[int], cell: int) -> _Entry:
+        """Return how a robot gets into a cell of its own, if another one that waits is in its cell too.
+
+        It leaves the cell straight, in a direction in which it comes no nearer, and the other one gets it.
+        """
+        state = self._state
+        others = self.beside(record.id, {cell, *own})
+        if not state.ledger.length(record.id):
+            holders = {state.ledger.owner(other) for other in hull - own}
+            others += [state.robots[name] for name in sorted(filter(None, holders)) if name in state.robots]
+        if not others or self._state.mode_of(record) is not RobotMode.AUTOMATIC:
+            return _Entry(cell)
+        here, centre = (record.x, record.y), state.grid.centre
+        is_shared = any(cell in self.hull(other) for other in others)
+        if all(map(self._is_still, others)):
+            for first in self._exits(record, cell) if is_shared else [cell]:
+                swept = self._swept(record, first)
+                if self._may_sweep(record, swept - own) and all(
+                    self.keeps_off((here, centre(first)), other) for other in others
+                ):
+                    return _Entry(first, frozenset(swept))
+        names = ", ".join(dict.fromkeys(other.id for other in others))
+        return _Entry(None, reason=f"too near to {names} to leave cell {cell}: drive one of them by hand")
+
+    def _is_still(self, record: RobotRecord) -> bool:
+        """Return whether a robot stands, and is not about to drive."""
+        granted = self._state.ledger.granted(record.id)
+        may_drive = record.phase is Phase.ACTIVE and (len(granted) > 1 or not record.centred)
+        return not may_drive and self._dispatcher.now - record.still_since() >= self._settings.settle_time
+
+    def _exits(self, record: RobotRecord, cell: int) -> list[int]:
+        """Return the cells beside one that a robot may enter, the nearest first."""
+        state = self._state
+        closed, forbidden = state.zones.closed(state.grid), state.forbidden(record.id)
+        exits = [
+            other
+            for other in state.grid.around(cell)
+            if not state.is_shut(other) and other not in forbidden and (cell, other) not in closed
+        ]
+        return sorted(exits, key=lambda other: hypot(*_minus(state.grid.centre(other), (record.x, record.y))))
+
+    def _swept(self, record: RobotRecord, cell: int) -> set[int]:
+        """Return the cells that a robot overlaps on its straight way to the centre of one."""
+        grid, (x, y) = self._state.grid, self._state.grid.centre(cell)
+        shares = [number / _SAMPLES for number in range(_SAMPLES + 1)]
+        places = [(record.x + share * (x - record.x), record.y + share * (y - record.y)) for share in shares]
+        reach = self._settings.robot_radius + _BETWEEN_SAMPLES
+        return set().union(*(grid.cells_touched(*place, reach) for place in places))
+
+    def _may_sweep(self, record: RobotRecord, cells: Iterable[int]) -> bool:
+        """Return whether a robot may pass over cells: they are open, and no other robot may be there."""
+        state = self._state
+        return all(
+            not state.is_blocked(cell)
+            and state.ledger.owner(cell) in (None, record.id)
+            and not state.index.displaced.at({cell}) - {record.id}
+            for cell in cells
+        )
 
     def _may_drive_to(self, cell: int) -> bool:
         """Return whether a cell's owner is elsewhere, and may drive there."""
@@ -162,5 +276,21 @@ class Placement:
         for record in self._state.robots.values():
             stands = record.phase is Phase.HOLDING and record.stands(self._settings)
             is_placed = self._state.mode_of(record).is_placed
-            if stands and is_placed and not self._place_of(record)[-1]:
+            if not stands or not is_placed:
+                continue
+            hull, own, _, reason = self._place_of(record)
+            # Beside others it waits until they stand, and is looked at with its next message.
+            if not reason and not self.beside(record.id, own) and hull <= own:
                 raise InvariantError(f"{record.id} stands still and was not placed in its cell")
+
+
+def _distance(begin: tuple[float, float], end: tuple[float, float], place: tuple[float, float]) -> float:
+    """Return the distance of a place from a straight way, metres."""
+    (dx, dy), (x, y) = _minus(end, begin), _minus(place, begin)
+    length = dx * dx + dy * dy
+    share = min(max((x * dx + y * dy) / length, 0.0), 1.0) if length else 0.0
+    return hypot(x - share * dx, y - share * dy)
+
+
+def _minus(a: tuple[float, float], b: tuple[float, float]) -> tuple[float, float]:
+    return a[0] - b[0], a[1] - b[1]

@@ -274,7 +274,7 @@ class FleetPlanner:
         # Messages that are still on the way must not add it again.
         self._deaf_until[event.robot] = self._now + self.settings.silence_timeout
         self._deadlines.forget(event.robot)
-        self._dispatcher.expected.pop(event.robot, None)
+        self._dispatcher.forget(event.robot)
         self.state.remove(event.robot)
         self._dispatcher.require(other.id for other in self.state.robots.values() if other.unreachable)
         return Reply(True, f"{event.robot} was removed")

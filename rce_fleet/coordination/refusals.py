@@ -48,7 +48,7 @@ def hindrance(
     state: FleetState,
     record: RobotRecord,
     hull: AbstractSet[int],
-    own: AbstractSet[int],
+    held: AbstractSet[int],
     cell: int | None,
     reachable: AbstractSet[int],
 ) -> str:
@@ -61,15 +61,14 @@ def hindrance(
         state: The fleet.
         record: The robot.
         hull: Cells that its hull overlaps.
-        own: Cells that it overlaps, with a margin, and that no other robot claims.
+        held: Those of them that other robots claim.
         cell: The cell to place it in; None if there is none.
         reachable: Cells of its hull that other robots claim, are not in, and may drive to.
     """
     if not hull:
         return "it is outside the map"
-    held = hull - own
     if cell is None or reachable or (held and not state.ledger.length(record.id)):
-        other = min(reachable or held)
+        other = min(reachable or held or hull)
         return f"cell {other} is held by {state.ledger.owner(other)}"
     if state.is_blocked(cell):
         return "it stands in a blocked cell"

@@ -97,6 +97,8 @@ class RobotRecord:
         rest: The cell it returns to when it has no goal.
         unreachable: Whether no path leads to its goal.
         centred: Whether it has been at the centre of its cell since it was placed there.
+        leaving: Whether it drives out of a cell in which another robot waits; it is granted no more until it
+            is at the centre of the next.
         replans: How often it lost its path because a cell on it was blocked.
         held_at: When it was last told to stand still.
         sent_at: When it was last sent a message.
@@ -127,6 +129,7 @@ class RobotRecord:
     rest: int | None = None
     unreachable: bool = False
     centred: bool = False
+    leaving: bool = False
     replans: int = 0
     held_at: float = -inf
     sent_at: float = -inf

@@ -184,6 +184,11 @@ class SimulatedClients:
         self.robots[robot] = MakeBelieveRobot(robot, self.grid, x, y, self.rng.uniform(0.3, 0.9))
         self.clients[robot] = MoveClient(self.grid, robot, self.wall)
 
+    def add_robot_at(self, robot: str, x: float, y: float) -> None:
+        """Add a robot between the centres of cells."""
+        self.add_robot(robot, 0)
+        self.robots[robot].x, self.robots[robot].y = x, y
+
     def restart_client(self, robot: str) -> None:
         self.clients[robot] = MoveClient(self.grid, robot, self.wall)
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from unit.fleet.conftest import SimulatedClients
 
 
+RADIUS = FleetSettings().robot_radius
 JUMP_SETTLE_TIME = FleetSettings().jump_settle_time
 FARTHER_THAN_IT_DRIVES = 5.0
 """Metres, although some poses get lost."""
@@ -117,6 +118,47 @@ def test_indexes_equal_a_recomputation_whatever_happens(
         fleet.run(fleet.settled)
         assert fleet.send_all(rng.sample(grid.free, len(fleet.robots)))
         fleet.run(fleet.all_arrived)
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32), count=st.integers(2, 6))
+@example(seed=126, count=3)  # a robot that leaves the cell of another has its path through that cell
+def test_robots_that_start_side_by_side_separate(
+    make_fleet: type[SimulatedClients], seed: int, count: int
+) -> None:
+    """Several in one cell, and between cells. Where they are too near to each other they say so and stand."""
+    rng = Random(seed)
+    grid = connected_map(rng, 3)
+    fleet = make_fleet(FleetPlanner(grid), [], seed, loss=rng.choice((0.0, 0.1)))
+    for x, y in crowd(rng, grid, count):
+        fleet.add_robot_at(f"Robot{len(fleet.robots) + 1}", x, y)
+    fleet.run(lambda: len(fleet.states()) == len(fleet.robots))
+    for robot, goal in zip(sorted(fleet.robots), rng.sample(grid.free, len(fleet.robots)), strict=True):
+        assert fleet.ask(GoalSet(robot, goal)).ok
+    seen = ""
+    for _ in range(3000):
+        fleet.step()
+        if fleet.all_arrived():
+            return
+        seen = " ".join(robot.reason for robot in fleet.planner.snapshot().robots)
+    assert "drive one of them by hand" in seen or "is held by" in seen
+
+
+def crowd(rng: Random, grid: GridMap, count: int) -> list[tuple[float, float]]:
+    """Return places of robots that do not touch each other or walls, most of them side by side."""
+    places: list[tuple[float, float]] = []
+    for _ in range(5000):
+        x, y = rng.uniform(RADIUS, 8 - RADIUS), rng.uniform(RADIUS, 8 - RADIUS)
+        if places and rng.random() < 0.6:
+            beside_x, beside_y = rng.choice(places)
+            x, y = beside_x + rng.uniform(-0.6, 0.6), beside_y + rng.uniform(-0.6, 0.6)
+        is_inside = min(x, y) >= RADIUS and max(x, y) <= 8 - RADIUS
+        is_free = is_inside and not grid.cells_touched(x, y, RADIUS) & grid.blocked
+        if is_free and all(hypot(x - a, y - b) > 2 * RADIUS + 0.05 for a, b in places):
+            places.append((x, y))
+        if len(places) == count:
+            break
+    return places
 
 
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
