@@ -18,7 +18,7 @@ class TaskRequests(ApiRequests):
         Args:
             task: The task.
             key: The caller's own key, such as the number of an order: a second request with the same key and
-                content returns the first task. A random one if empty.
+                content returns the first task. If empty, that of the task, or a random one.
 
         Example:
             ```python
@@ -26,8 +26,9 @@ class TaskRequests(ApiRequests):
             task = await fleet.create_task(TaskRequest(stops=stops, priority=5), key="order-4711")
             ```
         """
-        headers = {"Idempotency-Key": key or task.key or secrets.token_hex(16)}
-        return await self._send("POST", "/tasks", TaskModel, task, headers=headers)
+        # In the body: a header lacks the spaces around a key, and cannot have all characters.
+        keyed = task.model_copy(update={"key": key or task.key or secrets.token_hex(16)})
+        return await self._send("POST", "/tasks", TaskModel, keyed)
 
     async def task(self, task_id: str) -> TaskModel:
         """Return a task.

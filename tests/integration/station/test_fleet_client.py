@@ -19,6 +19,7 @@ from aiohttp import web
 from aiohttp.test_utils import TestServer
 from typer.testing import CliRunner
 
+from rce_fleet.api.tasks import StopModel, TaskRequest
 from rce_fleet.cli.commands import app as commands
 from rce_fleet.client import ApiError, FleetApiUnavailableError, FleetClient, NotFoundError
 
@@ -94,6 +95,23 @@ async def test_a_zone_that_was_removed_without_an_answer_is_removed(is_first: bo
             with pytest.raises(NotFoundError):
                 await client.remove_zone("gate", revision=3)
     assert asked == (1 if is_first else 3)
+
+
+@pytest.mark.parametrize("key", [" 4711", "order\n4711", "Auftrag 4711 für Jürgen"])
+async def test_a_task_is_created_with_any_key(key: str) -> None:
+    """In a header the first was refused as another one than that of the task, and the second failed."""
+    asked: list[tuple[str, Any]] = []
+
+    async def create(request: web.Request) -> web.Response:
+        asked.append((request.headers.get("Idempotency-Key", ""), await request.json()))
+        return web.json_response({"error": "seen"}, status=409)
+
+    async with client_of(create) as client:
+        stops = [StopModel(cell=9)]
+        for request, other in ((TaskRequest(stops=stops, key=key), ""), (TaskRequest(stops=stops), key)):
+            with pytest.raises(ApiError, match="seen"):
+                await client.create_task(request, key=other)
+    assert asked == [("", {"stops": [{"cell": 9}], "key": key})] * 2
 
 
 async def test_an_answer_that_is_not_text_is_an_error_of_the_client() -> None:
