@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -64,24 +65,29 @@ class Route(Generic[H]):
         return {}
 
 
-def unknown_parameter(route: Route[Any], given: Iterable[str], also: Iterable[str] = ()) -> str:
-    """Return why a request is refused: it has a query parameter that its route does not have.
+def parameter_fault(route: Route[Any], given: Iterable[tuple[str, str]], also: Iterable[str] = ()) -> str:
+    """Return why a request is refused: it has a query parameter twice, or one that its route does not have.
 
-    A filter that is spelled wrongly must not return, or change, what others have.
+    A filter that is spelled wrongly must not return, or change, what others have. Of two values one would
+    be left out.
 
     Args:
         route: The route.
-        given: The names of the request's query parameters.
+        given: The names and values of the request's query parameters.
         also: Names that every route takes.
 
     Returns:
-        The reason, which names the parameter and those that there are; empty: all are known.
+        The reason, which names the parameter; empty: all are as they should be.
     """
     known = sorted(query.name for query in route.query)
-    for name in given:
-        if name not in known and name not in also:
+    for name, count in Counter(name for name, _ in given).items():
+        if name in also:
+            continue
+        if name not in known:
             shown = name[:MAX_SHOWN]
             return f"query parameter {shown!r} is unknown here; known are: {', '.join(known) or 'none'}"
+        if count > 1:
+            return f"query parameter {name!r} is given {count} times; give it once"
     return ""
 
 

@@ -11,7 +11,7 @@ from aiohttp import hdrs, web
 from rce.aio.tasks import cancel_and_wait
 from rce.web.openapi import PREFIX
 from rce.web.origin import ServerNames, is_foreign
-from rce.web.routes import Route, unknown_parameter
+from rce.web.routes import Route, parameter_fault
 from rce_fleet.station.authentication import AuditedAction, AuthenticationError, Authenticator, StationUser
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -160,7 +160,7 @@ def with_known_query(route: Route[Any], handler: Handler) -> Handler:
         return handler
 
     async def answer(request: web.Request) -> web.StreamResponse:
-        fault = unknown_parameter(route, request.query, also=("token",))
+        fault = parameter_fault(route, request.query.items(), also=("token",))
         return problem(422, fault) if fault else await handler(request)
 
     return answer

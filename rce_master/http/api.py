@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from rce.web.bodies import read_whole
 from rce.web.openapi import PREFIX, build_document
-from rce.web.routes import unknown_parameter
+from rce.web.routes import parameter_fault
 from rce_master.answers import PendingAnswer
 from rce_master.exceptions import InvalidRequestError, MasterError
 from rce_master.http import (
@@ -132,7 +132,7 @@ def _adapt(route: Route, services: Services) -> Answer:
 
 
 def _check_parameters(route: Route, request: web.Request) -> None:
-    if fault := unknown_parameter(route, request.query):
+    if fault := parameter_fault(route, request.query.items()):
         raise InvalidRequestError(fault)
 
 

@@ -141,5 +141,7 @@ async def test_a_query_parameter_that_a_route_does_not_have_is_named(site: Site)
         answer = await site.api(method, path, status=422)
         assert "is unknown here" in answer["error"]
         assert answer["error"].endswith(f"known are: {known}")
+    answer = await site.api("GET", "/containers?user=yan&user=testUser", status=422)
+    assert answer["error"] == "query parameter 'user' is given 2 times; give it once"
     described = (await site.api("GET", "/openapi.json"))["paths"]
     assert "422" in described["/api/v1/masters"]["get"]["responses"]

@@ -121,15 +121,16 @@ async def test_reads_the_fleet(running: RunningStation) -> None:
         ("figures?second=60", "", "query parameter 'second' is unknown here; known are: seconds"),
         ("fleet?robot=Robot1", "", "query parameter 'robot' is unknown here; known are: none"),
         ("tasks?states=open", "", "known are: cursor, limit, order, requester, robot, state"),
+        ("tasks?state=open&state=ended", "", "query parameter 'state' is given 2 times; give it once"),
         ("events?task=7", "text/event-stream", "known are: after, id, limit"),
         ("events?id=7", "text/event-stream", "a stream of events takes no 'id'"),
         ("history?format=csv&robot=Robot1", "", "query parameter 'robot' is unknown here"),
     ],
 )
-async def test_unknown_parameters_are_refused(
+async def test_unknown_and_repeated_parameters_are_refused(
     running: RunningStation, path: str, accept: str, fault: str
 ) -> None:
-    """A filter that is ignored shows what others did as if it passed."""
+    """A filter that is ignored shows what others did as if it passed; of two states one was ignored."""
     await running.start("secret")
     # The token counts as known everywhere.
     answer = await running.client.get(f"/api/v1/{path}&token=secret", headers={"Accept": accept})
